@@ -1,0 +1,45 @@
+"""Host time, injected: the real monotonic clock, or one that tests and simulations move by hand.
+
+Three time bases exist, and names tell them apart: `host_s` (monotonic, this module), `plan_s`
+(seconds from a plan's start) and `tick` (the board's counter).
+"""
+
+import time
+from typing import Protocol
+
+
+class Clock(Protocol):
+    """What the package asks of a clock."""
+
+    def now_s(self) -> float:
+        """Monotonic time, s."""
+
+    def sleep(self, duration_s: float) -> None:
+        """Let `duration_s` seconds pass."""
+
+
+class MonotonicClock:
+    """The machine's monotonic clock."""
+
+    def now_s(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    def sleep(self, duration_s: float) -> None:
+        """Block for `duration_s` seconds."""
+        time.sleep(duration_s)
+
+
+class ManualClock:
+    """A clock that moves only when told."""
+
+    def __init__(self, start_s: float = 0.0) -> None:
+        self._now_s = start_s
+
+    def now_s(self) -> float:
+        """Time as last set, s."""
+        return self._now_s
+
+    def sleep(self, duration_s: float) -> None:
+        """Advance by `duration_s` seconds at once."""
+        self._now_s += duration_s

@@ -1,0 +1,74 @@
+"""Errors, by whose fault they are: the caller's input, the plan, the board, the link."""
+
+from difflib import get_close_matches
+
+
+class OptodriveError(Exception):
+    """Base of all errors this package raises on purpose; `code` is stable and machine-readable."""
+
+    code = "error"
+    exit_status = 1
+
+
+class InputError(OptodriveError):
+    """The caller's input is wrong: says where, which value, and what was expected, in one line."""
+
+    code = "bad_input"
+    exit_status = 2
+
+    def __init__(self, where: str, value: object, expected: str, code: str = "bad_input") -> None:
+        self.where = where
+        self.value = value
+        self.expected = expected
+        self.code = code
+        super().__init__(f"{where}: got {abbreviate(value)}, expected {expected}")
+
+
+class RefusedError(OptodriveError):
+    """The input is well formed, but what it asks for is refused (limits, deadlines, reach)."""
+
+    code = "refused"
+
+
+class NotReadyError(OptodriveError):
+    """The board is not in a state in which this may be done (not armed, busy, faulted)."""
+
+    code = "not_ready"
+
+
+class LinkError(OptodriveError):
+    """The link to the board failed or was lost; the message carries the likely cause."""
+
+    code = "link"
+
+
+class BoardFaultError(OptodriveError):
+    """The board is in FAULT; the message carries the fault's name and likely cause."""
+
+    code = "board_fault"
+
+
+class ProtocolError(OptodriveError):
+    """Bytes or messages that the protocol does not allow."""
+
+    code = "protocol"
+
+
+class LocalProtocolError(ProtocolError):
+    """This side tried to send what the protocol does not allow now: a bug here."""
+
+
+class RemoteProtocolError(ProtocolError):
+    """The other side sent what the protocol does not allow."""
+
+
+def abbreviate(value: object, limit: int = 60) -> str:
+    """`repr` of a value, cut to `limit` characters, so that one line stays one line."""
+    text = repr(value)
+    return text if len(text) <= limit else text[: limit - 1] + "…"
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """A phrase that names the known word nearest to `name`, or all of them when none is near."""
+    match = get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"'{match[0]}'" if match else "one of " + ", ".join(known)

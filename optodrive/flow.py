@@ -1,0 +1,211 @@
+"""The types that flow through the driver, one way.
+
+    FrameSequence → PulsePlan → LimitedPlan → wire bytes → ExecutedPulses → PixelTrace → Measurement
+
+Stages share these and nothing else. Arrays are read-only; n pulses, p pixels, m times; SI units, in the names.
+"""
+
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+StrArray = NDArray[np.str_]
+
+
+def freeze_arrays(instance: object) -> None:
+    """Make every array field of a dataclass instance read-only."""
+    for item in fields(instance):  # type: ignore[arg-type]
+        value: Any = getattr(instance, item.name)
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class TactileFrame:
+    """One tactile picture: the peak displacement asked of each pixel while the frame is shown.
+
+    target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
+    """
+
+    frame_id: str
+    show_at_s: float
+    duration_s: float
+    target_m: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True)
+class PulseTrain:
+    """Cyclic stimulation of one pixel: pulses of `pulse_width_s` with `gap_s` between, for `duration_s`.
+
+    power_w: incident power while on, W. The train holds every pulse that starts before its end; the last may end later.
+    """
+
+    pixel: int
+    start_s: float
+    duration_s: float
+    pulse_width_s: float
+    gap_s: float
+    power_w: float
+
+    def pulse_starts_s(self) -> FloatArray:
+        """Nominal start of each pulse, s: [n]."""
+        period_s = self.pulse_width_s + self.gap_s
+        count = max(1, int(np.ceil(self.duration_s / period_s - 1e-9)))
+        return np.asarray(self.start_s + period_s * np.arange(count), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class FrameSequence:
+    """What a caller asks to be felt: frames by height, trains by pulse; times from the plan's start."""
+
+    frames: tuple[TactileFrame, ...] = ()
+    trains: tuple[PulseTrain, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class PulsePlan:
+    """Timed pulses before the limiter: one row a pulse, in order of time, one beam. All arrays [n].
+
+    start_s: gate on, from the plan's start, whole microseconds; width_s: whole PWM periods
+    x_rad, y_rad: mechanical mirror angles (the beam turns by twice that)
+    power_w: mean incident power while on; pixel: index
+    settle_s: dark time kept before the pulse for the mirrors' move and settling
+    target_m: peak displacement the pulse is meant to reach, NaN for pulses of a train
+    nominal_s: when the request wanted the pulse (frame: shown by; train: gate on); source: index of frame, or of
+    train counted on from the frames
+    """
+
+    start_s: FloatArray
+    width_s: FloatArray
+    x_rad: FloatArray
+    y_rad: FloatArray
+    power_w: FloatArray
+    pixel: IntArray
+    settle_s: FloatArray
+    target_m: FloatArray
+    nominal_s: FloatArray
+    source: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.start_s)
+
+
+@dataclass(frozen=True, eq=False)
+class LimitedPlan(PulsePlan):
+    """A plan as the limiter passed it; only `optodrive.limit` makes one.
+
+    energy_j: incident energy of the pulse as passed [n]; trimmed_j: energy taken from it [n]
+    reason: why energy was taken, '' where none was [n]
+    headroom_k: least distance of each pixel's absorber bound from its cap during the plan [p]
+    """
+
+    energy_j: FloatArray
+    trimmed_j: FloatArray
+    reason: StrArray
+    headroom_k: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class BudgetState:
+    """What the limiter remembers between plans; pulses passed count as fired until shown otherwise.
+
+    at_s: the time up to which the plan reached, on the budget's time line
+    rise_k: [p] upper bound on each absorber's rise at at_s
+    recent_*: [r] pulses still inside a sliding window: start_s, width_s, power_w, pixel
+    """
+
+    at_s: float
+    rise_k: FloatArray
+    recent_start_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    recent_width_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    recent_power_w: FloatArray = field(default_factory=lambda: np.zeros(0))
+    recent_pixel: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, eq=False)
+class ExecutedPulses:
+    """What the board says it did, one row an executed pulse, in order; complete: none is missing. All arrays [n].
+
+    on_tick: board tick of gate on; width_ticks: gate-on time; index: wire index of the point
+    pixel, power_w: of the plan's row; start_s: on_tick from the tick at which the plan was started, s
+    """
+
+    index: IntArray
+    on_tick: IntArray
+    width_ticks: IntArray
+    pixel: IntArray
+    power_w: FloatArray
+    start_s: FloatArray
+    width_s: FloatArray
+    complete: bool
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+@dataclass(frozen=True, eq=False)
+class PixelTrace:
+    """What pixels do in time. t_s [m]; absorber_k, gas_k (rises above ambient), displacement_m, force_n: [m, p]."""
+
+    t_s: FloatArray
+    pixel: IntArray
+    absorber_k: FloatArray
+    gas_k: FloatArray
+    displacement_m: FloatArray
+    force_n: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """One measured signal of one pixel: t_s [m] increasing; value [m], NaN where missing; sigma: stated noise."""
+
+    pixel: int
+    t_s: FloatArray
+    value: FloatArray
+    sigma: float | None = None
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One run of a recording: the drive as commanded, and the signals measured meanwhile.
+
+    pulses: [n, 4] start_s, width_s, power_w, pixel; signals: by the format's names; attributes: as in the file
+    """
+
+    name: str
+    ambient_k: float
+    pulses: FloatArray
+    signals: dict[str, Signal]
+    attributes: dict[str, str | float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A recording: runs in order."""
+
+    runs: tuple[Run, ...]

@@ -1,0 +1,113 @@
+"""Parameter sets: one file a source, each value with its unit, uncertainty and source."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
+from optodrive.errors import InputError
+from optodrive.flow import FloatArray, freeze_arrays
+from optodrive.physics.pixel import Pixel
+
+FORMAT = "optodrive-parameters"
+VERSION = 1
+
+
+class Parameter(BaseModel):
+    """One number: value, unit, standard uncertainty (absent where the source gives none) and source."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    value: Annotated[float, Field(gt=0)]
+    unit: str
+    sigma: Annotated[float, Field(ge=0)] | None = None
+    source: str
+
+
+class Bridge(BaseModel):
+    """Thermal parameters of the absorber at one bridge width (a row of Table S3)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    width_m: Annotated[float, Field(gt=0)]
+    R: Parameter
+    C: Parameter
+
+
+class ParameterSet(BaseModel):
+    """A named set of pixel parameters; `claims` says what it stands for and what it does not."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    format: Literal["optodrive-parameters"]
+    version: Literal[1]
+    name: str
+    claims: str
+    epsilon: Parameter
+    tau_g: Parameter
+    kappa: Parameter
+    phi: Parameter
+    R_width_product: Parameter
+    C_mean: Parameter
+    bridge: tuple[Bridge, ...]
+
+    def pixel(self, bridge_width_m: float) -> Pixel:
+        """The pixel of a bridge width: its row of Table S3, or R = a / w and the mean C between rows."""
+        row = next((b for b in self.bridge if abs(b.width_m - bridge_width_m) < 1e-6), None)
+        return Pixel(
+            r_k_per_w=row.R.value if row else self.R_width_product.value / bridge_width_m,
+            c_j_per_k=row.C.value if row else self.C_mean.value,
+            epsilon=self.epsilon.value,
+            tau_g_s=self.tau_g.value,
+            kappa_m_per_k=self.kappa.value,
+            phi_n_per_k=self.phi.value,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PixelArray:
+    """The nominal parameters of every pixel of a display, each [p]; names and units as in `Pixel`."""
+
+    r_k_per_w: FloatArray
+    c_j_per_k: FloatArray
+    epsilon: FloatArray
+    tau_g_s: FloatArray
+    kappa_m_per_k: FloatArray
+    phi_n_per_k: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.r_k_per_w)
+
+    @classmethod
+    def uniform(cls, pixel: Pixel, count: int) -> "PixelArray":
+        """The same pixel `count` times."""
+        return cls(*(np.full(count, getattr(pixel, name)) for name in cls.__dataclass_fields__))
+
+    def pixel(self, index: int) -> Pixel:
+        """The parameters of one pixel."""
+        return Pixel(*(float(getattr(self, name)[index]) for name in self.__dataclass_fields__))
+
+
+def load_parameters(name: str | Path) -> ParameterSet:
+    """A parameter set by its shipped name or from a file; raises InputError with one line."""
+    path = Path(name)
+    if path.suffix != ".toml":
+        known = sorted(p.stem for p in shipped_path("parameters").glob("*.toml"))
+        if str(name) not in known:
+            raise InputError("pixel_model.parameters", str(name), "a .toml file, or " + ", ".join(known))
+        path = shipped_path("parameters", f"{name}.toml")
+    table = read_toml(path)
+    check_format(path, table, FORMAT, VERSION)
+    try:
+        return ParameterSet.model_validate(table)
+    except ValidationError as error:
+        raise input_error(error, str(path), ParameterSet) from None
+
+
+def display_pixels(config: Config) -> PixelArray:
+    """The parameters of every pixel of the configured display."""
+    pixel = load_parameters(config.pixel_model.parameters).pixel(config.display.bridge_width_m)
+    return PixelArray.uniform(pixel, len(pixel_layout(config.display)))

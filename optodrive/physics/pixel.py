@@ -1,0 +1,76 @@
+"""The nominal pixel in closed form, exact for piecewise-constant power.
+
+    C dθ/dt   = ε P − θ/R        θ absorber rise, K      (the paper's Text S1, uncoupled form)
+    τ_g dγ/dt = θ/2 − γ          γ gas rise, K
+    z = κ γ,  F = φ γ
+
+Everything is written with a = 1/(RC), b = 1/τ_g and the divided difference
+D(t) = (e^(−at) − e^(−bt)) / (b − a), which stays exact as τ_g → RC.
+"""
+
+from dataclasses import dataclass
+from math import exp, expm1, log1p
+
+GAS_FRACTION = 0.5
+"""Steady gas rise over absorber rise: the air conducts equally to absorber and wall (Text S1)."""
+
+
+@dataclass(frozen=True)
+class Pixel:
+    """The nominal parameters of one pixel.
+
+    r_k_per_w: absorber to wall; c_j_per_k: absorber heat capacity; epsilon: share of incident light turned into heat;
+    tau_g_s: gas lag; kappa_m_per_k: displacement, and phi_n_per_k: blocked force, per kelvin of gas rise.
+    """
+
+    r_k_per_w: float
+    c_j_per_k: float
+    epsilon: float
+    tau_g_s: float
+    kappa_m_per_k: float
+    phi_n_per_k: float
+
+    @property
+    def tau_s(self) -> float:
+        """Absorber relaxation time RC, s."""
+        return self.r_k_per_w * self.c_j_per_k
+
+
+def divided_difference(a: float, b: float, t_s: float) -> float:
+    """(e^(−a t) − e^(−b t)) / (b − a), s; t e^(−a t) where a = b."""
+    x = (b - a) * t_s
+    if abs(x) < 1e-9:
+        return t_s * exp(-a * t_s) * (1.0 - 0.5 * x)
+    return exp(-a * t_s) * -expm1(-x) / (b - a)
+
+
+def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: float) -> tuple[float, float]:
+    """Absorber and gas rise (K) after `t_s` seconds at constant incident power (W)."""
+    a, b = 1.0 / pixel.tau_s, 1.0 / pixel.tau_g_s
+    steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
+    excess_k = theta_k - steady_k
+    theta_end_k = steady_k + excess_k * exp(-a * t_s)
+    gas_steady_k = GAS_FRACTION * steady_k
+    gamma_end_k = (
+        gas_steady_k
+        + (gamma_k - gas_steady_k) * exp(-b * t_s)
+        + GAS_FRACTION * b * excess_k * divided_difference(a, b, t_s)
+    )
+    return theta_end_k, gamma_end_k
+
+
+def cooling_peak(pixel: Pixel, theta_k: float, gamma_k: float, within_s: float = float("inf")) -> tuple[float, float]:
+    """Largest gas rise (K), and its time (s), while cooling in the dark for at most `within_s` seconds.
+
+    With θ/2 > γ the gas still warms; its maximum is where θ/2 = γ, at t = log1p((b − a) u)/(b − a) with
+    u = (1 − 2γ/θ)/a.
+    """
+    a, b = 1.0 / pixel.tau_s, 1.0 / pixel.tau_g_s
+    drive_k = GAS_FRACTION * theta_k
+    if drive_k <= gamma_k or drive_k <= 0.0:
+        return gamma_k, 0.0
+    u_s = (1.0 - gamma_k / drive_k) / a
+    x = (b - a) * u_s
+    t_s = u_s if abs(x) < 1e-12 else log1p(x) / (b - a)
+    t_s = min(t_s, within_s)
+    return advance(pixel, theta_k, gamma_k, 0.0, t_s)[1], t_s

@@ -1,0 +1,1 @@
+"""Tactile frames to timed pulses: mirror angles, move times, drive, order."""
