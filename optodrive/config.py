@@ -77,11 +77,17 @@ class ScannerSection(Section):
 
 
 class LimitsSection(Section):
-    """Caps that no plan passes. absorbed_power_margin: declared uncertainty of the absorbed power, counted in full."""
+    """Caps that no plan passes.
+
+    pulse_energy_max_j caps a pulse, and what several pulses leave in a pixel's bucket, which leaks at
+    pixel_mean_power_max_w. Pulses on a pixel closer than pulse_rest_min_s count as one against pulse_width_max_s.
+    absorbed_power_margin: declared uncertainty of the absorbed power, counted in full.
+    """
 
     absorber_max_c: float
     pulse_energy_max_j: Positive
     pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
+    pulse_rest_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
     pixel_mean_power_max_w: Positive
     pixel_mean_window_s: Positive
     display_mean_power_max_w: Positive

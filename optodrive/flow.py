@@ -100,6 +100,23 @@ class PulsePlan:
         return len(self.start_s)
 
 
+_NO_FLOATS: FloatArray = np.zeros(0)
+_NO_INTS: IntArray = np.zeros(0, dtype=np.int64)
+EMPTY_PLAN = PulsePlan(
+    start_s=_NO_FLOATS,
+    width_s=_NO_FLOATS,
+    x_rad=_NO_FLOATS,
+    y_rad=_NO_FLOATS,
+    power_w=_NO_FLOATS,
+    pixel=_NO_INTS,
+    settle_s=_NO_FLOATS,
+    target_m=_NO_FLOATS,
+    nominal_s=_NO_FLOATS,
+    source=_NO_INTS,
+)
+"""A plan without pulses."""
+
+
 @dataclass(frozen=True, eq=False)
 class LimitedPlan(PulsePlan):
     """A plan as the limiter passed it; only `optodrive.limit` makes one.
@@ -121,11 +138,16 @@ class BudgetState:
 
     at_s: the time up to which the plan reached, on the budget's time line
     rise_k: [p] upper bound on each absorber's rise at at_s
+    spot_j: [p] each pixel's leaky bucket of energy at at_s
+    on_s, dark_since_s: [p] light without a rest so far, and when it ended
     recent_*: [r] pulses still inside a sliding window: start_s, width_s, power_w, pixel
     """
 
     at_s: float
     rise_k: FloatArray
+    spot_j: FloatArray
+    on_s: FloatArray
+    dark_since_s: FloatArray
     recent_start_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     recent_width_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     recent_power_w: FloatArray = field(default_factory=lambda: np.zeros(0))

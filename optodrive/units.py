@@ -1,14 +1,20 @@
 """Conversions at the edges; inside, everything is SI and says its unit in its name."""
 
-MICRO = 1e-6
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+Number = TypeVar("Number", float, NDArray[np.float64])
+
 ZERO_CELSIUS_K = 273.15
 
 
-def um_to_m(value_um: float) -> float:
-    """Micrometres to metres."""
-    return value_um * MICRO
+def um_to_m(value_um: Number) -> Number:
+    """Micrometres to metres, a number or an array."""
+    return value_um * 1e-6
 
 
-def m_to_um(value_m: float) -> float:
-    """Metres to micrometres."""
-    return value_m / MICRO
+def m_to_um(value_m: Number) -> Number:
+    """Metres to micrometres, a number or an array."""
+    return value_m * 1e6

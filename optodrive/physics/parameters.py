@@ -1,6 +1,7 @@
 """Parameter sets: one file a source, each value with its unit, uncertainty and source."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -86,9 +87,11 @@ class PixelArray:
         """The same pixel `count` times."""
         return cls(*(np.full(count, getattr(pixel, name)) for name in cls.__dataclass_fields__))
 
-    def pixel(self, index: int) -> Pixel:
-        """The parameters of one pixel."""
-        return Pixel(*(float(getattr(self, name)[index]) for name in self.__dataclass_fields__))
+    @cached_property
+    def each(self) -> tuple[Pixel, ...]:
+        """The parameters pixel by pixel: [p] of `Pixel`."""
+        columns = (getattr(self, name).tolist() for name in self.__dataclass_fields__)
+        return tuple(Pixel(*row) for row in zip(*columns, strict=True))
 
 
 def load_parameters(name: str | Path) -> ParameterSet:

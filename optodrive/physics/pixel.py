@@ -59,18 +59,33 @@ def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: f
     return theta_end_k, gamma_end_k
 
 
-def cooling_peak(pixel: Pixel, theta_k: float, gamma_k: float, within_s: float = float("inf")) -> tuple[float, float]:
-    """Largest gas rise (K), and its time (s), while cooling in the dark for at most `within_s` seconds.
+def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, within_s: float) -> tuple[float, float]:
+    """Largest gas rise (K), and its time (s), within `within_s` seconds at constant incident power.
 
-    With θ/2 > γ the gas still warms; its maximum is where θ/2 = γ, at t = log1p((b − a) u)/(b − a) with
-    u = (1 − 2γ/θ)/a.
+    With the rises taken from their steady values, θ' and γ', the gas turns where θ'/2 = γ', at
+    t = log1p((b − a) u)/(b − a) with u = (1 − 2γ'/θ')/a; that is a maximum where the absorber cools, θ' > 0.
     """
     a, b = 1.0 / pixel.tau_s, 1.0 / pixel.tau_g_s
-    drive_k = GAS_FRACTION * theta_k
-    if drive_k <= gamma_k or drive_k <= 0.0:
+    steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
+    drive_k = GAS_FRACTION * (theta_k - steady_k)
+    lag_k = gamma_k - GAS_FRACTION * steady_k
+    turn_s = within_s
+    if drive_k > 0.0:
+        u_s = (1.0 - lag_k / drive_k) / a
+        x = (b - a) * u_s
+        if abs(x) < 1e-12:
+            turn_s = u_s
+        elif x > -1.0:
+            turn_s = log1p(x) / (b - a)
+    turn_s = min(max(turn_s, 0.0), within_s)
+    if turn_s == 0.0:
         return gamma_k, 0.0
-    u_s = (1.0 - gamma_k / drive_k) / a
-    x = (b - a) * u_s
-    t_s = u_s if abs(x) < 1e-12 else log1p(x) / (b - a)
-    t_s = min(t_s, within_s)
-    return advance(pixel, theta_k, gamma_k, 0.0, t_s)[1], t_s
+    peak_k = advance(pixel, theta_k, gamma_k, power_w, turn_s)[1]
+    return (peak_k, turn_s) if peak_k > gamma_k else (gamma_k, 0.0)
+
+
+def cooling_peak(pixel: Pixel, theta_k: float, gamma_k: float, within_s: float = float("inf")) -> tuple[float, float]:
+    """Largest gas rise (K), and its time (s), in the dark."""
+    if theta_k <= 0.0:
+        return gamma_k, 0.0
+    return gas_peak(pixel, theta_k, gamma_k, 0.0, within_s)

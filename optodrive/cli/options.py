@@ -1,0 +1,68 @@
+"""Options and output that commands share."""
+
+import json
+import sys
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
+
+ConfigOption = Annotated[str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else on stdout.")]
+UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens.")]
+StrictOption = Annotated[bool, typer.Option("--strict", help="Refuse what would be trimmed or late.")]
+DEFAULT_URL = "http://127.0.0.1:8450"
+
+
+def print_json(document: dict[str, Any]) -> None:
+    """One JSON object on stdout."""
+    json.dump(document, sys.stdout, indent=2, ensure_ascii=False)
+    sys.stdout.write("\n")
+
+
+def progress_bar() -> "Progress":
+    """A progress bar on stderr that shows itself only on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console = Console(stderr=True)
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        console=console,
+        disable=not console.is_terminal,
+        transient=True,
+    )
+
+
+def report_lines(summary: dict[str, Any]) -> list[str]:
+    """A plan's summary as a few lines of plain words."""
+    lines = [
+        f"pulses           {summary['pulses']}",
+        f"duration         {summary['duration_s']:.4f} s",
+        f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
+        f"moves            {summary['moves_s']:.4f} s",
+        f"energy           {summary['energy_j']:.4f} J incident",
+        f"tallest          {summary['predicted_max_um']:.1f} µm predicted"
+        + (f", {summary['asked_max_um']:.1f} µm asked for" if summary["asked_max_um"] else "")
+        + (f", at pixel {summary['tallest_pixel']}" if summary["tallest_pixel"] is not None else ""),
+        f"least headroom   {summary['headroom_min_k']:.1f} K below the absorber cap",
+    ]
+    trimmed = summary["trimmed"]
+    if trimmed["pulses"]:
+        reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed["by_reason"].items())
+        lines.append(f"trimmed          {trimmed['pulses']} pulses, {trimmed['energy_j'] * 1e3:.2f} mJ: {reasons}")
+    else:
+        lines.append("trimmed          nothing")
+    lines += [f"late             {sentence}" for sentence in summary["late"][:5]]
+    if len(summary["late"]) > 5:
+        lines.append(f"late             and {len(summary['late']) - 5} more frames")
+    if summary["train_late_s"] > 0:
+        lines.append(f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms")
+    if summary["skipped"]:
+        lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
+    return lines

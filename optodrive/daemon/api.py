@@ -1,0 +1,170 @@
+"""REST, version 1: a thin face over the engine; every error is a problem document with a stable code."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+from concurrent.futures import Future
+from typing import Annotated, Any
+
+from fastapi import FastAPI, Path, Query, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+from starlette.middleware import Middleware
+
+from optodrive import __version__
+from optodrive.daemon.auth import BodyTooLargeError, Guard, problem
+from optodrive.daemon.engine import Engine
+from optodrive.daemon.resolved import resolved_config
+from optodrive.errors import (
+    BoardFaultError,
+    InputError,
+    LinkError,
+    NotReadyError,
+    OptodriveError,
+    RefusedError,
+    abbreviate,
+)
+from optodrive.frames.files import parse_json, parse_sequence
+from optodrive.frames.patterns import build_pattern, describe_patterns
+
+Answer = dict[str, Any]
+STATUS: tuple[tuple[type[OptodriveError], int], ...] = (
+    (InputError, 422),
+    (RefusedError, 409),
+    (NotReadyError, 409),
+    (BoardFaultError, 409),
+    (LinkError, 503),
+)
+ERRORS: dict[int | str, dict[str, Any]] = {
+    status: {"description": text, "content": {"application/problem+json": {}}}
+    for status, text in {
+        401: "no token, or a wrong one",
+        403: "a foreign Origin",
+        404: "no such thing",
+        409: "refused, or not possible in this state",
+        413: "body too large",
+        421: "a foreign Host",
+        422: "bad input",
+        503: "no link to the board",
+    }.items()
+}
+PlanId = Annotated[str, Path(max_length=40)]
+DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")]
+Strict = Annotated[bool, Query(description="refuse what would be trimmed or late")]
+
+
+def make_app(engine: Engine, token: str) -> FastAPI:
+    """The daemon's web application over a running engine."""
+    display = engine.display
+    daemon = display.config.daemon
+    guard = Middleware(Guard, token=token, hosts=daemon.hosts, body_max_bytes=daemon.body_max_bytes)
+    app = FastAPI(
+        title="optodrive", version=__version__, middleware=[guard], responses=ERRORS, docs_url=None, redoc_url=None
+    )
+    _add_error_answers(app)
+
+    @app.get("/v1/health")
+    async def health() -> Answer:
+        """Whether the daemon runs; needs no token."""
+        return {"status": "ok", "version": __version__}
+
+    @app.get("/v1/state")
+    async def state() -> Answer:
+        """The board, the link, the queue, the display's heat."""
+        return engine.snapshot()
+
+    @app.get("/v1/config")
+    async def config() -> Answer:
+        """The resolved configuration, as `optodrive config show --json`."""
+        return resolved_config(display)
+
+    @app.post("/v1/arm")
+    async def arm() -> Answer:
+        """Arm the board: its indicator is lit for at least two seconds before it emits."""
+        return await _result(engine.arm())
+
+    @app.post("/v1/disarm")
+    async def disarm() -> Answer:
+        """Disarm; also acknowledges a fault whose cause is gone."""
+        return await _result(engine.disarm())
+
+    @app.post("/v1/stop")
+    async def stop() -> Answer:
+        """Gate off now, everything queued dropped, board disarmed."""
+        return await _result(engine.stop())
+
+    @app.post("/v1/plans", status_code=201, openapi_extra=_json_body("FRAMES.json: frames and trains"))
+    async def push(request: Request, dry_run: DryRun = False, strict: Strict = False) -> Answer:
+        """Plan frames and trains, and show them."""
+        body = await request.body()
+        return await _result(engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, strict))
+
+    @app.get("/v1/plans/{plan_id}")
+    async def plan(plan_id: PlanId) -> Answer:
+        """One plan: what was planned, sent, executed."""
+        return engine.plan(plan_id)
+
+    @app.delete("/v1/plans/{plan_id}")
+    async def cancel(plan_id: PlanId) -> Answer:
+        """Take a plan out of the queue, or end it dark when it runs; the board stays armed."""
+        return await _result(engine.cancel(plan_id))
+
+    @app.get("/v1/patterns")
+    async def patterns() -> Answer:
+        """The named patterns and their parameters."""
+        return {"patterns": describe_patterns()}
+
+    @app.post("/v1/patterns/{name}", status_code=201, openapi_extra=_json_body("the pattern's parameters"))
+    async def play(
+        name: Annotated[str, Path(max_length=80)], request: Request, dry_run: DryRun = False, strict: Strict = False
+    ) -> Answer:
+        """Build a named pattern, plan it, show it."""
+        body = await request.body()
+        given = parse_json(body, "body") if body.strip() else {}
+        if not isinstance(given, dict):
+            raise InputError("body", given, "an object of the pattern's parameters")
+        return await _result(engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, strict))
+
+    return app
+
+
+def _json_body(description: str) -> dict[str, Any]:
+    return {"requestBody": {"description": description, "content": {"application/json": {"schema": {"type": "object"}}}}}
+
+
+async def _result(future: "Future[Answer]") -> Answer:
+    return await asyncio.wrap_future(future)
+
+
+def _add_error_answers(app: FastAPI) -> None:
+    def answer(document: dict[str, object]) -> JSONResponse:
+        status = document["status"]
+        return JSONResponse(document, status_code=int(str(status)), media_type="application/problem+json")
+
+    def on(kind: type[Exception]) -> Callable[[Callable[[Request, Any], Awaitable[JSONResponse]]], None]:
+        return lambda handler: app.add_exception_handler(kind, handler)
+
+    @on(OptodriveError)
+    async def _known(request: Request, error: OptodriveError) -> JSONResponse:
+        status = next((status for kind, status in STATUS if isinstance(error, kind)), 500)
+        if error.code in ("no_plan", "unknown_pattern"):
+            status = 404
+        more: dict[str, object] = {}
+        if isinstance(error, InputError):
+            more = {"where": error.where, "value": abbreviate(error.value), "expected": error.expected}
+        return answer(problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more))
+
+    @on(RequestValidationError)
+    async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        return answer(problem(422, "bad_input", "Bad input", f"{where}: {first['msg']}", where=where))
+
+    @on(HTTPException)
+    async def _http(request: Request, error: HTTPException) -> JSONResponse:
+        code = {404: "no_such_route", 405: "method_not_allowed"}.get(error.status_code, "http")
+        return answer(problem(error.status_code, code, str(error.detail), f"{request.method} {request.url.path}"))
+
+    @on(BodyTooLargeError)
+    async def _too_large(request: Request, error: BodyTooLargeError) -> JSONResponse:
+        return answer(problem(413, "body_too_large", "Body too large", "the body grew past its bound"))

@@ -1,0 +1,401 @@
+"""The engine: joins the stages, owns the board's session, and alone keeps the board's permit to emit alive.
+
+Two threads. The engine's own loop talks to the board and renews its lease; it does so only while the planner, which
+works in the second thread, is idle or making progress. Callers on any thread get futures.
+"""
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import count
+from queue import Empty, SimpleQueue
+from typing import Any
+
+from optodrive.board.faults import hint
+from optodrive.board.session import Job, Session
+from optodrive.clock import Clock
+from optodrive.daemon.plans import PlanRecord
+from optodrive.daemon.thermal import Thermal
+from optodrive.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError
+from optodrive.flow import FrameSequence
+from optodrive.limit.limiter import verify
+from optodrive.physics.array import pulse_peaks
+from optodrive.pipeline import Display, Prepared, prepare
+from optodrive.transport.base import Transport
+from optodrive.wire.quantise import decode, quantise
+
+Answer = dict[str, Any]
+
+TURN_S = 0.002
+IDLE_TURN_S = 0.01
+START_LEAD_S = 0.05
+"""A plan starts this long after it is ready, so that its first points are there in time."""
+PLANNER_STALL_S = 2.0
+"""A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
+RECONNECT_S = 1.0
+COMMAND_TIMEOUT_S = 5.0
+RECORDS_KEPT = 200
+DELAY_NOTICED_S = 1e-5
+
+
+@dataclass
+class _Wait:
+    """A caller waiting for the board to reach one of some states."""
+
+    states: tuple[str, ...]
+    what: str
+    until_s: float
+    future: "Future[Answer]"
+
+
+class Engine:
+    """Runs plans on a board. Methods that return futures may be called from any thread."""
+
+    def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
+        self.display = display
+        self._clock = clock
+        self._session = Session(transport, clock, display.config)
+        self._thermal = Thermal(*display.at_rest())
+        self._records: OrderedDict[str, PlanRecord] = OrderedDict()
+        self._waiting: deque[PlanRecord] = deque()
+        self._running: tuple[PlanRecord, Job] | None = None
+        self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._waits: list[_Wait] = []
+        self._ids = count(1)
+        self._lock = threading.RLock()
+        self._closing = threading.Event()
+        self._planner = ThreadPoolExecutor(1, thread_name_prefix="planner")
+        self._bookkeeper = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
+        self._plans_pending = 0
+        self._progress_at_s = clock.now_s()
+        self._link_error: str | None = None
+        self._retry_at_s = 0.0
+        self._queue_end_s = 0.0
+        self._totals = {"planned": 0, "sent": 0, "executed": 0}
+        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
+
+    # --- life ---------------------------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Connect to the board and start; raises InputError or LinkError where the board cannot be reached."""
+        self._session.connect()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop: the board is told to abort, the threads end."""
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=5.0)
+        self._session.close()
+        self._planner.shutdown(wait=False, cancel_futures=True)
+        self._bookkeeper.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self) -> None:
+        try:
+            while not self._closing.is_set():
+                try:
+                    self._turn()
+                except LinkError as error:
+                    self._link_lost(error)
+        finally:
+            self._session.close()
+
+    def _turn(self) -> None:
+        self._obey()
+        if not self._session.connected:
+            self._reconnect()
+            return
+        busy = self._running is not None or self._waits or self._waiting
+        self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner_alive())
+        self._settle_waits()
+        self._follow_job()
+        self._start_next()
+
+    def _obey(self) -> None:
+        while True:
+            try:
+                command = self._commands.get_nowait()
+            except Empty:
+                return
+            command()
+
+    def _planner_alive(self) -> bool:
+        with self._lock:
+            return self._plans_pending == 0 or self._clock.now_s() - self._progress_at_s < PLANNER_STALL_S
+
+    # --- the link -----------------------------------------------------------------------------------------------
+
+    def _link_lost(self, error: LinkError) -> None:
+        self._link_error = str(error)
+        self._session.drop()
+        self._fail_all(str(error))
+        self._retry_at_s = self._clock.now_s() + RECONNECT_S
+
+    def _reconnect(self) -> None:
+        self._settle_waits()
+        if self._clock.now_s() < self._retry_at_s:
+            self._clock.sleep(IDLE_TURN_S)
+            return
+        before_s = self._session.board_s()
+        try:
+            self._session.connect()
+        except (LinkError, InputError) as error:
+            self._link_error = str(error)
+            self._retry_at_s = self._clock.now_s() + RECONNECT_S
+            return
+        # The board may have restarted its clock: what is known of heat moves onto the new one.
+        with self._lock:
+            delay_s = self._session.board_s() - before_s
+            self._thermal = self._thermal.later(delay_s)
+            self._queue_end_s = 0.0
+        self._link_error = None
+
+    # --- commands from any thread -------------------------------------------------------------------------------
+
+    def arm(self) -> "Future[Answer]":
+        """Arm the board; done when it is ARMED."""
+        return self._command(self._session.arm, ("ARMED",), "arm")
+
+    def disarm(self) -> "Future[Answer]":
+        """Disarm, or acknowledge a fault; done when the board is DISARMED."""
+        return self._command(self._session.disarm, ("DISARMED",), "disarm")
+
+    def stop(self) -> "Future[Answer]":
+        """Abort: gate off, queue dropped; done when the board is dark for good."""
+        return self._command(self._session.abort, ("DISARMED", "FAULT"), "stop")
+
+    def _command(self, action: Callable[[], None], states: tuple[str, ...], what: str) -> "Future[Answer]":
+        future: Future[Answer] = Future()
+
+        def obey() -> None:
+            try:
+                self._require_link()
+                action()
+            except OptodriveError as error:
+                future.set_exception(error)
+                return
+            if what != "arm":
+                self._fail_all(f"ended by {what}")
+            self._waits.append(_Wait(states, what, self._clock.now_s() + COMMAND_TIMEOUT_S, future))
+
+        self._commands.put(obey)
+        return future
+
+    def _require_link(self) -> None:
+        if not self._session.connected:
+            raise LinkError(self._link_error or "no link to the board")
+
+    def _settle_waits(self) -> None:
+        board, refusal = self._session.board, self._session.take_refusal()
+        for wait in list(self._waits):
+            error: OptodriveError | None = None
+            if not self._session.connected:
+                error = LinkError(self._link_error or "no link to the board")
+            elif refusal is not None:
+                error = NotReadyError(f"the board refuses to {wait.what}: {refusal}")
+            elif board.state in wait.states and self._session.quiet:
+                wait.future.set_result(self.snapshot())
+            elif board.state == "FAULT":
+                error = BoardFaultError(f"the board is in FAULT {board.fault}: {hint(board.fault)}")
+            elif self._clock.now_s() > wait.until_s:
+                error = NotReadyError(f"the board did not {wait.what} within {COMMAND_TIMEOUT_S:g} s: it is {board.state}")
+            if error is not None:
+                wait.future.set_exception(error)
+            if wait.future.done():
+                self._waits.remove(wait)
+
+    # --- plans --------------------------------------------------------------------------------------------------
+
+    def submit(
+        self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, strict: bool = False
+    ) -> "Future[Answer]":
+        """Plan the sequence that `build` makes, and queue it unless dry_run; the answer says what will be shown when."""
+        with self._lock:
+            if self._plans_pending == 0:
+                self._progress_at_s = self._clock.now_s()
+            self._plans_pending += 1
+        return self._planner.submit(self._plan, build, name, dry_run, strict)
+
+    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, strict: bool) -> Answer:
+        try:
+            self._note_progress(0.0)
+            sequence = build()
+            if not dry_run:
+                self._require_armed()
+            return self._planned(sequence, name, dry_run, strict)
+        finally:
+            with self._lock:
+                self._plans_pending -= 1
+            self._note_progress(1.0)
+
+    def _note_progress(self, _share: float) -> None:
+        self._progress_at_s = self._clock.now_s()
+
+    def _require_armed(self) -> None:
+        self._require_link()
+        board = self._session.board
+        if board.state not in ("ARMED", "RUNNING", "HOLD"):
+            fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
+            raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
+
+    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, strict: bool) -> Answer:
+        with self._lock:
+            thermal, start_s = self._thermal, max(self._queue_end_s, self._session.board_s() + START_LEAD_S)
+        heat, budget = thermal.seen_from(start_s)
+        policy = "refuse" if strict else "trim"
+        prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
+        record = PlanRecord(f"p{next(self._ids)}", name, prepared, start_s, heat, status="planned")
+        if dry_run:
+            return record.answer(self._session.board_s())
+        record.points = quantise(prepared.plan, self._session.scale)
+        self._prove(record, budget)
+        with self._lock:
+            if self._thermal is not thermal:  # a plan failed, or the board restarted, meanwhile
+                raise NotReadyError("the board stopped while this was planned; send it again")
+            record.start_s = max(start_s, self._session.board_s() + START_LEAD_S)
+            self._thermal = Thermal.after_plan(prepared.heat, prepared.budget, record.start_s)
+            self._queue_end_s = record.start_s + prepared.duration_s
+            self._totals["planned"] += len(prepared.plan)
+            self._remember(record)
+            record.status = "queued"
+            self._waiting.append(record)
+        return record.answer(self._session.board_s())
+
+    def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
+        """Decode the very bytes that will leave, and hold them against the budget."""
+        points, plan = record.points, record.prepared.plan
+        decoded = decode(b"".join(points.payloads()), self._session.scale)
+        pixel = [int(plan.pixel[row]) for row in points.rows_of(decoded.index)]
+        verify(pixel, decoded.start_s, decoded.width_s, decoded.power_w, budget, self.display.budget)
+
+    def _remember(self, record: PlanRecord) -> None:
+        self._records[record.plan_id] = record
+        while len(self._records) > RECORDS_KEPT:
+            self._records.popitem(last=False)
+
+    def plan(self, plan_id: str, pulses: bool = True) -> Answer:
+        """A plan by its id; InputError (no_plan) where there is none."""
+        return self._record(plan_id).answer(self._session.board_s(), pulses)
+
+    def _record(self, plan_id: str) -> PlanRecord:
+        record = self._records.get(plan_id)
+        if record is None:
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
+        return record
+
+    def cancel(self, plan_id: str) -> "Future[Answer]":
+        """Take a plan out of the queue, or end it dark; the board stays armed."""
+        future: Future[Answer] = Future()
+
+        def obey() -> None:
+            try:
+                record = self._record(plan_id)
+                if record in self._waiting:
+                    self._waiting.remove(record)
+                    record.end("cancelled", "taken out of the queue")
+                elif self._running is not None and self._running[0] is record:
+                    self._session.flush()
+                    self._finish("cancelled", "ended while it ran")
+                future.set_result(record.answer(self._session.board_s()))
+            except OptodriveError as error:
+                future.set_exception(error)
+
+        self._commands.put(obey)
+        return future
+
+    # --- running them -------------------------------------------------------------------------------------------
+
+    def _start_next(self) -> None:
+        if self._running is not None or not self._waiting or not self._session.ready:
+            return
+        record = self._waiting.popleft()
+        if not len(record.prepared.plan):
+            record.end("done", None)
+            return
+        record.status = "running"
+        self._running = record, self._session.begin(record.points, record.start_s)
+
+    def _follow_job(self) -> None:
+        board = self._session.board
+        if board.state in ("FAULT", "DISARMED", "ARMING", "BOOT") and (self._running or self._waiting):
+            why = f"{board.fault}: {hint(board.fault)}" if board.fault else self._session.last_reason
+            self._fail_all(f"the board went to {board.state} ({why})")
+        if self._running is None:
+            return
+        record, job = self._running
+        self._totals["sent"] += job.sent_rows - record.sent
+        self._totals["executed"] += job.executed_rows - record.executed_count
+        record.sent, record.executed_count = job.sent_rows, job.executed_rows
+        if job.finished:
+            self._finish("done", None)
+
+    def _finish(self, status: Status, error: str | None) -> None:
+        """End the running plan: what was executed is taken over, a delay moves everything after it."""
+        assert self._running is not None  # noqa: S101 - callers have just looked
+        (record, job), self._running = self._running, None
+        executed = job.executed(record.prepared.plan)
+        record.executed = executed
+        record.end(status, error)
+        if len(executed):
+            row = len(executed) - 1
+            record.delay_s = float(executed.start_s[row] - record.prepared.plan.start_s[row])
+        with self._lock:
+            if record.delay_s > DELAY_NOTICED_S:
+                self._thermal = self._thermal.later(record.delay_s)
+                self._queue_end_s += record.delay_s
+                for waiting in self._waiting:
+                    waiting.start_s += record.delay_s
+            if status != "done":
+                self._thermal = self._thermal.with_heat_of(record.heat_before.shifted(record.start_s), executed, record.start_s)
+        self._bookkeeper.submit(self._simulate, record)
+
+    def _simulate(self, record: PlanRecord) -> None:
+        executed = record.executed
+        if executed is not None:
+            heat = record.heat_before.copy()
+            record.simulated_m = pulse_peaks(heat, executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+
+    def _fail_all(self, why: str) -> None:
+        waiting = list(self._waiting)
+        self._waiting.clear()
+        if self._running is not None:
+            self._finish("failed", why)
+        for record in waiting:
+            record.end("failed", why)
+        self._queue_end_s = 0.0
+
+    # --- what can be seen from outside --------------------------------------------------------------------------
+
+    @property
+    def link_name(self) -> str:
+        """The board's port."""
+        return self._session.port
+
+    @property
+    def board_state(self) -> str:
+        """The board's state, or the link's."""
+        return self._session.board.state if self._session.connected else "no link"
+
+    def snapshot(self) -> Answer:
+        """Everything GET /v1/state answers."""
+        running = self._running
+        return {
+            "display": self.display.config.name,
+            "pixels": len(self.display.layout),
+            "link": {
+                "port": self._session.port,
+                "state": "up" if self._session.connected else "down",
+                "error": self._link_error,
+                **self._session.link_figures(),
+            },
+            "board": self._session.board.figures(),
+            "queue": {
+                "waiting": len(self._waiting),
+                "running": None if running is None else running[0].plan_id,
+                "plans": [{"plan": r.plan_id, "name": r.name, "status": r.status} for r in list(self._records.values())[-20:]],
+            },
+            "totals": dict(self._totals),
+            "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},
+        }

@@ -1,0 +1,28 @@
+"""The configuration with everything derived from it filled in."""
+
+from typing import Any
+
+from optodrive.pipeline import Display
+
+
+def resolved_config(display: Display) -> dict[str, Any]:
+    """`optodrive config show --json`: sections as configured; pixels with positions; the pixel model's numbers."""
+    config, layout = display.config, display.layout
+    resolved = config.model_dump(mode="json")
+    resolved["display"]["pixels"] = [
+        {"index": index, "x_m": x_m, "y_m": y_m, "bridge_width_m": config.display.bridge_width_m}
+        for index, (x_m, y_m) in enumerate(zip(layout.x_m.tolist(), layout.y_m.tolist(), strict=True))
+    ]
+    pixel = display.pixels.each[0]
+    resolved["pixel_model"].update(
+        {
+            "R": pixel.r_k_per_w,
+            "C": pixel.c_j_per_k,
+            "epsilon": pixel.epsilon,
+            "tau_g": pixel.tau_g_s,
+            "kappa": pixel.kappa_m_per_k,
+            "phi": pixel.phi_n_per_k,
+            "units": {"R": "K/W", "C": "J/K", "epsilon": "1", "tau_g": "s", "kappa": "m/K", "phi": "N/K"},
+        }
+    )
+    return resolved

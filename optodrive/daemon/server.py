@@ -1,0 +1,49 @@
+"""The daemon's process: engine up, web server up, and both down again, dark, whatever ends it."""
+
+import signal
+import socket
+
+import uvicorn
+
+from optodrive.clock import MonotonicClock
+from optodrive.config import Config
+from optodrive.daemon.api import make_app
+from optodrive.daemon.engine import Engine
+from optodrive.daemon.token import make_token
+from optodrive.errors import InputError
+from optodrive.pipeline import Display
+from optodrive.transport.registry import make_transport
+
+
+def run(config: Config) -> None:
+    """Serve until a signal; the board is told to stop on the way out, and goes dark by itself if that is not heard."""
+    listener = _listen(config.daemon.host, config.daemon.port)
+    port = listener.getsockname()[1]
+    board = config.board
+    engine = Engine(Display.of(config), make_transport(board.transport, board.port, board.baud), MonotonicClock())
+    try:
+        engine.start()
+        token, path = make_token(port)
+        server = uvicorn.Server(
+            uvicorn.Config(make_app(engine, token), log_level="warning", access_log=False, server_header=False)
+        )
+        # SIGHUP would end the process before it could tell the board; treat it as SIGTERM.
+        signal.signal(signal.SIGHUP, lambda *_: setattr(server, "should_exit", True))
+        print(f"optodrive: {config.name} on http://{config.daemon.host}:{port}, token in {path}", flush=True)
+        print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
+        server.run(sockets=[listener])
+    finally:
+        engine.close()
+        listener.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    listener = socket.socket(family, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise InputError("daemon.port", port, f"an address that is free on {host} ({error.strerror})") from None
+    return listener

@@ -1,0 +1,38 @@
+"""A short sequence that shows what the display can do."""
+
+from dataclasses import replace
+
+from optodrive.config import Config
+from optodrive.flow import FrameSequence
+from optodrive.frames.experiments import fingers
+from optodrive.frames.showing import end_s
+from optodrive.frames.sweeps import circle, dot
+from optodrive.frames.text import text_frames
+
+PAUSE_S = 0.3
+
+
+def showcase(config: Config, where: str) -> FrameSequence:
+    """A dot that runs round a ring, the ring, "hello" in braille, two pairs of fingers; about nine seconds.
+
+    Raises InputError on a display too small for a hand.
+    """
+    return one_after_the_other(
+        dot(config, where, radius_m=None, height_m=200e-6, step_s=0.06, turns=1),
+        circle(config, where, radius_m=None, height_m=100e-6, seconds=1.5),
+        text_frames(config, where, "hello", height_m=150e-6, seconds=2.0),
+        fingers(config, where, "2-4", centre=None),
+        fingers(config, where, "3-5", centre=None),
+    )
+
+
+def one_after_the_other(*sequences: FrameSequence) -> FrameSequence:
+    """Sequences joined in time, with a pause between."""
+    joined, start_s = FrameSequence(), 0.0
+    for sequence in sequences:
+        joined = FrameSequence(
+            frames=joined.frames + tuple(replace(f, show_at_s=f.show_at_s + start_s) for f in sequence.frames),
+            trains=joined.trains + tuple(replace(t, start_s=t.start_s + start_s) for t in sequence.trains),
+        )
+        start_s = end_s(joined) + PAUSE_S
+    return joined

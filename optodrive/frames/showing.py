@@ -1,0 +1,86 @@
+"""How long the beam needs for a picture, and pictures shown for a while: a membrane stays up only while it is hit."""
+
+from bisect import bisect_left
+from math import ceil
+
+import numpy as np
+
+from optodrive.config import Config
+from optodrive.flow import FloatArray, FrameSequence, TactileFrame
+from optodrive.frames.lattice import Lattice
+from optodrive.physics.parameters import display_pixels
+from optodrive.physics.pixel import Pixel, advance, cooling_peak
+
+REFRESH_HZ = 10.0
+"""A picture that stays is drawn again at most this often."""
+
+RESERVE = 1.05
+"""Beam time asked for over the estimate."""
+
+
+class Beam:
+    """Estimates how long one beam needs to draw a picture from rest: pulses in whole PWM periods, and moves by rows."""
+
+    def __init__(self, config: Config) -> None:
+        self.lattice = Lattice.of(config)
+        self._scanner = config.scanner
+        self._period_s = 1.0 / config.laser.pwm_hz
+        longest = int(config.limits.pulse_width_max_s * config.laser.pwm_hz + 1e-9)
+        pixel = display_pixels(config).each[0]
+        widths_s = [n * self._period_s for n in range(1, longest + 1)]
+        self._peaks_m = [_peak_m(pixel, config.laser.max_power_w, width_s) for width_s in widths_s]
+
+    def pulse_s(self, target_m: float) -> float:
+        """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
+        periods = bisect_left(self._peaks_m, target_m * (1 - 1e-9)) + 1
+        return min(periods, len(self._peaks_m)) * self._period_s
+
+    def picture_s(self, target_m: FloatArray) -> float:
+        """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
+        driven = np.flatnonzero(target_m > 0)
+        if not len(driven):
+            return 0.0
+        heights_m, counts = np.unique(target_m[driven], return_counts=True)
+        pulses_s = sum(self.pulse_s(float(h)) * int(n) for h, n in zip(heights_m, counts, strict=True))
+        layout = self.lattice.layout
+        backwards = layout.row[driven] % 2 == 1
+        order = driven[np.lexsort((np.where(backwards, -1, 1) * layout.column[driven], layout.row[driven]))]
+        steps_m = np.maximum(
+            *(np.abs(np.diff(at_m[order], append=at_m[order[0]])) for at_m in (layout.x_m, layout.y_m))
+        )
+        turns_s = steps_m / (2.0 * self._scanner.focal_length_m * self._scanner.slew_rad_per_s)
+        moves_s = float(np.sum(turns_s)) + len(driven) * self._scanner.settle_s
+        return ceil(RESERVE * (pulses_s + moves_s) * 1e3) / 1e3
+
+
+def _peak_m(pixel: Pixel, power_w: float, width_s: float) -> float:
+    theta_k, gamma_k = advance(pixel, 0.0, 0.0, power_w, width_s)
+    return pixel.kappa_m_per_k * cooling_peak(pixel, theta_k, gamma_k)[0]
+
+
+def hold(beam: Beam, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0) -> list[TactileFrame]:
+    """A picture kept up for at least `seconds`: drawn again and again, each time as long as the beam needs.
+
+    target_m: [p]. The frames abut; the first starts at start_s.
+    """
+    each_s = max(beam.picture_s(target_m), 1.0 / REFRESH_HZ)
+    count = max(1, ceil(seconds / each_s - 1e-9))
+    return [TactileFrame(f"{name}-{k}", start_s + k * each_s, each_s, target_m) for k in range(count)]
+
+
+def steps(beam: Beam, pictures: list[FloatArray], step_s: float, name: str) -> list[TactileFrame]:
+    """Pictures one after the other, each shown once, for step_s or as long as the beam needs. pictures: of [p]."""
+    frames: list[TactileFrame] = []
+    start_s = 0.0
+    for k, target_m in enumerate(pictures):
+        each_s = max(beam.picture_s(target_m), step_s)
+        frames.append(TactileFrame(f"{name}-{k}", start_s, each_s, target_m))
+        start_s += each_s
+    return frames
+
+
+def end_s(sequence: FrameSequence) -> float:
+    """When the last frame or the last pulse of a sequence ends, s; 0 for an empty one."""
+    frame_ends = [frame.show_at_s + frame.duration_s for frame in sequence.frames]
+    train_ends = [float(train.pulse_starts_s()[-1]) + train.pulse_width_s for train in sequence.trains]
+    return max(frame_ends + train_ends, default=0.0)

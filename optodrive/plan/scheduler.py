@@ -1,0 +1,194 @@
+"""Frames and trains onto one beam: when each pulse starts, and how strong it must be.
+
+Trains keep their times; a frame's pulses fill the beam time between them. Times are whole microseconds inside.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from optodrive.config import PixelLayout
+from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
+from optodrive.physics.array import DisplayHeat
+from optodrive.plan.drive import DriveRange, pulse_for_peak
+from optodrive.plan.field import IdealField
+from optodrive.plan.galvo import MoveModel
+from optodrive.plan.order import serpentine
+
+TRAIN_PIECE = 1000
+"""Pulses of trains planned in one piece."""
+
+
+@dataclass(frozen=True)
+class Machine:
+    """What the scheduler knows of optics and laser."""
+
+    layout: PixelLayout
+    field: IdealField
+    moves: MoveModel
+    drive: DriveRange
+
+
+@dataclass(frozen=True)
+class Skipped:
+    """A pixel that got no pulse: the heat left there reaches its target by itself."""
+
+    source: int
+    pixel: int
+    target_m: float
+
+
+class _TrainPulse(NamedTuple):
+    nominal_us: int
+    source: int
+    pixel: int
+    width_us: int
+    power_w: float
+
+
+class _Row(NamedTuple):
+    start_us: int
+    width_us: int
+    power_w: float
+    pixel: int
+    settle_us: int
+    target_m: float
+    nominal_us: int
+    source: int
+
+
+@dataclass
+class Scheduler:
+    """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
+
+    lead_us: dark time before the sequence's zero, in which the mirrors reach the first pixel.
+    """
+
+    machine: Machine
+    sequence: FrameSequence
+    beam_rad: tuple[float, float] = (0.0, 0.0)
+    lead_us: int = 0
+    skipped: list[Skipped] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        layout = self.machine.layout
+        self._x_rad = self.machine.field.mirror_rad(layout.x_m)
+        self._y_rad = self.machine.field.mirror_rad(layout.y_m)
+        self._trains = _train_pulses(self.sequence.trains, len(self.sequence.frames))
+        self._next_train = 0
+        self._free_us = 0
+        self.lead_us = self._lead_us()
+
+    def pieces(self, heat: DisplayHeat) -> Iterator[PulsePlan]:
+        """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
+
+        What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came.
+        """
+        for source, frame in enumerate(self.sequence.frames):
+            yield from self._trains_before(self._sequence_us(frame.show_at_s))
+            yield from self._frame(source, frame, heat)
+        yield from self._trains_before(None)
+
+    def _sequence_us(self, time_s: float) -> int:
+        return self.lead_us + round(time_s * 1e6)
+
+    def _lead_us(self) -> int:
+        """Dark time so that the first pixels of every kind are reached in time at the sequence's zero."""
+        first = [pulse.pixel for pulse in self._trains[:1]]
+        if self.sequence.frames:
+            active = self._order(self.sequence.frames[0])
+            first += active[:1]
+        return max((self._move_us(pixel) for pixel in first), default=0)
+
+    def _move_us(self, pixel: int, origin: int | None = None) -> int:
+        x_rad, y_rad = self.beam_rad if origin is None else (self._x_rad[origin], self._y_rad[origin])
+        return self.machine.moves.time_us(float(self._x_rad[pixel] - x_rad), float(self._y_rad[pixel] - y_rad))
+
+    def _order(self, frame: TactileFrame) -> list[int]:
+        layout = self.machine.layout
+        order = serpentine(np.flatnonzero(frame.target_m > 0), layout.row, layout.column)
+        return [int(pixel) for pixel in order]
+
+    def _place(self, pixel: int, width_us: int, power_w: float, earliest_us: int, target_m: float, source: int) -> _Row:
+        settle_us = self._move_us(pixel)
+        start_us = max(earliest_us, self._free_us + settle_us)
+        self._free_us = start_us + width_us
+        self.beam_rad = (float(self._x_rad[pixel]), float(self._y_rad[pixel]))
+        return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, earliest_us, source)
+
+    def _train_row(self) -> _Row:
+        pulse = self._trains[self._next_train]
+        self._next_train += 1
+        earliest_us = self.lead_us + pulse.nominal_us
+        return self._place(pulse.pixel, pulse.width_us, pulse.power_w, earliest_us, float("nan"), pulse.source)
+
+    def _trains_before(self, until_us: int | None) -> Iterator[PulsePlan]:
+        rows: list[_Row] = []
+        while self._next_train < len(self._trains):
+            if until_us is not None and self.lead_us + self._trains[self._next_train].nominal_us >= until_us:
+                break
+            rows.append(self._train_row())
+            if len(rows) == TRAIN_PIECE:
+                yield self._plan(rows)
+                rows = []
+        if rows:
+            yield self._plan(rows)
+
+    def _train_is_due(self, end_us: int, pixel: int) -> bool:
+        """Whether the next train pulse would come late if the beam stayed on `pixel` until end_us."""
+        if self._next_train >= len(self._trains):
+            return False
+        pulse = self._trains[self._next_train]
+        return self.lead_us + pulse.nominal_us < end_us + self._move_us(pulse.pixel, origin=pixel)
+
+    def _frame(self, source: int, frame: TactileFrame, heat: DisplayHeat) -> Iterator[PulsePlan]:
+        """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
+        show_us = self._sequence_us(frame.show_at_s)
+        drive = self.machine.drive
+        rows: list[_Row] = []
+        for pixel in self._order(frame):
+            target_m = float(frame.target_m[pixel])
+            while True:
+                start_us = max(show_us, self._free_us + self._move_us(pixel))
+                theta_k, gamma_k = heat.rises(pixel, start_us * 1e-6)
+                pulse = pulse_for_peak(heat.pixels.each[pixel], theta_k, gamma_k, target_m, drive)
+                if pulse is None:
+                    self.skipped.append(Skipped(source, pixel, target_m))
+                    break
+                width_us = round(pulse[0] * drive.period_s * 1e6)
+                if not self._train_is_due(start_us + width_us, pixel):
+                    rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, show_us, target_m, source))
+                    break
+                yield self._plan([*rows, self._train_row()])
+                rows = []
+        if rows:
+            yield self._plan(rows)
+
+    def _plan(self, rows: list[_Row]) -> PulsePlan:
+        start_us, width_us, power_w, pixel, settle_us, target_m, nominal_us, source = zip(*rows, strict=True)
+        index = np.array(pixel, dtype=np.int64)
+        return PulsePlan(
+            start_s=np.array(start_us) * 1e-6,
+            width_s=np.array(width_us) * 1e-6,
+            x_rad=self._x_rad[index],
+            y_rad=self._y_rad[index],
+            power_w=np.array(power_w),
+            pixel=index,
+            settle_s=np.array(settle_us) * 1e-6,
+            target_m=np.array(target_m),
+            nominal_s=np.array(nominal_us) * 1e-6,
+            source=np.array(source, dtype=np.int64),
+        )
+
+
+def _train_pulses(trains: tuple[PulseTrain, ...], first_source: int) -> list[_TrainPulse]:
+    pulses = [
+        _TrainPulse(
+            round(start_s * 1e6), first_source + k, train.pixel, round(train.pulse_width_s * 1e6), train.power_w
+        )
+        for k, train in enumerate(trains)
+        for start_s in train.pulse_starts_s()
+    ]
+    return sorted(pulses)

@@ -1,0 +1,82 @@
+"""Random frames on every display: predicted, asked for, and the caps, held against an integrator written here."""
+
+import numpy as np
+import pytest
+from conftest import DISPLAYS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.pipeline import prepare
+from optodrive.plan.drive import reach_m
+
+STEP_S = 2e-5
+
+
+def integrate(pixel, pulses, until_s):
+    """Fourth-order Runge–Kutta of the pixel's two equations; returns times, absorber rise, displacement."""
+    steps = int(np.ceil(until_s / STEP_S))
+    power = np.zeros(steps)
+    time = np.arange(steps) * STEP_S
+    for start_s, width_s, power_w in pulses:
+        overlap = np.clip(np.minimum(time + STEP_S, start_s + width_s) - np.maximum(time, start_s), 0, None)
+        power += power_w * overlap / STEP_S
+    matrix = np.array([[-1 / (pixel.r_k_per_w * pixel.c_j_per_k), 0.0], [0.5 / pixel.tau_g_s, -1 / pixel.tau_g_s]])
+    drive = np.array([pixel.epsilon / pixel.c_j_per_k, 0.0])
+    h = STEP_S
+    hm = h * matrix
+    propagate = np.eye(2) + hm + hm @ hm / 2 + hm @ hm @ hm / 6 + hm @ hm @ hm @ hm / 24
+    source = h * (np.eye(2) + hm / 2 + hm @ hm / 6 + hm @ hm @ hm / 24) @ drive
+    state = np.zeros((steps + 1, 2))
+    for k in range(steps):
+        state[k + 1] = propagate @ state[k] + source * power[k]
+    return np.arange(steps + 1) * STEP_S, state[:, 0], pixel.kappa_m_per_k * state[:, 1]
+
+
+@st.composite
+def sequences(draw, name):
+    """A few frames on a few pixels, close in time, and perhaps a train."""
+    display = DISPLAYS[name]
+    count = len(display.layout)
+    most_um = reach_m(display.pixels.each[0], display.machine.drive) * 1e6
+    chosen = draw(st.lists(st.integers(0, count - 1), min_size=1, max_size=4, unique=True))
+    frames, at_s = [], 0.0
+    for k in range(draw(st.integers(1, 4))):
+        target = np.zeros(count)
+        for pixel in chosen:
+            target[pixel] = 1e-6 * draw(st.one_of(st.just(0.0), st.floats(0.5, most_um * 0.999)))
+        duration = draw(st.sampled_from([0.02, 0.06, 0.15, 0.4]))
+        frames.append(TactileFrame(f"f{k}", at_s, duration, target))
+        at_s += duration
+    trains = ()
+    if draw(st.booleans()):
+        width, gap = draw(st.sampled_from([(0.02, 0.06), (0.025, 0.025), (0.04, 0.01), (0.001, 0.001), (0.05, 0.0)]))
+        start = draw(st.floats(0.0, 0.3))
+        trains = (PulseTrain(draw(st.sampled_from(chosen)), start, 0.3, width, gap, draw(st.floats(0.2, 2.45))),)
+    return FrameSequence(tuple(frames), trains)
+
+
+@pytest.mark.parametrize("name", sorted(DISPLAYS))
+@settings(max_examples=12)
+@given(data=st.data())
+def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
+    display = DISPLAYS[name]
+    sequence = data.draw(sequences(name))
+    result = prepare(display, sequence, *display.at_rest())
+    plan = result.plan
+    cap_k = display.config.limits.absorber_max_c - display.config.ambient_c
+    ends_s = plan.start_s + plan.width_s
+    for pixel in np.unique(plan.pixel):
+        rows = np.flatnonzero(plan.pixel == pixel)
+        pulses = list(zip(plan.start_s[rows], plan.width_s[rows], plan.power_w[rows], strict=True))
+        time, absorber, height = integrate(display.pixels.each[pixel], pulses, ends_s[rows[-1]] + 0.05)
+        assert absorber.max() <= cap_k
+        assert result.plan.headroom_k[pixel] <= cap_k - absorber.max() + 1e-6
+        until = np.append(plan.start_s[rows[1:]], np.inf)
+        for row, limit_s in zip(rows, until, strict=True):
+            window = (time >= plan.start_s[row] - STEP_S) & (time <= limit_s + STEP_S)
+            measured = height[window].max()
+            assert measured == pytest.approx(result.predicted_m[row], rel=0.02, abs=2e-8)
+            crowded = limit_s - ends_s[row] < 0.02
+            if plan.source[row] < len(sequence.frames) and not plan.reason[row] and not crowded:
+                assert measured == pytest.approx(plan.target_m[row], rel=0.05)
