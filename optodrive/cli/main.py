@@ -6,7 +6,7 @@ import sys
 import click
 import typer
 
-from optodrive.cli import config_cmd, control, play, plan, serve, simulate, validate_cmd
+from optodrive.cli import config_cmd, control, plan, play, serve, simulate, validate_cmd
 from optodrive.errors import OptodriveError
 
 app = typer.Typer(

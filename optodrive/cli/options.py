@@ -9,7 +9,9 @@ import typer
 if TYPE_CHECKING:
     from rich.progress import Progress
 
-ConfigOption = Annotated[str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")]
+ConfigOption = Annotated[
+    str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else on stdout.")]
 UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens.")]
 StrictOption = Annotated[bool, typer.Option("--strict", help="Refuse what would be trimmed or late.")]
@@ -62,7 +64,9 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     if len(summary["late"]) > 5:
         lines.append(f"late             and {len(summary['late']) - 5} more frames")
     if summary["train_late_s"] > 0:
-        lines.append(f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms")
+        lines.append(
+            f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms"
+        )
     if summary["skipped"]:
         lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
     return lines

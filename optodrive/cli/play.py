@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, JsonOption, StrictOption, UrlOption, print_json, progress_bar, report_lines
+from optodrive.cli.options import (
+    DEFAULT_URL,
+    JsonOption,
+    StrictOption,
+    UrlOption,
+    print_json,
+    progress_bar,
+    report_lines,
+)
 from optodrive.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
@@ -42,9 +50,7 @@ def push(
         raise InputError(str(frames), error.strerror, "a readable file") from None
     remote = Remote(url)
     query = {"dry_run": dry_run, "strict": strict}
-    answer = remote.call(
-        "POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"}
-    )
+    answer = remote.call("POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"})
     _follow(remote, answer, wait, json)
 
 
@@ -127,6 +133,6 @@ def _wait(remote: "Remote", answer: dict[str, Any]) -> dict[str, Any]:
         task = bar.add_task("showing", total=max(1, answer["planned"]))
         while answer["status"] in ("queued", "running"):
             time.sleep(POLL_S)
-            answer = remote.call("GET", f"/v1/plans/{answer['plan']}")
+            answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
             bar.update(task, completed=answer["executed"])
-    return answer
+    return remote.call("GET", f"/v1/plans/{answer['plan']}")

@@ -14,7 +14,9 @@ def register(app: typer.Typer) -> None:
 
 def serve(
     config: ConfigOption = None,
-    port: Annotated[int | None, typer.Option("--port", min=0, max=65535, help="TCP port, instead of the configured.")] = None,
+    port: Annotated[
+        int | None, typer.Option("--port", min=0, max=65535, help="TCP port, instead of the configured.")
+    ] = None,
 ) -> None:
     """Run the daemon: the engine that drives the board, and REST."""
     from optodrive.config import load_config

@@ -97,12 +97,14 @@ def make_app(engine: Engine, token: str) -> FastAPI:
     async def push(request: Request, dry_run: DryRun = False, strict: Strict = False) -> Answer:
         """Plan frames and trains, and show them."""
         body = await request.body()
-        return await _result(engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, strict))
+        return await _result(
+            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, strict)
+        )
 
     @app.get("/v1/plans/{plan_id}")
-    async def plan(plan_id: PlanId) -> Answer:
+    async def plan(plan_id: PlanId, pulses: Annotated[bool, Query(description="list every pulse")] = True) -> Answer:
         """One plan: what was planned, sent, executed."""
-        return engine.plan(plan_id)
+        return engine.plan(plan_id, pulses)
 
     @app.delete("/v1/plans/{plan_id}")
     async def cancel(plan_id: PlanId) -> Answer:
@@ -129,7 +131,9 @@ def make_app(engine: Engine, token: str) -> FastAPI:
 
 
 def _json_body(description: str) -> dict[str, Any]:
-    return {"requestBody": {"description": description, "content": {"application/json": {"schema": {"type": "object"}}}}}
+    return {
+        "requestBody": {"description": description, "content": {"application/json": {"schema": {"type": "object"}}}}
+    }
 
 
 async def _result(future: "Future[Answer]") -> Answer:

@@ -14,15 +14,17 @@ from queue import Empty, SimpleQueue
 from typing import Any
 
 from optodrive.board.faults import hint
-from optodrive.board.session import Job, Session
+from optodrive.board.job import Job
+from optodrive.board.requirements import Requirements
+from optodrive.board.session import Session
 from optodrive.clock import Clock
-from optodrive.daemon.plans import PlanRecord
+from optodrive.daemon.plans import PlanRecord, Status
 from optodrive.daemon.thermal import Thermal
 from optodrive.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError
-from optodrive.flow import FrameSequence
-from optodrive.limit.limiter import verify
+from optodrive.flow import BudgetState, FrameSequence
+from optodrive.limit.limiter import Policy, verify
 from optodrive.physics.array import pulse_peaks
-from optodrive.pipeline import Display, Prepared, prepare
+from optodrive.pipeline import Display, prepare
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
 
@@ -56,7 +58,7 @@ class Engine:
     def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
         self.display = display
         self._clock = clock
-        self._session = Session(transport, clock, display.config)
+        self._session = Session(transport, clock, Requirements.of(display.config))
         self._thermal = Thermal(*display.at_rest())
         self._records: OrderedDict[str, PlanRecord] = OrderedDict()
         self._waiting: deque[PlanRecord] = deque()
@@ -200,7 +202,9 @@ class Engine:
             elif board.state == "FAULT":
                 error = BoardFaultError(f"the board is in FAULT {board.fault}: {hint(board.fault)}")
             elif self._clock.now_s() > wait.until_s:
-                error = NotReadyError(f"the board did not {wait.what} within {COMMAND_TIMEOUT_S:g} s: it is {board.state}")
+                error = NotReadyError(
+                    f"the board did not {wait.what} within {COMMAND_TIMEOUT_S:g} s: it is {board.state}"
+                )
             if error is not None:
                 wait.future.set_exception(error)
             if wait.future.done():
@@ -211,7 +215,7 @@ class Engine:
     def submit(
         self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, strict: bool = False
     ) -> "Future[Answer]":
-        """Plan the sequence that `build` makes, and queue it unless dry_run; the answer says what will be shown when."""
+        """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when."""
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
@@ -244,13 +248,13 @@ class Engine:
         with self._lock:
             thermal, start_s = self._thermal, max(self._queue_end_s, self._session.board_s() + START_LEAD_S)
         heat, budget = thermal.seen_from(start_s)
-        policy = "refuse" if strict else "trim"
+        policy: Policy = "refuse" if strict else "trim"
         prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
-        record = PlanRecord(f"p{next(self._ids)}", name, prepared, start_s, heat, status="planned")
+        points = quantise(prepared.plan, self._session.scale)
+        record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, start_s)
+        self._prove(record, budget)
         if dry_run:
             return record.answer(self._session.board_s())
-        record.points = quantise(prepared.plan, self._session.scale)
-        self._prove(record, budget)
         with self._lock:
             if self._thermal is not thermal:  # a plan failed, or the board restarted, meanwhile
                 raise NotReadyError("the board stopped while this was planned; send it again")
@@ -266,8 +270,8 @@ class Engine:
     def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
         points, plan = record.points, record.prepared.plan
-        decoded = decode(b"".join(points.payloads()), self._session.scale)
-        pixel = [int(plan.pixel[row]) for row in points.rows_of(decoded.index)]
+        decoded = decode(b"".join(payload for _, payload, _ in points.frames(0)), self._session.scale)
+        pixel = plan.pixel[points.row[decoded.index]].tolist()
         verify(pixel, decoded.start_s, decoded.width_s, decoded.power_w, budget, self.display.budget)
 
     def _remember(self, record: PlanRecord) -> None:
@@ -335,12 +339,13 @@ class Engine:
         """End the running plan: what was executed is taken over, a delay moves everything after it."""
         assert self._running is not None  # noqa: S101 - callers have just looked
         (record, job), self._running = self._running, None
-        executed = job.executed(record.prepared.plan)
+        scale = self._session.scale
+        executed = job.executed(record.prepared.plan, scale.full_power_w, scale.tick_s)
         record.executed = executed
         record.end(status, error)
         if len(executed):
-            row = len(executed) - 1
-            record.delay_s = float(executed.start_s[row] - record.prepared.plan.start_s[row])
+            last = int(job.rows_executed()[-1])
+            record.delay_s = float(executed.start_s[-1] - record.prepared.plan.start_s[last])
         with self._lock:
             if record.delay_s > DELAY_NOTICED_S:
                 self._thermal = self._thermal.later(record.delay_s)
@@ -348,7 +353,9 @@ class Engine:
                 for waiting in self._waiting:
                     waiting.start_s += record.delay_s
             if status != "done":
-                self._thermal = self._thermal.with_heat_of(record.heat_before.shifted(record.start_s), executed, record.start_s)
+                self._thermal = self._thermal.with_heat_of(
+                    record.heat_before.shifted(record.start_s), executed, record.start_s
+                )
         self._bookkeeper.submit(self._simulate, record)
 
     def _simulate(self, record: PlanRecord) -> None:
@@ -394,7 +401,9 @@ class Engine:
             "queue": {
                 "waiting": len(self._waiting),
                 "running": None if running is None else running[0].plan_id,
-                "plans": [{"plan": r.plan_id, "name": r.name, "status": r.status} for r in list(self._records.values())[-20:]],
+                "plans": [
+                    {"plan": r.plan_id, "name": r.name, "status": r.status} for r in list(self._records.values())[-20:]
+                ],
             },
             "totals": dict(self._totals),
             "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},

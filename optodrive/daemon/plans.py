@@ -1,6 +1,6 @@
 """A submitted plan through its life: queued, running, then done, failed or cancelled."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 from optodrive.flow import ExecutedPulses, FloatArray
@@ -8,46 +8,49 @@ from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
 from optodrive.units import m_to_um
+from optodrive.wire.quantise import WirePoints
 
 Status = Literal["planned", "queued", "running", "done", "failed", "cancelled"]
 
 
 @dataclass
 class PlanRecord:
-    """One plan. start_s: board time of its zero; simulated_m: [n executed] displacement computed from what was executed."""
+    """One plan. start_s: board time of its zero; heat_before: on the plan's time line, as it was planned from.
+
+    simulated_m: [n executed] displacement computed from what the board says it executed
+    """
 
     plan_id: str
     name: str
     prepared: Prepared
-    start_s: float
+    points: WirePoints
     heat_before: DisplayHeat
-    status: Status = "queued"
+    start_s: float
+    status: Status = "planned"
     error: str | None = None
     sent: int = 0
     executed: ExecutedPulses | None = None
     simulated_m: FloatArray | None = None
     executed_count: int = 0
     delay_s: float = 0.0
-    payloads: list[bytes] = field(default_factory=list)
 
-    @property
-    def ended(self) -> bool:
-        """Whether nothing more will happen to it."""
-        return self.status in ("planned", "done", "failed", "cancelled")
+    def end(self, status: Status, error: str | None) -> None:
+        """Nothing more will happen to it."""
+        self.status, self.error = status, error
 
-    def answer(self, board_now_s: float | None = None) -> dict[str, Any]:
-        """The plan as REST answers it."""
+    def answer(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
+        """The plan as REST answers it; pulses: list them one by one."""
         answer: dict[str, Any] = {
             "plan": self.plan_id,
             "name": self.name,
             "status": self.status,
             "error": self.error,
-            "starts_in_s": None if board_now_s is None else self.start_s + self.delay_s - board_now_s,
+            "starts_in_s": self.start_s + self.delay_s - board_now_s,
             "planned": len(self.prepared.plan),
             "sent": self.sent,
             "executed": self.executed_count,
             "summary": summary(self.prepared),
-            "pulses": pulse_columns(self.prepared),
+            "pulses": pulse_columns(self.prepared) if pulses else None,
             "executed_pulses": None,
         }
         if self.executed is not None:
@@ -55,7 +58,7 @@ class PlanRecord:
             answer["delay_s"] = self.delay_s
             if self.simulated_m is not None and len(self.simulated_m):
                 answer["simulated_max_um"] = m_to_um(float(self.simulated_m.max()))
-            if len(self.executed) <= PULSES_LISTED_MAX:
+            if pulses and len(self.executed) <= PULSES_LISTED_MAX:
                 answer["executed_pulses"] = self._executed_columns()
         return answer
 

@@ -13,7 +13,7 @@ PAUSE_S = 0.3
 
 
 def showcase(config: Config, where: str) -> FrameSequence:
-    """A dot that runs round a ring, the ring, "hello" in braille, two pairs of fingers; about nine seconds.
+    """A dot that runs round a ring, the ring, "hello" in braille, two pairs of fingers; about eight seconds.
 
     Raises InputError on a display too small for a hand.
     """

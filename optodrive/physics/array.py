@@ -87,7 +87,7 @@ def _settle(heat: DisplayHeat, peaks_m: FloatArray, pixel: int, row: int, end_s:
 def pixel_trace(
     heat: DisplayHeat, pulses: Iterable[tuple[int, float, float, float]], pixels: list[int], t_s: FloatArray
 ) -> PixelTrace:
-    """Exact values of some pixels at given times. pulses: (pixel, start_s, width_s, power_w) in order; t_s: [m] rising."""
+    """Exact values of some pixels at times t_s [m], increasing; pulses: (pixel, start_s, width_s, power_w) in order."""
     wanted = {index: column for column, index in enumerate(pixels)}
     absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
     own: dict[int, list[tuple[float, float, float]]] = {index: [] for index in pixels}

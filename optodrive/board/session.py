@@ -1,0 +1,389 @@
+"""The host's session with one board: handshake, limits, clock, arming, lease, streaming, faults.
+
+Nothing here blocks but `connect`; `step` is called again and again by the loop that owns the session. Arming is never
+repeated by itself: a reconnect ends in DISARMED.
+"""
+
+import secrets
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from optodrive.board.clocksync import ClockSync
+from optodrive.board.faults import hint
+from optodrive.board.job import Job
+from optodrive.board.requirements import Requirements
+from optodrive.clock import Clock
+from optodrive.errors import InputError, LinkError, NotReadyError
+from optodrive.transport.base import Transport
+from optodrive.wire import messages as m
+from optodrive.wire.connection import HostConnection
+from optodrive.wire.quantise import WirePoints, WireScale
+
+LEASE_SHARE = 0.2
+"""The lease is renewed five times in its length."""
+HELLO_RETRY_S = 0.25
+CONNECT_TIMEOUT_S = 6.0
+STATUS_EVERY_S = 0.2
+CLOCK_EVERY_S = 1.0
+CLOCK_FIRST = 8
+SILENCE_S = 2.0
+"""A board that answers nothing for this long counts as lost."""
+GAP_AFTER_S = 0.1
+WATERMARK_POINTS = 48
+LEASED = ("ARMING", "ARMED", "RUNNING", "HOLD")
+
+
+@dataclass
+class BoardView:
+    """What the host last heard of the board."""
+
+    state: str = "UNKNOWN"
+    fault: str = ""
+    inputs: int = 0
+    done_index: int = 0
+    queued: int = 0
+    free_points: int = 0
+    underruns: int = 0
+    crc_errors: int = 0
+    format_errors: int = 0
+    seq_errors: int = 0
+    laser_on_s: float = 0.0
+    temperature_c: float | None = None
+    uid: str = ""
+    firmware: int = 0
+
+    def figures(self) -> dict[str, Any]:
+        """As REST answers it, with the fault's likely cause in plain words."""
+        return {**asdict(self), "fault": self.fault or None, "hint": hint(self.fault)}
+
+
+class Session:
+    """A session over a transport, with the requirements of a configuration."""
+
+    def __init__(self, transport: Transport, clock: Clock, requirements: Requirements) -> None:
+        self._transport = transport
+        self._clock = clock
+        self._requirements = requirements
+        self._connection = HostConnection()
+        self._sync = ClockSync()
+        self._clock_asked_s: dict[int, float] = {}
+        self._job: Job | None = None
+        self._frames: deque[tuple[int, bytes, int]] = deque()
+        self._next_index = 0
+        self._hello_sent_s = 0.0
+        self._refusal: str | None = None
+        self._arm_nonce: int | None = None
+        self._lease_sent_s = self._status_asked_s = self._clock_sent_s = self._heard_s = self._gap_asked_s = 0.0
+        self._jobs = 0
+        self._queue_points = 0
+        self.board = BoardView()
+        self.connected = False
+        self.last_reason = ""
+
+    @property
+    def port(self) -> str:
+        """The transport's name."""
+        return self._transport.name
+
+    @property
+    def scale(self) -> WireScale:
+        """How SI becomes codes on this board."""
+        return self._requirements.scale
+
+    def board_s(self) -> float:
+        """The board's time now, s."""
+        return self._sync.board_s(self._clock.now_s())
+
+    @property
+    def ready(self) -> bool:
+        """Whether a job may begin now."""
+        return self.board.state == "ARMED" and self._job is None and self.quiet
+
+    @property
+    def quiet(self) -> bool:
+        """Whether the board has greeted and acknowledged everything that was sent."""
+        return self._connection.peer is not None and self._connection.outstanding == 0
+
+    # --- connecting ---------------------------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Open the link and shake hands; LinkError without an answer, InputError for a board that does not fit."""
+        self._transport.open()
+        try:
+            self._shake_hands()
+        except (LinkError, InputError):
+            self._transport.close()
+            raise
+        self.connected = True
+
+    def _shake_hands(self) -> None:
+        self._forget()
+        self._greet()
+        give_up_s = self._clock.now_s() + CONNECT_TIMEOUT_S
+        while self._connection.peer is None:
+            self._greet_again()
+            self._exchange(0.02)
+            if self._clock.now_s() > give_up_s:
+                raise LinkError(
+                    f"{self.port} is open, but no board answers: is it powered, the right port, the right baud rate?"
+                )
+        while not (self.quiet and self._sync.known and self.board.state != "UNKNOWN"):
+            self._ask_clock()
+            self._ask_status()
+            self._exchange(0.02)
+            if self._clock.now_s() > give_up_s:
+                raise LinkError(f"{self.port}: the board greets, but does not answer further; {self._counters()}")
+        for _ in range(CLOCK_FIRST):
+            self._ask_clock()
+            self._exchange(0.005)
+
+    def _greet(self) -> None:
+        """Begin a session: whatever the board did, it ends, and leads to DISARMED."""
+        self._end_job()
+        self._hello_sent_s = self._clock.now_s()
+        self._connection.hello(secrets.randbits(32))
+
+    def _greet_again(self) -> None:
+        if self._connection.peer is None and self._clock.now_s() - self._hello_sent_s > HELLO_RETRY_S:
+            self._greet()
+
+    def _take_hello(self, peer: m.HelloReply, now_s: float) -> None:
+        self._requirements.check(peer)
+        self.board.uid, self.board.firmware = peer.uid.hex(), peer.firmware
+        self._queue_points = peer.queue_points
+        self._next_index = 0
+        self._connection.send(self._requirements.limits())
+        self._ask_status()
+
+    def _forget(self) -> None:
+        self._connection = HostConnection(self._requirements.rto_s)
+        self._sync = ClockSync()
+        self._clock_asked_s.clear()
+        self._arm_nonce = None
+        self._refusal = None
+        self.board = BoardView()
+        self._heard_s = self._clock.now_s()
+
+    def drop(self) -> None:
+        """Give the link up after an error."""
+        self.connected = False
+        self._transport.close()
+
+    def close(self) -> None:
+        """Tell the board to abort, if it can still be told, and close the link."""
+        if not self.connected:
+            return
+        with suppress(LinkError):  # the board's own lease ends it dark where it cannot be told
+            self._connection.abort()
+            self._transport.write(self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes))
+        self.drop()
+
+    # --- the loop's turn ----------------------------------------------------------------------------------------
+
+    def step(self, wait_s: float, lease: bool) -> None:
+        """Send what is due, wait at most wait_s for bytes, take them in. lease: whether the planner is alive."""
+        now_s = self._clock.now_s()
+        if (
+            lease
+            and self.board.state in LEASED
+            and now_s - self._lease_sent_s >= LEASE_SHARE * self._requirements.lease_s
+        ):
+            self._connection.send(m.Lease(ms=round(self._requirements.lease_s * 1e3)))
+            self._lease_sent_s = now_s
+        if now_s - self._status_asked_s >= STATUS_EVERY_S:
+            self._ask_status()
+        if now_s - self._clock_sent_s >= CLOCK_EVERY_S:
+            self._ask_clock()
+        self._greet_again()
+        self._stream()
+        self._exchange(wait_s)
+        if now_s - self._heard_s > SILENCE_S:
+            raise LinkError(f"{self.port}: the board fell silent for {SILENCE_S:g} s; {self._counters()}")
+
+    def _exchange(self, wait_s: float) -> None:
+        out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes)
+        if out:
+            self._transport.write(out)
+        data = self._transport.read(wait_s)
+        if data:
+            now_s = self._clock.now_s()
+            for message in self._connection.receive_bytes(data, now_s):
+                self._heard_s = now_s
+                self._take(message, now_s)
+
+    def _ask_status(self) -> None:
+        self._status_asked_s = self._clock.now_s()
+        self._connection.send(m.Get())
+
+    def _ask_clock(self) -> None:
+        self._clock_sent_s = self._clock.now_s()
+        stamp = secrets.randbits(32)
+        if len(self._clock_asked_s) > 64:
+            self._clock_asked_s.clear()
+        self._clock_asked_s[stamp] = self._clock_sent_s
+        self._connection.send(m.Clock(host_t=stamp))
+
+    def _take(self, message: m.Message, now_s: float) -> None:
+        takers: dict[type[m.Message], Callable[[Any, float], None]] = {
+            m.HelloReply: self._take_hello,
+            m.Ack: self._take_ack,
+            m.Nak: self._take_nak,
+            m.Status: self._take_status,
+            m.Event: self._take_event,
+            m.ClockReply: self._take_clock,
+            m.ArmChallenge: self._take_challenge,
+            m.Executed: self._take_executed,
+        }
+        taker = takers.get(type(message))
+        if taker is not None:
+            taker(message, now_s)
+
+    def _take_ack(self, message: m.Ack, now_s: float) -> None:
+        self.board.free_points, self.board.done_index = message.free_points, message.done_index
+        self._set_state(m.STATES[message.state])
+
+    def _take_nak(self, message: m.Nak, now_s: float) -> None:
+        reason = m.NAK_REASONS[message.reason]
+        if reason not in m.NOT_CONSUMED:
+            self._refusal = reason
+
+    def _take_status(self, message: m.Status, now_s: float) -> None:
+        board = self.board
+        board.inputs, board.done_index, board.queued = message.inputs, message.done_index, message.queued
+        board.underruns, board.crc_errors = message.underruns, message.crc_errors
+        board.format_errors, board.seq_errors = message.format_errors, message.seq_errors
+        board.laser_on_s = message.laser_on_us * 1e-6
+        board.temperature_c = message.temperature_dc / 10.0
+        board.fault = m.FAULTS[message.fault]
+        self._set_state(m.STATES[message.state])
+
+    def _take_event(self, message: m.Event, now_s: float) -> None:
+        self.board.fault = m.FAULTS[message.fault]
+        self.last_reason = m.REASONS[message.reason]
+        self._set_state(m.STATES[message.state])
+
+    def _set_state(self, state: str) -> None:
+        self.board.state = state
+        if state != "FAULT":
+            self.board.fault = ""
+
+    def _take_clock(self, message: m.ClockReply, now_s: float) -> None:
+        sent_s = self._clock_asked_s.pop(message.host_t, None)
+        if sent_s is not None:
+            self._sync.add(sent_s, now_s, message.tick * self.scale.tick_s)
+
+    def _take_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
+        if message.host_nonce == self._arm_nonce:
+            self._arm_nonce = None
+            self._connection.send(m.ArmConfirm(board_nonce=message.board_nonce, host_nonce=message.host_nonce))
+
+    def _take_executed(self, message: m.Executed, now_s: float) -> None:
+        if self._job is not None:
+            self._job.note(message)
+
+    # --- orders -------------------------------------------------------------------------------------------------
+
+    def arm(self) -> None:
+        """Ask the board to arm; it lights its indicator and is ARMED two seconds after the confirmation."""
+        if self.board.state != "DISARMED":
+            fault = f" {self.board.fault}" if self.board.fault else ""
+            raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
+        self._refusal = None
+        self._arm_nonce = secrets.randbits(32)
+        self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
+
+    def disarm(self) -> None:
+        """Disarm; from FAULT, acknowledge the fault."""
+        self._refusal = None
+        self._end_job()
+        self._connection.send(m.ClearFault() if self.board.state == "FAULT" else m.Disarm())
+
+    def abort(self) -> None:
+        """Gate off now, queue dropped, DISARMED; goes ahead of everything else that waits to be sent."""
+        self._refusal = None
+        self._connection.abort()
+        self._greet()
+
+    def flush(self) -> None:
+        """Drop what is queued; the board stays armed."""
+        self._end_job()
+        self._connection.send(m.Flush())
+
+    def take_refusal(self) -> str | None:
+        """Why the board refused the last order, once."""
+        refusal, self._refusal = self._refusal, None
+        return refusal
+
+    # --- streaming ----------------------------------------------------------------------------------------------
+
+    def begin(self, points: WirePoints, start_s: float) -> Job:
+        """Begin to stream a plan whose zero is at the board's time start_s."""
+        self._jobs += 1
+        job = Job(self._jobs, points, self._next_index, max(1, round(start_s / self.scale.tick_s)))
+        self._frames = deque(points.frames(self._next_index))
+        self._next_index = job.end_index
+        self._job = job
+        return job
+
+    def _end_job(self) -> None:
+        if self._job is not None:
+            self._next_index = self._job.next_to_send
+        self._job = None
+        self._frames.clear()
+
+    def _stream(self) -> None:
+        job = self._job
+        if job is None:
+            return
+        link = self._connection
+        while self._frames and link.outstanding < link.window:
+            first_index, payload, count = self._frames[0]
+            done_index = max(job.first_index, self.board.done_index)
+            if job.next_to_send + count - done_index > self._queue_points:
+                break
+            self._frames.popleft()
+            link.send(m.Data(first_index, payload))
+            job.next_to_send = first_index + count
+            if not job.started:
+                watermark = min(WATERMARK_POINTS, job.end_index - job.first_index)
+                link.send(m.Start(job.job_id, job.first_index, job.start_tick, watermark))
+                job.started = True
+        if not self._frames and not job.end_sent and link.outstanding < link.window:
+            link.send(m.End(job.job_id, job.end_index))
+            job.end_sent = True
+        self._fill_gaps(job)
+        if job.finished and self.board.state == "ARMED":
+            self._job = None
+
+    def _fill_gaps(self, job: Job) -> None:
+        """Ask again for reports that were lost: the board has done more than it was heard to say."""
+        missing = job.first_missing
+        now_s = self._clock.now_s()
+        if missing is None or missing >= self.board.done_index or now_s - self._gap_asked_s < GAP_AFTER_S:
+            return
+        self._gap_asked_s = now_s
+        self._connection.send(m.GetExecuted(first_index=missing))
+
+    # --- figures ------------------------------------------------------------------------------------------------
+
+    def link_figures(self) -> dict[str, Any]:
+        """Counters of the link, for people who wonder why it is slow or lost."""
+        counters = self._connection.counters
+        return {
+            "round_trip_ms": None if self._sync.round_trip_s is None else self._sync.round_trip_s * 1e3,
+            "received_bad": counters.crc_errors + counters.format_errors,
+            "retransmitted": counters.retransmitted,
+            "naks": counters.naks,
+            "board_bad": self.board.crc_errors + self.board.format_errors,
+            "underruns": self.board.underruns,
+        }
+
+    def _counters(self) -> str:
+        figures = self.link_figures()
+        return (
+            f"{figures['received_bad']} bad frames here, {figures['board_bad']} at the board, "
+            f"{figures['retransmitted']} sent again"
+        )

@@ -1,0 +1,7 @@
+"""`optodrive simulate`."""
+
+import typer
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""

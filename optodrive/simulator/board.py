@@ -1,0 +1,222 @@
+"""The simulated board as a process of its own on a pseudo-terminal.
+
+python -m optodrive.simulator.board --pty LINK [--log FILE] [--limits FILE] [--script FILE] [--baud N]
+"""
+
+import argparse
+import json
+import os
+import select
+import signal
+import sys
+import time
+import tty
+from pathlib import Path
+from typing import IO, Any
+
+from optodrive.errors import InputError
+from optodrive.simulator.core import BoardCore
+from optodrive.simulator.limits import BoardSettings, load_settings
+from optodrive.simulator.link import FaultyLink
+from optodrive.simulator.script import Step, load_script
+
+TURN_MAX_S = 0.005
+BITS_A_BYTE = 10
+BURST_BYTES = 64
+READ_MAX = 4096
+
+
+class Pace:
+    """Lets bytes pass at a serial line's rate."""
+
+    def __init__(self, baud: int) -> None:
+        self._bytes_per_s = baud / BITS_A_BYTE
+        self._tokens = float(BURST_BYTES)
+        self._at_s = 0.0
+
+    def allowed(self, now_s: float) -> int:
+        """How many bytes may pass now."""
+        # A late turn may catch up on what the line would have carried meanwhile, up to a whole read.
+        self._tokens = min(READ_MAX, self._tokens + (now_s - self._at_s) * self._bytes_per_s)
+        self._at_s = now_s
+        return int(self._tokens)
+
+    def passed(self, count: int) -> None:
+        """Count bytes that passed."""
+        self._tokens -= count
+
+
+class PtyBoard:
+    """A `BoardCore` between a pty and the real clock."""
+
+    def __init__(
+        self,
+        link: Path,
+        log: IO[str] | None,
+        settings: BoardSettings,
+        script: list[Step],
+        baud: int,
+        exit_closed_s: float | None,
+    ) -> None:
+        self._link_path = link
+        self._log_file = log
+        self._script = script
+        self._exit_closed_s = exit_closed_s
+        self._started_s = time.monotonic()
+        self._core = BoardCore(settings, self._log)
+        self._faults = FaultyLink()
+        self._in_pace, self._out_pace = Pace(baud), Pace(baud)
+        self._out = b""
+        self._open = False
+        self._was_open = False
+        self._closed_since_s = 0.0
+        self._master = -1
+        self._running = True
+        self._make_pty()
+
+    def _make_pty(self) -> None:
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        temporary = self._link_path.with_name(self._link_path.name + ".new")
+        temporary.unlink(missing_ok=True)
+        temporary.symlink_to(os.ttyname(slave))
+        temporary.replace(self._link_path)
+        os.close(slave)  # from here on a hang-up means that no host has the port open
+
+    def _log(self, event: dict[str, Any]) -> None:
+        if self._log_file is not None:
+            self._log_file.write(json.dumps(event) + "\n")
+            self._log_file.flush()
+
+    def _now_s(self) -> float:
+        return time.monotonic() - self._started_s
+
+    def stop(self, *_: object) -> None:
+        """End after this turn."""
+        self._running = False
+
+    def run(self) -> None:
+        """Serve until stopped, then go dark."""
+        try:
+            while self._running:
+                self._turn()
+        finally:
+            self._core.link_lost(self._now_us())
+            self._link_path.unlink(missing_ok=True)
+
+    def _now_us(self) -> int:
+        return int(self._now_s() * 1e6)
+
+    def _turn(self) -> None:
+        self._follow_script()
+        self._core.advance(self._now_us())
+        self._watch_port()
+        if self._open:
+            self._read()
+            self._core.advance(self._now_us())
+            self._write()
+        else:
+            self._core.bytes_to_send()
+            self._out = b""
+        self._wait()
+
+    def _wait(self) -> None:
+        now_us, due_us = self._now_us(), self._core.next_event_us()
+        wait_s = TURN_MAX_S if due_us is None else min(TURN_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
+        if not self._open:
+            time.sleep(max(wait_s, 0.001))
+        elif self._in_pace.allowed(self._now_s()) < 1:
+            time.sleep(0.0005)
+        else:
+            select.select([self._master], [self._master] if self._out else [], [], wait_s)
+
+    def _watch_port(self) -> None:
+        poller = select.poll()
+        poller.register(self._master, select.POLLIN)
+        hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
+        if self._open and hung_up:
+            self._log({"t_us": self._now_us(), "event": "port", "open": False})
+            self._core.link_lost(self._now_us())
+            self._closed_since_s = self._now_s()
+        elif not self._open and not hung_up:
+            self._log({"t_us": self._now_us(), "event": "port", "open": True})
+            self._was_open = True
+        self._open = not hung_up
+        closed_for_s = self._now_s() - self._closed_since_s
+        if self._exit_closed_s is not None and self._was_open and not self._open and closed_for_s > self._exit_closed_s:
+            self._running = False
+
+    def _read(self) -> None:
+        allowed = self._in_pace.allowed(self._now_s())
+        if allowed < 1:
+            return
+        try:
+            data = os.read(self._master, min(allowed, READ_MAX))
+        except (BlockingIOError, OSError):
+            return  # nothing there, or the host has just closed: the next look at the port tells
+        self._in_pace.passed(len(data))
+        self._core.receive(self._faults.carry(data), self._now_us())
+
+    def _write(self) -> None:
+        self._out += self._faults.carry(self._core.bytes_to_send())
+        allowed = min(self._out_pace.allowed(self._now_s()), len(self._out))
+        if allowed < 1:
+            return
+        try:
+            written = os.write(self._master, self._out[:allowed])
+        except (BlockingIOError, OSError):
+            return
+        self._out_pace.passed(written)
+        self._out = self._out[written:]
+
+    def _follow_script(self) -> None:
+        while self._script and self._script[0].at_s <= self._now_s():
+            self._do(self._script.pop(0))
+
+    def _do(self, step: Step) -> None:
+        now_us = self._now_us()
+        if step.kind == "set":
+            self._core.set_input(step.name, step.value, now_us)
+        elif step.name == "reset":
+            self._core.reset(now_us)
+        elif step.name == "repair":
+            self._faults.repair()
+        elif step.name == "close":
+            self._core.link_lost(now_us)
+            os.close(self._master)
+            self._open = False
+            self._make_pty()
+        else:
+            self._faults.break_down(step.name, step.rate)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a board until SIGTERM or SIGINT."""
+    parser = argparse.ArgumentParser(prog="optodrive.simulator.board", description="A simulated board on a pty.")
+    parser.add_argument("--pty", type=Path, required=True, metavar="LINK", help="link this name to the pty")
+    parser.add_argument("--log", type=Path, help="JSON lines: gate edges, states, faults, pulses")
+    parser.add_argument("--limits", type=Path, help="TOML: the board's own limits")
+    parser.add_argument("--script", type=Path, help="TOML: what happens to it, and when")
+    parser.add_argument("--baud", type=int, default=1_000_000, help="pace of the serial line")
+    parser.add_argument("--exit-when-closed", type=float, metavar="SECONDS", help="end when no host has it open")
+    options = parser.parse_args(arguments)
+    try:
+        settings = load_settings(options.limits) if options.limits else BoardSettings()
+        script = load_script(options.script) if options.script else []
+        log = options.log.open("a", encoding="utf-8") if options.log else None
+    except InputError as error:
+        print(f"optodrive.simulator.board: {error}", file=sys.stderr)
+        return error.exit_status
+    except OSError as error:
+        print(f"optodrive.simulator.board: --log {options.log}: {error.strerror}", file=sys.stderr)
+        return 2
+    board = PtyBoard(options.pty, log, settings, script, options.baud, options.exit_when_closed)
+    signal.signal(signal.SIGTERM, board.stop)
+    signal.signal(signal.SIGINT, board.stop)
+    board.run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,116 @@
+"""Limited plans to points of codes and ticks, and the very bytes back to SI, for the proof before emission."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.errors import LocalProtocolError
+from optodrive.flow import FloatArray, IntArray, LimitedPlan, freeze_arrays
+from optodrive.wire.messages import POINTS_MAX
+
+CENTRE_CODE = 32768
+CODE_MAX = 65535
+DUTY_MAX = 65535
+TICKS_MAX = 65535
+DARK_STEP_TICKS = 60_000
+"""A pause longer than a point can hold is cut into dark points of this length."""
+
+
+@dataclass(frozen=True)
+class WireScale:
+    """How SI becomes codes and ticks."""
+
+    rad_per_code: float
+    full_power_w: float
+    tick_s: float
+
+    def codes(self, angle_rad: FloatArray) -> IntArray:
+        """Mirror angle to DAC codes; LocalProtocolError beyond the DAC's range. Any shape."""
+        codes = np.rint(angle_rad / self.rad_per_code).astype(np.int64) + CENTRE_CODE
+        if codes.size and (codes.min() < 0 or codes.max() > CODE_MAX):
+            raise LocalProtocolError(f"codes {codes.min()} to {codes.max()} leave the DAC's range 0 to {CODE_MAX}")
+        return codes
+
+    def angles(self, codes: IntArray) -> FloatArray:
+        """DAC codes to mirror angle, rad. Any shape."""
+        return np.asarray((codes - CENTRE_CODE) * self.rad_per_code, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class WirePoints:
+    """Points of a plan: table uint16 [n, 5] of x, y, dark, on, duty; row [n] the plan's pulse, -1 for a dark point."""
+
+    table: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
+    row: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.row)
+
+    def frames(self, first_index: int) -> list[tuple[int, bytes, int]]:
+        """The points cut into DATA frames: index of the first, bytes, count."""
+        cuts = range(0, len(self), POINTS_MAX)
+        pieces = [self.table[at : at + POINTS_MAX] for at in cuts]
+        return [
+            (first_index + at, piece.astype("<u2").tobytes(), len(piece))
+            for at, piece in zip(cuts, pieces, strict=True)
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class DecodedPulses:
+    """Pulses read back from bytes, times from the plan's zero; all [n]. index counts the points from the first."""
+
+    index: IntArray
+    start_s: FloatArray
+    width_s: FloatArray
+    x_rad: FloatArray
+    y_rad: FloatArray
+    power_w: FloatArray
+
+
+def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
+    """Points for a plan. Starts come from absolute times, so rounding never adds up; duty is rounded down.
+
+    A pulse trimmed to nothing becomes a dark point of the same length, so that times stay.
+    """
+    start = np.rint(plan.start_s / scale.tick_s).astype(np.int64)
+    width = np.rint(plan.width_s / scale.tick_s).astype(np.int64)
+    duty = np.floor(plan.power_w / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
+    if len(plan) and (width.max() > TICKS_MAX or width.min() < 1 or duty.max() > DUTY_MAX or duty.min() < 0):
+        raise LocalProtocolError("a pulse does not fit a point of the wire")
+    x, y = scale.codes(plan.x_rad), scale.codes(plan.y_rad)
+    dark = start - np.concatenate([[0], (start + width)[:-1]])
+    if len(plan) and dark.min() < 0:
+        raise LocalProtocolError("pulses overlap")
+    table: list[tuple[int, int, int, int, int]] = []
+    rows: list[int] = []
+    columns = (x.tolist(), y.tolist(), dark.tolist(), width.tolist(), duty.tolist())
+    for row, (x_code, y_code, dark_ticks, on_ticks, duty_code) in enumerate(zip(*columns, strict=True)):
+        if duty_code == 0:
+            dark_ticks, on_ticks = dark_ticks + on_ticks, 0
+        while dark_ticks > TICKS_MAX:
+            table.append((x_code, y_code, DARK_STEP_TICKS, 0, 0))
+            rows.append(-1)
+            dark_ticks -= DARK_STEP_TICKS
+        table.append((x_code, y_code, dark_ticks, on_ticks, duty_code))
+        rows.append(row)
+    return WirePoints(np.array(table, dtype=np.uint16).reshape(-1, 5), np.array(rows, dtype=np.int64))
+
+
+def decode(payload: bytes, scale: WireScale) -> DecodedPulses:
+    """Read points back from the bytes of DATA frames, joined in order; dark points only pass time."""
+    table = np.frombuffer(payload, dtype="<u2").reshape(-1, 5).astype(np.int64)
+    x, y, dark, on, duty = table.T
+    end = np.cumsum(dark + on)
+    lit = np.flatnonzero(on > 0)
+    return DecodedPulses(
+        index=lit,
+        start_s=np.asarray((end - on)[lit] * scale.tick_s, dtype=np.float64),
+        width_s=np.asarray(on[lit] * scale.tick_s, dtype=np.float64),
+        x_rad=scale.angles(x[lit]),
+        y_rad=scale.angles(y[lit]),
+        power_w=duty[lit] / DUTY_MAX * scale.full_power_w,
+    )

@@ -1,0 +1,165 @@
+import json
+from io import BytesIO
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from optodrive.config import load_config
+from optodrive.errors import InputError
+from optodrive.frames.braille import DIGITS, PUNCTUATION
+from optodrive.frames.files import parse_sequence, sequence_to_json
+from optodrive.frames.patterns import build_pattern
+
+CONFIG = load_config("display-16")
+HEIGHTS = st.floats(0, 2000, allow_subnormal=False)
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
+    lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
+    max_leaves=8,
+)
+FRAME = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 50}}
+TRAIN = {"pixel": 3, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": 2.0}
+
+
+def accepted(value):
+    """Whether a sequence was made of it; anything but a refusal in one line is an error."""
+    try:
+        parse_sequence(value, CONFIG, "frames.json")
+    except InputError as error:
+        return not _one_line(error)
+    return True
+
+
+def _one_line(error):
+    assert "\n" not in str(error)
+    return True
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(1e-3, 10),
+            st.floats(0, 1),
+            st.dictionaries(st.integers(0, 15), HEIGHTS) | st.lists(HEIGHTS, min_size=16, max_size=16),
+        ),
+        min_size=1,
+        max_size=5,
+    ),
+    st.integers(1, 250),
+    st.floats(0, 1),
+    st.floats(0.01, 2.45),
+)
+def test_what_is_written_is_read_again(frames, periods, gap_s, power_w):
+    entries, at_s = [], 0.0
+    for duration_s, pause_s, heights in frames:
+        target = {str(pixel): h for pixel, h in heights.items()} if isinstance(heights, dict) else heights
+        entries.append({"show_at_s": at_s, "duration_s": duration_s, "target_um": target})
+        at_s += duration_s + pause_s
+    train = {**TRAIN, "pulse_width_s": periods / 5000, "gap_s": gap_s, "power_w": power_w}
+    once = parse_sequence(json.dumps({"frames": entries, "trains": [train]}), CONFIG, "f")
+    again = parse_sequence(json.dumps(sequence_to_json(once)), CONFIG, "f")
+    assert again.trains == once.trains
+    for one, two, entry in zip(once.frames, again.frames, entries, strict=True):
+        assert (one.frame_id, one.show_at_s, one.duration_s) == (two.frame_id, two.show_at_s, two.duration_s)
+        assert np.allclose(one.target_m, two.target_m, rtol=1e-12, atol=1e-15)
+        target = entry["target_um"]
+        wanted = [target.get(str(k), 0.0) for k in range(16)] if isinstance(target, dict) else target
+        assert np.allclose(one.target_m, np.array(wanted) * 1e-6, rtol=1e-12, atol=0)
+
+
+@given(JSON)
+def test_any_json_is_read_or_refused(value):
+    assert not accepted(value)
+    assert not accepted(json.dumps(value))
+
+
+@given(st.sampled_from(sorted(FRAME)), JSON)
+def test_any_value_in_a_frame_is_read_or_refused(key, value):
+    if accepted({"frames": [{**FRAME, key: value}]}):
+        assert type(value) in ((dict, list) if key == "target_um" else (int, float))
+
+
+@given(st.sampled_from(sorted(TRAIN)), JSON)
+def test_any_value_in_a_train_is_read_or_refused(key, value):
+    if accepted({"trains": [{**TRAIN, key: value}]}):
+        assert type(value) in (int, float)
+
+
+@given(st.binary(max_size=60))
+def test_any_bytes_are_refused(body):
+    assert not accepted(body)
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 15), st.integers(0, 400), st.integers(1, 60), st.integers(0, 60), st.integers(1, 300)),
+        min_size=2,
+        max_size=5,
+    )
+)
+def test_overlaps_are_found_as_by_comparing_every_pair(rows):
+    """In PWM periods, so that both sides are exact."""
+    entries = [
+        dict(zip(TRAIN, (p, at / 5000, long / 5000, wide / 5000, gap / 5000, 1.0), strict=True))
+        for p, at, wide, gap, long in rows
+    ]
+    spans = [
+        [(at + k * (wide + gap), at + k * (wide + gap) + wide) for k in range(-(-long // (wide + gap)))]
+        for _, at, wide, gap, long in rows
+    ]
+    clash = any(a < d and c < b for i, one in enumerate(spans) for two in spans[:i] for a, b in one for c, d in two)
+    assert accepted({"trains": entries}) != clash
+
+
+@given(
+    st.text(
+        alphabet=st.sampled_from(["a", "j", "k", "Z", *DIGITS, *PUNCTUATION, " ", "\n", '"']), min_size=1, max_size=40
+    )
+)
+@settings(max_examples=50, deadline=None)
+def test_known_text_is_shown_whole(text):
+    if not text.strip():
+        return
+    config = load_config("display-437")
+    sequence = build_pattern("text", {"text": text, "seconds": 0}, config)
+    assert sum(np.count_nonzero(frame.target_m) for frame in sequence.frames) == _dots(text)
+
+
+def _dots(text):
+    from optodrive.frames.braille import word_cells
+
+    return sum(len(cell) for word in text.split() for cell in word_cells(word))
+
+
+def _pictures():
+    rng = np.random.default_rng(5)
+    moving = [Image.fromarray(rng.integers(0, 256, (24, 20), dtype=np.uint8)) for _ in range(3)]
+    for kind in ("PNG", "GIF", "JPEG"):
+        buffer = BytesIO()
+        extra = {} if kind == "JPEG" else {"save_all": True, "append_images": moving[1:], "duration": 40}
+        moving[0].save(buffer, kind, **extra)
+        yield buffer.getvalue()
+
+
+PICTURES = list(_pictures())
+
+
+@pytest.mark.parametrize("name", ["image", "animation"])
+@given(data=st.data())
+@settings(max_examples=200, deadline=None)
+def test_a_damaged_picture_is_read_or_refused(name, data):
+    file = bytearray(data.draw(st.sampled_from(PICTURES)))
+    for _ in range(data.draw(st.integers(1, 6))):
+        file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
+    file = bytes(file[: data.draw(st.integers(len(file) // 2, len(file)))])
+    try:
+        sequence = build_pattern(name, {"file": file}, CONFIG)
+    except InputError as error:
+        _one_line(error)
+        return
+    for frame in sequence.frames:
+        assert frame.duration_s > 0
+        assert np.all((frame.target_m >= 0) & (frame.target_m <= 50e-6 * (1 + 1e-6)))
