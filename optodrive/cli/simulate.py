@@ -1,7 +1,137 @@
-"""`optodrive simulate`."""
+"""`optodrive simulate`: a plan on the simulated board, and what instruments would have measured."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, print_json, progress_bar, report_lines
+from optodrive.cli.plan import FramesArgument
+from optodrive.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from optodrive.flow import ExecutedPulses, PixelTrace
+    from optodrive.pipeline import Display, Prepared
+
+PIXELS_MAX = 16
+"""Without --pixels, so many of the driven pixels are looked at, the tallest first."""
 
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
+    app.command("simulate")(simulate)
+
+
+def simulate(
+    frames: FramesArgument,
+    out: Annotated[Path | None, typer.Option("--out", metavar="recording.h5", help="Write the recording.")] = None,
+    pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to look at.")] = None,
+    dt: Annotated[float, typer.Option("--dt", metavar="SECONDS", help="Time between samples.")] = 1e-3,
+    noise: Annotated[float, typer.Option("--noise", help="Instrument noise, in units of what each states.")] = 0.0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Plan frames, run them on the simulated board, and measure what the pixels do."""
+    from optodrive.config import load_config
+    from optodrive.frames.files import load_sequence
+    from optodrive.pipeline import Display, prepare
+    from optodrive.simulator.run import execute
+    from optodrive.simulator.truth import trace
+
+    if not 1e-6 <= dt <= 1.0:
+        raise InputError("--dt", dt, "a time between 1e-6 and 1 s")
+    if not 0.0 <= noise <= 1000.0:
+        raise InputError("--noise", noise, "a factor between 0 and 1000")
+    display = Display.of(load_config(config))
+    wanted = _wanted(pixels, len(display.layout))
+    with progress_bar() as bar:
+        planning = bar.add_task("planning", total=1.0)
+        sequence = load_sequence(frames, display.config)
+        prepared = prepare(
+            display, sequence, *display.at_rest(), progress=lambda share: bar.update(planning, completed=share)
+        )
+        running = bar.add_task("simulating", total=1.0)
+        executed = execute(display, prepared, lambda share: bar.update(running, completed=share))
+        looked_at = _tallest(prepared) if wanted is None else wanted
+        traced = trace(display.pixels, executed, looked_at, dt)
+    if out is not None:
+        _write(out, display, executed, traced, noise, seed)
+    report = _report(display, prepared, executed, traced)
+    if json:
+        print_json(report)
+        return
+    for line in report_lines(report["summary"]):
+        print(line)
+    print(f"executed         {report['executed']} of {report['planned']} planned")
+    for item in report["pixels"]:
+        print(
+            f"pixel {item['pixel']:<10} {item['measured_max_um']:.1f} µm measured, {item['predicted_max_um']:.1f} µm "
+            f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
+        )
+    if out is not None:
+        print(f"written          {out}")
+
+
+def _wanted(pixels: str | None, count: int) -> list[int] | None:
+    if pixels is None:
+        return None
+    wanted = []
+    for word in pixels.split(","):
+        if not word.strip().isdigit() or int(word) >= count:
+            raise InputError("--pixels", word, f"indices 0 to {count - 1}, separated by commas")
+        wanted.append(int(word))
+    return list(dict.fromkeys(wanted))
+
+
+def _tallest(prepared: "Prepared") -> list[int]:
+    order = prepared.plan.pixel[prepared.predicted_m.argsort()[::-1]]
+    return sorted(list(dict.fromkeys(order.tolist()))[:PIXELS_MAX])
+
+
+def _write(
+    out: Path, display: "Display", executed: "ExecutedPulses", traced: "PixelTrace", noise: float, seed: int
+) -> None:
+    import numpy as np
+
+    from optodrive.recording import write_recording
+    from optodrive.simulator.sensor import measure
+
+    pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
+    width_m = display.config.display.bridge_width_m
+    write_recording(out, measure(traced, pulses, display.ambient_k, width_m, noise, seed))
+
+
+def _report(
+    display: "Display", prepared: "Prepared", executed: "ExecutedPulses", traced: "PixelTrace"
+) -> dict[str, Any]:
+    from optodrive.physics.array import DisplayHeat, pulse_peaks
+    from optodrive.summary import pulse_columns, summary
+    from optodrive.units import m_to_um
+
+    heat = DisplayHeat(display.pixels)
+    simulated_m = pulse_peaks(heat, executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    return {
+        "summary": summary(prepared),
+        "planned": len(prepared.plan),
+        "executed": len(executed),
+        "complete": executed.complete,
+        "simulated_max_um": m_to_um(float(simulated_m.max())) if len(executed) else 0.0,
+        "pixels": [
+            {
+                "pixel": pixel,
+                "measured_max_um": m_to_um(float(traced.displacement_m[:, column].max())),
+                "predicted_max_um": m_to_um(_predicted_max_m(prepared, pixel)),
+                "absorber_max_c": display.config.ambient_c + float(traced.absorber_k[:, column].max()),
+            }
+            for column, pixel in enumerate(traced.pixel.tolist())
+        ],
+        "pulses": pulse_columns(prepared),
+    }
+
+
+def _predicted_max_m(prepared: "Prepared", pixel: int) -> float:
+    of_pixel: np.ndarray[Any, Any] = prepared.predicted_m[prepared.plan.pixel == pixel]
+    return float(of_pixel.max()) if len(of_pixel) else 0.0

@@ -344,7 +344,8 @@ class Engine:
         record.executed = executed
         record.end(status, error)
         if len(executed):
-            last = int(job.rows_executed()[-1])
+            record.executed_rows = job.rows_executed()
+            last = int(record.executed_rows[-1])
             record.delay_s = float(executed.start_s[-1] - record.prepared.plan.start_s[last])
         with self._lock:
             if record.delay_s > DELAY_NOTICED_S:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from optodrive.flow import ExecutedPulses, FloatArray
+import numpy as np
+
+from optodrive.flow import ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
@@ -17,7 +19,7 @@ Status = Literal["planned", "queued", "running", "done", "failed", "cancelled"]
 class PlanRecord:
     """One plan. start_s: board time of its zero; heat_before: on the plan's time line, as it was planned from.
 
-    simulated_m: [n executed] displacement computed from what the board says it executed
+    executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
     """
 
     plan_id: str
@@ -30,6 +32,7 @@ class PlanRecord:
     error: str | None = None
     sent: int = 0
     executed: ExecutedPulses | None = None
+    executed_rows: IntArray | None = None
     simulated_m: FloatArray | None = None
     executed_count: int = 0
     delay_s: float = 0.0
@@ -51,6 +54,8 @@ class PlanRecord:
             "executed": self.executed_count,
             "summary": summary(self.prepared),
             "pulses": pulse_columns(self.prepared) if pulses else None,
+            "simulated_max_um": None,
+            "tallest_asked": self._tallest_asked(),
             "executed_pulses": None,
         }
         if self.executed is not None:
@@ -61,6 +66,23 @@ class PlanRecord:
             if pulses and len(self.executed) <= PULSES_LISTED_MAX:
                 answer["executed_pulses"] = self._executed_columns()
         return answer
+
+    def _tallest_asked(self) -> dict[str, Any] | None:
+        """The pulse asked to be the tallest: asked for, predicted, and simulated from what was executed."""
+        plan = self.prepared.plan
+        asked_m = np.nan_to_num(plan.target_m)
+        if not len(plan) or not asked_m.any():
+            return None
+        row = int(asked_m.argmax())
+        simulated_um = None
+        if self.simulated_m is not None and self.executed_rows is not None and row in self.executed_rows:
+            simulated_um = m_to_um(float(self.simulated_m[self.executed_rows == row][0]))
+        return {
+            "pixel": int(plan.pixel[row]),
+            "asked_um": m_to_um(float(asked_m[row])),
+            "predicted_um": m_to_um(float(self.prepared.predicted_m[row])),
+            "simulated_um": simulated_um,
+        }
 
     def _executed_columns(self) -> dict[str, list[Any]]:
         executed = self.executed
