@@ -250,12 +250,13 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
 
 def input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
     """The first of pydantic's complaints as one line; an unknown key comes with the nearest known one."""
-    first = error.errors(include_url=False)[0]
+    complaints = error.errors(include_url=False)
+    first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
     place = ".".join(str(part) for part in first["loc"])
     label = f"{where}: {place}" if place else where
     if first["type"] == "extra_forbidden":
         known = _known_keys(model, first["loc"][:-1]) if model else []
-        expected = f"a known key, nearest is {nearest(str(first['loc'][-1]), known)}" if known else "no such key"
+        expected = f"a known key, {nearest(str(first['loc'][-1]), known)}" if known else "no such key"
         return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "missing":

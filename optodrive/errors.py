@@ -71,4 +71,4 @@ def abbreviate(value: object, limit: int = 60) -> str:
 def nearest(name: str, known: list[str]) -> str:
     """A phrase that names the known word nearest to `name`, or all of them when none is near."""
     match = get_close_matches(name, known, n=1, cutoff=0.5)
-    return f"'{match[0]}'" if match else "one of " + ", ".join(known)
+    return f"nearest is '{match[0]}'" if match else "one of " + ", ".join(known)

@@ -101,9 +101,7 @@ def _read_run(where: str, name: str, group: "h5py.Group") -> Run:
         if member in KNOWN_RUN_MEMBERS:
             continue
         if member not in SIGNALS:
-            raise InputError(
-                f"{where}/{member}", member, f"a known signal, nearest is {nearest(member, list(SIGNALS))}"
-            )
+            raise InputError(f"{where}/{member}", member, f"a known signal, {nearest(member, list(SIGNALS))}")
         signals[member] = _read_signal(f"{where}/{member}", group[member])
     ambient_k = float(attributes.pop("ambient_K"))
     return Run(name, ambient_k, pulses, signals, attributes)

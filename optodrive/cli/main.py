@@ -2,12 +2,15 @@
 
 import os
 import sys
+from typing import Any
 
-import click
 import typer
 
 from optodrive.cli import config_cmd, control, plan, play, serve, simulate, validate_cmd
 from optodrive.errors import OptodriveError
+
+UsageError: Any = typer.BadParameter.__bases__[0]
+"""The base of every complaint about arguments; typer brings its own copy of click, or uses click's."""
 
 app = typer.Typer(
     name="optodrive",
@@ -28,22 +31,22 @@ def main(arguments: list[str] | None = None) -> None:
 def run(arguments: list[str]) -> int:
     """Run the command line; every error it knows becomes one line on stderr and an exit status."""
     try:
-        app(args=arguments, prog_name="optodrive", standalone_mode=False)
+        status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
+        return status if isinstance(status, int) else 0
     except OptodriveError as error:
         print(f"optodrive: {error}", file=sys.stderr)
         return error.exit_status
-    except click.exceptions.Exit as error:
-        return error.exit_code
-    except click.exceptions.Abort:
+    except (typer.Abort, KeyboardInterrupt):
         print("optodrive: interrupted", file=sys.stderr)
         return 130
-    except click.ClickException as error:
-        print(f"optodrive: {error.format_message()}", file=sys.stderr)
-        return error.exit_code
+    except UsageError as error:
+        message = " ".join(error.format_message().split())
+        if message:  # without arguments there is none: help was shown instead
+            print(f"optodrive: {message}", file=sys.stderr)
+        return 2
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone: nobody is left to tell
         return 0
-    return 0
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 import signal
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import uvicorn
 
@@ -14,6 +16,17 @@ from optodrive.errors import InputError
 from optodrive.pipeline import Display
 from optodrive.transport.registry import make_transport
 
+GRACE_S = 2
+
+
+class _Server(uvicorn.Server):
+    """Leaves signals to `run`: uvicorn would raise them again and end the process before the board is told."""
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Capture none."""
+        yield
+
 
 def run(config: Config) -> None:
     """Serve until a signal; the board is told to stop on the way out, and goes dark by itself if that is not heard."""
@@ -24,11 +37,17 @@ def run(config: Config) -> None:
     try:
         engine.start()
         token, path = make_token(port)
-        server = uvicorn.Server(
-            uvicorn.Config(make_app(engine, token), log_level="warning", access_log=False, server_header=False)
+        server = _Server(
+            uvicorn.Config(
+                make_app(engine, token),
+                log_level="warning",
+                access_log=False,
+                server_header=False,
+                timeout_graceful_shutdown=GRACE_S,
+            )
         )
-        # SIGHUP would end the process before it could tell the board; treat it as SIGTERM.
-        signal.signal(signal.SIGHUP, lambda *_: setattr(server, "should_exit", True))
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            signal.signal(number, lambda *_: setattr(server, "should_exit", True))
         print(f"optodrive: {config.name} on http://{config.daemon.host}:{port}, token in {path}", flush=True)
         print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
         server.run(sockets=[listener])

@@ -42,7 +42,7 @@ def table_at(value: object, where: str, known: Sequence[str], required: Sequence
         raise InputError(where, value, "an object with " + ", ".join(known), code="bad_json")
     for key in value:
         if key not in known:
-            expected = f"a known key, nearest is {nearest(str(key)[:60], list(known))}"
+            expected = f"a known key, {nearest(str(key)[:60], list(known))}"
             raise InputError(where, key, expected, code="unknown_key")
     for key in required:
         if key not in value:

@@ -52,9 +52,7 @@ class Pattern:
         known = {parameter.name: parameter for parameter in self.parameters}
         for key in given:
             if key not in known:
-                expected = (
-                    f"a known parameter, nearest is {nearest(str(key)[:60], list(known))}" if known else "no parameter"
-                )
+                expected = f"a known parameter, {nearest(str(key)[:60], list(known))}" if known else "no parameter"
                 raise InputError(where, key, expected, code="unknown_parameter")
         values: dict[str, Value] = {}
         for name, parameter in known.items():

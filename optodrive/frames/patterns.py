@@ -177,7 +177,7 @@ PATTERNS: dict[str, Pattern] = {pattern.name: pattern for pattern in _ALL}
 def find_pattern(name: str) -> Pattern:
     """A pattern by its name; raises InputError (unknown_pattern) with the nearest known one."""
     if name not in PATTERNS:
-        expected = f"a known pattern, nearest is {nearest(name[:60], list(PATTERNS))}"
+        expected = f"a known pattern, {nearest(name[:60], list(PATTERNS))}"
         raise InputError("pattern", name, expected, code="unknown_pattern")
     return PATTERNS[name]
 

@@ -136,6 +136,7 @@ class PtyBoard:
         poller.register(self._master, select.POLLIN)
         hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
         if self._open and hung_up:
+            self._read()  # the host's last words, an ABORT perhaps
             self._log({"t_us": self._now_us(), "event": "port", "open": False})
             self._core.link_lost(self._now_us())
             self._closed_since_s = self._now_s()

@@ -52,7 +52,7 @@ def load_settings(path: Path) -> BoardSettings:
     other_names = [item.name for item in fields(BoardSettings) if item.name != "limits"]
     for name, value in table.items():
         if name not in limit_names + other_names:
-            raise InputError(f"{path}", name, f"a known key, nearest is {nearest(name, limit_names + other_names)}")
+            raise InputError(f"{path}", name, f"a known key, {nearest(name, limit_names + other_names)}")
         if name in limit_names and (not isinstance(value, int) or not 0 <= value < 2**32):
             raise InputError(f"{path}: {name}", value, "a whole number that fits its field")
     limits = replace(OWN, **{name: value for name, value in table.items() if name in limit_names})

@@ -44,6 +44,6 @@ def load_script(path: Path) -> list[Step]:
         known = INPUTS if kind == "set" else ACTIONS
         name = entry.get(kind)
         if name not in known:
-            raise InputError(f"{where}: {kind}", name, nearest(str(name), list(known)))
+            raise InputError(f"{where}: {kind}", name, f"a known one, {nearest(str(name), list(known))}")
         steps.append(Step(float(at_s), kind, name, bool(entry.get("value", False)), float(entry.get("rate", 0.01))))
     return sorted(steps, key=lambda step: step.at_s)

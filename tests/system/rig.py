@@ -1,0 +1,131 @@
+"""A board process on a pty and a daemon on it, both real, for the system tests."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import httpx
+
+from optodrive.config import shipped_path
+
+TOKEN = "a-token-for-tests"
+PATIENCE_S = 20.0
+
+
+def wait_for(condition, what, patience_s=PATIENCE_S):
+    """Poll until condition() is truthy; its value."""
+    until = time.monotonic() + patience_s
+    while time.monotonic() < until:
+        value = condition()
+        if value:
+            return value
+        time.sleep(0.005)
+    raise AssertionError(f"waited {patience_s} s in vain for {what}")
+
+
+class Board:
+    """The board's process; its log is the witness."""
+
+    def __init__(self, folder, script="", limits=""):
+        self.port = folder / "tty"
+        self.log = folder / "board.jsonl"
+        arguments = ["--pty", self.port, "--log", self.log]
+        for option, text in (("--script", script), ("--limits", limits)):
+            if text:
+                path = folder / f"board{option}.toml"
+                path.write_text(text)
+                arguments += [option, path]
+        self.process = subprocess.Popen([sys.executable, "-m", "optodrive.simulator.board", *arguments])
+        wait_for(self.port.exists, "the board's port")
+
+    def events(self):
+        if not self.log.exists():
+            return []
+        lines = self.log.read_text().splitlines(keepends=True)
+        return [json.loads(line) for line in lines if line.endswith("\n")]
+
+    def of(self, kind):
+        return [event for event in self.events() if event["event"] == kind]
+
+    def stop(self):
+        self.process.terminate()
+        self.process.wait(timeout=10)
+
+
+class Daemon:
+    """`optodrive serve` on a board's port."""
+
+    def __init__(self, folder, port, name="display-437", replace=()):
+        text = shipped_path(f"{name}.toml").read_text()
+        text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
+        for old, new in replace:
+            assert old in text
+            text = text.replace(old, new)
+        self.config = folder / "config.toml"
+        self.config.write_text(text)
+        self.errors = folder / "daemon.err"
+        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder)}
+        with self.errors.open("a") as errors:
+            self.process = subprocess.Popen(
+                [Path(sys.executable).with_name("optodrive"), "serve", "--config", self.config, "--port", "0"],
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                env=environment,
+                text=True,
+            )
+        first = self.process.stdout.readline()
+        found = re.search(r"(http://[\d.:]+)", first)
+        assert found, first + self.errors.read_text()
+        self.url = found.group(1)
+        self.client = httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
+        self.call("GET", "/v1/state")
+
+    def call(self, method, path, status=None, **request):
+        response = self.client.request(method, path, **request)
+        if status is None:
+            assert response.is_success, response.text
+        else:
+            assert response.status_code == status, response.text
+        return response.json()
+
+    def arm(self):
+        return self.call("POST", "/v1/arm")
+
+    def state(self):
+        return self.call("GET", "/v1/state")
+
+    def board_state(self):
+        return self.state()["board"]["state"]
+
+    def finished(self, plan):
+        def ended():
+            answer = self.call("GET", f"/v1/plans/{plan}")
+            return answer if answer["status"] in ("done", "failed", "cancelled") else None
+
+        return wait_for(ended, f"plan {plan} to end")
+
+    def stop(self):
+        if self.process.poll() is None:
+            self.process.send_signal(signal.SIGCONT)
+            self.process.terminate()
+        self.process.wait(timeout=15)
+        self.process.stdout.close()
+        self.client.close()
+
+
+def long_train(pixel=200, seconds=5.0):
+    """Pulses for a while: 10 ms on, 10 ms off."""
+    train = {
+        "pixel": pixel,
+        "start_s": 0.0,
+        "duration_s": seconds,
+        "pulse_width_s": 0.010,
+        "gap_s": 0.010,
+        "power_w": 1.0,
+    }
+    return {"trains": [train]}

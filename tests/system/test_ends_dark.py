@@ -1,0 +1,141 @@
+"""Every way out ends dark, and the board's own log is the witness."""
+
+import os
+import signal
+import time
+
+import pytest
+
+from rig import long_train, wait_for
+
+LEASE_US = 100_000
+LATENESS_US = 30_000
+"""The board's process and this test may each be scheduled late by so much; the gate's times in the log are exact."""
+
+
+def start_pulses(board, daemon):
+    daemon.arm()
+    plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
+    wait_for(lambda: len(board.of("pulse")) > 20, "pulses")
+    return plan
+
+
+def ends(board):
+    """The last gate edge and the last state in the log."""
+    return board.of("gate")[-1], board.of("state")[-1]
+
+
+def assert_dark_and_unarmed(board, states):
+    gate, state = ends(board)
+    assert gate["on"] is False
+    assert state["state"] in states
+
+
+def test_kill_9_while_pulses_run(board, make_daemon):
+    daemon = make_daemon(board)
+    start_pulses(board, daemon)
+    daemon.process.kill()
+    killed_us = board.events()[-1]["t_us"]
+    daemon.process.wait()
+    wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the board to leave RUNNING")
+    assert_dark_and_unarmed(board, ("DISARMED", "FAULT"))
+    assert board.of("gate")[-1]["t_us"] <= killed_us + LEASE_US + LATENESS_US
+
+    again = make_daemon(board)
+    assert again.board_state() in ("DISARMED", "FAULT")
+    count = len(board.of("pulse"))
+    again.call("POST", "/v1/plans", status=409, json=long_train())
+    assert len(board.of("pulse")) == count
+
+
+def test_sigstop_while_pulses_run(board, daemon):
+    plan = start_pulses(board, daemon)
+    os.kill(daemon.process.pid, signal.SIGSTOP)
+    stopped_us = board.events()[-1]["t_us"]
+    wait_for(lambda: board.of("fault"), "the board's fault")
+    assert board.of("fault") == [{"t_us": board.of("fault")[0]["t_us"], "event": "fault", "fault": "LINK"}]
+    assert_dark_and_unarmed(board, ("FAULT",))
+    assert board.of("gate")[-1]["t_us"] <= stopped_us + LEASE_US + LATENESS_US
+    time.sleep(0.3)
+    assert board.of("pulse")[-1]["t_us"] <= stopped_us + LEASE_US + LATENESS_US
+
+    os.kill(daemon.process.pid, signal.SIGCONT)
+    answer = daemon.finished(plan)
+    assert answer["status"] == "failed"
+    assert "LINK" in answer["error"]
+    assert daemon.board_state() == "FAULT"
+    refused = daemon.call("POST", "/v1/arm", status=409)
+    assert "LINK" in refused["detail"]
+    assert daemon.call("POST", "/v1/disarm")["board"]["state"] == "DISARMED"
+    assert daemon.arm()["board"]["state"] == "ARMED"
+
+
+def test_sigterm_while_pulses_run(board, daemon):
+    start_pulses(board, daemon)
+    daemon.stop()
+    assert daemon.process.returncode == 0
+    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
+    assert_dark_and_unarmed(board, ("DISARMED",))
+    assert board.of("state")[-1]["reason"] == "abort"
+    assert "Traceback" not in daemon.errors.read_text()
+
+
+def test_stop_while_pulses_run(board, daemon):
+    plan = start_pulses(board, daemon)
+    answer = daemon.call("POST", "/v1/stop")
+    assert answer["board"]["state"] == "DISARMED"
+    assert_dark_and_unarmed(board, ("DISARMED",))
+    stopped = daemon.finished(plan)
+    assert stopped["status"] == "failed"
+    assert stopped["error"] == "ended by stop"
+    assert 0 < stopped["executed"] < stopped["planned"]
+
+
+def test_cancel_ends_dark_and_stays_armed(board, daemon):
+    plan = start_pulses(board, daemon)
+    assert daemon.call("DELETE", f"/v1/plans/{plan}")["status"] == "cancelled"
+    wait_for(lambda: board.of("state")[-1]["state"] == "ARMED", "ARMED")
+    assert_dark_and_unarmed(board, ("ARMED",))
+    following = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.1))["plan"]
+    assert daemon.finished(following)["status"] == "done"
+
+
+@pytest.mark.parametrize("name", ["interlock", "key", "estop"])
+def test_inputs_end_it_and_are_named(make_board, make_daemon, name):
+    value = "true" if name == "estop" else "false"
+    board = make_board(script=f'[[step]]\nat_s = 6.0\nset = "{name}"\nvalue = {value}\n')
+    daemon = make_daemon(board)
+    plan = start_pulses(board, daemon)
+    answer = daemon.finished(plan)
+    assert answer["status"] == "failed"
+    assert name.upper() in answer["error"]
+    fault, gate = board.of("fault")[-1], board.of("gate")[-1]
+    assert gate["on"] is False
+    assert gate["t_us"] <= fault["t_us"] + 1000
+    daemon.call("POST", "/v1/disarm", status=409)
+
+
+def test_unplugged_in_mid_plan(make_board, make_daemon):
+    board = make_board(script='[[step]]\nat_s = 6.0\ndo = "close"\n')
+    daemon = make_daemon(board)
+    plan = start_pulses(board, daemon)
+    answer = daemon.finished(plan)
+    assert answer["status"] == "failed"
+    assert "lost" in answer["error"]
+    assert 0 < answer["executed"] < answer["planned"]
+    assert_dark_and_unarmed(board, ("DISARMED",))
+    state = wait_for(lambda: (s := daemon.state())["link"]["state"] == "up" and s, "the link to come back")
+    assert state["board"]["state"] == "DISARMED"
+    assert state["totals"]["executed"] == answer["executed"]
+    assert "Traceback" not in daemon.errors.read_text()
+
+
+def test_a_board_that_falls_silent(make_board, make_daemon):
+    board = make_board(script='[[step]]\nat_s = 6.0\ndo = "hang"\n[[step]]\nat_s = 10.0\ndo = "repair"\n')
+    daemon = make_daemon(board)
+    plan = start_pulses(board, daemon)
+    answer = daemon.finished(plan)
+    assert answer["status"] == "failed"
+    assert "silent" in answer["error"]
+    assert_dark_and_unarmed(board, ("FAULT", "DISARMED"))
+    wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link to come back")

@@ -1,0 +1,111 @@
+"""The paper's six experiments, played over REST, come back executed with its timings (Text S5, Fig. S17)."""
+
+import numpy as np
+import pytest
+
+PWM_S = 2e-4
+
+
+@pytest.fixture(scope="module")
+def executed(tmp_path_factory):
+    from rig import Board, Daemon
+
+    folder = tmp_path_factory.mktemp("experiments")
+    board = Board(folder)
+    daemon = Daemon(folder, board.port)
+    daemon.arm()
+
+    def play(name, **parameters):
+        plan = daemon.call("POST", f"/v1/patterns/{name}", json=parameters)["plan"]
+        answer = daemon.finished(plan)
+        assert answer["status"] == "done", answer["error"]
+        assert answer["planned"] == answer["sent"] == answer["executed"]
+        assert answer["executed_complete"]
+        assert answer["summary"]["trimmed"]["pulses"] == 0
+        logged = board.of("pulse")[-answer["executed"] :]
+        columns = {key: np.array(value) for key, value in answer["executed_pulses"].items()}
+        assert np.allclose(np.diff([p["on_us"] for p in logged]) * 1e-6, np.diff(columns["start_s"]), atol=2e-6)
+        columns["moves_s"] = answer["summary"]["moves_s"]
+        columns["first_s"] = columns["start_s"] - columns["start_s"][0]
+        columns["total_s"] = columns["first_s"][-1] + columns["width_s"][-1]
+        return columns
+
+    yield play
+    daemon.stop()
+    board.stop()
+
+
+def by_visit(pulses):
+    """Indices of pulses grouped by runs on one pixel."""
+    return np.split(np.arange(len(pulses["pixel"])), np.flatnonzero(np.diff(pulses["pixel"])) + 1)
+
+
+def assert_train(pulses, rows, width_s, gap_s):
+    assert pulses["width_s"][rows] == pytest.approx(width_s, abs=PWM_S)
+    gaps = np.diff(pulses["start_s"][rows]) - pulses["width_s"][rows[:-1]]
+    assert gaps == pytest.approx(gap_s, abs=PWM_S)
+
+
+def test_experiment_1_linear_motion(executed):
+    pulses = executed("experiment-1", direction="right")
+    visits = by_visit(pulses)
+    assert len(visits) == 6
+    for rows in visits:
+        assert_train(pulses, rows, 0.020, 0.060)
+    starts = [pulses["first_s"][rows[0]] for rows in visits]
+    assert starts == pytest.approx([0.0, 0.3, 0.6, 1.4, 1.7, 2.0], abs=PWM_S + pulses["moves_s"])
+    pixels = [int(pulses["pixel"][rows[0]]) for rows in visits]
+    assert pixels[:3] == pixels[3:] == list(range(pixels[0], pixels[0] + 3))
+
+
+@pytest.mark.parametrize(("speed", "slot_s"), [(16, 0.2), (32, 0.1), (64, 0.05)])
+def test_experiment_2_rotation(executed, speed, slot_s):
+    pulses = executed("experiment-2", direction="cw", speed=speed)
+    visits = by_visit(pulses)
+    assert len(visits) == 8
+    for rows in visits:
+        assert_train(pulses, rows, 0.025, 0.071)
+    starts = [pulses["first_s"][rows[0]] for rows in visits]
+    assert starts == pytest.approx(slot_s * np.arange(8), abs=PWM_S + pulses["moves_s"])
+
+
+def test_experiment_3_localisation(executed):
+    pulses = executed("experiment-3", target=3)
+    reference, target = by_visit(pulses)
+    for rows in (reference, target):
+        assert len(rows) == 10
+        assert_train(pulses, rows, 0.025, 0.025)
+    assert pulses["first_s"][target[0]] == pytest.approx(0.5 + 0.75, abs=PWM_S + pulses["moves_s"])
+
+
+@pytest.mark.parametrize(("level", "power_w"), [(1, 0.5), (5, 1.5), (9, 2.45)])
+def test_experiment_4_intensity(executed, level, power_w):
+    pulses = executed("experiment-4", level=level)
+    assert len(pulses["pixel"]) == 20
+    assert_train(pulses, np.arange(20), 0.025, 0.025)
+    assert pulses["power_w"] == pytest.approx(power_w, rel=1e-4)
+    assert pulses["total_s"] == pytest.approx(0.975, abs=PWM_S)
+
+
+def test_experiment_5_temporal_patterns(executed):
+    pulses = executed("experiment-5", oddball=2, kind="fast", pause_s=0.5)
+    starts = pulses["first_s"]
+    stimuli = np.split(np.arange(len(starts)), np.flatnonzero(np.diff(starts) > 0.3) + 1)
+    assert len(stimuli) == 3
+    for rows, half_s in zip(stimuli, (0.035, 0.010, 0.035), strict=True):
+        assert_train(pulses, rows, half_s, half_s)
+    assert [starts[rows[0]] for rows in stimuli] == pytest.approx([0.0, 0.9, 1.8], abs=PWM_S)
+
+
+def test_experiment_6_two_fingers_interleaved(executed):
+    pulses = executed("experiment-6", digits="2-3")
+    assert len(pulses["pixel"]) == 40
+    assert pulses["width_s"] == pytest.approx(0.015, abs=PWM_S)
+    first, second = set(pulses["pixel"][0::2]), set(pulses["pixel"][1::2])
+    assert len(first) == len(second) == 4
+    assert not first & second
+    assert pulses["pixel"].tolist() == pulses["pixel"][:8].tolist() * 5
+    assert pulses["total_s"] == pytest.approx(0.600 + pulses["moves_s"], abs=PWM_S + 0.005)
+    gaps = np.diff(pulses["start_s"]) - pulses["width_s"][:-1]
+    assert gaps.min() > 0
+    assert gaps.sum() <= pulses["moves_s"] + PWM_S
