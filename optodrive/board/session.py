@@ -173,13 +173,16 @@ class Session:
         self._transport.close()
 
     def close(self) -> None:
-        """Tell the board to abort, if it can still be told, and close the link."""
-        if not self.connected:
-            return
+        """Tell the board to abort, if it can still be told, and close the link for good."""
+        if self.connected:
+            self._say_goodbye()
+        self.connected = False
+        self._transport.release()
+
+    def _say_goodbye(self) -> None:
         with suppress(LinkError):  # the board's own lease ends it dark where it cannot be told
             self._connection.abort()
             self._transport.write(self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes))
-        self.drop()
 
     # --- the loop's turn ----------------------------------------------------------------------------------------
 

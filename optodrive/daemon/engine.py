@@ -19,10 +19,10 @@ from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
 from optodrive.clock import Clock
 from optodrive.daemon.plans import PlanRecord, Status
-from optodrive.daemon.thermal import Thermal
+from optodrive.daemon.thermal import Thermal, heated
 from optodrive.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError
-from optodrive.flow import BudgetState, FrameSequence
-from optodrive.limit.limiter import Policy, verify
+from optodrive.flow import BudgetState, ExecutedPulses, FrameSequence
+from optodrive.limit.limiter import Policy, fired, verify
 from optodrive.physics.array import pulse_peaks
 from optodrive.pipeline import Display, prepare
 from optodrive.transport.base import Transport
@@ -33,7 +33,7 @@ Answer = dict[str, Any]
 TURN_S = 0.002
 IDLE_TURN_S = 0.01
 START_LEAD_S = 0.05
-"""A plan starts this long after it is ready, so that its first points are there in time."""
+"""A plan starts so long after it is ready and the one before it has ended: its first points must be there in time."""
 PLANNER_STALL_S = 2.0
 """A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
 RECONNECT_S = 1.0
@@ -226,9 +226,12 @@ class Engine:
         try:
             self._note_progress(0.0)
             sequence = build()
-            if not dry_run:
-                self._require_armed()
-            return self._planned(sequence, name, dry_run, strict)
+            while True:
+                if not dry_run:
+                    self._require_armed()
+                answer = self._planned(sequence, name, dry_run, strict)
+                if answer is not None:
+                    return answer
         finally:
             with self._lock:
                 self._plans_pending -= 1
@@ -244,21 +247,22 @@ class Engine:
             fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
 
-    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, strict: bool) -> Answer:
+    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, strict: bool) -> Answer | None:
+        """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
         with self._lock:
-            thermal, start_s = self._thermal, max(self._queue_end_s, self._session.board_s() + START_LEAD_S)
+            thermal, start_s = self._thermal, self._earliest_start_s()
         heat, budget = thermal.seen_from(start_s)
         policy: Policy = "refuse" if strict else "trim"
         prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
         points = quantise(prepared.plan, self._session.scale)
-        record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, start_s)
+        record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, budget, start_s)
         self._prove(record, budget)
         if dry_run:
             return record.answer(self._session.board_s())
         with self._lock:
-            if self._thermal is not thermal:  # a plan failed, or the board restarted, meanwhile
-                raise NotReadyError("the board stopped while this was planned; send it again")
-            record.start_s = max(start_s, self._session.board_s() + START_LEAD_S)
+            if self._thermal is not thermal:  # a plan before this one came late or failed, or the board restarted
+                return None
+            record.start_s = max(start_s, self._earliest_start_s())
             self._thermal = Thermal.after_plan(prepared.heat, prepared.budget, record.start_s)
             self._queue_end_s = record.start_s + prepared.duration_s
             self._totals["planned"] += len(prepared.plan)
@@ -266,6 +270,9 @@ class Engine:
             record.status = "queued"
             self._waiting.append(record)
         return record.answer(self._session.board_s())
+
+    def _earliest_start_s(self) -> float:
+        return max(self._queue_end_s, self._session.board_s()) + START_LEAD_S
 
     def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
@@ -353,10 +360,8 @@ class Engine:
                 self._queue_end_s += record.delay_s
                 for waiting in self._waiting:
                     waiting.start_s += record.delay_s
-            if status != "done":
-                self._thermal = self._thermal.with_heat_of(
-                    record.heat_before.shifted(record.start_s), executed, record.start_s
-                )
+            if status != "done" and not self._waiting:
+                self._rewind(record, executed)
         self._bookkeeper.submit(self._simulate, record)
 
     def _simulate(self, record: PlanRecord) -> None:
@@ -365,14 +370,25 @@ class Engine:
             heat = record.heat_before.copy()
             record.simulated_m = pulse_peaks(heat, executed.pixel, executed.start_s, executed.width_s, executed.power_w)
 
+    def _rewind(self, record: PlanRecord, executed: ExecutedPulses | None) -> None:
+        """Nothing after `record` will run, nor what it has not fired: heat and budget forget both."""
+        dark_s = self._session.board_s() + self.display.config.board.lease_s
+        until_s = dark_s - record.start_s
+        budget = fired(record.prepared.plan, until_s, record.budget_before, self.display.budget)
+        heat = record.heat_before if executed is None else heated(record.heat_before, executed)
+        self._thermal = Thermal.after_plan(heat, budget, record.start_s)
+        self._queue_end_s = max(dark_s, self._thermal.budget.at_s)
+
     def _fail_all(self, why: str) -> None:
         waiting = list(self._waiting)
         self._waiting.clear()
         if self._running is not None:
             self._finish("failed", why)
+        elif waiting:
+            with self._lock:
+                self._rewind(waiting[0], None)
         for record in waiting:
             record.end("failed", why)
-        self._queue_end_s = 0.0
 
     # --- what can be seen from outside --------------------------------------------------------------------------
 

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from optodrive.flow import ExecutedPulses, FloatArray, IntArray
+from optodrive.flow import BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
@@ -17,8 +17,9 @@ Status = Literal["planned", "queued", "running", "done", "failed", "cancelled"]
 
 @dataclass
 class PlanRecord:
-    """One plan. start_s: board time of its zero; heat_before: on the plan's time line, as it was planned from.
+    """One plan.
 
+    start_s: board time of its zero; heat_before, budget_before: what it was planned from, on its own time line
     executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
     """
 
@@ -27,6 +28,7 @@ class PlanRecord:
     prepared: Prepared
     points: WirePoints
     heat_before: DisplayHeat
+    budget_before: BudgetState
     start_s: float
     status: Status = "planned"
     error: str | None = None

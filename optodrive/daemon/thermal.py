@@ -1,6 +1,6 @@
 """What the daemon knows of heat: the planner's best estimate and the limiter's bound, on the board's time line."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from optodrive.flow import BudgetState, ExecutedPulses
 from optodrive.limit.limiter import shifted
@@ -27,10 +27,11 @@ class Thermal:
         """Everything happened delay_s later than assumed."""
         return Thermal(self.heat.shifted(delay_s), shifted(self.budget, delay_s))
 
-    def with_heat_of(self, before: DisplayHeat, executed: ExecutedPulses, start_s: float) -> "Thermal":
-        """The heat of what was really executed; the budget still counts everything that was sent."""
-        heat = before.copy()
-        rows = zip(executed.pixel, executed.start_s + start_s, executed.width_s, executed.power_w, strict=True)
-        for pixel, at_s, width_s, power_w in rows:
-            heat.pulse(int(pixel), float(at_s), float(width_s), float(power_w))
-        return replace(self, heat=heat)
+
+def heated(before: DisplayHeat, executed: ExecutedPulses) -> DisplayHeat:
+    """The heat of what was really executed, on the plan's time line as both arguments are."""
+    heat = before.copy()
+    columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    for pixel, start_s, width_s, power_w in zip(*(column.tolist() for column in columns), strict=True):
+        heat.pulse(pixel, start_s, width_s, power_w)
+    return heat

@@ -94,6 +94,17 @@ def joined(pieces: list[LimitedPlan], state: BudgetState, budget: Budget) -> Lim
     return LimitedPlan(**columns)
 
 
+def fired(plan: LimitedPlan, until_s: float, state: BudgetState, budget: Budget) -> BudgetState:
+    """What a plan leaves of which no pulse from until_s on was fired: the earlier ones count in full."""
+    ledger = _Ledger(state, budget)
+    columns = (plan.pixel, plan.start_s, plan.width_s, plan.power_w)
+    for pixel, start_s, width_s, power_w in zip(*(column.tolist() for column in columns), strict=True):
+        if start_s >= until_s:
+            break
+        ledger.fire(pixel, start_s, width_s, power_w)
+    return ledger.state()
+
+
 def verify(
     pixel: list[int],
     start_s: FloatArray,

@@ -23,6 +23,10 @@ class MemoryLink:
         """The board hears that the host has gone."""
         self._core.link_lost(self._now_us())
 
+    def release(self) -> None:
+        """Nothing was started."""
+        self.close()
+
     def _now_us(self) -> int:
         return round(self._clock.now_s() * 1e6)
 

@@ -18,4 +18,7 @@ class Transport(Protocol):
         """Hand all of data to the operating system."""
 
     def close(self) -> None:
-        """Close the link; does nothing when it is closed."""
+        """Close the link, which may be opened again; does nothing when it is closed."""
+
+    def release(self) -> None:
+        """Close for good: whatever opening has started ends."""

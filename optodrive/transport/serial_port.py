@@ -67,3 +67,7 @@ class SerialPort:
             port, self._serial = self._serial, None
             with suppress(OSError):  # an unplugged device cannot be closed any better
                 port.close()
+
+    def release(self) -> None:
+        """Close the port; nothing else was started."""
+        self.close()

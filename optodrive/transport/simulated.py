@@ -15,12 +15,12 @@ LINGER_S = 5.0
 
 
 class SimulatedBoard(SerialPort):
-    """Starts the board process when opened, and again when it has ended."""
+    """Starts the board process when opened, and again when it has ended; `log` is the board's own."""
 
     def __init__(self, port: str, baud: int) -> None:
-        self._folder = Path(tempfile.mkdtemp(prefix="optodrive-board-"))
-        super().__init__(port or str(self._folder / "tty"), baud)
-        self.log = self._folder / "board.jsonl"
+        self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
+        super().__init__(port or str(Path(self._folder.name) / "tty"), baud)
+        self.log = Path(self._folder.name) / "board.jsonl"
         self._process: subprocess.Popen[bytes] | None = None
 
     def open(self) -> None:
@@ -28,6 +28,15 @@ class SimulatedBoard(SerialPort):
         if self._process is None or self._process.poll() is not None:
             self._start()
         super().open()
+
+    def release(self) -> None:
+        """Close the port and end the board, which goes dark on its way out."""
+        self.close()
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait()
+            self._process = None
+        self._folder.cleanup()
 
     def _start(self) -> None:
         arguments = ["--pty", self.name, "--log", str(self.log), "--baud", str(self._baud)]

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from conftest import DISPLAYS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from conftest import DISPLAYS
 from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
 from optodrive.pipeline import prepare
 from optodrive.plan.drive import reach_m

@@ -1,0 +1,138 @@
+"""The engine on the simulated board's process, real clock, real threads."""
+
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from optodrive.clock import MonotonicClock
+from optodrive.config import load_config
+from optodrive.daemon.engine import PLANNER_STALL_S, Engine
+from optodrive.errors import InputError, NotReadyError, RefusedError
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.pipeline import Display
+from optodrive.transport.simulated import SimulatedBoard
+from rig import wait_for
+
+
+@pytest.fixture
+def transport():
+    return SimulatedBoard("", 1_000_000)
+
+
+@pytest.fixture
+def engine(transport):
+    engine = Engine(Display.of(load_config()), transport, MonotonicClock())
+    engine.start()
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def armed(engine):
+    engine.arm().result(10)
+    return engine
+
+
+def frame(height_um=100.0, pixel=17, duration_s=0.05):
+    target = np.zeros(437)
+    target[pixel] = height_um * 1e-6
+    return FrameSequence((TactileFrame("f", 0.0, duration_s, target),))
+
+
+def train(seconds):
+    return FrameSequence((), (PulseTrain(200, 0.0, seconds, 0.01, 0.01, 1.0),))
+
+
+def ended(engine, answer):
+    def look():
+        record = engine.plan(answer["plan"])
+        return record if record["status"] in ("done", "failed", "cancelled") else None
+
+    return wait_for(look, "the plan's end")
+
+
+def events(transport, kind):
+    lines = transport.log.read_text().splitlines()
+    return [event for event in map(json.loads, lines) if event["event"] == kind]
+
+
+def test_a_planner_that_hangs_costs_the_lease(armed, transport):
+    hang = threading.Event()
+    future = armed.submit(lambda: hang.wait() and frame(), "hangs")
+    begun_s = time.monotonic()
+    wait_for(lambda: armed.board_state == "FAULT", "the lease to lapse")
+    assert time.monotonic() - begun_s > 0.9 * PLANNER_STALL_S
+    assert events(transport, "fault")[-1]["fault"] == "LINK"
+    hang.set()
+    with pytest.raises(NotReadyError, match="FAULT LINK"):
+        future.result(10)
+
+
+def test_a_planner_at_work_keeps_the_lease(armed):
+    long_one = train(200.0)
+    answers = [armed.submit(lambda: long_one, "long", dry_run=True) for _ in range(3)]
+    for answer in answers:
+        assert answer.result(60)["planned"] == 10_000
+    assert armed.board_state == "ARMED"
+
+
+def test_plans_queue_and_the_next_knows_the_heat_of_the_last(armed):
+    first = armed.submit(lambda: frame(300.0), "first").result(10)
+    second = armed.submit(lambda: frame(350.0), "second").result(10)
+    rest = armed.submit(lambda: frame(350.0, pixel=300), "rest", dry_run=True).result(10)
+    assert second["pulses"]["energy_j"][0] < 0.99 * rest["pulses"]["energy_j"][0]
+    for answer, height_um in ((first, 300.0), (second, 350.0)):
+        record = ended(armed, answer)
+        assert record["status"] == "done"
+        wait_for(lambda plan=answer["plan"]: armed.plan(plan)["simulated_max_um"], "the simulation")
+        assert armed.plan(answer["plan"])["tallest_asked"]["simulated_um"] == pytest.approx(height_um, rel=0.01)
+
+
+def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
+    running = armed.submit(lambda: train(1.0), "a").result(10)
+    waiting = armed.submit(lambda: train(1.0), "b").result(10)
+    last = armed.submit(lambda: train(0.1), "c").result(10)
+    assert armed.cancel(waiting["plan"]).result(10)["status"] == "cancelled"
+    assert ended(armed, running)["status"] == "done"
+    assert ended(armed, last)["status"] == "done"
+    assert armed.plan(waiting["plan"])["executed"] == 0
+
+
+def test_a_blank_plan_is_done_at_once(armed):
+    answer = armed.submit(lambda: frame(0.0), "blank").result(10)
+    assert ended(armed, answer)["status"] == "done"
+
+
+def test_an_unarmed_board_gets_no_plan_but_answers_dry_runs(engine):
+    with pytest.raises(NotReadyError, match="arm it first"):
+        engine.submit(frame, "x").result(10)
+    assert engine.submit(frame, "x", dry_run=True).result(10)["status"] == "planned"
+
+
+def test_arming_twice_is_refused(armed):
+    with pytest.raises(NotReadyError, match="only a DISARMED board"):
+        armed.arm().result(10)
+
+
+def test_a_failed_plan_leaves_its_heat_uncounted_and_its_energy_counted(armed):
+    answer = armed.submit(lambda: train(5.0), "long").result(10)
+    wait_for(lambda: armed.plan(answer["plan"])["executed"] > 10, "pulses")
+    armed.stop().result(10)
+    record = armed.plan(answer["plan"])
+    assert record["status"] == "failed"
+    assert len(record["executed_pulses"]["start_s"]) < record["planned"]
+    armed.arm().result(10)
+    again = armed.submit(lambda: frame(100.0, pixel=200), "again").result(10)
+    assert ended(armed, again)["status"] == "done"
+
+
+def test_what_cannot_be_planned_is_refused_by_name(armed):
+    with pytest.raises(InputError, match="target_um of pixel 17"):
+        armed.submit(lambda: frame(5000.0), "x").result(10)
+    with pytest.raises(RefusedError, match="needs"):
+        armed.submit(lambda: frame(500.0, duration_s=0.01), "x", strict=True).result(10)
+    with pytest.raises(InputError, match="plan"):
+        armed.plan("p99")
