@@ -1,13 +1,12 @@
 """Recordings of measured data: HDF5, format "optotactile-recording", version 1."""
 
-import os
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optodrive.errors import InputError, nearest
+from optodrive.files import written_whole
 from optodrive.flow import Measurement, Run, Signal
 
 if TYPE_CHECKING:
@@ -31,20 +30,8 @@ def _h5py() -> Any:
 def write_recording(path: Path, measurement: Measurement) -> None:
     """Write a recording, whole or not at all; InputError where the file cannot be written."""
     h5 = _h5py()
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        os.close(handle)
-    except OSError as error:
-        raise InputError(str(path), error.strerror, "a folder that can be written") from None
-    try:
-        with h5.File(name, "w") as file:
-            _fill(file, measurement)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except OSError as error:
-        raise InputError(str(path), str(error), "a file that can be written") from None
-    finally:
-        Path(name).unlink(missing_ok=True)
+    with written_whole(path) as temporary, h5.File(temporary, "w") as file:
+        _fill(file, measurement)
 
 
 def _fill(file: "h5py.File", measurement: Measurement) -> None:

@@ -1,14 +1,12 @@
 """A prepared plan in figures: what the command line prints and REST answers, in one place."""
 
 import csv
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from optodrive.errors import InputError
+from optodrive.files import written_whole
 from optodrive.pipeline import Display, Prepared, lateness
 from optodrive.units import m_to_um
 
@@ -141,20 +139,10 @@ def write_plan_csv(path: Path, prepared: Prepared, display: Display) -> None:
         m_to_um(prepared.predicted_m).tolist(),
         strict=True,
     )
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise InputError("--out", str(path), f"a folder that can be written ({error.strerror})") from None
-    try:
-        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(PLAN_COLUMNS)
-            writer.writerows([_number(value) for value in row] for row in rows)
-        Path(name).chmod(0o644)
-        Path(name).replace(path)
-    except OSError as error:
-        Path(name).unlink(missing_ok=True)
-        raise InputError("--out", str(path), f"a file that can be written ({error.strerror})") from None
+    with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(PLAN_COLUMNS)
+        writer.writerows([_number(value) for value in row] for row in rows)
 
 
 def _number(value: float | int | str) -> float | int | str:

@@ -32,6 +32,7 @@ def run(arguments: list[str]) -> int:
     """Run the command line; every error it knows becomes one line on stderr and an exit status."""
     try:
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
+        sys.stdout.flush()
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
         print(f"optodrive: {error}", file=sys.stderr)
@@ -44,9 +45,13 @@ def run(arguments: list[str]) -> int:
         if message:  # without arguments there is none: help was shown instead
             print(f"optodrive: {message}", file=sys.stderr)
         return 2
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader has gone: nobody is left to tell
-        return 0
+    except OSError as error:
+        # What is still buffered cannot be written either; without this the interpreter would complain at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if isinstance(error, BrokenPipeError):
+            return 0  # the reader has gone: nobody is left to tell
+        print(f"optodrive: {error}", file=sys.stderr)
+        return 1
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, StrictOption, print_json, report_lines
+from optodrive.cli.options import ConfigOption, JsonOption, StrictOption, print_json, progress, report_lines
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
 
@@ -30,7 +30,8 @@ def plan(
 
     display = Display.of(load_config(config))
     sequence = load_sequence(frames, display.config)
-    prepared = prepare(display, sequence, *display.at_rest(), policy="refuse" if strict else "trim")
+    with progress("planning") as done:
+        prepared = prepare(display, sequence, *display.at_rest(), "refuse" if strict else "trim", done)
     if out is not None:
         write_plan_csv(out, prepared, display)
     figures = summary(prepared)

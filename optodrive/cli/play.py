@@ -13,7 +13,7 @@ from optodrive.cli.options import (
     StrictOption,
     UrlOption,
     print_json,
-    progress_bar,
+    progress,
     report_lines,
 )
 from optodrive.errors import InputError, RefusedError
@@ -129,10 +129,9 @@ def _follow(remote: "Remote", answer: dict[str, Any], wait: bool, as_json: bool)
 
 
 def _wait(remote: "Remote", answer: dict[str, Any]) -> dict[str, Any]:
-    with progress_bar() as bar:
-        task = bar.add_task("showing", total=max(1, answer["planned"]))
+    with progress("showing") as done:
         while answer["status"] in ("queued", "running"):
             time.sleep(POLL_S)
             answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
-            bar.update(task, completed=answer["executed"])
+            done(answer["executed"] / max(1, answer["planned"]))
     return remote.call("GET", f"/v1/plans/{answer['plan']}")

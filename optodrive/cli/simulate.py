@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json, progress_bar, report_lines
+from optodrive.cli.options import ConfigOption, JsonOption, print_json, progress, report_lines
 from optodrive.cli.plan import FramesArgument
 from optodrive.errors import InputError
 
@@ -47,16 +47,13 @@ def simulate(
         raise InputError("--noise", noise, "a factor between 0 and 1000")
     display = Display.of(load_config(config))
     wanted = _wanted(pixels, len(display.layout))
-    with progress_bar() as bar:
-        planning = bar.add_task("planning", total=1.0)
-        sequence = load_sequence(frames, display.config)
-        prepared = prepare(
-            display, sequence, *display.at_rest(), progress=lambda share: bar.update(planning, completed=share)
-        )
-        running = bar.add_task("simulating", total=1.0)
-        executed = execute(display, prepared, lambda share: bar.update(running, completed=share))
-        looked_at = _tallest(prepared) if wanted is None else wanted
-        traced = trace(display.pixels, executed, looked_at, dt)
+    sequence = load_sequence(frames, display.config)
+    with progress("planning") as done:
+        prepared = prepare(display, sequence, *display.at_rest(), progress=done)
+    with progress("simulating") as done:
+        executed = execute(display, prepared, done)
+    looked_at = _tallest(prepared) if wanted is None else wanted
+    traced = trace(display.pixels, executed, looked_at, dt)
     if out is not None:
         _write(out, display, executed, traced, noise, seed)
     report = _report(display, prepared, executed, traced)

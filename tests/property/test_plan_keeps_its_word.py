@@ -77,6 +77,6 @@ def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
             window = (time >= plan.start_s[row] - STEP_S) & (time <= limit_s + STEP_S)
             measured = height[window].max()
             assert measured == pytest.approx(result.predicted_m[row], rel=0.02, abs=2e-8)
-            crowded = limit_s - ends_s[row] < 0.02
+            crowded = limit_s - ends_s[row] < 0.008  # the gas lags: the next pulse came before this one's peak
             if plan.source[row] < len(sequence.frames) and not plan.reason[row] and not crowded:
                 assert measured == pytest.approx(plan.target_m[row], rel=0.05)

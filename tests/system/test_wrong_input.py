@@ -258,3 +258,18 @@ def test_no_daemon(tmp_path):
     )
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["serve", "--port", "0"], ["config", "show", "--json"]])
+def test_a_full_disk_behind_stdout_ends_in_one_line(arguments, tmp_path):
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [OPTODRIVE, *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            timeout=60,
+            env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+        )
+    assert done.returncode == 1
+    assert done.stderr == "optodrive: [Errno 28] No space left on device\n"
