@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import httpx
@@ -116,6 +117,20 @@ class Daemon:
         self.process.wait(timeout=15)
         self.process.stdout.close()
         self.client.close()
+
+
+@contextmanager
+def running(folder):
+    """A board and a daemon on it, both ended whatever happens."""
+    board = Board(folder)
+    try:
+        daemon = Daemon(folder, board.port)
+        try:
+            yield board, daemon
+        finally:
+            daemon.stop()
+    finally:
+        board.stop()
 
 
 def long_train(pixel=200, seconds=5.0):

@@ -1,38 +1,36 @@
 """The paper's six experiments, played over REST, come back executed with its timings (Text S5, Fig. S17)."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+
+from rig import running
 
 PWM_S = 2e-4
 
 
 @pytest.fixture(scope="module")
 def executed(tmp_path_factory):
-    from rig import Board, Daemon
+    with running(tmp_path_factory.mktemp("experiments")) as (board, daemon):
+        daemon.arm()
+        yield partial(play, board, daemon)
 
-    folder = tmp_path_factory.mktemp("experiments")
-    board = Board(folder)
-    daemon = Daemon(folder, board.port)
-    daemon.arm()
 
-    def play(name, **parameters):
-        plan = daemon.call("POST", f"/v1/patterns/{name}", json=parameters)["plan"]
-        answer = daemon.finished(plan)
-        assert answer["status"] == "done", answer["error"]
-        assert answer["planned"] == answer["sent"] == answer["executed"]
-        assert answer["executed_complete"]
-        assert answer["summary"]["trimmed"]["pulses"] == 0
-        logged = board.of("pulse")[-answer["executed"] :]
-        columns = {key: np.array(value) for key, value in answer["executed_pulses"].items()}
-        assert np.allclose(np.diff([p["on_us"] for p in logged]) * 1e-6, np.diff(columns["start_s"]), atol=2e-6)
-        columns["moves_s"] = answer["summary"]["moves_s"]
-        columns["first_s"] = columns["start_s"] - columns["start_s"][0]
-        columns["total_s"] = columns["first_s"][-1] + columns["width_s"][-1]
-        return columns
-
-    yield play
-    daemon.stop()
-    board.stop()
+def play(board, daemon, name, **parameters):
+    plan = daemon.call("POST", f"/v1/patterns/{name}", json=parameters)["plan"]
+    answer = daemon.finished(plan)
+    assert answer["status"] == "done", answer["error"]
+    assert answer["planned"] == answer["sent"] == answer["executed"]
+    assert answer["executed_complete"]
+    assert answer["summary"]["trimmed"]["pulses"] == 0
+    logged = board.of("pulse")[-answer["executed"] :]
+    columns = {key: np.array(value) for key, value in answer["executed_pulses"].items()}
+    assert np.allclose(np.diff([p["on_us"] for p in logged]) * 1e-6, np.diff(columns["start_s"]), atol=2e-6)
+    columns["moves_s"] = answer["summary"]["moves_s"]
+    columns["first_s"] = columns["start_s"] - columns["start_s"][0]
+    columns["total_s"] = columns["first_s"][-1] + columns["width_s"][-1]
+    return columns
 
 
 def by_visit(pulses):

@@ -12,20 +12,16 @@ import httpx
 import pytest
 
 from optodrive.config import shipped_path
-from rig import TOKEN, Board, Daemon
+from rig import TOKEN, running
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 
 
 @pytest.fixture(scope="module")
 def armed(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("wrong")
-    board = Board(folder)
-    daemon = Daemon(folder, board.port)
-    daemon.arm()
-    yield daemon
-    daemon.stop()
-    board.stop()
+    with running(tmp_path_factory.mktemp("wrong")) as (_, daemon):
+        daemon.arm()
+        yield daemon
 
 
 def frame(**changes):
