@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
 from optodrive.errors import InputError
@@ -15,6 +15,19 @@ from optodrive.physics.pixel import Pixel
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
+
+
+UNITS = {
+    "epsilon": "1",
+    "tau_g": "s",
+    "kappa": "m/K",
+    "phi": "N/K",
+    "R_width_product": "m K/W",
+    "C_mean": "J/K",
+    "R": "K/W",
+    "C": "J/K",
+}
+"""The unit each parameter's value must be in."""
 
 
 class Parameter(BaseModel):
@@ -27,7 +40,18 @@ class Parameter(BaseModel):
     source: str
 
 
-class Bridge(BaseModel):
+class _Units(BaseModel):
+    # A value in another unit would be read as SI without a word.
+    @model_validator(mode="after")
+    def _units_are_si(self) -> Self:
+        for name, unit in UNITS.items():
+            parameter = getattr(self, name, None)
+            if parameter is not None and parameter.unit != unit:
+                raise ValueError(f"{name} in {unit}, not in '{parameter.unit}'")
+        return self
+
+
+class Bridge(_Units):
     """Thermal parameters of the absorber at one bridge width (a row of Table S3)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -36,7 +60,7 @@ class Bridge(BaseModel):
     C: Parameter
 
 
-class ParameterSet(BaseModel):
+class ParameterSet(_Units):
     """A named set of pixel parameters; `claims` says what it stands for and what it does not."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

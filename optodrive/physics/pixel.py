@@ -38,8 +38,10 @@ class Pixel:
 
 def divided_difference(a: float, b: float, t_s: float) -> float:
     """(e^(−a t) − e^(−b t)) / (b − a), s; t e^(−a t) where a = b."""
+    if b < a:
+        a, b = b, a  # it is symmetric, and e^(+x) would overflow after seconds of dark
     x = (b - a) * t_s
-    if abs(x) < 1e-9:
+    if x < 1e-9:
         return t_s * exp(-a * t_s) * (1.0 - 0.5 * x)
     return exp(-a * t_s) * -expm1(-x) / (b - a)
 
@@ -70,6 +72,8 @@ def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, withi
     drive_k = GAS_FRACTION * (theta_k - steady_k)
     lag_k = gamma_k - GAS_FRACTION * steady_k
     turn_s = within_s
+    if lag_k >= drive_k >= 0.0:  # falling towards a target that does not rise
+        return gamma_k, 0.0
     if drive_k > 0.0:
         u_s = (1.0 - lag_k / drive_k) / a
         x = (b - a) * u_s

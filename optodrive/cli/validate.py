@@ -1,0 +1,116 @@
+"""The paper's facts against both parameter sets: rows, a table on the terminal, JSON."""
+
+from dataclasses import asdict, dataclass
+from math import isfinite
+from typing import Any, Literal
+
+from optodrive.physics.facts import Fact, paper_facts
+from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, REMARKS, SILENT, STANDS_ON_FITTED
+from optodrive.physics.parameters import load_parameters
+
+MISS = 0.15
+"""Misses of the calibrated set beyond this share get a word."""
+
+SCALES = {"m": (1e6, "µm"), "N": (1e3, "mN"), "J": (1e3, "mJ"), "J/K": (1e6, "µJ/K"), "m K/W": (1e3, "mm K/W")}
+"""Display scale and unit of SI units whose numbers would be awkward."""
+
+
+HEADINGS = ("fact", "measured", "literal", "ratio", "calibrated", "ratio", "role")
+TABLE_WIDTH = 100
+"""Narrower terminals wrap lines rather than lose digits."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One fact beside the literal and the calibrated model, SI; ratios are model over measured, None for a bound.
+
+    role: whether the calibrated set was fitted on it, predicts it, or took it from the paper; remark: '' unless missed.
+    """
+
+    fact: Fact
+    literal: float
+    literal_ratio: float | None
+    calibrated: float
+    calibrated_ratio: float | None
+    role: Literal["input", "fitted", "predicted"]
+    remark: str
+
+
+def validate_table() -> list[Row]:
+    """Every fact that a parameter set can speak to, in the order of the facts."""
+    literal, calibrated = load_parameters("paper_s1_literal"), load_parameters("calibrated")
+    models = INPUTS | OUTCOMES
+    rows = []
+    for name, fact in paper_facts().items():
+        if name in models:
+            said, fitted = models[name](literal), models[name](calibrated)
+            remark = REMARKS[name] if fact.missed(fitted, MISS) else ""
+            rows.append(Row(fact, said, fact.ratio(said), fitted, fact.ratio(fitted), _role(name), remark))
+    return rows
+
+
+def _role(name: str) -> Literal["input", "fitted", "predicted"]:
+    if name in INPUTS:
+        return "input"
+    return "fitted" if name in FITTED_ON.values() or name in STANDS_ON_FITTED else "predicted"
+
+
+def validate(json: bool = False) -> None:
+    """Print the table, or one JSON object."""
+    rows = validate_table()
+    if json:
+        from optodrive.cli.options import print_json
+
+        print_json(as_json(rows))
+    else:
+        _print_table(rows)
+
+
+def as_json(rows: list[Row]) -> dict[str, Any]:
+    """The rows as plain data in SI units; a number that is not finite becomes null."""
+    facts = [asdict(row.fact) | _plain(row) for row in rows]
+    return {"facts": facts, "silent": dict(SILENT), "fitted_on": dict(FITTED_ON)}
+
+
+def _plain(row: Row) -> dict[str, Any]:
+    plain = {key: value for key, value in vars(row).items() if key != "fact"}
+    return {key: None if isinstance(value, float) and not isfinite(value) else value for key, value in plain.items()}
+
+
+def cells(row: Row) -> list[str]:
+    """A row as text under HEADINGS, in readable units."""
+    scale, unit = SCALES.get(row.fact.unit, (1.0, row.fact.unit))
+    measured = ("< " if row.fact.relation == "<" else "") + f"{row.fact.value * scale:.4g}"
+    if row.fact.uncertainty is not None:
+        measured += f" ± {row.fact.uncertainty * scale:.2g}"
+    return [
+        row.fact.id,
+        measured + ("" if unit == "1" else f" {unit}"),
+        f"{row.literal * scale:.3g}",
+        _ratio(row.literal_ratio),
+        f"{row.calibrated * scale:.3g}",
+        _ratio(row.calibrated_ratio),
+        row.role,
+    ]
+
+
+def _ratio(ratio: float | None) -> str:
+    return "" if ratio is None else f"{ratio:.2f}"
+
+
+def _print_table(rows: list[Row]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title="The paper's facts, and what the two parameter sets make of them")
+    for heading in HEADINGS:
+        table.add_column(heading, justify="left" if heading in ("fact", "role") else "right", no_wrap=True)
+    for row in rows:
+        table.add_row(*cells(row), style="bold" if row.remark else None)
+    console = Console(width=max(Console().width, TABLE_WIDTH))
+    console.print(table)
+    console.print(f"Calibrated, off by more than {100 * MISS:.0f} %:")
+    for row in rows:
+        if row.remark:
+            console.print(f"  {row.fact.id}: {row.remark}", highlight=False, soft_wrap=True)
+    console.print(f"No parameter set speaks to the other {len(SILENT)} facts; docs/validation.md says why.")

@@ -1,0 +1,59 @@
+"""What a pixel does under the paper's stimuli: one pulse from rest, the shortest pulse to a height, a steady train."""
+
+from dataclasses import dataclass
+
+from optodrive.physics.pixel import GAS_FRACTION, Pixel, advance, cooling_peak, gas_peak
+
+LONGEST_PULSE_S = 1.0
+"""Pulses longer than this are not looked for; every relaxation time here is far shorter."""
+
+
+def pulse_peak_k(pixel: Pixel, power_w: float, width_s: float) -> float:
+    """Largest gas rise, K, after one pulse from rest."""
+    return cooling_peak(pixel, *advance(pixel, 0.0, 0.0, power_w, width_s))[0]
+
+
+def width_to_reach_s(pixel: Pixel, power_w: float, height_m: float) -> float:
+    """Width, s, of the shortest pulse from rest that reaches a height; infinite for a height out of reach."""
+    goal_k = height_m / pixel.kappa_m_per_k
+    low_s, high_s = 0.0, LONGEST_PULSE_S
+    if pulse_peak_k(pixel, power_w, high_s) < goal_k:
+        return float("inf")
+    for _ in range(60):
+        middle_s = 0.5 * (low_s + high_s)
+        if pulse_peak_k(pixel, power_w, middle_s) < goal_k:
+            low_s = middle_s
+        else:
+            high_s = middle_s
+    return high_s
+
+
+@dataclass(frozen=True)
+class SteadyTrain:
+    """Gas rise, K, of a pulse train that has run for ever: least, largest and mean over a period."""
+
+    least_k: float
+    largest_k: float
+    mean_k: float
+
+
+def steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: float) -> SteadyTrain:
+    """The steady state of pulses of width_s with gap_s between.
+
+    The mean is exact: over a period nothing is stored, so absorber and gas average what the mean power holds them at.
+    """
+    theta_k = gamma_k = 0.0
+    period_s = width_s + gap_s
+    memory_s = pixel.tau_s + pixel.tau_g_s
+    for _ in range(1 + int(40.0 * memory_s / period_s)):
+        lit = advance(pixel, theta_k, gamma_k, power_w, width_s)
+        theta_k, gamma_k = advance(pixel, *lit, 0.0, gap_s)
+    largest_k = max(
+        gas_peak(pixel, theta_k, gamma_k, power_w, width_s)[0],
+        cooling_peak(pixel, *lit, gap_s)[0],
+    )
+    # The equations are linear: the trough is the peak of the same motion upside down.
+    lowest_lit_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
+    lowest_dark_k = -gas_peak(pixel, -lit[0], -lit[1], 0.0, gap_s)[0]
+    mean_k = GAS_FRACTION * pixel.epsilon * pixel.r_k_per_w * power_w * width_s / period_s
+    return SteadyTrain(min(lowest_lit_k, lowest_dark_k), largest_k, mean_k)

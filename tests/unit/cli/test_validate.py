@@ -1,0 +1,57 @@
+"""`optodrive validate`, as a process and as rows."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from optodrive.cli.validate import cells, validate_table
+from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, SILENT
+
+ROWS = {row.fact.id: row for row in validate_table()}
+
+
+def run(*options):
+    command = [sys.executable, "-c", "from optodrive.cli.main import main; main()", "validate", *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=30, check=True).stdout
+
+
+def test_rows_are_all_that_can_be_said():
+    assert set(ROWS) == {*INPUTS, *OUTCOMES}
+    assert {name for name, row in ROWS.items() if row.role == "fitted"} == {*FITTED_ON.values(), "eta_stroke"}
+    assert {name for name, row in ROWS.items() if row.role == "input"} == set(INPUTS)
+
+
+def test_cells_are_in_readable_units():
+    assert cells(ROWS["z_tp8_w040"])[:2] == ["z_tp8_w040", "155.2 ± 2.3 µm"]
+    assert cells(ROWS["z_repeat_w040"])[1] == "< 0.5 µm"
+    assert cells(ROWS["z_repeat_w040"])[3] == ""
+    assert cells(ROWS["R_w020"]) == ["R_w020", "382 K/W", "382", "1.00", "382", "1.00", "input"]
+
+
+def test_the_table_shows_every_fact_whole_also_without_a_terminal():
+    text = run()
+    for row in ROWS.values():
+        line = next(line for line in text.splitlines() if f" {row.fact.id} " in line)
+        assert all(cell in line for cell in cells(row))
+        if row.remark:
+            assert f"  {row.fact.id}: {row.remark}" in text
+    assert "…" not in text
+
+
+def test_json_is_one_object_in_si_units():
+    document = json.loads(run("--json"))
+    facts = {item["id"]: item for item in document["facts"]}
+    assert list(facts) == list(ROWS)
+    assert facts["z_tp8_w040"]["value"] == pytest.approx(155.2e-6)
+    assert facts["z_tp8_w040"]["uncertainty"] == pytest.approx(2.3e-6)
+    assert facts["N_50um"]["calibrated_ratio"] == pytest.approx(ROWS["N_50um"].calibrated_ratio)
+    assert facts["z_repeat_w040"]["calibrated_ratio"] is None
+    assert document["silent"] == SILENT
+    assert document["fitted_on"] == FITTED_ON
+
+
+def test_it_loads_nothing_heavy():
+    check = "import sys; import optodrive.cli.validate as v; v.validate(True); assert 'scipy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=30)

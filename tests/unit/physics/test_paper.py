@@ -1,0 +1,93 @@
+"""Every fact is spoken to or passed over with a reason; what the models say is held against sums done here."""
+
+import csv
+from math import exp
+
+import pytest
+
+from optodrive.config import shipped_path
+from optodrive.physics.facts import Fact, paper_facts
+from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, REMARKS, SILENT, STANDS_ON_FITTED
+from optodrive.physics.parameters import load_parameters
+
+CALIBRATED = load_parameters("calibrated")
+LITERAL = load_parameters("paper_s1_literal")
+FACTS = paper_facts()
+
+
+def test_every_fact_is_spoken_to_or_passed_over_once():
+    named = [*INPUTS, *OUTCOMES, *SILENT]
+    assert sorted(named) == sorted(FACTS)
+    assert all(len(reason) > 10 for reason in SILENT.values())
+
+
+def test_fitted_and_remarked_facts_are_outcomes():
+    assert set(FITTED_ON) == {"kappa", "tau_g", "phi"}
+    assert {*FITTED_ON.values(), *STANDS_ON_FITTED, *REMARKS} <= set(OUTCOMES)
+
+
+@pytest.mark.parametrize("fact", FITTED_ON.values())
+def test_fitted_facts_are_met(fact):
+    assert OUTCOMES[fact](CALIBRATED) == pytest.approx(FACTS[fact].value, rel=1e-3)
+
+
+@pytest.mark.parametrize("name", INPUTS)
+@pytest.mark.parametrize("parameters", [CALIBRATED, LITERAL], ids=["calibrated", "literal"])
+def test_inputs_are_the_papers_own(name, parameters):
+    assert INPUTS[name](parameters) == pytest.approx(FACTS[name].value, rel=0.021)
+
+
+def test_every_miss_has_its_word_and_no_word_is_left_without_a_miss():
+    missed = {name for name, model in OUTCOMES.items() if FACTS[name].missed(model(CALIBRATED), 0.15)}
+    assert missed == set(REMARKS)
+
+
+def test_absorber_rise_by_hand():
+    rise = 0.66 * 2.45 * 382 * (1 - exp(-50e-3 / (382 * 81e-6)))
+    assert OUTCOMES["dT_peak_w020"](CALIBRATED) == pytest.approx(rise, rel=1e-12)
+    assert OUTCOMES["T_peak_w020"](CALIBRATED) == pytest.approx(rise + 20, rel=1e-12)
+
+
+def test_efficiencies_multiply():
+    stroke, heat, work = (OUTCOMES[name](CALIBRATED) for name in ("eta_stroke", "eta_qt", "eta_tm"))
+    assert stroke == pytest.approx(heat * work, rel=1e-12)
+    half_work = 0.5 * OUTCOMES["F_peak_w020"](CALIBRATED) * OUTCOMES["z_peak_w020"](CALIBRATED)
+    assert stroke == pytest.approx(half_work / (0.66 * 2.45 * 0.05), rel=1e-12)
+
+
+def test_heat_in_the_gas():
+    assert OUTCOMES["dQ_air"](CALIBRATED) == pytest.approx(10e-6 * OUTCOMES["dT_air_isometric"](CALIBRATED))
+
+
+def test_the_literal_set_lags():
+    for name, at_most in {"z_peak_w020": 0.5, "z_tp8_w040": 0.3, "dpp_200Hz": 0.05}.items():
+        assert 0 < OUTCOMES[name](LITERAL) / FACTS[name].value < at_most
+
+
+def test_repeats_agree_and_force_is_linear():
+    assert OUTCOMES["z_repeat_w040"](CALIBRATED) < 1e-12
+    assert OUTCOMES["F_linear_in_P"](CALIBRATED) == pytest.approx(1.0, rel=1e-12)
+
+
+def fact(value, unit="m", relation="="):
+    return Fact("x", "", relation, value, unit, None, "", "")
+
+
+def test_ratios_of_values_temperatures_and_bounds():
+    assert fact(2.0).ratio(3.0) == 1.5
+    assert fact(120.0, "°C").ratio(70.0) == 0.5
+    assert fact(2.0, relation="<").ratio(1.0) is None
+
+
+@pytest.mark.parametrize(
+    ("relation", "model", "missed"),
+    [("=", 1.14, False), ("=", 1.16, True), ("=", 0.84, True), ("<", 0.1, False), ("<", 1.01, True)],
+)
+def test_what_counts_as_a_miss(relation, model, missed):
+    assert fact(1.0, relation=relation).missed(model, 0.15) is missed
+
+
+def test_the_file_has_one_row_a_fact():
+    with shipped_path("paper_facts.csv").open(encoding="utf-8", newline="") as file:
+        ids = [row["id"] for row in csv.DictReader(file)]
+    assert len(ids) == len(set(ids)) == len(FACTS)
