@@ -39,6 +39,9 @@ PLANNER_STALL_S = 2.0
 RECONNECT_S = 1.0
 COMMAND_TIMEOUT_S = 5.0
 RECORDS_KEPT = 200
+PULSES_KEPT = 1_000_000
+"""Ended plans are forgotten, the oldest first, beyond so many plans or pulses."""
+QUEUE_MAX = 50
 DELAY_NOTICED_S = 1e-5
 
 
@@ -246,6 +249,8 @@ class Engine:
         if board.state not in ("ARMED", "RUNNING", "HOLD"):
             fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
+        if len(self._waiting) >= QUEUE_MAX:
+            raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
 
     def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, strict: bool) -> Answer | None:
         """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
@@ -283,8 +288,12 @@ class Engine:
 
     def _remember(self, record: PlanRecord) -> None:
         self._records[record.plan_id] = record
-        while len(self._records) > RECORDS_KEPT:
-            self._records.popitem(last=False)
+        pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
+        for plan_id, oldest in list(self._records.items()):
+            if not oldest.ended or (len(self._records) <= RECORDS_KEPT and pulses <= PULSES_KEPT):
+                break
+            del self._records[plan_id]
+            pulses -= len(oldest.prepared.plan)
 
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
         """A plan by its id; InputError (no_plan) where there is none."""

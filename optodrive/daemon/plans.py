@@ -39,6 +39,11 @@ class PlanRecord:
     executed_count: int = 0
     delay_s: float = 0.0
 
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will happen to it."""
+        return self.status in ("done", "failed", "cancelled")
+
     def end(self, status: Status, error: str | None) -> None:
         """Nothing more will happen to it."""
         self.status, self.error = status, error

@@ -101,6 +101,21 @@ def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
     assert armed.plan(waiting["plan"])["executed"] == 0
 
 
+def test_the_queue_is_bounded_and_ended_plans_are_forgotten(armed, monkeypatch):
+    monkeypatch.setattr("optodrive.daemon.engine.QUEUE_MAX", 2)
+    monkeypatch.setattr("optodrive.daemon.engine.RECORDS_KEPT", 3)
+    first = armed.submit(lambda: train(1.0), "first").result(10)
+    wait_for(lambda: armed.plan(first["plan"])["status"] == "running", "the first to run")
+    waiting = [armed.submit(lambda: train(0.02), "waiting").result(10) for _ in range(2)]
+    with pytest.raises(NotReadyError, match="2 plans wait already"):
+        armed.submit(lambda: train(0.02), "too many").result(10)
+    for answer in (first, *waiting):
+        assert ended(armed, answer)["status"] == "done"
+    armed.submit(lambda: train(0.02), "one more").result(10)
+    with pytest.raises(InputError, match="plan"):
+        armed.plan(first["plan"])
+
+
 def test_a_blank_plan_is_done_at_once(armed):
     answer = armed.submit(lambda: frame(0.0), "blank").result(10)
     assert ended(armed, answer)["status"] == "done"
