@@ -56,10 +56,15 @@ class _Wait:
 
 
 class Engine:
-    """Runs plans on a board. Methods that return futures may be called from any thread."""
+    """Runs plans on a board. Methods that return futures may be called from any thread.
+
+    failure: what ended the loop, None while it runs; on_failure is then called, after the board was told to abort.
+    """
 
     def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
         self.display = display
+        self.failure: BaseException | None = None
+        self.on_failure: Callable[[], None] = lambda: None
         self._clock = clock
         self._session = Session(transport, clock, Requirements.of(display.config))
         self._thermal = Thermal(*display.at_rest())
@@ -102,10 +107,15 @@ class Engine:
             while not self._closing.is_set():
                 try:
                     self._turn()
-                except LinkError as error:
+                except (LinkError, InputError) as error:
                     self._link_lost(error)
+        except BaseException as error:
+            self.failure = error
+            raise
         finally:
             self._session.close()
+            if self.failure is not None:
+                self.on_failure()
 
     def _turn(self) -> None:
         self._obey()
@@ -132,7 +142,7 @@ class Engine:
 
     # --- the link -----------------------------------------------------------------------------------------------
 
-    def _link_lost(self, error: LinkError) -> None:
+    def _link_lost(self, error: OptodriveError) -> None:
         self._link_error = str(error)
         self._session.drop()
         self._fail_all(str(error))
@@ -202,7 +212,7 @@ class Engine:
                 error = NotReadyError(f"the board refuses to {wait.what}: {refusal}")
             elif board.state in wait.states and self._session.quiet:
                 wait.future.set_result(self.snapshot())
-            elif board.state == "FAULT":
+            elif board.state == "FAULT" and wait.what == "arm":
                 error = BoardFaultError(f"the board is in FAULT {board.fault}: {hint(board.fault)}")
             elif self._clock.now_s() > wait.until_s:
                 error = NotReadyError(
@@ -300,7 +310,8 @@ class Engine:
         return self._record(plan_id).answer(self._session.board_s(), pulses)
 
     def _record(self, plan_id: str) -> PlanRecord:
-        record = self._records.get(plan_id)
+        with self._lock:
+            record = self._records.get(plan_id)
         if record is None:
             raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
         return record
@@ -389,12 +400,12 @@ class Engine:
         self._queue_end_s = max(dark_s, self._thermal.budget.at_s)
 
     def _fail_all(self, why: str) -> None:
-        waiting = list(self._waiting)
-        self._waiting.clear()
-        if self._running is not None:
-            self._finish("failed", why)
-        elif waiting:
-            with self._lock:
+        with self._lock:
+            waiting = list(self._waiting)
+            self._waiting.clear()
+            if self._running is not None:
+                self._finish("failed", why)
+            elif waiting:
                 self._rewind(waiting[0], None)
         for record in waiting:
             record.end("failed", why)
@@ -414,6 +425,8 @@ class Engine:
     def snapshot(self) -> Answer:
         """Everything GET /v1/state answers."""
         running = self._running
+        with self._lock:
+            recent = list(self._records.values())[-20:]
         return {
             "display": self.display.config.name,
             "pixels": len(self.display.layout),
@@ -427,9 +440,7 @@ class Engine:
             "queue": {
                 "waiting": len(self._waiting),
                 "running": None if running is None else running[0].plan_id,
-                "plans": [
-                    {"plan": r.plan_id, "name": r.name, "status": r.status} for r in list(self._records.values())[-20:]
-                ],
+                "plans": [{"plan": item.plan_id, "name": item.name, "status": item.status} for item in recent],
             },
             "totals": dict(self._totals),
             "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},

@@ -12,7 +12,7 @@ from optodrive.config import Config
 from optodrive.daemon.api import make_app
 from optodrive.daemon.engine import Engine
 from optodrive.daemon.token import make_token
-from optodrive.errors import InputError
+from optodrive.errors import InputError, LinkError
 from optodrive.pipeline import Display
 from optodrive.transport.registry import make_transport
 
@@ -50,7 +50,10 @@ def run(config: Config) -> None:
             signal.signal(number, lambda *_: setattr(server, "should_exit", True))
         print(f"optodrive: {config.name} on http://{config.daemon.host}:{port}, token in {path}", flush=True)
         print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
+        engine.on_failure = lambda: setattr(server, "should_exit", True)
         server.run(sockets=[listener])
+        if engine.failure is not None:
+            raise LinkError(f"the engine failed, the board was told to abort: {engine.failure!r}")
     finally:
         engine.close()
         listener.close()

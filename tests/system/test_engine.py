@@ -121,6 +121,28 @@ def test_a_blank_plan_is_done_at_once(armed):
     assert ended(armed, answer)["status"] == "done"
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
+def test_a_crash_of_the_loop_ends_dark_and_is_told(armed, transport, monkeypatch):
+    told = threading.Event()
+    armed.on_failure = told.set
+    armed.submit(lambda: train(5.0), "long").result(10)
+    wait_for(lambda: len(events(transport, "pulse")) > 10, "pulses")
+    log = transport.log.open()  # outlives its folder, which goes when the board is released
+
+    def crash(*_, **__):
+        raise ZeroDivisionError("a bug")
+
+    monkeypatch.setattr(armed._session, "step", crash)
+    assert told.wait(10)
+    assert isinstance(armed.failure, ZeroDivisionError)
+    lines = [json.loads(line) for line in log]
+    log.close()
+    assert [line for line in lines if line["event"] == "gate"][-1]["on"] is False
+    last = [line for line in lines if line["event"] == "state"][-1]
+    assert last["state"] == "DISARMED"
+    assert last["reason"] in ("abort", "link lost")  # the board's process is ended right behind the ABORT
+
+
 def test_an_unarmed_board_gets_no_plan_but_answers_dry_runs(engine):
     with pytest.raises(NotReadyError, match="arm it first"):
         engine.submit(frame, "x").result(10)
