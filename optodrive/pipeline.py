@@ -144,14 +144,13 @@ def prepare(
     budget: BudgetState,
     policy: Policy = "trim",
     progress: Progress | None = None,
-    beam_rad: tuple[float, float] = (0.0, 0.0),
 ) -> Prepared:
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
 
     Raises InputError for a target out of reach, RefusedError under policy "refuse" where a cap or a deadline is missed.
     """
     check_reach(display, sequence)
-    scheduler = Scheduler(display.machine, sequence, beam_rad)
+    scheduler = Scheduler(display.machine, sequence)
     working = heat.copy()
     pieces: list[LimitedPlan] = []
     for piece in scheduler.pieces(working):

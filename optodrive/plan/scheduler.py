@@ -4,7 +4,7 @@ Trains keep their times; a frame's pulses fill the beam time between them. Times
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -59,34 +59,31 @@ class _Row(NamedTuple):
     source: int
 
 
-@dataclass
 class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
-    lead_us: dark time before the sequence's zero, in which the mirrors reach the first pixel.
+    lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
+    skipped: pixels that needed no pulse, so far.
     """
 
-    machine: Machine
-    sequence: FrameSequence
-    beam_rad: tuple[float, float] = (0.0, 0.0)
-    lead_us: int = 0
-    skipped: list[Skipped] = field(default_factory=list)
-
-    def __post_init__(self) -> None:
-        layout = self.machine.layout
-        self._x_rad = self.machine.field.mirror_rad(layout.x_m)
-        self._y_rad = self.machine.field.mirror_rad(layout.y_m)
-        self._trains = _train_pulses(self.sequence.trains, len(self.sequence.frames))
+    def __init__(self, machine: Machine, sequence: FrameSequence) -> None:
+        self._machine = machine
+        self._sequence = sequence
+        self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
+        self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
+        self._trains = _train_pulses(sequence.trains, len(sequence.frames))
         self._next_train = 0
         self._free_us = 0
-        self.lead_us = self._lead_us()
+        self._lit: int | None = None
+        self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
+        self.skipped: list[Skipped] = []
 
     def pieces(self, heat: DisplayHeat) -> Iterator[PulsePlan]:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
 
         What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came.
         """
-        for source, frame in enumerate(self.sequence.frames):
+        for source, frame in enumerate(self._sequence.frames):
             yield from self._trains_before(self._sequence_us(frame.show_at_s))
             yield from self._frame(source, frame, heat)
         yield from self._trains_before(None)
@@ -94,28 +91,23 @@ class Scheduler:
     def _sequence_us(self, time_s: float) -> int:
         return self.lead_us + round(time_s * 1e6)
 
-    def _lead_us(self) -> int:
-        """Dark time so that the first pixels of every kind are reached in time at the sequence's zero."""
-        first = [pulse.pixel for pulse in self._trains[:1]]
-        if self.sequence.frames:
-            active = self._order(self.sequence.frames[0])
-            first += active[:1]
-        return max((self._move_us(pixel) for pixel in first), default=0)
-
-    def _move_us(self, pixel: int, origin: int | None = None) -> int:
-        x_rad, y_rad = self.beam_rad if origin is None else (self._x_rad[origin], self._y_rad[origin])
-        return self.machine.moves.time_us(float(self._x_rad[pixel] - x_rad), float(self._y_rad[pixel] - y_rad))
+    def _move_us(self, origin: int | None, pixel: int) -> int:
+        if origin is None:
+            return self.lead_us
+        return self._machine.moves.time_us(
+            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin]
+        )
 
     def _order(self, frame: TactileFrame) -> list[int]:
-        layout = self.machine.layout
+        layout = self._machine.layout
         order = serpentine(np.flatnonzero(frame.target_m > 0), layout.row, layout.column)
         return [int(pixel) for pixel in order]
 
     def _place(self, pixel: int, width_us: int, power_w: float, earliest_us: int, target_m: float, source: int) -> _Row:
-        settle_us = self._move_us(pixel)
+        settle_us = self._move_us(self._lit, pixel)
         start_us = max(earliest_us, self._free_us + settle_us)
         self._free_us = start_us + width_us
-        self.beam_rad = (float(self._x_rad[pixel]), float(self._y_rad[pixel]))
+        self._lit = pixel
         return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, earliest_us, source)
 
     def _train_row(self) -> _Row:
@@ -141,17 +133,17 @@ class Scheduler:
         if self._next_train >= len(self._trains):
             return False
         pulse = self._trains[self._next_train]
-        return self.lead_us + pulse.nominal_us < end_us + self._move_us(pulse.pixel, origin=pixel)
+        return self.lead_us + pulse.nominal_us < end_us + self._move_us(pixel, pulse.pixel)
 
     def _frame(self, source: int, frame: TactileFrame, heat: DisplayHeat) -> Iterator[PulsePlan]:
         """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
         show_us = self._sequence_us(frame.show_at_s)
-        drive = self.machine.drive
+        drive = self._machine.drive
         rows: list[_Row] = []
         for pixel in self._order(frame):
             target_m = float(frame.target_m[pixel])
             while True:
-                start_us = max(show_us, self._free_us + self._move_us(pixel))
+                start_us = max(show_us, self._free_us + self._move_us(self._lit, pixel))
                 theta_k, gamma_k = heat.rises(pixel, start_us * 1e-6)
                 pulse = pulse_for_peak(heat.pixels.each[pixel], theta_k, gamma_k, target_m, drive)
                 if pulse is None:
@@ -172,8 +164,8 @@ class Scheduler:
         return PulsePlan(
             start_s=np.array(start_us) * 1e-6,
             width_s=np.array(width_us) * 1e-6,
-            x_rad=self._x_rad[index],
-            y_rad=self._y_rad[index],
+            x_rad=np.array(self._x_rad)[index],
+            y_rad=np.array(self._y_rad)[index],
             power_w=np.array(power_w),
             pixel=index,
             settle_s=np.array(settle_us) * 1e-6,
