@@ -295,6 +295,7 @@ class Session:
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
         self._refusal = None
+        self._end_job()
         self._arm_nonce = secrets.randbits(32)
         self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
 
@@ -340,6 +341,9 @@ class Session:
     def _stream(self) -> None:
         job = self._job
         if job is None:
+            return
+        if self.board.state in ("DISARMED", "FAULT"):  # it ended by itself: send no more of it, but hear the rest
+            self._fill_gaps(job)
             return
         link = self._connection
         while self._frames and link.outstanding < link.window:

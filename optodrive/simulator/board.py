@@ -11,6 +11,7 @@ import signal
 import sys
 import time
 import tty
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -22,6 +23,7 @@ from optodrive.simulator.script import Step, load_script
 
 TURN_MAX_S = 0.005
 BITS_A_BYTE = 10
+BAUD_MIN = 300
 BURST_BYTES = 64
 READ_MAX = 4096
 
@@ -124,6 +126,8 @@ class PtyBoard:
     def _wait(self) -> None:
         now_us, due_us = self._now_us(), self._core.next_event_us()
         wait_s = TURN_MAX_S if due_us is None else min(TURN_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
+        if self._script:
+            wait_s = min(wait_s, max(0.0, self._script[0].at_s - self._now_s()))
         if not self._open:
             time.sleep(max(wait_s, 0.001))
         elif self._in_pace.allowed(self._now_s()) < 1:
@@ -136,7 +140,7 @@ class PtyBoard:
         poller.register(self._master, select.POLLIN)
         hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
         if self._open and hung_up:
-            self._read()  # the host's last words, an ABORT perhaps
+            self._last_words()
             self._log({"t_us": self._now_us(), "event": "port", "open": False})
             self._core.link_lost(self._now_us())
             self._closed_since_s = self._now_s()
@@ -159,6 +163,12 @@ class PtyBoard:
         self._in_pace.passed(len(data))
         self._core.receive(self._faults.carry(data), self._now_us())
 
+    def _last_words(self) -> None:
+        """Take what a host wrote before it closed, so that no later host finds it in the line."""
+        with suppress(OSError):  # empty, or the other end's EIO
+            while data := os.read(self._master, READ_MAX):
+                self._core.receive(self._faults.carry(data), self._now_us())
+
     def _write(self) -> None:
         self._out += self._faults.carry(self._core.bytes_to_send())
         allowed = min(self._out_pace.allowed(self._now_s()), len(self._out))
@@ -176,7 +186,7 @@ class PtyBoard:
             self._do(self._script.pop(0))
 
     def _do(self, step: Step) -> None:
-        now_us = self._now_us()
+        now_us = min(self._now_us(), int(step.at_s * 1e6))  # it happened when the script says, not when we looked
         if step.kind == "set":
             self._core.set_input(step.name, step.value, now_us)
         elif step.name == "reset":
@@ -192,6 +202,16 @@ class PtyBoard:
             self._faults.break_down(step.name, step.rate)
 
 
+def _check_options(options: argparse.Namespace) -> None:
+    link: Path = options.pty
+    if not link.parent.is_dir():
+        raise InputError("--pty", str(link), "a name in a folder that exists")
+    if link.exists() and not link.is_symlink():
+        raise InputError("--pty", str(link), "a name that is free, or a link")
+    if options.baud < BAUD_MIN:
+        raise InputError("--baud", options.baud, f"at least {BAUD_MIN}")
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Run a board until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(prog="optodrive.simulator.board", description="A simulated board on a pty.")
@@ -203,6 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--exit-when-closed", type=float, metavar="SECONDS", help="end when no host has it open")
     options = parser.parse_args(arguments)
     try:
+        _check_options(options)
         settings = load_settings(options.limits) if options.limits else BoardSettings()
         script = load_script(options.script) if options.script else []
         log = options.log.open("a", encoding="utf-8") if options.log else None

@@ -23,6 +23,7 @@ HOLD_MAX_US = 1_000_000
 UNDERRUNS_MAX = 3
 UNDERRUN_WINDOW_US = 10_000_000
 RING_RECORDS = 8192
+INDEX_MAX = 0xFFFF_FFFF
 TICK_HZ = 1_000_000
 FIRMWARE = 0x0001_0000
 CAPABILITY_KEY_EDGE = 1
@@ -31,6 +32,8 @@ SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
 INPUT_FAULTS = {"interlock": "INTERLOCK", "key": "KEY", "estop": "ESTOP"}
 
 Sink = Callable[[dict[str, Any]], None]
+Record = tuple[int, int, int, int]
+"""Number of the point, tick of gate on, gate-on time, duty."""
 
 
 class Point(NamedTuple):
@@ -78,12 +81,13 @@ class BoardCore:
         self._guards = Guards(self._settings.cell_codes)
         self._queue: deque[Point] = deque()
         self._position = (32768, 32768)
+        self._settled_us = self._now_us
         self._job: Job | None = None
         self._current: Point | None = None
-        self._begun_us = self._lit_us = self._due_us = 0
+        self._lit_us = self._due_us = 0
         self._next_index = self._done_index = 0
-        self._records: deque[tuple[int, int, int, int]] = deque(maxlen=RING_RECORDS)
-        self._unreported: list[tuple[int, int, int, int]] = []
+        self._records: deque[Record] = deque(maxlen=RING_RECORDS)
+        self._unreported: list[Record] = []
         self._lease_until_us = 0
         self._nonce: int | None = None
         self._armed_by: int | None = None
@@ -93,7 +97,8 @@ class BoardCore:
         self._underruns: deque[int] = deque()
         self._underruns_total = 0
         self._laser_on_us = 0
-        self._key_turned = True
+        self._key_turned = False
+        self._version_fits = False
         self._ack_due = False
         self._set_state("DISARMED", "boot")
 
@@ -135,7 +140,12 @@ class BoardCore:
         return self._arming_since_us + (INDICATOR_US if self._confirmed else ARMING_TIMEOUT_US)
 
     def _hold_due_us(self) -> int | None:
-        return self._hold_since_us + HOLD_MAX_US if self.state == "HOLD" else None
+        if self.state == "HOLD":
+            return self._hold_since_us + HOLD_MAX_US
+        job = self._job
+        if self.state == "RUNNING" and self._current is None and job is not None and not self._enough_queued(job):
+            return job.start_us + HOLD_MAX_US
+        return None
 
     def _point_due_us(self) -> int | None:
         if self.state != "RUNNING":
@@ -169,13 +179,13 @@ class BoardCore:
 
     def _begin_point(self, point: Point) -> None:
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
-        settle_us = 0
         if move:
             settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000)
+            # A move that was broken off may have left the mirrors anywhere on its way: its own time counts too.
+            self._settled_us = max(self._settled_us, self._now_us) + settle_us
         self._position = point.x, point.y
         self._current = point
-        self._begun_us = self._now_us
-        self._due_us = self._now_us + max(point.dark_us, settle_us)
+        self._due_us = max(self._now_us + point.dark_us, self._settled_us)
 
     def _light(self, point: Point) -> None:
         fault = self._guards.refuses(self._limits, point.x, point.y, self._now_us, point.on_us, point.duty)
@@ -374,9 +384,8 @@ class BoardCore:
         elif isinstance(message, m.Get):
             self._send(self._status())
         elif isinstance(message, m.GetExecuted):
-            self._send_records(
-                [record for record in self._records if record[0] >= message.first_index][: m.RECORDS_MAX]
-            )
+            wanted = [record for record in self._records if record[0] >= message.first_index]
+            self._send_records(_one_report(wanted))
 
     def _obey(self, message: m.Message) -> str:
         """Carry a sequenced message out; the NAK reason where it is refused."""
@@ -404,6 +413,8 @@ class BoardCore:
         self._records.clear()
         self._unreported.clear()
         self._out.clear()
+        self._ack_due = False
+        self._version_fits = hello.major == m.MAJOR
         self._send(
             m.HelloReply(
                 major=m.MAJOR,
@@ -423,7 +434,7 @@ class BoardCore:
         )
 
     def _limit(self, message: m.Limits) -> str:
-        if self.state != "DISARMED":
+        if self.state not in ("DISARMED", "FAULT"):
             return "STATE"
         self._limits = tightened(self._limits, message)
         return ""
@@ -437,6 +448,8 @@ class BoardCore:
         points = [
             Point(message.first_index + k, *values) for k, values in enumerate(m.POINT.iter_unpack(message.points))
         ]
+        if message.first_index + len(points) > INDEX_MAX:
+            return "INDEX"
         if len(self._queue) + len(points) > self._settings.queue_points:
             return "NO_ROOM"
         for point in points:
@@ -487,6 +500,8 @@ class BoardCore:
     def _arm(self, message: m.ArmReq) -> str:
         if self.state != "DISARMED":
             return "STATE"
+        if not self._version_fits:
+            return "VERSION"
         if self.inputs != SAFE_INPUTS:
             return "INPUT"
         if self._settings.key_edge and not self._key_turned:
@@ -553,10 +568,11 @@ class BoardCore:
 
     def _report_executed(self) -> None:
         while self._unreported:
-            self._send_records(self._unreported[: m.RECORDS_MAX])
-            del self._unreported[: m.RECORDS_MAX]
+            report = _one_report(self._unreported)
+            self._send_records(report)
+            del self._unreported[: len(report)]
 
-    def _send_records(self, records: list[tuple[int, int, int, int]]) -> None:
+    def _send_records(self, records: list[Record]) -> None:
         if records:
             self._send(m.Executed(records[0][0], tuple(record[1:] for record in records)))
 
@@ -569,6 +585,16 @@ class BoardCore:
 
     def _log(self, event: str, **more: object) -> None:
         self._sink({"t_us": self._now_us, "event": event, **more})
+
+
+def _one_report(records: list[Record]) -> list[Record]:
+    """As many from the first on as one EXECUTED can tell: numbers without a gap, offsets that fit 32 bits."""
+    count = 0
+    for number, on_tick, _, _ in records[: m.RECORDS_MAX]:
+        if number != records[0][0] + count or on_tick - records[0][1] >= 1 << 32:
+            break
+        count += 1
+    return records[:count]
 
 
 def _reached(due_us: int | None, now_us: int) -> bool:

@@ -27,7 +27,7 @@ class Guards:
         cell = self.cell(x, y)
         if self.on_time_us(limits, cell, start_us) + on_us > limits.max_on_us:
             return "ON_TIME"
-        if self.mean_account(start_us + on_us) + on_us * duty > WINDOW_US * limits.mean_duty:
+        if self.mean_account(start_us, on_us, duty) > WINDOW_US * limits.mean_duty:
             return "MEAN_POWER"
         if self.bucket_uj(limits, cell, start_us) + energy_uj(limits, on_us, duty) > limits.spot_uj:
             return "SPOT"
@@ -50,11 +50,20 @@ class Guards:
         level_uj, since_us = self._bucket.get(cell, (0, 0))
         return max(0, level_uj - (at_us - since_us) * limits.spot_leak_uw // 1_000_000)
 
-    def mean_account(self, end_us: int) -> int:
-        """Gate-on time × duty in the second before end_us, µs × duty code."""
-        begin_us = end_us - WINDOW_US
-        while self._recent and sum(self._recent[0][:2]) <= begin_us:
+    def mean_account(self, start_us: int, on_us: int, duty: int) -> int:
+        """Most gate-on time × duty that any second would hold with this pulse, µs × duty code."""
+        while self._recent and sum(self._recent[0][:2]) <= start_us - WINDOW_US:
             self._recent.popleft()
+        # The sum of a second grows until the pulse ends, or a brighter old pulse begins to leave the second.
+        ends = [start_us + on_us]
+        for begun_us, _, _ in self._recent:
+            if begun_us + WINDOW_US >= start_us + on_us:
+                break
+            ends.append(max(start_us, begun_us + WINDOW_US))
+        return max(self._second_before(end_us) + (end_us - start_us) * duty for end_us in ends)
+
+    def _second_before(self, end_us: int) -> int:
+        begin_us = end_us - WINDOW_US
         return sum(max(0, start + on - max(start, begin_us)) * duty for start, on, duty in self._recent)
 
 

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from re import fullmatch
 
 from optodrive.config import read_toml
 from optodrive.errors import InputError, nearest
-from optodrive.wire.messages import Limits
+from optodrive.wire.messages import POINTS_MAX, Limits
 
 OWN = Limits(
     max_on_us=50_000,
@@ -23,6 +24,9 @@ OWN = Limits(
     rest_us=500,
     lease_ms=100,
 )
+FIELD_MAX = {"H": 0xFFFF, "I": 0xFFFF_FFFF}
+RANGES = {item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)}
+RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
 LOOSENED_BY_MORE = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
 LOOSENED_BY_LESS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
@@ -48,12 +52,23 @@ class BoardSettings:
 def load_settings(path: Path) -> BoardSettings:
     """Settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge."""
     table = read_toml(path)
-    limit_names = [item.name for item in fields(Limits)]
-    other_names = [item.name for item in fields(BoardSettings) if item.name != "limits"]
+    known = [*RANGES, "uid", "key_edge"]
     for name, value in table.items():
-        if name not in limit_names + other_names:
-            raise InputError(f"{path}", name, f"a known key, {nearest(name, limit_names + other_names)}")
-        if name in limit_names and (not isinstance(value, int) or not 0 <= value < 2**32):
-            raise InputError(f"{path}: {name}", value, "a whole number that fits its field")
-    limits = replace(OWN, **{name: value for name, value in table.items() if name in limit_names})
-    return BoardSettings(limits, **{name: value for name, value in table.items() if name in other_names})
+        if name not in known:
+            raise InputError(f"{path}", name, f"a known key, {nearest(name, known)}")
+        _check(f"{path}: {name}", name, value)
+    limits = replace(OWN, **{name: value for name, value in table.items() if hasattr(OWN, name)})
+    return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(OWN, name)})
+
+
+def _check(where: str, name: str, value: object) -> None:
+    if name == "uid":
+        if not isinstance(value, str) or not fullmatch("[0-9a-fA-F]{24}", value):
+            raise InputError(where, value, "24 hexadecimal digits")
+    elif name == "key_edge":
+        if not isinstance(value, bool):
+            raise InputError(where, value, "true or false")
+    else:
+        low, high = RANGES[name]
+        if type(value) is not int or not low <= value <= high:
+            raise InputError(where, value, f"a whole number from {low} to {high}")

@@ -12,7 +12,9 @@ rate = 0.01
 """
 
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
+from typing import Any
 
 from optodrive.config import read_toml
 from optodrive.errors import InputError, nearest
@@ -34,16 +36,34 @@ class Step:
 
 def load_script(path: Path) -> list[Step]:
     """The steps of a script file in order of time; InputError for what it cannot mean."""
-    steps = []
-    for k, entry in enumerate(read_toml(path).get("step", [])):
-        where = f"{path}: step {k}"
-        at_s = entry.get("at_s")
-        if not isinstance(at_s, int | float) or at_s < 0:
-            raise InputError(f"{where}: at_s", at_s, "a time ≥ 0 in s")
-        kind = "set" if "set" in entry else "do"
-        known = INPUTS if kind == "set" else ACTIONS
-        name = entry.get(kind)
-        if name not in known:
-            raise InputError(f"{where}: {kind}", name, f"a known one, {nearest(str(name), list(known))}")
-        steps.append(Step(float(at_s), kind, name, bool(entry.get("value", False)), float(entry.get("rate", 0.01))))
-    return sorted(steps, key=lambda step: step.at_s)
+    table = read_toml(path)
+    entries = table.pop("step", [])
+    for name in table:
+        raise InputError(f"{path}", name, "nothing but [[step]]")
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: step", entries, "[[step]], with two brackets")
+    return sorted((_step(f"{path}: step {k}", entry) for k, entry in enumerate(entries)), key=lambda step: step.at_s)
+
+
+def _step(where: str, entry: dict[str, Any]) -> Step:
+    kind = "set" if "set" in entry else "do"
+    known = INPUTS if kind == "set" else ACTIONS
+    name = entry.get(kind)
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"{where}: {kind}", name, f"a known one, {nearest(str(name), list(known))}")
+    at_s = _number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
+    rate = _number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
+    value = entry.get("value", False)
+    if not isinstance(value, bool):
+        raise InputError(f"{where}: value", value, "true or false")
+    allowed = ["at_s", "set", "value"] if kind == "set" else ["at_s", "do", "rate"]
+    for key in entry:
+        if key not in allowed:
+            raise InputError(where, key, f"a known key, {nearest(key, allowed)}")
+    return Step(at_s, kind, name, value, rate)
+
+
+def _number(where: str, value: object, expected: str, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
+        raise InputError(where, value, expected)
+    return float(value)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from optodrive.errors import RemoteProtocolError
 from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
 from optodrive.wire.messages import (
+    BOARD_MESSAGES,
     MAJOR,
     MINOR,
     NAK_REASONS,
@@ -47,6 +48,7 @@ class HostConnection:
         self._next_seq = 0
         self._base_seq = 0
         self._resend = False
+        self._resent = False
         self._sent_s = 0.0
         self._nonce: int | None = None
         self._naks = 0
@@ -77,15 +79,16 @@ class HostConnection:
         self._control.append(encode_frame(Frame(Hello.TYPE, 0, 0, Hello(MAJOR, MINOR, nonce).body())))
 
     def abort(self) -> None:
-        """Forget everything not yet acknowledged and put ABORT ahead of all."""
-        self._forget()
+        """Put ABORT ahead of all and forget everything else; only a new hello goes on from here."""
         self._control = [encode_frame(Frame(Abort.TYPE, 0, self.session, b""))]
+        self.peer = self._nonce = None
+        self._forget()
 
     def _forget(self) -> None:
         self._waiting.clear()
         self._unacked.clear()
         self._next_seq = self._base_seq = 0
-        self._resend = False
+        self._resend = self._resent = False
 
     def send(self, message: Message) -> None:
         """Queue a message."""
@@ -102,7 +105,7 @@ class HostConnection:
         if self._unacked and (self._resend or now_s - self._sent_s > self._rto_s):
             out += b"".join(self._unacked)
             self._retransmitted += len(self._unacked)
-            self._resend = False
+            self._resend, self._resent = False, True
             self._sent_s = now_s
         in_flight = sum(len(frame) for frame in self._unacked)
         while self._waiting and len(self._unacked) < WINDOW:
@@ -128,6 +131,9 @@ class HostConnection:
             except RemoteProtocolError:
                 self._decoder.counters.format_errors += 1
                 continue
+            if not isinstance(message, BOARD_MESSAGES):
+                self._decoder.counters.format_errors += 1  # our own words: the line echoes
+                continue
             if isinstance(message, HelloReply):
                 if message.host_nonce != self._nonce or self.peer is not None:
                     continue
@@ -139,7 +145,8 @@ class HostConnection:
             elif isinstance(message, Nak):
                 self._naks += 1
                 self._acknowledged(message.next_seq, now_s)
-                self._resend = message.reason == NAK_REASONS.index("SEQUENCE")
+                if message.reason == NAK_REASONS.index("SEQUENCE") and not self._resent:
+                    self._resend = True  # once: the other frames behind a gap are refused too, and say no more
             messages.append(message)
         return messages
 
@@ -152,6 +159,7 @@ class HostConnection:
         if count:
             self._base_seq = next_seq
             self._sent_s = now_s
+            self._resend = self._resent = False
 
 
 class BoardLink:

@@ -28,7 +28,7 @@ FAULTS = (
     "TICK",
     "READBACK",
 )
-NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "MALFORMED")
+NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """Refusals after which the same frame is sent again; after the others it counts as taken and refused."""
 REASONS = (
@@ -61,11 +61,15 @@ RECORDS_MAX = 28
 
 
 class Message:
-    """A message; TYPE and LAYOUT are the class's, SEQUENCED says whether it goes through the go-back-N window."""
+    """A message; TYPE and LAYOUT are the class's, SEQUENCED says whether it goes through the go-back-N window.
+
+    ENUMS: fields that hold an index into names; an index beyond them is no message.
+    """
 
     TYPE: ClassVar[int]
     LAYOUT: ClassVar[struct.Struct]
     SEQUENCED: ClassVar[bool] = False
+    ENUMS: ClassVar[dict[str, tuple[str, ...]]] = {}
 
     def body(self) -> bytes:
         """The body's bytes."""
@@ -286,7 +290,7 @@ class GetExecuted(Message):
 class Ack(Message):
     """Everything before next_seq was taken."""
 
-    TYPE, LAYOUT = 0x90, struct.Struct("<BHIB")
+    TYPE, LAYOUT, ENUMS = 0x90, struct.Struct("<BHIB"), {"state": STATES}
     next_seq: int
     free_points: int
     done_index: int
@@ -297,7 +301,7 @@ class Ack(Message):
 class Nak(Message):
     """A frame was not taken, or taken and refused; next_seq as in ACK."""
 
-    TYPE, LAYOUT = 0x91, struct.Struct("<BB")
+    TYPE, LAYOUT, ENUMS = 0x91, struct.Struct("<BB"), {"reason": NAK_REASONS}
     next_seq: int
     reason: int
 
@@ -307,6 +311,7 @@ class Event(Message):
     """The state changed."""
 
     TYPE, LAYOUT = 0x92, struct.Struct("<BBBQ")
+    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS, "reason": REASONS}
     state: int
     fault: int
     reason: int
@@ -318,6 +323,7 @@ class Status(Message):
     """How the board is."""
 
     TYPE, LAYOUT = 0x98, struct.Struct("<BBBQIHHHHHQh")
+    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS}
     state: int
     fault: int
     inputs: int
@@ -389,11 +395,12 @@ BY_TYPE: dict[int, type[Message]] = {kind.TYPE: kind for kind in HOST_MESSAGES +
 
 
 def parse_message(kind: int, body: bytes) -> Message:
-    """A message from a frame's type and body; RemoteProtocolError for unknown types and wrong lengths."""
+    """A message from a frame's type and body; RemoteProtocolError for unknown types, lengths and enumerations."""
     known = BY_TYPE.get(kind)
     if known is None:
         raise RemoteProtocolError(f"unknown message type 0x{kind:02x}")
-    try:
-        return known.parse(body)
-    except struct.error as error:
-        raise RemoteProtocolError(f"{known.__name__}: {error}") from None
+    message = known.parse(body)
+    for name, names in known.ENUMS.items():
+        if getattr(message, name) >= len(names):
+            raise RemoteProtocolError(f"{known.__name__}: {name} {getattr(message, name)} has no meaning")
+    return message

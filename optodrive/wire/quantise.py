@@ -84,7 +84,7 @@ def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
     x, y = scale.codes(plan.x_rad), scale.codes(plan.y_rad)
     dark = start - np.concatenate([[0], (start + width)[:-1]])
     if len(plan) and dark.min() < 0:
-        raise LocalProtocolError("pulses overlap")
+        raise LocalProtocolError("pulses overlap, or the first begins before the plan")
     table: list[tuple[int, int, int, int, int]] = []
     rows: list[int] = []
     columns = (x.tolist(), y.tolist(), dark.tolist(), width.tolist(), duty.tolist())
