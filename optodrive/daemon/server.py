@@ -65,6 +65,7 @@ def _listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        listener.listen()  # from the line that tells the address on, whoever calls is heard
     except OSError as error:
         listener.close()
         raise InputError("daemon.port", port, f"an address that is free on {host} ({error.strerror})") from None

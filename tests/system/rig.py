@@ -79,12 +79,17 @@ class Daemon:
                 env=environment,
                 text=True,
             )
-        first = self.process.stdout.readline()
-        found = re.search(r"(http://[\d.:]+)", first)
-        assert found, first + self.errors.read_text()
-        self.url = found.group(1)
-        self.client = httpx.Client(base_url=self.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
-        self.call("GET", "/v1/state")
+        self.client = httpx.Client(headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30)
+        try:
+            first = self.process.stdout.readline()
+            found = re.search(r"(http://[\d.:]+)", first)
+            assert found, first + self.errors.read_text()
+            self.url = found.group(1)
+            self.client.base_url = self.url
+            self.call("GET", "/v1/state")
+        except BaseException:
+            self.stop()
+            raise
 
     def call(self, method, path, status=None, **request):
         response = self.client.request(method, path, **request)
