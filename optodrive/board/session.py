@@ -250,7 +250,7 @@ class Session:
 
     def _take_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
-        if reason not in m.NOT_CONSUMED:
+        if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first is the cause, others follow from it
             self._refusal = reason
 
     def _take_status(self, message: m.Status, now_s: float) -> None:
@@ -284,6 +284,8 @@ class Session:
             self._connection.send(m.ArmConfirm(board_nonce=message.board_nonce, host_nonce=message.host_nonce))
 
     def _take_executed(self, message: m.Executed, now_s: float) -> None:
+        # What is done makes room: a small queue would run dry before an ACK or a STATUS tells.
+        self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
         if self._job is not None:
             self._job.note(message)
 

@@ -59,7 +59,8 @@ class Guards:
         for begun_us, _, _ in self._recent:
             if begun_us + WINDOW_US >= start_us + on_us:
                 break
-            ends.append(max(start_us, begun_us + WINDOW_US))
+            if begun_us + WINDOW_US > start_us:
+                ends.append(begun_us + WINDOW_US)
         return max(self._second_before(end_us) + (end_us - start_us) * duty for end_us in ends)
 
     def _second_before(self, end_us: int) -> int:

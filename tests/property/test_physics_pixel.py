@@ -3,10 +3,10 @@
 from math import exp
 
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, example, given
 from hypothesis import strategies as st
 
-from optodrive.physics.pixel import Pixel, advance, cooling_peak, divided_difference
+from optodrive.physics.pixel import Pixel, advance, cooling_peak, divided_difference, gas_peak
 
 rises = st.floats(0.0, 600.0)
 powers = st.floats(0.0, 2.5)
@@ -59,6 +59,15 @@ def test_no_moment_in_the_dark_passes_the_peak(pixel, theta, gamma, t_s):
     peak, _ = cooling_peak(pixel, theta, gamma)
     assert advance(pixel, theta, gamma, 0.0, t_s)[1] <= peak * (1 + 1e-12) + 1e-12
     assert peak <= max(gamma, theta / 2) * (1 + 1e-12)
+
+
+@given(pixels(), st.floats(1.0, 600.0), st.floats(0.0, 0.9))
+@example(Pixel(145.0, 100e-6, 0.66, 14.5e-3 * 1.005, 4e-6, 2e-4), 500.0, 0.1)
+def test_the_gas_turns_where_it_meets_half_the_absorber(pixel, theta, share):
+    peak, at_s = gas_peak(pixel, theta, share * theta / 2, 0.0, float("inf"))
+    theta_then, gamma_then = advance(pixel, theta, share * theta / 2, 0.0, at_s)
+    assert peak == gamma_then
+    assert gamma_then == pytest.approx(theta_then / 2, rel=1e-7)
 
 
 @given(pixels(), rises, rises, powers, st.floats(0.0, 1e4))

@@ -1,0 +1,206 @@
+"""A link that loses, doubles, flips and cuts bytes, a host that says anything: each point at most once, in order."""
+
+from itertools import pairwise
+
+from hypothesis import event, given, settings
+from hypothesis import strategies as st
+
+from optodrive.simulator.core import BoardCore
+from optodrive.simulator.limits import OWN, BoardSettings
+from optodrive.wire import messages as m
+from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
+from optodrive.wire.connection import HostConnection
+
+TURN_US = 2000
+FLIGHT_BYTES = 600
+FRAMES, POINTS = 20, 8
+TOTAL = FRAMES * POINTS
+PATIENT = BoardSettings(limits=m.Limits(**{**vars(OWN), "lease_ms": 60_000}))
+
+
+class Rig:
+    """The host's end and the board, with time between them."""
+
+    def __init__(self):
+        self.log = []
+        self.core = BoardCore(PATIENT, self.log.append, seed=1)
+        self.host = HostConnection()
+        self.now_us = 0
+        self.heard = []
+        self.host.hello(1)
+        self.turn()
+        self.host.send(m.ArmReq(5))
+        self.turn()
+        (challenge,) = [x for x in self.heard if isinstance(x, m.ArmChallenge)]
+        self.host.send(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
+        self.host.send(m.Lease(60_000))
+        self.turn()
+        self.now_us += 2_000_000
+        self.turn()
+        assert self.core.state == "ARMED"
+
+    def turn(self, to_board=lambda data: data, to_host=lambda data: data):
+        """Bytes pass both ways, and a little time."""
+        now_s = self.now_us * 1e-6
+        self.core.receive(to_board(self.host.bytes_to_send(now_s, FLIGHT_BYTES)), self.now_us)
+        self.now_us += TURN_US
+        self.core.advance(self.now_us)
+        self.heard += self.host.receive_bytes(to_host(self.core.bytes_to_send()), self.now_us * 1e-6)
+
+    @property
+    def fired(self):
+        return [entry["index"] for entry in self.log if entry["event"] == "pulse"]
+
+
+@st.composite
+def damages(draw):
+    """What a link does to one portion of bytes."""
+    kind = draw(st.sampled_from(["pass", "pass", "lose", "double", "flip", "cut", "cut both ends", "junk"]))
+    where, bit = draw(st.floats(0, 1)), draw(st.integers(0, 7))
+
+    def damage(data):
+        at = int(where * (len(data) - 1))
+        if kind == "lose":
+            return b""
+        if kind == "double":
+            return data + data
+        if kind == "flip" and data:
+            return data[:at] + bytes([data[at] ^ 1 << bit]) + data[at + 1 :]
+        if kind == "cut":
+            return data[:at]
+        if kind == "cut both ends":
+            return data[at // 2 : at]
+        return data + bytes([bit] * at) if kind == "junk" else data
+
+    return damage
+
+
+@settings(max_examples=150)
+@given(
+    st.lists(st.tuples(damages(), damages()), min_size=5, max_size=80),
+    st.sampled_from([1, POINTS, TOTAL]),
+    st.integers(0, 2**16),
+)
+def test_each_point_at_most_once_in_order_and_all_after_repair(bad_turns, watermark, first_index):
+    rig = Rig()
+    for k in range(FRAMES):
+        point = m.POINT.pack(32768, 32768, 900, 100, 3000)
+        rig.host.send(m.Data(first_index + k * POINTS, point * POINTS))
+        if k == 0:
+            rig.host.send(m.Start(1, first_index, 0, watermark))
+    rig.host.send(m.End(1, first_index + TOTAL))
+    for to_board, to_host in bad_turns:
+        rig.turn(to_board, to_host)
+        assert rig.fired == list(range(first_index, first_index + len(rig.fired)))
+    for _ in range(300):
+        rig.turn()
+    assert rig.host.outstanding == 0, "the link does not recover"
+    assert rig.fired == list(range(first_index, first_index + len(rig.fired)))
+    event(f"{rig.core.state} {rig.core.fault}")
+    if rig.core.fault != "UNDERRUN":  # three holes in the stream are a fault, and meant to be
+        assert rig.core.state == "ARMED"
+        assert len(rig.fired) == TOTAL
+        rig.host.send(m.GetExecuted(first_index))
+        rig.turn()
+        report = rig.heard[-1]
+        assert (report.first_index, len(report.records)) == (first_index, m.RECORDS_MAX)
+
+
+FRAME = st.builds(Frame, st.integers(0, 255), st.integers(0, 255), st.integers(0, 65535), st.binary(max_size=244))
+STREAM = st.lists(
+    st.one_of(
+        st.binary(max_size=300),
+        FRAME.map(encode_frame),
+        st.tuples(FRAME.map(encode_frame), damages()).map(lambda pair: pair[1](pair[0])),
+    ),
+    max_size=8,
+).map(b"".join)
+
+
+@given(STREAM, st.integers(1, 400))
+def test_decoder_never_raises_and_gives_only_frames_that_were_there(data, portion):
+    whole, pieces = FrameDecoder(), FrameDecoder()
+    frames = list(whole.feed(data))
+    assert frames == [f for at in range(0, len(data), portion) for f in pieces.feed(data[at : at + portion])]
+    assert whole.counters == pieces.counters
+    padded = b"\0" + data
+    for frame in frames:
+        assert b"\0" + encode_frame(frame) in padded
+
+
+@given(STREAM)
+def test_neither_end_raises_on_any_bytes(data):
+    rig = Rig()
+    rig.core.receive(data, rig.now_us)
+    rig.host.receive_bytes(data, 0.0)
+    assert rig.core.state in ("ARMED", "DISARMED")
+    assert not rig.core.gate
+
+
+def bodies(kind):
+    """Bodies of a message with fields anywhere in their range, often at its ends."""
+    length = kind.LAYOUT.size + (m.POINT.size * 3 if kind is m.Data else 0)
+    dull = st.sampled_from([0, 0, 1, 2, 100, 255])
+    return st.lists(dull, min_size=length, max_size=length).map(bytes)
+
+
+POINT = st.tuples(
+    st.sampled_from([0, 10_000, 32768, 32769, 50_000, 65535]),
+    st.sampled_from([32768, 40000]),
+    st.sampled_from([0, 100, 60_000]),
+    st.sampled_from([0, 1, 200, 1000, 5000, 50_000]),
+    st.sampled_from([0, 30_000, 65535]),
+)
+STEPS = st.one_of(
+    st.tuples(st.just("play"), st.lists(POINT, min_size=1, max_size=6)),
+    st.tuples(st.just("queue"), st.lists(POINT, min_size=1, max_size=6)),
+    st.tuples(st.sampled_from(["start", "end", "clear", "arm", "lease", "hello", "flush"]), st.none()),
+    st.tuples(st.just("wait"), st.sampled_from([10, 1000, 60_000, 500_000, 2_000_000])),
+    st.tuples(
+        st.just("anything"), st.sampled_from(m.HOST_MESSAGES).flatmap(lambda k: st.tuples(st.just(k), bodies(k)))
+    ),
+)
+
+
+def said(core, what, detail):
+    """Frames' types and bodies for a step, mostly such as the board may take in its state."""
+    first = core._queue[0].number if core._queue else core._next_index
+    if what == "anything":
+        return [(detail[0].TYPE, detail[1])]
+    if what in ("play", "queue"):
+        end = core._next_index + len(detail)
+        messages = [m.Data(core._next_index, b"".join(m.POINT.pack(*point) for point in detail))]
+        messages += [m.Start(1, first, 0, 1), m.End(1, end)] if what == "play" else []
+    else:
+        confirm = m.ArmConfirm(core._armed_by or 0, core._nonce or 0)
+        messages = {
+            "start": [m.Start(1, first, 0, 1)],
+            "end": [m.End(1, core._next_index)],
+            "clear": [m.ClearFault()],
+            "arm": [m.ArmReq(5) if core.state == "DISARMED" else confirm],
+            "lease": [m.Lease(60_000)],
+            "hello": [m.Hello(1, 0, 3)],
+            "flush": [m.Flush()],
+        }[what]
+    return [(message.TYPE, message.body()) for message in messages]
+
+
+@settings(max_examples=200)
+@given(st.lists(STEPS, min_size=5, max_size=60))
+def test_a_board_survives_a_host_that_says_anything(steps):
+    rig = Rig()
+    core, link = rig.core, rig.core._link
+    for what, detail in steps:
+        if what == "wait":
+            rig.now_us += detail
+            core.advance(rig.now_us)
+            continue
+        for kind, body in said(core, what, detail):
+            core.receive(encode_frame(Frame(kind, link.expected_seq, link.session, body)), rig.now_us)
+        assert not core.gate or core.state == "RUNNING"
+        for answer in FrameDecoder().feed(core.bytes_to_send()):
+            m.parse_message(answer.type, answer.body)
+    pulses = [entry for entry in rig.log if entry["event"] == "pulse"]
+    assert all(entry["off_us"] - entry["on_us"] <= OWN.max_on_us for entry in pulses)
+    assert all(one["off_us"] <= other["on_us"] for one, other in pairwise(pulses))
+    event(f"{min(len(pulses), 5)} pulses, 5 meaning more")
