@@ -13,7 +13,7 @@ import time
 import tty
 from contextlib import suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import Any, BinaryIO
 
 from optodrive.errors import InputError
 from optodrive.simulator.core import BoardCore
@@ -49,22 +49,24 @@ class Pace:
 
 
 class PtyBoard:
-    """A `BoardCore` between a pty and the real clock."""
+    """A `BoardCore` between a pty and the real clock; failure: why it ended by itself, '' where it did not."""
 
     def __init__(
         self,
         link: Path,
-        log: IO[str] | None,
+        log: BinaryIO | None,
         settings: BoardSettings,
         script: list[Step],
         baud: int,
         exit_closed_s: float | None,
     ) -> None:
+        self.failure = ""
         self._link_path = link
         self._log_file = log
         self._script = script
         self._exit_closed_s = exit_closed_s
         self._started_s = time.monotonic()
+        self._running = True
         self._core = BoardCore(settings, self._log)
         self._faults = FaultyLink()
         self._in_pace, self._out_pace = Pace(baud), Pace(baud)
@@ -73,7 +75,6 @@ class PtyBoard:
         self._was_open = False
         self._closed_since_s = 0.0
         self._master = -1
-        self._running = True
         self._make_pty()
 
     def _make_pty(self) -> None:
@@ -87,9 +88,14 @@ class PtyBoard:
         os.close(slave)  # from here on a hang-up means that no host has the port open
 
     def _log(self, event: dict[str, Any]) -> None:
-        if self._log_file is not None:
-            self._log_file.write(json.dumps(event) + "\n")
-            self._log_file.flush()
+        if self._log_file is None:
+            return
+        try:
+            self._log_file.write(json.dumps(event).encode() + b"\n")
+        except OSError as error:
+            self._log_file = None
+            self.failure = f"the log cannot be written ({error.strerror}); without its witness the board ends dark"
+            self.stop()
 
     def _now_s(self) -> float:
         return time.monotonic() - self._started_s
@@ -226,7 +232,7 @@ def main(arguments: list[str] | None = None) -> int:
         _check_options(options)
         settings = load_settings(options.limits) if options.limits else BoardSettings()
         script = load_script(options.script) if options.script else []
-        log = options.log.open("a", encoding="utf-8") if options.log else None
+        log = options.log.open("ab", buffering=0) if options.log else None
     except InputError as error:
         print(f"optodrive.simulator.board: {error}", file=sys.stderr)
         return error.exit_status
@@ -237,6 +243,9 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     board.run()
+    if board.failure:
+        print(f"optodrive.simulator.board: {board.failure}", file=sys.stderr)
+        return 1
     return 0
 
 

@@ -3,11 +3,13 @@
 import json
 import os
 import re
+import resource
 import signal
 import subprocess
 import sys
 import time
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import httpx
@@ -32,7 +34,7 @@ def wait_for(condition, what, patience_s=PATIENCE_S):
 class Board:
     """The board's process; its log is the witness."""
 
-    def __init__(self, folder, script="", limits=""):
+    def __init__(self, folder, script="", limits="", disk_bytes=None):
         self.port = folder / "tty"
         self.log = folder / "board.jsonl"
         arguments = ["--pty", self.port, "--log", self.log]
@@ -41,7 +43,12 @@ class Board:
                 path = folder / f"board{option}.toml"
                 path.write_text(text)
                 arguments += [option, path]
-        self.process = subprocess.Popen([sys.executable, "-m", "optodrive.simulator.board", *arguments])
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "optodrive.simulator.board", *arguments],
+            stderr=subprocess.PIPE if disk_bytes else None,
+            text=True,
+            preexec_fn=disk_bytes and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (disk_bytes, disk_bytes)),
+        )
         wait_for(self.port.exists, "the board's port")
 
     def events(self):
@@ -56,6 +63,8 @@ class Board:
     def stop(self):
         self.process.terminate()
         self.process.wait(timeout=10)
+        if self.process.stderr:
+            self.process.stderr.close()
 
 
 class Daemon:

@@ -130,6 +130,20 @@ def test_unplugged_in_mid_plan(make_board, make_daemon):
     assert "Traceback" not in daemon.errors.read_text()
 
 
+def test_a_full_disk_under_the_boards_log(make_board, make_daemon):
+    board = make_board(disk_bytes=12_000)
+    daemon = make_daemon(board)
+    plan = start_pulses(board, daemon)
+    assert board.process.wait(timeout=20) == 1
+    assert board.process.stderr.read().count("\n") == 1
+    assert not board.port.exists()
+    answer = daemon.finished(plan)
+    assert answer["status"] == "failed"
+    assert "is gone" in answer["error"]
+    assert daemon.state()["link"]["state"] == "down"
+    assert "Traceback" not in daemon.errors.read_text()
+
+
 def test_a_board_that_falls_silent(make_board, make_daemon):
     board = make_board(script='[[step]]\nat_s = 6.0\ndo = "hang"\n[[step]]\nat_s = 10.0\ndo = "repair"\n')
     daemon = make_daemon(board)
