@@ -3,15 +3,12 @@
 import pytest
 from hypothesis import HealthCheck, settings
 
-from optodrive.config import load_config, shipped_configs
-from optodrive.pipeline import Display
+from displays import DISPLAYS
 
 settings.register_profile(
     "project", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
 settings.load_profile("project")
-
-DISPLAYS = {name: Display.of(load_config(name)) for name in shipped_configs()}
 
 
 def pytest_addoption(parser):

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from conftest import DISPLAYS
+from displays import DISPLAYS
 from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
 from optodrive.pipeline import prepare
 from optodrive.plan.drive import reach_m

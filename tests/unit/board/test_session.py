@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from conftest import DISPLAYS
+from displays import DISPLAYS
 from optodrive.board.clocksync import DRIFT_MAX, ClockSync
 from optodrive.board.faults import HINTS, hint
 from optodrive.board.requirements import Requirements

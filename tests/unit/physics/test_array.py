@@ -67,6 +67,12 @@ def test_abutting_pulses_bear_rounding_and_are_one(pixels):
     assert heat.rises(0, 0.5) == pytest.approx(whole.rises(0, 0.5), rel=1e-12)
 
 
+def test_asked_a_rounding_before_its_end_a_pulse_has_ended(pixels):
+    heat = DisplayHeat(pixels)
+    heat.pulse(0, 0.0, 0.01, 2.45)
+    assert heat.rises(0, 0.01 - 0.9e-9) == heat.rises(0, 0.01)
+
+
 def test_a_copy_is_independent(pixels):
     heat = DisplayHeat(pixels)
     heat.pulse(0, 0.0, 0.01, 2.45)
@@ -146,6 +152,12 @@ def test_trace_leaves_the_heat_as_it_was(pixels):
     trace = pixel_trace(heat, [(0, 0.02, 0.01, 2.45)], [0], np.array([0.02, 0.03]))
     assert trace.absorber_k[0, 0] == pytest.approx(before[0])
     assert heat.rises(0, 0.02) == before
+
+
+def test_a_pixel_looked_at_twice_shows_the_same_twice(pixels):
+    trace = pixel_trace(DisplayHeat(pixels), [(1, 0.0, 0.01, 2.45)], [1, 1], np.array([0.005, 0.02]))
+    assert trace.gas_k[:, 0].min() > 0
+    assert trace.gas_k[:, 0].tolist() == trace.gas_k[:, 1].tolist()
 
 
 def test_arrays_of_pixels():

@@ -1,7 +1,7 @@
 """Every fact is spoken to or passed over with a reason; what the models say is held against sums done here."""
 
 import csv
-from math import exp
+from math import exp, pi
 
 import pytest
 
@@ -9,6 +9,7 @@ from optodrive.config import shipped_path
 from optodrive.physics.facts import Fact, paper_facts
 from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, REMARKS, SILENT, STANDS_ON_FITTED
 from optodrive.physics.parameters import load_parameters
+from optodrive.physics.responses import pulse_peak_k, width_to_reach_s
 
 CALIBRATED = load_parameters("calibrated")
 LITERAL = load_parameters("paper_s1_literal")
@@ -67,6 +68,37 @@ def test_the_literal_set_lags():
 def test_repeats_agree_and_force_is_linear():
     assert OUTCOMES["z_repeat_w040"](CALIBRATED) < 1e-12
     assert OUTCOMES["F_linear_in_P"](CALIBRATED) == pytest.approx(1.0, rel=1e-12)
+
+
+def said(name):
+    return OUTCOMES[name](CALIBRATED)
+
+
+def test_figures_in_the_remarks_are_so():
+    added = 0.5 * pi * FACTS["cavity_r"].value ** 2 * FACTS["z_peak_w020"].value
+    figures = {
+        "F_peak_w055": (FACTS["F_peak_w055"].value / FACTS["F_peak_w020"].value, "0.56", ".2f"),
+        "dT_air_isometric": (100 * added / FACTS["V_pixel"].value, "44 %", ".0f"),
+        "dQ_air": (1e6 * FACTS["dQ_air"].value / FACTS["dT_air_isometric"].value, "8.8 µJ/K", ".1f"),
+        "N_50um": (1e3 / FACTS["N_50um"].value, "4.6 ms", ".1f"),
+        "N_400um": (1e3 / FACTS["N_400um"].value, "37.7 ms", ".1f"),
+    }
+    for name, (figure, words, digits) in figures.items():
+        assert words in REMARKS[name]
+        assert words.startswith(format(figure, digits)), name
+    assert 293 * added / FACTS["V_pixel"].value > 100
+    assert format(said("F_peak_w055") / said("F_peak_w020"), ".2f") == "0.47"
+    assert format(said("N_400um") / FACTS["N_400um"].value, ".2f") == "1.24"
+
+
+def test_heights_at_the_papers_display_rates():
+    kappa, pixel = CALIBRATED.kappa.value, CALIBRATED.pixel(0.55e-3)
+    heights = {name: kappa * pulse_peak_k(pixel, 2.45, 1 / FACTS[name].value) for name in ("N_50um", "N_400um")}
+    assert heights["N_50um"] / 50e-6 == pytest.approx(2.0, abs=0.05)
+    assert heights["N_400um"] / 400e-6 == pytest.approx(1.07, abs=0.005)
+    slowest = max(width_to_reach_s(CALIBRATED.pixel(row.width_m), 2.45, 50e-6) for row in CALIBRATED.bridge)
+    assert format(1 / slowest, ".0f") == "374"
+    assert "374/s" in REMARKS["N_50um"]
 
 
 def fact(value, unit="m", relation="="):

@@ -1,5 +1,7 @@
 """The closed forms against an adaptive integrator and dense searches."""
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -58,6 +60,21 @@ def test_divided_difference_is_symmetric_and_exact_at_equal_rates():
     assert divided_difference(60.0, 300.0, 0.01) == divided_difference(300.0, 60.0, 0.01)
     assert divided_difference(60.0, 300.0, 0.01) == pytest.approx((np.exp(-0.6) - np.exp(-3.0)) / 240.0, rel=1e-14)
     assert divided_difference(70.0, 70.0, 0.02) == pytest.approx(0.02 * np.exp(-1.4), rel=1e-15)
+
+
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+@pytest.mark.parametrize("magnitude", range(-15, 1))
+@pytest.mark.parametrize("t_s", [2e-4, 0.01, 0.3])
+def test_divided_difference_keeps_its_digits_as_the_rates_meet(magnitude, side, t_s):
+    a = 70.0
+    b = a * (1.0 + side * 0.7 * 10.0**magnitude)
+    if a == b:
+        exact = t_s * np.exp(-a * t_s)
+    else:
+        with localcontext(prec=60):
+            exact_a, exact_b, t = Decimal(a), Decimal(b), Decimal(t_s)
+            exact = float(((-exact_a * t).exp() - (-exact_b * t).exp()) / (exact_b - exact_a))
+    assert divided_difference(a, b, t_s) == pytest.approx(exact, rel=2e-14)
 
 
 def test_time_constant():

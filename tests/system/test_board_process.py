@@ -1,0 +1,322 @@
+"""The simulated board as a process: a pty, a real serial port, real time, its log and its exits."""
+
+import subprocess
+import sys
+import time
+
+import pytest
+import serial
+
+from optodrive.board.requirements import Requirements
+from optodrive.board.session import Session
+from optodrive.clock import MonotonicClock
+from optodrive.config import load_config
+from optodrive.transport.serial_port import SerialPort
+from optodrive.wire import messages as m
+from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
+from rig import wait_for
+
+FIELDS = {
+    "gate": {"on", "reason"},
+    "state": {"state", "before", "reason"},
+    "fault": {"fault"},
+    "pulse": {"index", "x", "y", "duty", "on_us", "off_us"},
+    "rx_error": {"bad_frames"},
+    "input": {"input", "value"},
+    "port": {"open"},
+}
+CENTRE = 32768
+
+
+class Host:
+    """A host of a few lines on a real serial port: says and hears messages, renews the lease while it waits."""
+
+    def __init__(self, port):
+        self.port = serial.Serial(str(port), 1_000_000, timeout=0.005, exclusive=True)
+        self.decoder = FrameDecoder()
+        self.session, self.seq, self.heard = 0, 0, []
+
+    def say(self, *messages):
+        for message in messages:
+            seq = self.seq if message.SEQUENCED else 0
+            self.seq = (self.seq + message.SEQUENCED) % 256
+            self.port.write(encode_frame(Frame(message.TYPE, seq, self.session, message.body())))
+
+    def hear(self):
+        for frame in self.decoder.feed(self.port.read(4096)):
+            self.heard.append(m.parse_message(frame.type, frame.body))
+
+    def wait(self, condition, what, lease=True, patience_s=20.0):
+        until = time.monotonic() + patience_s
+        while not condition():
+            assert time.monotonic() < until, f"waited in vain for {what}"
+            if lease and self.session:
+                self.say(m.Lease(100))
+            self.hear()
+
+    def of(self, kind):
+        return [message for message in self.heard if isinstance(message, kind)]
+
+    def states(self):
+        return [m.STATES[event.state] for event in self.of(m.Event)]
+
+    def hello(self):
+        """Shake hands; the board may need a moment to see that its port was opened, so HELLO is repeated."""
+        for nonce in range(40):
+            self.session = self.seq = 0
+            self.say(m.Hello(1, 0, nonce))
+            for _ in range(50):
+                self.hear()
+                if self.of(m.HelloReply) and self.of(m.HelloReply)[-1].host_nonce == nonce:
+                    self.session = self.of(m.HelloReply)[-1].session
+                    return self
+        raise AssertionError("no answer to HELLO")
+
+    def arm(self):
+        self.say(m.ArmReq(3))
+        self.wait(lambda: self.of(m.ArmChallenge), "the challenge")
+        challenge = self.of(m.ArmChallenge)[-1]
+        self.say(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
+        self.wait(lambda: "ARMED" in self.states(), "ARMED")
+        return self
+
+    def play(self, points, first=0):
+        frames = [points[at : at + m.POINTS_MAX] for at in range(0, len(points), m.POINTS_MAX)]
+        for k, piece in enumerate(frames):
+            index = first + k * m.POINTS_MAX
+            self.say(m.Data(index, b"".join(m.POINT.pack(*point) for point in piece)))
+        self.say(m.Start(1, first, 0, 1), m.End(1, first + len(points)))
+
+    def close(self):
+        self.port.close()
+
+
+@pytest.fixture
+def open_host():
+    hosts = []
+
+    def open_port(board):
+        hosts.append(Host(board.port))
+        return hosts[-1]
+
+    yield open_port
+    for host in hosts:
+        host.close()
+
+
+def points(count, on_us=2000):
+    """Points in a row of cells; every fifth is dark."""
+    return [
+        (CENTRE + 2000 * (k % 5 - 2), CENTRE, 3000, 0 if k % 5 == 4 else on_us, 0 if k % 5 == 4 else 20_000 + k)
+        for k in range(count)
+    ]
+
+
+def test_fifty_points_and_the_log_line_by_line(board, open_host):
+    host = open_host(board).hello().arm()
+    asked = points(50)
+    host.play(asked)
+    host.wait(lambda: sum(len(x.records) for x in host.of(m.Executed)) == 50, "50 executed points")
+    host.close()
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+
+    events = board.events()
+    assert all(set(entry) == {"t_us", "event"} | FIELDS[entry["event"]] for entry in events)
+    times = [entry["t_us"] for entry in events]
+    assert all(isinstance(t_us, int) for t_us in times)
+    lit = [k for k, point in enumerate(asked) if point[3]]
+    pulses = board.of("pulse")
+    assert [entry["index"] for entry in pulses] == lit
+    assert [(entry["x"], entry["y"], entry["duty"]) for entry in pulses] == [
+        (asked[k][0], asked[k][1], asked[k][4]) for k in lit
+    ]
+    assert all(entry["off_us"] - entry["on_us"] == 2000 for entry in pulses)
+    edges = [(entry["t_us"], entry["on"]) for entry in board.of("gate")]
+    assert edges == [edge for entry in pulses for edge in ((entry["on_us"], True), (entry["off_us"], False))]
+    assert [entry["reason"] for entry in board.of("gate")][:2] == ["point 0", "point 0 done"]
+    walk = [(entry["before"], entry["state"], entry["reason"]) for entry in board.of("state")]
+    assert walk == [
+        ("BOOT", "DISARMED", "boot"),
+        ("DISARMED", "ARMING", "arm requested"),
+        ("ARMING", "ARMED", "armed"),
+        ("ARMED", "RUNNING", "start"),
+        ("RUNNING", "ARMED", "job done"),
+        ("ARMED", "DISARMED", "link lost"),
+    ]
+    told = [record for message in host.of(m.Executed) for record in message.records]
+    assert [(tick, on, duty) for tick, on, duty in told if on] == [
+        (entry["on_us"], 2000, entry["duty"]) for entry in pulses
+    ]
+
+
+def test_port_closed_in_mid_job_is_dark_and_disarmed_and_may_be_opened_again(board, open_host):
+    host = open_host(board).hello().arm()
+    host.play(points(200, on_us=8000))
+    host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
+    host.close()
+    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
+    state, gate = board.of("state")[-1], board.of("gate")[-1]
+    assert state["reason"] == "link lost"
+    assert gate["on"] is False
+    assert gate["t_us"] <= state["t_us"]
+    count = len(board.of("pulse"))
+
+    again = open_host(board).hello()
+    assert again.session != host.session
+    again.arm()
+    assert len(board.of("pulse")) == count, "nothing of the old job is left"
+    again.play(points(5))
+    again.wait(lambda: sum(len(x.records) for x in again.of(m.Executed)) == 5, "the new job")
+    assert [entry["open"] for entry in board.of("port")] == [True, False, True]
+
+
+def test_what_a_host_wrote_before_it_closed_does_not_reach_the_next(board, open_host):
+    host = open_host(board).hello()
+    host.say(*[m.Get()] * 400, m.ArmReq(1))
+    host.close()
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+    again = open_host(board).hello()
+    again.say(m.Get())
+    again.wait(lambda: again.of(m.Status), "a status", lease=False)
+    (status,) = again.of(m.Status)
+    assert m.STATES[status.state] == "DISARMED"
+    assert status.fault == 0
+
+
+def test_the_session_works_over_the_real_port(board):
+    session = Session(
+        SerialPort(str(board.port), 1_000_000), MonotonicClock(), Requirements.of(load_config("display-16"))
+    )
+    session.connect()
+    try:
+        assert session.board.state == "DISARMED"
+        assert 0 < session.link_figures()["round_trip_ms"] < 50
+    finally:
+        session.close()
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+
+
+# --- scripts, limits, exits -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "unsafe"), [("interlock", "false"), ("estop", "true")])
+def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host, name, unsafe):
+    board = make_board(script=f'[[step]]\nat_s = 5.0\nset = "{name}"\nvalue = {unsafe}\n')
+    host = open_host(board).hello().arm()
+    host.play(points(600, on_us=8000))
+    host.wait(lambda: board.of("fault"), "the fault")
+    (fault,) = board.of("fault")
+    assert fault["fault"] == name.upper()
+    assert 5_000_000 <= fault["t_us"] <= 5_001_000
+    assert board.of("gate")[-1]["on"] is False
+    assert board.of("gate")[-1]["t_us"] <= fault["t_us"] + 1000
+    host.wait(lambda: host.states()[-1] == "FAULT", "the event", lease=False)
+
+
+def test_a_scripted_reset_ends_the_session(make_board, open_host):
+    board = make_board(script='[[step]]\nat_s = 4.0\ndo = "reset"\n')
+    host = open_host(board).hello().arm()
+    wait_for(lambda: board.of("state")[-1]["reason"] == "boot" and len(board.of("state")) > 1, "the reset")
+    host.heard.clear()
+    host.hello()
+    assert host.of(m.HelloReply)[-1].reset_cause == 1
+    host.say(m.Get())
+    host.wait(lambda: host.of(m.Status), "a status", lease=False)
+    assert m.STATES[host.of(m.Status)[-1].state] == "DISARMED"
+
+
+def test_limits_come_from_the_file(make_board, open_host):
+    board = make_board(limits="max_on_us = 12345\nlease_ms = 60\n")
+    host = open_host(board).hello()
+    limits = host.of(m.HelloReply)[-1].limits
+    assert (limits.max_on_us, limits.lease_ms) == (12345, 60)
+
+
+def start(*arguments, **options):
+    command = [sys.executable, "-m", "optodrive.simulator.board", *map(str, arguments)]
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
+
+
+@pytest.mark.parametrize(
+    ("option", "text", "says"),
+    [
+        ("--limits", "max_on = 1", "max_on_us"),
+        ("--limits", "cell_codes = 0", "cell_codes"),
+        ("--limits", "=", "valid TOML"),
+        ("--limits", None, "a readable file"),
+        ("--script", '[[step]]\nat_s = 1\nset = "door"', "set"),
+        ("--script", '[[step]]\ndo = "reset"', "at_s"),
+        ("--script", None, "a readable file"),
+        ("--log", None, "--log"),
+        ("--pty", None, "--pty"),
+        ("--pty", "a file that is no link", "free"),
+        ("--baud", 0, "at least 300"),
+    ],
+)
+def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
+    path = tmp_path / ("there.toml" if text else "no/such/file")
+    if isinstance(text, str):
+        path.write_text(text)
+    value = text if option == "--baud" else path
+    arguments = ["--pty", tmp_path / "tty"] if option != "--pty" else []
+    board = start(*arguments, option, value if value is not None else path)
+    _, error = board.communicate(timeout=20)
+    assert board.returncode == 2
+    assert error.startswith("optodrive.simulator.board: ")
+    assert error.count("\n") == 1
+    assert says in error
+    assert not (tmp_path / "tty").exists()
+    if option == "--pty" and text:
+        assert path.read_text() == text
+
+
+def test_exit_when_closed_ends_it_and_takes_the_link_away(tmp_path):
+    port, log = tmp_path / "tty", tmp_path / "log"
+    board = start("--pty", port, "--log", log, "--exit-when-closed", "0.3")
+    try:
+        wait_for(port.exists, "the port")
+        time.sleep(0.6)
+        assert board.poll() is None, "it waits for its first host"
+        host = Host(port).hello()
+        time.sleep(0.6)
+        assert board.poll() is None
+        host.close()
+        closed = time.monotonic()
+        assert board.wait(timeout=10) == 0
+        assert time.monotonic() - closed > 0.25
+        assert not port.is_symlink()
+    finally:
+        board.kill()
+        board.communicate()
+
+
+def test_sigterm_goes_dark_first(tmp_path, make_board, open_host):
+    board = make_board()
+    host = open_host(board).hello().arm()
+    host.play(points(200, on_us=20_000))
+    host.wait(lambda: board.of("gate") and board.of("gate")[-1]["on"], "light")
+    board.stop()
+    assert board.process.returncode == 0
+    assert board.of("gate")[-1]["on"] is False
+    assert board.of("state")[-1]["reason"] == "link lost"
+
+
+def test_bytes_come_no_faster_than_the_line_carries_them(tmp_path):
+    port = tmp_path / "tty"
+    board = start("--pty", port, "--baud", 115_200)
+    try:
+        wait_for(port.exists, "the port")
+        host = Host(port).hello()
+        frame = encode_frame(Frame(m.Clock.TYPE, 0, host.session, m.Clock(0x01010101).body()))
+        count = -(-2000 // len(frame))
+        time.sleep(0.5)  # an idle line saves nothing up
+        began = time.monotonic()
+        host.port.write(frame * count)
+        host.wait(lambda: len(host.of(m.ClockReply)) == count, "all answers", lease=False)
+        took_s = time.monotonic() - began
+        assert took_s >= 0.15, "2,000 bytes are 174 ms of 115,200 baud"
+        assert took_s < 2.0
+        host.close()
+    finally:
+        board.kill()
+        board.communicate()
