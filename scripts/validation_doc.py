@@ -17,6 +17,10 @@ driven with, fitted by `scripts/calibrate-parameters` on three facts, one a para
 
 - Full power is 2.45 W, what the bolometer read, also where a figure says 2.5 W.
 - Ratio is model over measured, of temperatures by their rises above 20 °C; an upper bound has none.
+- No power is given for `dpp_200Hz` and `z_tp8_w040`: both are read at full power. τ_g rests on it; a tenth less for the
+  ripple would make it 2.6 ms in place of 3.0.
+- `N_50um` alone would ask for τ_g = 17 ms. It contradicts the other displacements at every width, so neither the fit
+  nor τ_g's uncertainty takes it in.
 - `F_linear_in_P` and `z_repeat_w040` hold by construction: the model is linear and remembers nothing for 5 s.
 - The paper fitted R and C on the first 30 ms of the temperatures that are predicted here at 50 ms.
 - That the gas settles at half the absorber's rise is Text S1's; displacements fix only its product with κ.

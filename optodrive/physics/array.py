@@ -88,13 +88,12 @@ def pixel_trace(
     heat: DisplayHeat, pulses: Iterable[tuple[int, float, float, float]], pixels: list[int], t_s: FloatArray
 ) -> PixelTrace:
     """Exact values of some pixels at times t_s [m], increasing; pulses: (pixel, start_s, width_s, power_w) in order."""
-    wanted = {index: column for column, index in enumerate(pixels)}
     absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
     own: dict[int, list[tuple[float, float, float]]] = {index: [] for index in pixels}
     for index, start_s, width_s, power_w in pulses:
-        if index in wanted:
+        if index in own:
             own[index].append((start_s, width_s, power_w))
-    for index, column in wanted.items():
+    for column, index in enumerate(pixels):
         state = heat.copy()
         parameters = heat.pixels.each[index]
         events = iter([*own[index], (float("inf"), 0.0, 0.0)])

@@ -175,11 +175,11 @@ REMARKS = {
     "F_peak_w055": "from w = 0.20 to 0.55 mm the force falls to 0.56, the gas rise to 0.47: no single φ gives both",
     "dT_air_isometric": "20.5 K comes from the force, taken on the whole aperture at constant volume; a membrane at "
     "0.97 mm adds 44 % to the volume, which no gas does that is less than 100 K warmer",
-    "dQ_air": "follows dT_air_isometric",
+    "dQ_air": "follows dT_air_isometric; 0.18 mJ for 20.5 K is 8.8 µJ/K, where C_gas is 10",
     "eta_qt": "follows dT_air_isometric",
     "eta_tm": "follows dT_air_isometric: the same work from more heat",
-    "N_50um": "217/s leaves 4.6 ms a pulse, which lifts the model twice as high; the measured 155 µm at 8 ms points to "
-    "some 90 µm there too",
+    "N_50um": "217/s leaves 4.6 ms a pulse, which lifts the model twice as high; at every width of Table S3 it makes "
+    "374/s or more; the measured 155 µm at 8 ms points to some 90 µm there too",
     "N_400um": "26.5/s leaves 37.7 ms a pulse, 7 % too high here; near the plateau 7 % of height is 24 % of time",
 }
 """What there is to say where the calibrated set misses by more than 15 %."""

@@ -47,6 +47,10 @@ class Pace:
         """Count bytes that passed."""
         self._tokens -= count
 
+    def idle(self) -> None:
+        """Nothing waits to pass: a line saves nothing up."""
+        self._tokens = min(self._tokens, BURST_BYTES)
+
 
 class PtyBoard:
     """A `BoardCore` between a pty and the real clock; failure: why it ended by itself, '' where it did not."""
@@ -163,10 +167,13 @@ class PtyBoard:
         if allowed < 1:
             return
         try:
-            data = os.read(self._master, min(allowed, READ_MAX))
+            data = os.read(self._master, allowed)
         except (BlockingIOError, OSError):
+            self._in_pace.idle()
             return  # nothing there, or the host has just closed: the next look at the port tells
         self._in_pace.passed(len(data))
+        if len(data) < allowed:
+            self._in_pace.idle()
         self._core.receive(self._faults.carry(data), self._now_us())
 
     def _last_words(self) -> None:
@@ -178,6 +185,8 @@ class PtyBoard:
     def _write(self) -> None:
         self._out += self._faults.carry(self._core.bytes_to_send())
         allowed = min(self._out_pace.allowed(self._now_s()), len(self._out))
+        if not self._out:
+            self._out_pace.idle()
         if allowed < 1:
             return
         try:
