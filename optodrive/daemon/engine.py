@@ -4,6 +4,7 @@ Two threads. The engine's own loop talks to the board and renews its lease; it d
 works in the second thread, is idle or making progress. Callers on any thread get futures.
 """
 
+import sys
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
@@ -36,6 +37,7 @@ START_LEAD_S = 0.05
 """A plan starts so long after it is ready and the one before it has ended: its first points must be there in time."""
 PLANNER_STALL_S = 2.0
 """A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
+SWITCH_INTERVAL_S = 2e-4
 RECONNECT_S = 1.0
 COMMAND_TIMEOUT_S = 5.0
 RECORDS_KEPT = 200
@@ -90,6 +92,9 @@ class Engine:
 
     def start(self) -> None:
         """Connect to the board and start; raises InputError or LinkError where the board cannot be reached."""
+        # The loop gives the interpreter up at every read and write; while the planner computes it would wait for it
+        # 5 ms each time, and a few of those are a lease.
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
         self._session.connect()
         self._thread.start()
 

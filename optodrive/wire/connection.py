@@ -100,8 +100,13 @@ class HostConnection:
     def bytes_to_send(self, now_s: float, flight_bytes: int) -> bytes:
         """What may leave now, keeping at most flight_bytes of sequenced frames unacknowledged."""
         out, self._control = b"".join(self._control), []
-        if self.peer is None:
-            return out
+        if self.peer is not None:
+            out += self._sequenced(now_s, flight_bytes)
+        # A frame whose end was lost would swallow the next one, an ABORT perhaps: a delimiter first ends it.
+        return b"\0" + out if out else b""
+
+    def _sequenced(self, now_s: float, flight_bytes: int) -> bytes:
+        out = b""
         if self._unacked and (self._resend or now_s - self._sent_s > self._rto_s):
             out += b"".join(self._unacked)
             self._retransmitted += len(self._unacked)

@@ -207,7 +207,9 @@ def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host,
     host.wait(lambda: board.of("fault"), "the fault")
     (fault,) = board.of("fault")
     assert fault["fault"] == name.upper()
-    assert 5_000_000 <= fault["t_us"] <= 5_001_000
+    (change,) = board.of("input")
+    assert 5_000_000 <= change["t_us"] <= 5_050_000, "the process may be scheduled late, its board's times are exact"
+    assert 0 <= fault["t_us"] - change["t_us"] <= 1000
     assert board.of("gate")[-1]["on"] is False
     assert board.of("gate")[-1]["t_us"] <= fault["t_us"] + 1000
     host.wait(lambda: host.states()[-1] == "FAULT", "the event", lease=False)

@@ -341,6 +341,17 @@ def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
     assert hint("INTERLOCK") == rig.session.board.figures()["hint"]
 
 
+def test_nothing_more_of_a_job_is_sent_after_a_fault():
+    rig = Rig(BoardSettings(queue_points=60)).connect().arm()
+    rig.play(plan(400))
+    rig.until(lambda: len(rig.pulses()) > 20)
+    rig.core.set_input("estop", True, round(rig.clock.now_s() * 1e6))
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    rig.link.sent.clear()
+    rig.run(0.5)
+    assert m.Data.TYPE not in {frame.type for frame in rig.link.sent}
+
+
 def test_every_fault_of_the_board_has_a_hint_but_those_of_its_own_electronics():
     assert set(m.FAULTS) - set(HINTS) == {"", "TICK", "READBACK"}
     assert "no likely cause" in hint("TICK")

@@ -1,12 +1,15 @@
 """The board's states, jobs and reports, with the clock moved by hand."""
 
 import random
+import tomllib
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 from board_bench import CENTRE, Bench, here, naks
 
+from optodrive.simulator import core as core_module
 from optodrive.simulator.guards import DUTY_FULL, WINDOW_US, Guards, energy_uj
 from optodrive.simulator.limits import OWN
 from optodrive.wire import messages as m
@@ -34,6 +37,21 @@ def dim(count, on_us=1000, dark_us=9000):
 def walk(b):
     """States entered, with their reasons."""
     return [(entry["state"], entry["reason"]) for entry in b.of("state")]
+
+
+def test_the_timing_of_the_contract():
+    contract = Path(__file__).parents[3] / "firmware_protocol" / "messages.toml"
+    timing = tomllib.loads(contract.read_text())["timing"]
+    assert timing == {
+        "tick_hz": core_module.TICK_HZ,
+        "indicator_us": core_module.INDICATOR_US,
+        "arming_timeout_us": core_module.ARMING_TIMEOUT_US,
+        "hold_max_us": core_module.HOLD_MAX_US,
+        "underruns_max": core_module.UNDERRUNS_MAX,
+        "underrun_window_us": core_module.UNDERRUN_WINDOW_US,
+        "mean_window_us": WINDOW_US,
+        "executed_ring": core_module.RING_RECORDS,
+    }
 
 
 # --- arming ---------------------------------------------------------------------------------------------------------

@@ -155,6 +155,8 @@ def check_b4(make):
     splits = [
         [here(30_000), here(20_001)],
         [here(30_000), here(20_001, x=CENTRE + 300)],
+        [here(30_000, x=CENTRE + 649), here(20_001, x=CENTRE + 650)],
+        [here(30_000, x=CENTRE + 649, y=CENTRE - 651), here(20_001, x=CENTRE + 650, y=CENTRE - 650)],
         [here(30_000), here(20_001, dark_us=499)],
         [here(25_000, duty=6553), here(25_001, duty=6553)],
     ]
@@ -186,7 +188,12 @@ def b4_no_account_of_cells(patch):
 
 
 def b4_by_position_and_not_by_cell(patch):
-    patch.setattr(Guards, "cell", lambda self, x, y: (x, y))
+    patch.setattr(Guards, "cells", lambda self, x, y: [(0, x, y)])
+
+
+def b4_one_grid_whose_borders_hide(patch):
+    cells = Guards.cells
+    patch.setattr(Guards, "cells", lambda self, x, y: cells(self, x, y)[:1])
 
 
 # --- B5: duty at most max_duty; mean power over any second at most mean_duty ----------------------------------------
@@ -240,6 +247,11 @@ def check_b6(make):
     assert (b.fault, len(b.pulses)) == ("", 3), "another cell has its own bucket, and this one has leaked"
 
     b = make().ready()
+    b.play(here(45_000, x=CENTRE + 649), here(45_000, dark_us=1000, x=CENTRE + 650))
+    b.wait(100_000)
+    assert (b.fault, len(b.pulses)) == ("SPOT", 1), "a cell's border parts no spot"
+
+    b = make().ready()
     b.play(*[here(10_000, dark_us=9000, duty=65535)] * 24)
     b.wait(600_000)
     assert (b.fault, len(b.pulses)) == ("", 24), "24.5 mJ every 19 ms leak away at 26.6 mJ"
@@ -259,7 +271,12 @@ def b6_bucket_never_leaks(patch):
 
 
 def b6_one_bucket_for_all(patch):
-    patch.setattr(Guards, "cell", lambda self, x, y: (0, 0))
+    patch.setattr(Guards, "cells", lambda self, x, y: [(0, 0, 0)])
+
+
+def b6_one_grid_whose_borders_hide(patch):
+    cells = Guards.cells
+    patch.setattr(Guards, "cells", lambda self, x, y: cells(self, x, y)[:1])
 
 
 # --- B7: no gate until the host's settling and the board's own are over ---------------------------------------------

@@ -1,5 +1,6 @@
 """The Python messages against messages.toml, the vectors and the refused frames: three statements of one wire."""
 
+import re
 import struct
 import tomllib
 from dataclasses import fields
@@ -12,6 +13,7 @@ from optodrive.wire import cobs, connection
 from optodrive.wire import messages as m
 
 CONTRACT = Path(__file__).parents[3] / "firmware_protocol"
+PAGE = (CONTRACT / "PROTOCOL.md").read_text()
 TOML = tomllib.loads((CONTRACT / "messages.toml").read_text())
 STRUCTS = TOML["struct"]
 CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i16": "h", "bytes12": "12s"}
@@ -97,6 +99,40 @@ def test_enumerations_and_framing():
         connection.SEQ_MODULUS,
     )
     assert TOML["protocol"] == {"major": m.MAJOR, "minor": m.MINOR}
+
+
+def offsets(entries):
+    """(offset, type, name) of each field, as PROTOCOL.md writes them; a struct has no type there."""
+    at, placed = 0, []
+    for entry in entries:
+        placed.append((str(at), entry["type"].replace("bytes12", "u8[12]"), entry["name"]))
+        at += struct.calcsize("<" + codes([entry]))
+    return placed
+
+
+def written(text):
+    return re.findall(r"(\d+) (u8\[12\]|[ui]\d+) (\w+)", text)
+
+
+@pytest.mark.parametrize("name", STATED)
+def test_the_page_s_table_says_the_same(name):
+    row = re.search(rf"^\| (\w\w) \| {name} \| (S?) ?\| (.*) \|$", PAGE, re.MULTILINE)
+    assert row, "no row"
+    assert (int(row[1], 16), row[2] == "S") == (STATED[name]["id"], STATED[name]["sequenced"])
+    assert written(row[3]) == [place for place in offsets(STATED[name]["fields"]) if place[1] not in STRUCTS]
+
+
+@pytest.mark.parametrize("name", STRUCTS)
+def test_the_page_s_structs_say_the_same(name):
+    text = re.search(rf"^    {name}:(.*\n(?:     +.*\n)*)", PAGE, re.MULTILINE)
+    assert written(re.sub(r"\(.*?\)", "", text[1])) == offsets(STRUCTS[name])
+
+
+@pytest.mark.parametrize("name", ["nak_reason", "fault", "reason"])
+def test_the_page_s_numbers_say_the_same(name):
+    for number, word in enumerate(TOML["enumerations"][name]):
+        if word:
+            assert re.search(rf"\b{number}(?: \|)? {word}\b", PAGE), word
 
 
 # --- vectors --------------------------------------------------------------------------------------------------------
