@@ -129,8 +129,9 @@ class Engine:
             return
         busy = self._running is not None or self._waits or self._waiting
         self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner_alive())
-        self._settle_waits()
-        self._follow_job()
+        refusal = self._session.take_refusal()
+        self._settle_waits(refusal)
+        self._follow_job(refusal)
         self._start_next()
 
     def _obey(self) -> None:
@@ -154,7 +155,7 @@ class Engine:
         self._retry_at_s = self._clock.now_s() + RECONNECT_S
 
     def _reconnect(self) -> None:
-        self._settle_waits()
+        self._settle_waits(None)
         if self._clock.now_s() < self._retry_at_s:
             self._clock.sleep(IDLE_TURN_S)
             return
@@ -207,8 +208,8 @@ class Engine:
         if not self._session.connected:
             raise LinkError(self._link_error or "no link to the board")
 
-    def _settle_waits(self) -> None:
-        board, refusal = self._session.board, self._session.take_refusal()
+    def _settle_waits(self, refusal: str | None) -> None:
+        board = self._session.board
         for wait in list(self._waits):
             error: OptodriveError | None = None
             if not self._session.connected:
@@ -353,7 +354,7 @@ class Engine:
         record.status = "running"
         self._running = record, self._session.begin(record.points, record.start_s)
 
-    def _follow_job(self) -> None:
+    def _follow_job(self, refusal: str | None) -> None:
         board = self._session.board
         if board.state in ("FAULT", "DISARMED", "ARMING", "BOOT") and (self._running or self._waiting):
             why = f"{board.fault}: {hint(board.fault)}" if board.fault else self._session.last_reason
@@ -366,6 +367,9 @@ class Engine:
         record.sent, record.executed_count = job.sent_rows, job.executed_rows
         if job.finished:
             self._finish("done", None)
+        elif refusal is not None:
+            self._session.flush()
+            self._finish("failed", f"the board refused a part of it ({refusal})")
 
     def _finish(self, status: Status, error: str | None) -> None:
         """End the running plan: what was executed is taken over, a delay moves everything after it."""

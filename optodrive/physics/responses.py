@@ -52,8 +52,8 @@ def steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: float) -> 
         gas_peak(pixel, theta_k, gamma_k, power_w, width_s)[0],
         cooling_peak(pixel, *lit, gap_s)[0],
     )
-    # The equations are linear: the trough is the peak of the same motion upside down.
-    lowest_lit_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
-    lowest_dark_k = -gas_peak(pixel, -lit[0], -lit[1], 0.0, gap_s)[0]
+    # Gas in the dark has no trough but at its ends, which are the pulse's ends too. The equations are linear: the
+    # trough is the peak of the same motion upside down.
+    least_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
     mean_k = GAS_FRACTION * pixel.epsilon * pixel.r_k_per_w * power_w * width_s / period_s
-    return SteadyTrain(min(lowest_lit_k, lowest_dark_k), largest_k, mean_k)
+    return SteadyTrain(least_k, largest_k, mean_k)

@@ -151,9 +151,7 @@ class PtyBoard:
         hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
         if self._open and hung_up:
             self._last_words()
-            self._log({"t_us": self._now_us(), "event": "port", "open": False})
-            self._core.link_lost(self._now_us())
-            self._closed_since_s = self._now_s()
+            self._port_closed(self._now_us())
         elif not self._open and not hung_up:
             self._log({"t_us": self._now_us(), "event": "port", "open": True})
             self._was_open = True
@@ -161,6 +159,12 @@ class PtyBoard:
         closed_for_s = self._now_s() - self._closed_since_s
         if self._exit_closed_s is not None and self._was_open and not self._open and closed_for_s > self._exit_closed_s:
             self._running = False
+
+    def _port_closed(self, now_us: int) -> None:
+        self._log({"t_us": now_us, "event": "port", "open": False})
+        self._core.link_lost(now_us)
+        self._closed_since_s = self._now_s()
+        self._open = False
 
     def _read(self) -> None:
         allowed = self._in_pace.allowed(self._now_s())
@@ -209,9 +213,8 @@ class PtyBoard:
         elif step.name == "repair":
             self._faults.repair()
         elif step.name == "close":
-            self._core.link_lost(now_us)
+            self._port_closed(now_us)
             os.close(self._master)
-            self._open = False
             self._make_pty()
         else:
             self._faults.break_down(step.name, step.rate)

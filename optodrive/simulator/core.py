@@ -96,7 +96,7 @@ class BoardCore:
         self._hold_since_us = 0
         self._underruns: deque[int] = deque()
         self._underruns_total = 0
-        self._laser_on_us = 0
+        self._laser_on = 0
         self._key_turned = False
         self._version_fits = False
         self._ack_due = False
@@ -214,7 +214,7 @@ class BoardCore:
 
     def _record(self, point: Point, on_at_us: int, on_us: int) -> None:
         self._done_index = point.number + 1
-        self._laser_on_us += on_us * point.duty // 65535
+        self._laser_on += on_us * point.duty
         record = point.number, on_at_us - self._epoch_us, on_us, point.duty if on_us else 0
         self._records.append(record)
         self._unreported.append(record)
@@ -562,7 +562,7 @@ class BoardCore:
             format_errors=counters.format_errors & 0xFFFF,
             seq_errors=self._link.seq_errors & 0xFFFF,
             underruns=self._underruns_total & 0xFFFF,
-            laser_on_us=self._laser_on_us,
+            laser_on_us=self._laser_on // 65535,
             temperature_dc=250,
         )
 

@@ -51,7 +51,7 @@ class Host:
         while not condition():
             assert time.monotonic() < until, f"waited in vain for {what}"
             if lease and self.session:
-                self.say(m.Lease(100))
+                self.say(m.Lease(60_000))
             self.hear()
 
     def of(self, kind):
@@ -201,7 +201,9 @@ def test_the_session_works_over_the_real_port(board):
 
 @pytest.mark.parametrize(("name", "unsafe"), [("interlock", "false"), ("estop", "true")])
 def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host, name, unsafe):
-    board = make_board(script=f'[[step]]\nat_s = 5.0\nset = "{name}"\nvalue = {unsafe}\n')
+    # A long lease: this test's own loop may be scheduled late, and only the input is to end the job.
+    script = f'[[step]]\nat_s = 5.0\nset = "{name}"\nvalue = {unsafe}\n'
+    board = make_board(script=script, limits="lease_ms = 2000\n")
     host = open_host(board).hello().arm()
     host.play(points(600, on_us=8000))
     host.wait(lambda: board.of("fault"), "the fault")
