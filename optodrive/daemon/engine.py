@@ -6,30 +6,27 @@ works in the second thread, is idle or making progress. Callers on any thread ge
 
 import sys
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import count
 from queue import Empty, SimpleQueue
-from typing import Any
 
 from optodrive.board.faults import hint
 from optodrive.board.job import Job
 from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
 from optodrive.clock import Clock
-from optodrive.daemon.plans import PlanRecord, Status
+from optodrive.daemon.plans import PlanBook, PlanRecord, Status
 from optodrive.daemon.thermal import Thermal, heated
-from optodrive.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError
+from optodrive.daemon.waits import Answer, Waits
+from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, ExecutedPulses, FrameSequence
 from optodrive.limit.limiter import Policy, fired, verify
 from optodrive.physics.array import pulse_peaks
 from optodrive.pipeline import Display, prepare
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
-
-Answer = dict[str, Any]
 
 TURN_S = 0.002
 IDLE_TURN_S = 0.01
@@ -39,22 +36,8 @@ PLANNER_STALL_S = 2.0
 """A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
 SWITCH_INTERVAL_S = 2e-4
 RECONNECT_S = 1.0
-COMMAND_TIMEOUT_S = 5.0
-RECORDS_KEPT = 200
-PULSES_KEPT = 1_000_000
-"""Ended plans are forgotten, the oldest first, beyond so many plans or pulses."""
 QUEUE_MAX = 50
 DELAY_NOTICED_S = 1e-5
-
-
-@dataclass
-class _Wait:
-    """A caller waiting for the board to reach one of some states."""
-
-    states: tuple[str, ...]
-    what: str
-    until_s: float
-    future: "Future[Answer]"
 
 
 class Engine:
@@ -70,11 +53,11 @@ class Engine:
         self._clock = clock
         self._session = Session(transport, clock, Requirements.of(display.config))
         self._thermal = Thermal(*display.at_rest())
-        self._records: OrderedDict[str, PlanRecord] = OrderedDict()
+        self._book = PlanBook()
         self._waiting: deque[PlanRecord] = deque()
         self._running: tuple[PlanRecord, Job] | None = None
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._waits: list[_Wait] = []
+        self._waits = Waits()
         self._ids = count(1)
         self._lock = threading.RLock()
         self._closing = threading.Event()
@@ -199,7 +182,7 @@ class Engine:
                 return
             if what != "arm":
                 self._fail_all(f"ended by {what}")
-            self._waits.append(_Wait(states, what, self._clock.now_s() + COMMAND_TIMEOUT_S, future))
+            self._waits.add(states, what, self._clock.now_s(), future)
 
         self._commands.put(obey)
         return future
@@ -209,25 +192,7 @@ class Engine:
             raise LinkError(self._link_error or "no link to the board")
 
     def _settle_waits(self, refusal: str | None) -> None:
-        board = self._session.board
-        for wait in list(self._waits):
-            error: OptodriveError | None = None
-            if not self._session.connected:
-                error = LinkError(self._link_error or "no link to the board")
-            elif refusal is not None:
-                error = NotReadyError(f"the board refuses to {wait.what}: {refusal}")
-            elif board.state in wait.states and self._session.quiet:
-                wait.future.set_result(self.snapshot())
-            elif board.state == "FAULT" and wait.what == "arm":
-                error = BoardFaultError(f"the board is in FAULT {board.fault}: {hint(board.fault)}")
-            elif self._clock.now_s() > wait.until_s:
-                error = NotReadyError(
-                    f"the board did not {wait.what} within {COMMAND_TIMEOUT_S:g} s: it is {board.state}"
-                )
-            if error is not None:
-                wait.future.set_exception(error)
-            if wait.future.done():
-                self._waits.remove(wait)
+        self._waits.settle(self._session, refusal, self._link_error, self._clock.now_s(), self.snapshot)
 
     # --- plans --------------------------------------------------------------------------------------------------
 
@@ -287,7 +252,7 @@ class Engine:
             self._thermal = Thermal.after_plan(prepared.heat, prepared.budget, record.start_s)
             self._queue_end_s = record.start_s + prepared.duration_s
             self._totals["planned"] += len(prepared.plan)
-            self._remember(record)
+            self._book.add(record)
             record.status = "queued"
             self._waiting.append(record)
         return record.answer(self._session.board_s())
@@ -302,25 +267,9 @@ class Engine:
         pixel = plan.pixel[points.row[decoded.index]].tolist()
         verify(pixel, decoded.start_s, decoded.width_s, decoded.power_w, budget, self.display.budget)
 
-    def _remember(self, record: PlanRecord) -> None:
-        self._records[record.plan_id] = record
-        pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
-        for plan_id, oldest in list(self._records.items()):
-            if not oldest.ended or (len(self._records) <= RECORDS_KEPT and pulses <= PULSES_KEPT):
-                break
-            del self._records[plan_id]
-            pulses -= len(oldest.prepared.plan)
-
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
         """A plan by its id; InputError (no_plan) where there is none."""
-        return self._record(plan_id).answer(self._session.board_s(), pulses)
-
-    def _record(self, plan_id: str) -> PlanRecord:
-        with self._lock:
-            record = self._records.get(plan_id)
-        if record is None:
-            raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
-        return record
+        return self._book.find(plan_id).answer(self._session.board_s(), pulses)
 
     def cancel(self, plan_id: str) -> "Future[Answer]":
         """Take a plan out of the queue, or end it dark; the board stays armed."""
@@ -328,7 +277,7 @@ class Engine:
 
         def obey() -> None:
             try:
-                record = self._record(plan_id)
+                record = self._book.find(plan_id)
                 if record in self._waiting:
                     self._waiting.remove(record)
                     record.end("cancelled", "taken out of the queue")
@@ -434,8 +383,6 @@ class Engine:
     def snapshot(self) -> Answer:
         """Everything GET /v1/state answers."""
         running = self._running
-        with self._lock:
-            recent = list(self._records.values())[-20:]
         return {
             "display": self.display.config.name,
             "pixels": len(self.display.layout),
@@ -449,7 +396,9 @@ class Engine:
             "queue": {
                 "waiting": len(self._waiting),
                 "running": None if running is None else running[0].plan_id,
-                "plans": [{"plan": item.plan_id, "name": item.name, "status": item.status} for item in recent],
+                "plans": [
+                    {"plan": item.plan_id, "name": item.name, "status": item.status} for item in self._book.recent()
+                ],
             },
             "totals": dict(self._totals),
             "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},

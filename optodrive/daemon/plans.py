@@ -1,16 +1,23 @@
 """A submitted plan through its life: queued, running, then done, failed or cancelled."""
 
+import threading
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
+from optodrive.errors import InputError
 from optodrive.flow import BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
 from optodrive.units import m_to_um
 from optodrive.wire.quantise import WirePoints
+
+RECORDS_KEPT = 200
+PULSES_KEPT = 1_000_000
+"""Ended plans are forgotten beyond so many plans or pulses."""
+RECENT = 20
 
 Status = Literal["planned", "queued", "running", "done", "failed", "cancelled"]
 
@@ -101,3 +108,35 @@ class PlanRecord:
             "pixel": executed.pixel.tolist(),
             "simulated_um": [] if self.simulated_m is None else m_to_um(self.simulated_m).tolist(),
         }
+
+
+class PlanBook:
+    """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._records: dict[str, PlanRecord] = {}
+
+    def add(self, record: PlanRecord) -> None:
+        """Keep a plan."""
+        with self._lock:
+            self._records[record.plan_id] = record
+            pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
+            for plan_id, oldest in list(self._records.items()):
+                if not oldest.ended or (len(self._records) <= RECORDS_KEPT and pulses <= PULSES_KEPT):
+                    break
+                del self._records[plan_id]
+                pulses -= len(oldest.prepared.plan)
+
+    def find(self, plan_id: str) -> PlanRecord:
+        """A plan by its id; InputError (no_plan) where there is none."""
+        with self._lock:
+            record = self._records.get(plan_id)
+        if record is None:
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
+        return record
+
+    def recent(self) -> list[PlanRecord]:
+        """The latest plans, oldest first."""
+        with self._lock:
+            return list(self._records.values())[-RECENT:]
