@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -61,7 +61,10 @@ class Bridge(_Units):
 
 
 class ParameterSet(_Units):
-    """A named set of pixel parameters; `claims` says what it stands for and what it does not."""
+    """A named set of pixel parameters; `claims` says what it stands for and what it does not.
+
+    terms: what is added to the nominal pixel, by the keys of `optodrive.physics.terms`, and each term's parameters.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     format: Literal["optodrive-parameters"]
@@ -75,6 +78,7 @@ class ParameterSet(_Units):
     R_width_product: Parameter
     C_mean: Parameter
     bridge: tuple[Bridge, ...]
+    terms: dict[str, dict[str, Parameter]] = {}
 
     def pixel(self, bridge_width_m: float) -> Pixel:
         """The pixel of a bridge width: its row of Table S3, or R = a / w and the mean C between rows."""
@@ -126,12 +130,23 @@ def load_parameters(name: str | Path) -> ParameterSet:
         if str(name) not in known:
             raise InputError("pixel_model.parameters", str(name), "a .toml file, or " + ", ".join(known))
         path = shipped_path("parameters", f"{name}.toml")
-    table = read_toml(path)
-    check_format(path, table, FORMAT, VERSION)
+    table = _with_base(path, read_toml(path))
     try:
         return ParameterSet.model_validate(table)
     except ValidationError as error:
         raise input_error(error, str(path), ParameterSet) from None
+
+
+def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
+    """A set that names a base is the base with the set's own entries over it."""
+    check_format(path, table, FORMAT, VERSION)
+    base = table.pop("base", None)
+    if base is None:
+        return table
+    below = shipped_path("parameters", f"{base}.toml")
+    if not below.is_file():
+        raise InputError(f"{path}: base", base, "the name of a shipped parameter set")
+    return _with_base(below, read_toml(below)) | table
 
 
 def display_pixels(config: Config) -> PixelArray:
