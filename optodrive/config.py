@@ -13,14 +13,14 @@ from optodrive.errors import InputError, nearest
 from optodrive.flow import FloatArray, IntArray, freeze_arrays
 
 FORMAT = "optodrive-config"
-VERSION = 1
+VERSION = 2
 DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time one point of the wire protocol can carry (16 bit, microseconds)."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
-Fraction = Annotated[float, Field(gt=0, le=1)]
+HalfWidth = Annotated[float, Field(ge=0, le=0.5)]
 
 
 class Section(BaseModel):
@@ -76,15 +76,35 @@ class ScannerSection(Section):
     slew_rad_per_s: Positive
 
 
-class LimitsSection(Section):
-    """Caps that no plan passes.
+class UncertaintySection(Section):
+    """Declared half-widths of the model's parameters, relative; exponent: absolute. The limiter counts them in full."""
 
+    absorbed_power: HalfWidth = 0.02
+    bridge_resistance: HalfWidth = 0.015
+    absorber_capacity: HalfWidth = 0.05
+    exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
+    gas_lag: HalfWidth = 0.25
+    wall_resistance: HalfWidth = 0.02
+    wall_capacity: HalfWidth = 0.1
+    side_resistance: HalfWidth = 0.1
+    touch_share: HalfWidth = 0.02
+    touch_lag: HalfWidth = 0.05
+
+
+class LimitsSection(Section):
+    """Caps that no sequence of plans passes.
+
+    absorber_max_c, wall_max_c, touch_max_c: temperatures anywhere on the display, wall and touch surface as far as
+    the parameter set has them. galvo_acceleration_rms_max_rad_per_s2: of either mirror, mean over galvo_mean_s.
     pulse_energy_max_j caps a pulse, and what several pulses leave in a pixel's bucket, which leaks at
     pixel_mean_power_max_w. Pulses on a pixel closer than pulse_rest_min_s count as one against pulse_width_max_s.
-    absorbed_power_margin: declared uncertainty of the absorbed power, counted in full.
     """
 
     absorber_max_c: float
+    wall_max_c: float
+    touch_max_c: float
+    galvo_acceleration_rms_max_rad_per_s2: Positive
+    galvo_mean_s: Positive
     pulse_energy_max_j: Positive
     pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
     pulse_rest_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
@@ -92,7 +112,7 @@ class LimitsSection(Section):
     pixel_mean_window_s: Positive
     display_mean_power_max_w: Positive
     display_mean_window_s: Positive
-    absorbed_power_margin: Annotated[float, Field(ge=0, le=1)]
+    uncertainty: UncertaintySection = UncertaintySection()
 
 
 class BoardSection(Section):
@@ -124,7 +144,7 @@ class Config(Section):
     """The whole configuration of one display."""
 
     format: Literal["optodrive-config"]
-    version: Literal[1]
+    version: Literal[2]
     name: str
     ambient_c: Annotated[float, Field(ge=-20, le=60)]
     display: DisplaySection
@@ -138,8 +158,13 @@ class Config(Section):
     @model_validator(mode="after")
     def _limits_do_not_cross(self) -> Self:
         limits, laser = self.limits, self.laser
-        if limits.absorber_max_c <= self.ambient_c:
-            raise ValueError(f"limits.absorber_max_c {limits.absorber_max_c} must lie above ambient_c {self.ambient_c}")
+        for key in ("absorber_max_c", "wall_max_c", "touch_max_c"):
+            if getattr(limits, key) <= self.ambient_c:
+                raise ValueError(f"limits.{key} {getattr(limits, key)} must lie above ambient_c {self.ambient_c}")
+        if limits.wall_max_c > limits.absorber_max_c:
+            raise ValueError(
+                f"limits.wall_max_c {limits.wall_max_c} must not exceed limits.absorber_max_c {limits.absorber_max_c}"
+            )
         if limits.pulse_width_max_s < 1.0 / laser.pwm_hz:
             raise ValueError(
                 f"limits.pulse_width_max_s {limits.pulse_width_max_s} must hold one PWM period, {1 / laser.pwm_hz}"

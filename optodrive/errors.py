@@ -30,6 +30,22 @@ class RefusedError(OptodriveError):
     code = "refused"
 
 
+class OverBudgetError(RefusedError):
+    """A pulse that a cap does not allow. cap: the limiter's word for it; margin_j: energy too much.
+
+    earliest_s: how much later the whole would fit; infinite where it never does.
+    """
+
+    code = "over_budget"
+
+    def __init__(self, message: str, pixel: int, cap: str, margin_j: float, earliest_s: float) -> None:
+        self.pixel = pixel
+        self.cap = cap
+        self.margin_j = margin_j
+        self.earliest_s = earliest_s
+        super().__init__(message)
+
+
 class NotReadyError(OptodriveError):
     """The board is not in a state in which this may be done (not armed, busy, faulted)."""
 

@@ -137,21 +137,31 @@ class BudgetState:
     """What the limiter remembers between plans; pulses passed count as fired until shown otherwise.
 
     at_s: the time up to which the plan reached, on the budget's time line
-    rise_k: [p] upper bound on each absorber's rise at at_s
-    spot_j: [p] each pixel's leaky bucket of energy at at_s
-    on_s, dark_since_s: [p] light without a rest so far, and when it ended
+    dark_since_s: [p] end of each pixel's last pulse; rise_k, spot_j, on_s: [p] then: bound on the absorber's rise over
+    its wall, leaky bucket of energy, light without a rest
+    wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]; inflow_w: [p] what neighbours send a
+    wall at most, as of exchanged_at_s
+    mirror_rad: [2] where the mirrors stand; acceleration2: [2] their mean-square acceleration, rad²/s⁴, at mirror_at_s
     recent_*: [r] pulses still inside a sliding window: start_s, width_s, power_w, pixel
     """
 
     at_s: float
+    dark_since_s: FloatArray
     rise_k: FloatArray
     spot_j: FloatArray
     on_s: FloatArray
-    dark_since_s: FloatArray
-    recent_start_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    recent_width_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    recent_power_w: FloatArray = field(default_factory=lambda: np.zeros(0))
-    recent_pixel: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    wall_k: FloatArray
+    touch_k: FloatArray
+    nodes_at_s: FloatArray
+    inflow_w: FloatArray
+    exchanged_at_s: float
+    mirror_rad: FloatArray
+    acceleration2: FloatArray
+    mirror_at_s: float
+    recent_start_s: FloatArray
+    recent_width_s: FloatArray
+    recent_power_w: FloatArray
+    recent_pixel: IntArray
 
     def __post_init__(self) -> None:
         freeze_arrays(self)

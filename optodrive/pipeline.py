@@ -4,21 +4,23 @@ The engine, `optodrive plan` and `optodrive simulate` all come through here.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import ceil, inf
 
 import numpy as np
 
 from optodrive.config import Config, PixelLayout, pixel_layout
-from optodrive.errors import InputError, RefusedError
-from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan
+from optodrive.errors import InputError, OverBudgetError, RefusedError
+from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain
+from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
-from optodrive.limit.limiter import Policy, fresh_state, joined, limit
-from optodrive.physics.array import DisplayHeat, pulse_peaks
-from optodrive.physics.parameters import PixelArray, display_pixels
+from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
+from optodrive.physics.array import DisplayHeat
+from optodrive.physics.parameters import PixelArray, display_pixels, load_parameters
 from optodrive.plan.drive import DriveRange, reach_m
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
-from optodrive.plan.scheduler import Machine, Scheduler, Skipped
+from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
 
 Progress = Callable[[float], None]
@@ -47,18 +49,7 @@ class Display:
             moves=MoveModel(scanner.settle_s, scanner.slew_rad_per_s),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
         )
-        budget = Budget(
-            gain_k_per_w=pixels.epsilon * (1.0 + limits.absorbed_power_margin) * pixels.r_k_per_w,
-            tau_s=pixels.r_k_per_w * pixels.c_j_per_k,
-            rise_cap_k=limits.absorber_max_c - config.ambient_c,
-            pulse_energy_max_j=limits.pulse_energy_max_j,
-            pulse_width_max_s=limits.pulse_width_max_s,
-            pulse_rest_min_s=limits.pulse_rest_min_s,
-            pixel_mean_power_max_w=limits.pixel_mean_power_max_w,
-            pixel_mean_window_s=limits.pixel_mean_window_s,
-            display_mean_power_max_w=limits.display_mean_power_max_w,
-            display_mean_window_s=limits.display_mean_window_s,
-        )
+        budget = budget_of(config, load_parameters(config.pixel_model.parameters), pixels)
         return cls(config, layout, pixels, machine, budget)
 
     @property
@@ -89,11 +80,32 @@ class FrameTiming:
         return max(0.0, self.finished_s - self.due_s)
 
 
+@dataclass(frozen=True)
+class Shortfall:
+    """The first pulse that a cap cut, margin_j too much; fits_later_s: how much later its whole piece would fit."""
+
+    pixel: int
+    cap: str
+    margin_j: float
+    fits_later_s: float
+
+
+@dataclass(frozen=True)
+class Delay:
+    """How long a frame or train was made to wait for a cap, and for which pixel first."""
+
+    source: int
+    pixel: int
+    cap: str
+    wait_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class Prepared:
     """A limited plan and what is known about it before it runs. heat, budget: after the plan, on its time line.
 
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
+    shortfall: under "trim", None where nothing was; delays: under "delay"
     """
 
     sequence: FrameSequence
@@ -102,6 +114,8 @@ class Prepared:
     lead_s: float
     skipped: tuple[Skipped, ...]
     frames: tuple[FrameTiming, ...]
+    shortfall: Shortfall | None
+    delays: tuple[Delay, ...]
     heat: DisplayHeat
     budget: BudgetState
 
@@ -115,6 +129,20 @@ class Prepared:
         """The most by which a pulse of a train comes after its nominal time, s."""
         late = (self.plan.start_s - self.plan.nominal_s)[self.plan.source >= len(self.sequence.frames)]
         return float(late.max()) if len(late) else 0.0
+
+
+def chosen(policy: Policy, strict: bool) -> Policy:
+    """`strict` is another word for policy "refuse"; InputError where both say different things."""
+    if strict and policy == "delay":
+        raise InputError("strict", True, "either strict or policy 'delay'")
+    return "refuse" if strict else policy
+
+
+def warm_up(display: Display) -> None:
+    """Plan one pulse for nobody, so that every kernel is compiled and loaded."""
+    laser = display.config.laser
+    pulse = PulseTrain(0, 0.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
+    prepare(display, FrameSequence(trains=(pulse,)), *display.at_rest())
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
@@ -147,21 +175,38 @@ def prepare(
 ) -> Prepared:
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
 
-    Raises InputError for a target out of reach, RefusedError under policy "refuse" where a cap or a deadline is missed.
+    Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
+    frame as a whole. Raises InputError for a target out of reach, RefusedError for what no policy lets pass: under
+    "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
     """
     check_reach(display, sequence)
-    scheduler = Scheduler(display.machine, sequence)
-    working = heat.copy()
-    pieces: list[LimitedPlan] = []
-    for piece in scheduler.pieces(working):
-        limited, budget = limit(piece, budget, display.budget, policy)
-        _heat_by(working, limited)
-        pieces.append(limited)
+    scheduler = Scheduler(display.machine, sequence, train_piece=1 if policy == "delay" else TRAIN_PIECE)
+    working, state = heat.copy(), budget
+    limited: list[LimitedPlan] = []
+    delays: list[Delay] = []
+    shortfall: Shortfall | None = None
+    pieces = scheduler.pieces(working)
+    piece = next(pieces, None)
+    while piece is not None:
+        try:
+            passed, after = limit(piece, state, display.budget, policy)
+        except OverBudgetError as error:
+            if policy != "delay" or error.earliest_s == inf:
+                raise
+            delays.append(Delay(int(piece.source[0]), error.pixel, error.cap, error.earliest_s))
+            piece = pieces.send(ceil(error.earliest_s * 1e6))
+            continue
+        if shortfall is None and passed.trimmed_j.any():
+            shortfall = _shortfall(piece, passed, state, display.budget)
+        state = after
+        working.pulses(passed.pixel, passed.start_s, passed.width_s, passed.power_w)
+        limited.append(passed)
         if progress is not None:
-            progress(_share_done(sequence, limited))
-    plan = joined(pieces, budget, display.budget)
-    after = heat.copy()
-    predicted_m = pulse_peaks(after, plan.pixel, plan.start_s, plan.width_s, plan.power_w)
+            progress(_share_done(sequence, passed))
+        piece = next(pieces, None)
+    plan = joined(limited, state, display.budget)
+    after_heat = heat.copy()
+    predicted_m = after_heat.pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w).displacement_m
     lead_s = scheduler.lead_us * 1e-6
     prepared = Prepared(
         sequence=sequence,
@@ -170,18 +215,34 @@ def prepare(
         lead_s=lead_s,
         skipped=tuple(scheduler.skipped),
         frames=_frame_timings(sequence, plan, lead_s),
-        heat=after,
-        budget=budget,
+        shortfall=shortfall,
+        delays=_merged(delays),
+        heat=after_heat,
+        budget=state,
     )
     if policy == "refuse":
         _refuse_late(prepared)
     return prepared
 
 
-def _heat_by(heat: DisplayHeat, plan: PulsePlan) -> None:
-    rows = zip(plan.pixel.tolist(), plan.start_s.tolist(), plan.width_s.tolist(), plan.power_w.tolist(), strict=True)
-    for pixel, start_s, width_s, power_w in rows:
-        heat.pulse(pixel, start_s, width_s, power_w)
+def _shortfall(piece: PulsePlan, passed: LimitedPlan, state: BudgetState, budget: Budget) -> Shortfall:
+    row = int(np.flatnonzero(passed.reason != "")[0])
+    return Shortfall(
+        pixel=int(piece.pixel[row]),
+        cap=str(passed.reason[row]),
+        margin_j=float(passed.trimmed_j[row]),
+        fits_later_s=wait_s(piece, state, budget),
+    )
+
+
+def _merged(delays: list[Delay]) -> tuple[Delay, ...]:
+    """One entry for each source and cap, in order of their first wait."""
+    merged: dict[tuple[int, str], Delay] = {}
+    for delay in delays:
+        key = delay.source, delay.cap
+        before = merged.get(key, replace(delay, wait_s=0.0))
+        merged[key] = replace(before, wait_s=before.wait_s + delay.wait_s)
+    return tuple(merged.values())
 
 
 def _share_done(sequence: FrameSequence, piece: PulsePlan) -> float:

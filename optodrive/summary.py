@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from optodrive.files import written_whole
-from optodrive.pipeline import Display, Prepared, lateness
+from optodrive.pipeline import Display, Prepared, Shortfall, lateness
 from optodrive.units import m_to_um
 
 PULSES_LISTED_MAX = 20_000
@@ -33,6 +33,16 @@ def summary(prepared: Prepared) -> dict[str, Any]:
         "asked_max_um": m_to_um(float(asked_m.max())) if len(plan) else 0.0,
         "headroom_min_k": float(plan.headroom_k.min()),
         "trimmed": _trimmed(prepared),
+        "shortfall": _shortfall(prepared.shortfall),
+        "delays": [
+            {
+                "source": _source(prepared, item.source),
+                "pixel": item.pixel,
+                "cap": item.cap,
+                "wait_s": item.wait_s,
+            }
+            for item in prepared.delays
+        ],
         "skipped": [
             {
                 "frame": prepared.sequence.frames[item.source].frame_id,
@@ -58,6 +68,17 @@ def summary(prepared: Prepared) -> dict[str, Any]:
         "late": [lateness(timing) for timing in prepared.frames if timing.late_s > 0],
         "train_late_s": prepared.train_late_s,
     }
+
+
+def _shortfall(shortfall: Shortfall | None) -> dict[str, Any] | None:
+    if shortfall is None:
+        return None
+    return vars(shortfall) | {"fits_later_s": _finite(shortfall.fits_later_s)}
+
+
+def _source(prepared: Prepared, source: int) -> str:
+    frames = prepared.sequence.frames
+    return f"frame {frames[source].frame_id}" if source < len(frames) else f"train {source - len(frames)}"
 
 
 def _trimmed(prepared: Prepared) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from optodrive.config import load_config
 from optodrive.frames.patterns import build_pattern
-from optodrive.physics.array import DisplayHeat, pulse_peaks
+from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Display, prepare
 from optodrive.simulator.run import execute
 from optodrive.simulator.truth import trace
@@ -74,7 +74,7 @@ def main():
     executed = execute(display, prepared)
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     peaks_um = np.zeros(len(display.layout))
-    np.maximum.at(peaks_um, executed.pixel, 1e6 * pulse_peaks(DisplayHeat(display.pixels), *columns))
+    np.maximum.at(peaks_um, executed.pixel, 1e6 * DisplayHeat(display.pixels).pulses(*columns).displacement_m)
     shown = int(executed.pixel[0])
     own = executed.pixel == shown
     image = Image.new("RGB", (2 * MARGIN + 21 * SCALE + 560, 2 * MARGIN + 21 * SCALE + 24), DARK)

@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -13,7 +13,11 @@ ConfigOption = Annotated[
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else on stdout.")]
 UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens.")]
-StrictOption = Annotated[bool, typer.Option("--strict", help="Refuse what would be trimmed or late.")]
+StrictOption = Annotated[bool, typer.Option("--strict", help="The same as --policy refuse.")]
+PolicyOption = Annotated[
+    Literal["trim", "delay", "refuse"],
+    typer.Option("--policy", help="What becomes of a frame that a cap does not allow as it is."),
+]
 DEFAULT_URL = "http://127.0.0.1:8450"
 
 
@@ -55,8 +59,10 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     if trimmed["pulses"]:
         reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed["by_reason"].items())
         lines.append(f"trimmed          {trimmed['pulses']} pulses, {trimmed['energy_j'] * 1e3:.2f} mJ: {reasons}")
+        lines.append(f"                 {_shortfall(summary['shortfall'])}")
     else:
         lines.append("trimmed          nothing")
+    lines += [f"waited           {_waited(delay)}" for delay in summary["delays"]]
     lines += [f"late             {sentence}" for sentence in summary["late"][:5]]
     if len(summary["late"]) > 5:
         lines.append(f"late             and {len(summary['late']) - 5} more frames")
@@ -67,3 +73,13 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     if summary["skipped"]:
         lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
     return lines
+
+
+def _shortfall(shortfall: dict[str, Any]) -> str:
+    later_s = shortfall["fits_later_s"]
+    fits = "at no later time" if later_s is None else f"{later_s:.3f} s later"
+    return f"first pixel {shortfall['pixel']}, {shortfall['margin_j'] * 1e3:.2f} mJ too much; all of it fits {fits}"
+
+
+def _waited(delay: dict[str, Any]) -> str:
+    return f"{delay['wait_s']:.3f} s in {delay['source']}, first for pixel {delay['pixel']}: {delay['cap']}"

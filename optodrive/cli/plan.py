@@ -5,7 +5,15 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, StrictOption, print_json, progress, report_lines
+from optodrive.cli.options import (
+    ConfigOption,
+    JsonOption,
+    PolicyOption,
+    StrictOption,
+    print_json,
+    progress,
+    report_lines,
+)
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
 
@@ -20,18 +28,19 @@ def plan(
     out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row a pulse.")] = None,
     config: ConfigOption = None,
     strict: StrictOption = False,
+    policy: PolicyOption = "trim",
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames: pulses, beam-on share, duration, what was trimmed and why, predicted displacement."""
     from optodrive.config import load_config
     from optodrive.frames.files import load_sequence
-    from optodrive.pipeline import Display, prepare
+    from optodrive.pipeline import Display, chosen, prepare
     from optodrive.summary import summary, write_plan_csv
 
     display = Display.of(load_config(config))
     sequence = load_sequence(frames, display.config)
     with progress("planning") as done:
-        prepared = prepare(display, sequence, *display.at_rest(), "refuse" if strict else "trim", done)
+        prepared = prepare(display, sequence, *display.at_rest(), chosen(policy, strict), done)
     if out is not None:
         write_plan_csv(out, prepared, display)
     figures = summary(prepared)

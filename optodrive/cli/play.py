@@ -10,6 +10,7 @@ import typer
 from optodrive.cli.options import (
     DEFAULT_URL,
     JsonOption,
+    PolicyOption,
     StrictOption,
     UrlOption,
     print_json,
@@ -38,6 +39,7 @@ def push(
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
+    policy: PolicyOption = "trim",
     wait: WaitOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -49,7 +51,7 @@ def push(
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
     remote = Remote(url)
-    query = {"dry_run": dry_run, "strict": strict}
+    query = {"dry_run": dry_run, "strict": strict, "policy": policy}
     answer = remote.call("POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"})
     _follow(remote, answer, wait, json)
 
@@ -60,6 +62,7 @@ def play(
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
+    policy: PolicyOption = "trim",
     wait: WaitOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -68,7 +71,9 @@ def play(
 
     given = _parameters(pattern, values or [])
     remote = Remote(url)
-    answer = remote.call("POST", f"/v1/patterns/{pattern}", json=given, params={"dry_run": dry_run, "strict": strict})
+    answer = remote.call(
+        "POST", f"/v1/patterns/{pattern}", json=given, params={"dry_run": dry_run, "strict": strict, "policy": policy}
+    )
     _follow(remote, answer, wait, json)
 
 

@@ -104,12 +104,12 @@ def _write(
 def _report(
     display: "Display", prepared: "Prepared", executed: "ExecutedPulses", traced: "PixelTrace"
 ) -> dict[str, Any]:
-    from optodrive.physics.array import DisplayHeat, pulse_peaks
+    from optodrive.physics.array import DisplayHeat
     from optodrive.summary import pulse_columns, summary
     from optodrive.units import m_to_um
 
-    heat = DisplayHeat(display.pixels)
-    simulated_m = pulse_peaks(heat, executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    simulated_m = DisplayHeat(display.pixels).pulses(*columns).displacement_m
     return {
         "summary": summary(prepared),
         "planned": len(prepared.plan),

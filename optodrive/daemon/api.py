@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 from concurrent.futures import Future
+from math import inf
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request
@@ -21,11 +22,14 @@ from optodrive.errors import (
     LinkError,
     NotReadyError,
     OptodriveError,
+    OverBudgetError,
     RefusedError,
     abbreviate,
 )
 from optodrive.frames.files import parse_json, parse_sequence
 from optodrive.frames.patterns import build_pattern, describe_patterns
+from optodrive.limit.limiter import Policy
+from optodrive.pipeline import chosen
 
 Answer = dict[str, Any]
 STATUS: tuple[tuple[type[OptodriveError], int], ...] = (
@@ -50,7 +54,8 @@ ERRORS: dict[int | str, dict[str, Any]] = {
 }
 PlanId = Annotated[str, Path(max_length=40)]
 DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")]
-Strict = Annotated[bool, Query(description="refuse what would be trimmed or late")]
+Strict = Annotated[bool, Query(description="the same as policy=refuse")]
+PolicyQuery = Annotated[Policy, Query(description="what becomes of a frame that a cap does not allow as it is")]
 
 
 def make_app(engine: Engine, token: str) -> FastAPI:
@@ -94,11 +99,13 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         return await _result(engine.stop())
 
     @app.post("/v1/plans", status_code=201, openapi_extra=_json_body("FRAMES.json: frames and trains"))
-    async def push(request: Request, dry_run: DryRun = False, strict: Strict = False) -> Answer:
+    async def push(
+        request: Request, dry_run: DryRun = False, strict: Strict = False, policy: PolicyQuery = "trim"
+    ) -> Answer:
         """Plan frames and trains, and show them."""
         body = await request.body()
         return await _result(
-            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, strict)
+            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, chosen(policy, strict))
         )
 
     @app.get("/v1/plans/{plan_id}")
@@ -118,14 +125,19 @@ def make_app(engine: Engine, token: str) -> FastAPI:
 
     @app.post("/v1/patterns/{name}", status_code=201, openapi_extra=_json_body("the pattern's parameters"))
     async def play(
-        name: Annotated[str, Path(max_length=80)], request: Request, dry_run: DryRun = False, strict: Strict = False
+        name: Annotated[str, Path(max_length=80)],
+        request: Request,
+        dry_run: DryRun = False,
+        strict: Strict = False,
+        policy: PolicyQuery = "trim",
     ) -> Answer:
         """Build a named pattern, plan it, show it."""
         body = await request.body()
         given = parse_json(body, "body") if body.strip() else {}
         if not isinstance(given, dict):
             raise InputError("body", given, "an object of the pattern's parameters")
-        return await _result(engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, strict))
+        policy = chosen(policy, strict)
+        return await _result(engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy))
 
     return app
 
@@ -156,6 +168,9 @@ def _add_error_answers(app: FastAPI) -> None:
         more: dict[str, object] = {}
         if isinstance(error, InputError):
             more = {"where": error.where, "value": abbreviate(error.value), "expected": error.expected}
+        if isinstance(error, OverBudgetError):
+            later_s = error.earliest_s if error.earliest_s < inf else None
+            more = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": later_s}
         return answer(problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more))
 
     @on(RequestValidationError)

@@ -23,8 +23,7 @@ from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, ExecutedPulses, FrameSequence
 from optodrive.limit.limiter import Policy, fired, verify
-from optodrive.physics.array import pulse_peaks
-from optodrive.pipeline import Display, prepare
+from optodrive.pipeline import Display, prepare, warm_up
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
 
@@ -78,6 +77,8 @@ class Engine:
         # The loop gives the interpreter up at every read and write; while the planner computes it would wait for it
         # 5 ms each time, and a few of those are a lease.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
+        # A planner that compiles shows no progress, and would cost the lease.
+        warm_up(self.display)
         self._session.connect()
         self._thread.start()
 
@@ -197,23 +198,23 @@ class Engine:
     # --- plans --------------------------------------------------------------------------------------------------
 
     def submit(
-        self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, strict: bool = False
+        self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, policy: Policy = "trim"
     ) -> "Future[Answer]":
         """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when."""
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
             self._plans_pending += 1
-        return self._planner.submit(self._plan, build, name, dry_run, strict)
+        return self._planner.submit(self._plan, build, name, dry_run, policy)
 
-    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, strict: bool) -> Answer:
+    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, policy: Policy) -> Answer:
         try:
             self._note_progress(0.0)
             sequence = build()
             while True:
                 if not dry_run:
                     self._require_armed()
-                answer = self._planned(sequence, name, dry_run, strict)
+                answer = self._planned(sequence, name, dry_run, policy)
                 if answer is not None:
                     return answer
         finally:
@@ -233,12 +234,11 @@ class Engine:
         if len(self._waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
 
-    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, strict: bool) -> Answer | None:
+    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, policy: Policy) -> Answer | None:
         """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
         with self._lock:
             thermal, start_s = self._thermal, self._earliest_start_s()
         heat, budget = thermal.seen_from(start_s)
-        policy: Policy = "refuse" if strict else "trim"
         prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
         points = quantise(prepared.plan, self._session.scale)
         record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, budget, start_s)
@@ -264,8 +264,7 @@ class Engine:
         """Decode the very bytes that will leave, and hold them against the budget."""
         points, plan = record.points, record.prepared.plan
         decoded = decode(b"".join(payload for _, payload, _ in points.frames(0)), self._session.scale)
-        pixel = plan.pixel[points.row[decoded.index]].tolist()
-        verify(pixel, decoded.start_s, decoded.width_s, decoded.power_w, budget, self.display.budget)
+        verify(plan.pixel[points.row[decoded.index]], decoded, budget, self.display.budget)
 
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
         """A plan by its id; InputError (no_plan) where there is none."""
@@ -345,8 +344,8 @@ class Engine:
     def _simulate(self, record: PlanRecord) -> None:
         executed = record.executed
         if executed is not None:
-            heat = record.heat_before.copy()
-            record.simulated_m = pulse_peaks(heat, executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+            columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+            record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
 
     def _rewind(self, record: PlanRecord, executed: ExecutedPulses | None) -> None:
         """Nothing after `record` will run, nor what it has not fired: heat and budget forget both."""

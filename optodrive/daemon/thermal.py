@@ -31,7 +31,5 @@ class Thermal:
 def heated(before: DisplayHeat, executed: ExecutedPulses) -> DisplayHeat:
     """The heat of what was really executed, on the plan's time line as both arguments are."""
     heat = before.copy()
-    columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    for pixel, start_s, width_s, power_w in zip(*(column.tolist() for column in columns), strict=True):
-        heat.pulse(pixel, start_s, width_s, power_w)
+    heat.pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     return heat

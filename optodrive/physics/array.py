@@ -1,14 +1,41 @@
 """A whole display, event by event: each pixel is advanced only when something is asked of it."""
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.compiled import kernel
 from optodrive.flow import FloatArray, IntArray, PixelTrace
 from optodrive.physics.parameters import PixelArray
-from optodrive.physics.pixel import advance, cooling_peak, gas_peak
+from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 TIME_ROUNDING_S = 1e-9
+
+
+class Peaks(NamedTuple):
+    """The most each pulse [n] brings its pixel to, from its start to the pixel's next pulse, or for ever.
+
+    displacement_m: membrane; absorber_k: absorber over ambient, which is its rise at one end of the pulse.
+    """
+
+    displacement_m: FloatArray
+    absorber_k: FloatArray
+
+
+def kernel_columns(
+    pixels: int, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
+) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
+    """Pulses [n] as a kernel takes them, which does not look where it writes: IndexError for no pixel of `pixels`.
+
+    Copies, because a kernel is compiled for one layout and one writability of its arrays.
+    """
+    index = np.array(pixel, dtype=np.int64)
+    if len(index) and not 0 <= index.min() <= index.max() < pixels:
+        raise IndexError(f"pixels {index.min()} to {index.max()} of {pixels}")
+    if not len(index) == len(start_s) == len(width_s) == len(power_w):
+        raise ValueError("columns of pulses differ in length")
+    return index, np.array(start_s, dtype=float), np.array(width_s, dtype=float), np.array(power_w, dtype=float)
 
 
 class DisplayHeat:
@@ -16,9 +43,10 @@ class DisplayHeat:
 
     def __init__(self, pixels: PixelArray, at_s: float = 0.0) -> None:
         self.pixels = pixels
-        self._at_s = [at_s] * len(pixels)
-        self._theta_k = [0.0] * len(pixels)
-        self._gamma_k = [0.0] * len(pixels)
+        self._columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
+        self._at_s = np.full(len(pixels), at_s)
+        self._theta_k = np.zeros(len(pixels))
+        self._gamma_k = np.zeros(len(pixels))
 
     def copy(self) -> "DisplayHeat":
         """An independent copy."""
@@ -27,8 +55,8 @@ class DisplayHeat:
     def shifted(self, offset_s: float) -> "DisplayHeat":
         """A copy on a time line whose zero lies offset_s earlier."""
         twin = DisplayHeat.__new__(DisplayHeat)
-        twin.pixels = self.pixels
-        twin._at_s = [at_s + offset_s for at_s in self._at_s]
+        twin.pixels, twin._columns = self.pixels, self._columns
+        twin._at_s = self._at_s + offset_s
         twin._theta_k = self._theta_k.copy()
         twin._gamma_k = self._gamma_k.copy()
         return twin
@@ -37,25 +65,81 @@ class DisplayHeat:
         """Absorber and gas rise, K, of a pixel left dark until at_s; ValueError for a time before its last event."""
         dark_s = at_s - self._at_s[pixel]
         if dark_s < -TIME_ROUNDING_S:
-            raise ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
-        theta_k, gamma_k = self._theta_k[pixel], self._gamma_k[pixel]
-        if theta_k == 0.0 and gamma_k == 0.0:
-            return 0.0, 0.0
-        return advance(self.pixels.each[pixel], theta_k, gamma_k, 0.0, max(0.0, dark_s))
+            raise self._too_early(pixel, at_s)
+        return advance(self.pixels.each[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, dark_s))
+
+    def _too_early(self, pixel: int, at_s: float) -> ValueError:
+        return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
 
     def pulse(self, pixel: int, start_s: float, width_s: float, power_w: float) -> None:
         """Light a pixel from start_s for width_s at the mean incident power power_w."""
-        theta_k, gamma_k = self.rises(pixel, start_s)
-        self._theta_k[pixel], self._gamma_k[pixel] = advance(
-            self.pixels.each[pixel], theta_k, gamma_k, power_w, width_s
-        )
-        self._at_s[pixel] = start_s + width_s
+        self.pulses(np.array([pixel]), np.array([start_s]), np.array([width_s]), np.array([power_w]))
+
+    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> Peaks:
+        """Light pixels one after the other; all [n], pulses of a pixel in order of time, power the mean incident one.
+
+        ValueError for a pulse that starts before its pixel's last event; those before it have been.
+        """
+        columns = kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
+        peaks = Peaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
+        done = _walk(self._columns, self._at_s, self._theta_k, self._gamma_k, *columns, *peaks)
+        if done < len(pixel):
+            raise self._too_early(int(pixel[done]), float(start_s[done]))
+        return peaks
 
     def peak_m(self, pixel: int, within_s: float = float("inf")) -> float:
         """Largest displacement, m, of a pixel from its last event on, within_s seconds at most."""
         parameters = self.pixels.each[pixel]
         peak_k, _ = cooling_peak(parameters, self._theta_k[pixel], self._gamma_k[pixel], within_s)
         return parameters.kappa_m_per_k * peak_k
+
+
+@kernel
+def _walk(
+    columns: FloatArray,
+    at_s: FloatArray,
+    theta_k: FloatArray,
+    gamma_k: FloatArray,
+    pixel: IntArray,
+    start_s: FloatArray,
+    width_s: FloatArray,
+    power_w: FloatArray,
+    peak_m: FloatArray,
+    peak_k: FloatArray,
+) -> int:
+    """Heat by the pulses [n], fill in their peaks [n]; the number of pulses that did not come too early.
+
+    columns: [p, 6] the fields of `Pixel`; at_s, theta_k, gamma_k: [p] the last event and the rises then.
+    """
+    last = np.full(len(at_s), -1)
+    for row in range(len(pixel)):
+        i = pixel[row]
+        one = _parameters(columns, i)
+        dark_s = start_s[row] - at_s[i]
+        if dark_s < -TIME_ROUNDING_S:
+            return row
+        dark_s = max(0.0, dark_s)
+        if last[i] >= 0:
+            glow_k = cooling_peak(one, theta_k[i], gamma_k[i], dark_s)[0]
+            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
+        absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, dark_s)
+        peak_m[row] = one.kappa_m_per_k * gas_peak(one, absorber_k, gas_k, power_w[row], width_s[row])[0]
+        theta_k[i], gamma_k[i] = advance(one, absorber_k, gas_k, power_w[row], width_s[row])
+        peak_k[row] = max(absorber_k, theta_k[i])
+        at_s[i] = start_s[row] + width_s[row]
+        last[i] = row
+    for i in range(len(at_s)):
+        if last[i] >= 0:
+            one = _parameters(columns, i)
+            glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
+            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
+    return len(pixel)
+
+
+@kernel
+def _parameters(columns: FloatArray, i: int) -> Pixel:
+    one = columns[i]
+    return Pixel(one[0], one[1], one[2], one[3], one[4], one[5])
 
 
 def pulse_peaks(
@@ -65,23 +149,7 @@ def pulse_peaks(
 
     All arrays [n], pulses of a pixel in order of time.
     """
-    peaks_m = np.zeros(len(pixel))
-    last: dict[int, tuple[int, float]] = {}
-    rows = zip(pixel.tolist(), start_s.tolist(), width_s.tolist(), power_w.tolist(), strict=True)
-    for row, (index, begin_s, lit_s, power) in enumerate(rows):
-        if index in last:
-            _settle(heat, peaks_m, index, *last[index], begin_s)
-        parameters = heat.pixels.each[index]
-        peaks_m[row] = parameters.kappa_m_per_k * gas_peak(parameters, *heat.rises(index, begin_s), power, lit_s)[0]
-        heat.pulse(index, begin_s, lit_s, power)
-        last[index] = row, begin_s + lit_s
-    for index, (row, end_s) in last.items():
-        _settle(heat, peaks_m, index, row, end_s, float("inf"))
-    return peaks_m
-
-
-def _settle(heat: DisplayHeat, peaks_m: FloatArray, pixel: int, row: int, end_s: float, until_s: float) -> None:
-    peaks_m[row] = max(peaks_m[row], heat.peak_m(pixel, until_s - end_s))
+    return heat.pulses(pixel, start_s, width_s, power_w).displacement_m
 
 
 def pixel_trace(

@@ -5,18 +5,20 @@
     z = κ γ,  F = φ γ
 
 Everything is written with a = 1/(RC), b = 1/τ_g and the divided difference
-D(t) = (e^(−at) − e^(−bt)) / (b − a), which stays exact as τ_g → RC.
+D(t) = (e^(−at) − e^(−bt)) / (b − a), which stays exact as τ_g → RC. All functions are kernels: they take floats, and
+other kernels call them at no cost.
 """
 
-from dataclasses import dataclass
 from math import exp, expm1, log1p
+from typing import NamedTuple
+
+from optodrive.compiled import kernel
 
 GAS_FRACTION = 0.5
 """Steady gas rise over absorber rise: the air conducts equally to absorber and wall (Text S1)."""
 
 
-@dataclass(frozen=True)
-class Pixel:
+class Pixel(NamedTuple):
     """The nominal parameters of one pixel.
 
     r_k_per_w: absorber to wall; c_j_per_k: absorber heat capacity; epsilon: share of incident light turned into heat;
@@ -36,6 +38,7 @@ class Pixel:
         return self.r_k_per_w * self.c_j_per_k
 
 
+@kernel
 def divided_difference(a: float, b: float, t_s: float) -> float:
     """(e^(−a t) − e^(−b t)) / (b − a), s; t e^(−a t) where a = b."""
     if b < a:
@@ -46,9 +49,10 @@ def divided_difference(a: float, b: float, t_s: float) -> float:
     return exp(-a * t_s) * -expm1(-x) / (b - a)
 
 
+@kernel
 def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: float) -> tuple[float, float]:
     """Absorber and gas rise (K) after `t_s` seconds at constant incident power (W)."""
-    a, b = 1.0 / pixel.tau_s, 1.0 / pixel.tau_g_s
+    a, b = 1.0 / (pixel.r_k_per_w * pixel.c_j_per_k), 1.0 / pixel.tau_g_s
     steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
     excess_k = theta_k - steady_k
     theta_end_k = steady_k + excess_k * exp(-a * t_s)
@@ -61,13 +65,14 @@ def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: f
     return theta_end_k, gamma_end_k
 
 
+@kernel
 def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, within_s: float) -> tuple[float, float]:
     """Largest gas rise (K), and its time (s), within `within_s` seconds at constant incident power.
 
     With the rises taken from their steady values, θ' and γ', the gas turns where θ'/2 = γ', at
     t = log1p((b − a) u)/(b − a) with u = (1 − 2γ'/θ')/a; that is a maximum where the absorber cools, θ' > 0.
     """
-    a, b = 1.0 / pixel.tau_s, 1.0 / pixel.tau_g_s
+    a, b = 1.0 / (pixel.r_k_per_w * pixel.c_j_per_k), 1.0 / pixel.tau_g_s
     steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
     drive_k = GAS_FRACTION * (theta_k - steady_k)
     lag_k = gamma_k - GAS_FRACTION * steady_k
@@ -88,6 +93,7 @@ def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, withi
     return (peak_k, turn_s) if peak_k > gamma_k else (gamma_k, 0.0)
 
 
+@kernel
 def cooling_peak(pixel: Pixel, theta_k: float, gamma_k: float, within_s: float = float("inf")) -> tuple[float, float]:
     """Largest gas rise (K), and its time (s), in the dark."""
     if theta_k <= 0.0:

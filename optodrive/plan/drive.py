@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from optodrive.compiled import kernel
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 
@@ -19,10 +20,12 @@ class DriveRange:
         return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9))
 
 
+@kernel
 def pulse_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, width_s: float) -> tuple[float, float]:
     """Largest gas rise, K, after the start of a pulse on a pixel with these rises; its time from the start, s."""
     lit_k, lit_s = gas_peak(pixel, theta_k, gamma_k, power_w, width_s)
-    dark_k, dark_s = cooling_peak(pixel, *advance(pixel, theta_k, gamma_k, power_w, width_s))
+    theta_end_k, gamma_end_k = advance(pixel, theta_k, gamma_k, power_w, width_s)
+    dark_k, dark_s = cooling_peak(pixel, theta_end_k, gamma_end_k)
     return (lit_k, lit_s) if lit_k > dark_k else (dark_k, width_s + dark_s)
 
 
@@ -39,31 +42,47 @@ def pulse_for_peak(
     None when the heat there reaches the target by itself. A target beyond the longest pulse gets the longest pulse.
     """
     goal_k = target_m / pixel.kappa_m_per_k
+    periods, duty = _shortest(pixel, theta_k, gamma_k, goal_k, drive.max_power_w, drive.period_s, drive.max_periods)
+    return (periods, duty) if periods else None
+
+
+@kernel
+def _shortest(
+    pixel: Pixel,
+    theta_k: float,
+    gamma_k: float,
+    goal_k: float,
+    max_power_w: float,
+    period_s: float,
+    max_periods: int,
+) -> tuple[int, float]:
+    """As pulse_for_peak; no periods where no pulse is needed. In one kernel: each call from Python costs."""
     if cooling_peak(pixel, theta_k, gamma_k)[0] >= goal_k:
-        return None
-    low, high = 0, drive.max_periods
+        return 0, 0.0
+    low, high = 0, max_periods
     while high - low > 1:
         middle = (low + high) // 2
-        if pulse_peak(pixel, theta_k, gamma_k, drive.max_power_w, middle * drive.period_s)[0] >= goal_k:
+        if pulse_peak(pixel, theta_k, gamma_k, max_power_w, middle * period_s)[0] >= goal_k:
             high = middle
         else:
             low = middle
-    return high, _duty_for_peak(pixel, theta_k, gamma_k, goal_k, high * drive.period_s, drive.max_power_w)
+    return high, _duty_for_peak(pixel, theta_k, gamma_k, goal_k, high * period_s, max_power_w)
 
 
+@kernel
 def _duty_for_peak(
     pixel: Pixel, theta_k: float, gamma_k: float, goal_k: float, width_s: float, max_power_w: float
 ) -> float:
     # The peak is a maximum over time of functions linear in duty, hence convex in duty: Newton from duty 1 falls
     # monotonically onto the root, and its slope is the gas response to full power at the time of the peak.
-    full = advance(pixel, 0.0, 0.0, max_power_w, width_s)
+    full_theta_k, full_gamma_k = advance(pixel, 0.0, 0.0, max_power_w, width_s)
     duty = 1.0
     for _ in range(20):
         peak_k, at_s = pulse_peak(pixel, theta_k, gamma_k, duty * max_power_w, width_s)
         if at_s <= width_s:
             slope_k = advance(pixel, 0.0, 0.0, max_power_w, at_s)[1]
         else:
-            slope_k = advance(pixel, *full, 0.0, at_s - width_s)[1]
+            slope_k = advance(pixel, full_theta_k, full_gamma_k, 0.0, at_s - width_s)[1]
         step = (peak_k - goal_k) / slope_k
         duty -= step
         if abs(step) < 1e-9:

@@ -3,8 +3,8 @@
 Trains keep their times; a frame's pulses fill the beam time between them. Times are whole microseconds inside.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +18,10 @@ from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import serpentine
 
 TRAIN_PIECE = 1000
-"""Pulses of trains planned in one piece."""
+"""Pulses of trains planned in one piece, unless told otherwise."""
+
+Pieces = Generator[PulsePlan, int | None, None]
+"""Yields pieces of a plan; takes how much later, µs, the last one must come, or None where it may stay."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +62,18 @@ class _Row(NamedTuple):
     source: int
 
 
+@dataclass
+class _Cursor:
+    """How far a plan has come. place: in the frame's order; waited_us: pauses put in so far."""
+
+    free_us: int = 0
+    lit: int | None = None
+    next_train: int = 0
+    place: int = 0
+    waited_us: int = 0
+    skipped: int = 0
+
+
 class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
@@ -66,29 +81,44 @@ class Scheduler:
     skipped: pixels that needed no pulse, so far.
     """
 
-    def __init__(self, machine: Machine, sequence: FrameSequence) -> None:
+    def __init__(self, machine: Machine, sequence: FrameSequence, train_piece: int = TRAIN_PIECE) -> None:
         self._machine = machine
         self._sequence = sequence
+        self._train_piece = train_piece
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = _train_pulses(sequence.trains, len(sequence.frames))
-        self._next_train = 0
-        self._free_us = 0
-        self._lit: int | None = None
+        self._now = _Cursor()
         self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
         self.skipped: list[Skipped] = []
 
-    def pieces(self, heat: DisplayHeat) -> Iterator[PulsePlan]:
+    def pieces(self, heat: DisplayHeat) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
 
-        What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came.
+        What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came. A
+        piece that must come later is planned again for then, and all that follows comes as much later.
         """
         for source, frame in enumerate(self._sequence.frames):
-            yield from self._trains_before(self._sequence_us(frame.show_at_s))
+            yield from self._trains_before(frame.show_at_s)
             yield from self._frame(source, frame, heat)
-        yield from self._trains_before(None)
+        yield from self._trains_before(float("inf"))
 
-    def _sequence_us(self, time_s: float) -> int:
+    def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, int | None, bool]:
+        """Yield what build makes, later and later as the answers ask; False where it makes nothing."""
+        while True:
+            before = replace(self._now)
+            rows = build()
+            if not rows:
+                return False
+            wait_us = yield self._plan(rows)
+            if not wait_us:
+                return True
+            self._now = before
+            self._now.free_us += wait_us
+            self._now.waited_us += wait_us
+            del self.skipped[before.skipped :]
+
+    def _wanted_us(self, time_s: float) -> int:
         return self.lead_us + round(time_s * 1e6)
 
     def _move_us(self, origin: int | None, pixel: int) -> int:
@@ -103,60 +133,68 @@ class Scheduler:
         order = serpentine(np.flatnonzero(frame.target_m > 0), layout.row, layout.column)
         return [int(pixel) for pixel in order]
 
-    def _place(self, pixel: int, width_us: int, power_w: float, earliest_us: int, target_m: float, source: int) -> _Row:
-        settle_us = self._move_us(self._lit, pixel)
-        start_us = max(earliest_us, self._free_us + settle_us)
-        self._free_us = start_us + width_us
-        self._lit = pixel
-        return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, earliest_us, source)
+    def _place(self, pixel: int, width_us: int, power_w: float, wanted_us: int, target_m: float, source: int) -> _Row:
+        now = self._now
+        settle_us = self._move_us(now.lit, pixel)
+        start_us = max(wanted_us + now.waited_us, now.free_us + settle_us)
+        now.free_us, now.lit = start_us + width_us, pixel
+        return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
 
     def _train_row(self) -> _Row:
-        pulse = self._trains[self._next_train]
-        self._next_train += 1
-        earliest_us = self.lead_us + pulse.nominal_us
-        return self._place(pulse.pixel, pulse.width_us, pulse.power_w, earliest_us, float("nan"), pulse.source)
+        pulse = self._trains[self._now.next_train]
+        self._now.next_train += 1
+        wanted_us = self.lead_us + pulse.nominal_us
+        return self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)
 
-    def _trains_before(self, until_us: int | None) -> Iterator[PulsePlan]:
-        rows: list[_Row] = []
-        while self._next_train < len(self._trains):
-            if until_us is not None and self.lead_us + self._trains[self._next_train].nominal_us >= until_us:
-                break
-            rows.append(self._train_row())
-            if len(rows) == TRAIN_PIECE:
-                yield self._plan(rows)
-                rows = []
-        if rows:
-            yield self._plan(rows)
+    def _trains_before(self, until_s: float) -> Pieces:
+        def build() -> list[_Row]:
+            rows: list[_Row] = []
+            while self._now.next_train < len(self._trains) and len(rows) < self._train_piece:
+                if self._trains[self._now.next_train].nominal_us >= until_s * 1e6:
+                    break
+                rows.append(self._train_row())
+            return rows
+
+        while (yield from self._offer(build)):
+            pass
 
     def _train_is_due(self, end_us: int, pixel: int) -> bool:
         """Whether the next train pulse would come late if the beam stayed on `pixel` until end_us."""
-        if self._next_train >= len(self._trains):
+        now = self._now
+        if now.next_train >= len(self._trains):
             return False
-        pulse = self._trains[self._next_train]
-        return self.lead_us + pulse.nominal_us < end_us + self._move_us(pixel, pulse.pixel)
+        pulse = self._trains[now.next_train]
+        due_us = self.lead_us + pulse.nominal_us + now.waited_us
+        return due_us < end_us + self._move_us(pixel, pulse.pixel)
 
-    def _frame(self, source: int, frame: TactileFrame, heat: DisplayHeat) -> Iterator[PulsePlan]:
+    def _frame(self, source: int, frame: TactileFrame, heat: DisplayHeat) -> Pieces:
         """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
-        show_us = self._sequence_us(frame.show_at_s)
-        drive = self._machine.drive
+        order = self._order(frame)
+        self._now.place = 0
+        while (yield from self._offer(lambda: self._frame_rows(source, frame, order, heat))):
+            pass
+
+    def _frame_rows(self, source: int, frame: TactileFrame, order: list[int], heat: DisplayHeat) -> list[_Row]:
+        """The frame's rows from where it stands, up to the next train pulse or its own end."""
+        now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
         rows: list[_Row] = []
-        for pixel in self._order(frame):
+        while now.place < len(order):
+            pixel = order[now.place]
             target_m = float(frame.target_m[pixel])
-            while True:
-                start_us = max(show_us, self._free_us + self._move_us(self._lit, pixel))
-                theta_k, gamma_k = heat.rises(pixel, start_us * 1e-6)
-                pulse = pulse_for_peak(heat.pixels.each[pixel], theta_k, gamma_k, target_m, drive)
-                if pulse is None:
-                    self.skipped.append(Skipped(source, pixel, target_m))
-                    break
-                width_us = round(pulse[0] * drive.period_s * 1e6)
-                if not self._train_is_due(start_us + width_us, pixel):
-                    rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, show_us, target_m, source))
-                    break
-                yield self._plan([*rows, self._train_row()])
-                rows = []
-        if rows:
-            yield self._plan(rows)
+            start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel))
+            theta_k, gamma_k = heat.rises(pixel, start_us * 1e-6)
+            pulse = pulse_for_peak(heat.pixels.each[pixel], theta_k, gamma_k, target_m, drive)
+            if pulse is None:
+                self.skipped.append(Skipped(source, pixel, target_m))
+                now.skipped += 1
+                now.place += 1
+                continue
+            width_us = round(pulse[0] * drive.period_s * 1e6)
+            if self._train_is_due(start_us + width_us, pixel):
+                return [*rows, self._train_row()]
+            rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, wanted_us, target_m, source))
+            now.place += 1
+        return rows
 
     def _plan(self, rows: list[_Row]) -> PulsePlan:
         start_us, width_us, power_w, pixel, settle_us, target_m, nominal_us, source = zip(*rows, strict=True)

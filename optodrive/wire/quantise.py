@@ -74,14 +74,16 @@ class DecodedPulses:
 def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
     """Points for a plan. Starts come from absolute times, so rounding never adds up; duty is rounded down.
 
-    A pulse trimmed to nothing becomes a dark point of the same length, so that times stay.
+    A pulse trimmed to nothing becomes a dark point of the same length, so that times stay; the mirrors do not go there
+    but on to the next pulse.
     """
     start = np.rint(plan.start_s / scale.tick_s).astype(np.int64)
     width = np.rint(plan.width_s / scale.tick_s).astype(np.int64)
     duty = np.floor(plan.power_w / scale.full_power_w * DUTY_MAX * (1 + 1e-12)).astype(np.int64)
     if len(plan) and (width.max() > TICKS_MAX or width.min() < 1 or duty.max() > DUTY_MAX or duty.min() < 0):
         raise LocalProtocolError("a pulse does not fit a point of the wire")
-    x, y = scale.codes(plan.x_rad), scale.codes(plan.y_rad)
+    goal = _next_lit(duty)
+    x, y = scale.codes(plan.x_rad[goal]), scale.codes(plan.y_rad[goal])
     dark = start - np.concatenate([[0], (start + width)[:-1]])
     if len(plan) and dark.min() < 0:
         raise LocalProtocolError("pulses overlap, or the first begins before the plan")
@@ -98,6 +100,14 @@ def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
         table.append((x_code, y_code, dark_ticks, on_ticks, duty_code))
         rows.append(row)
     return WirePoints(np.array(table, dtype=np.uint16).reshape(-1, 5), np.array(rows, dtype=np.int64))
+
+
+def _next_lit(duty: IntArray) -> IntArray:
+    """[n] the row itself where it is lit, else the next lit row, or the last; the first where none is lit."""
+    lit = np.flatnonzero(duty)
+    if not len(lit):
+        return np.zeros(len(duty), dtype=np.int64)
+    return lit[np.minimum(np.searchsorted(lit, np.arange(len(duty))), len(lit) - 1)]
 
 
 def decode(payload: bytes, scale: WireScale) -> DecodedPulses:

@@ -170,6 +170,6 @@ def test_what_cannot_be_planned_is_refused_by_name(armed):
     with pytest.raises(InputError, match="target_um of pixel 17"):
         armed.submit(lambda: frame(5000.0), "x").result(10)
     with pytest.raises(RefusedError, match="needs"):
-        armed.submit(lambda: frame(500.0, duration_s=0.01), "x", strict=True).result(10)
+        armed.submit(lambda: frame(500.0, duration_s=0.01), "x", policy="refuse").result(10)
     with pytest.raises(InputError, match="plan"):
         armed.plan("p99")

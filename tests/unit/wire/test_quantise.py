@@ -163,3 +163,12 @@ def test_codes_and_angles_are_inverse():
     assert SCALE.codes(SCALE.angles(codes)).tolist() == codes.tolist()
     coarse = replace(SCALE, rad_per_code=1e-3)
     assert coarse.codes(np.array([0.0, 0.0006])).tolist() == [CENTRE_CODE, CENTRE_CODE + 1]
+
+
+def test_mirrors_do_not_go_to_a_pulse_that_was_trimmed_to_nothing():
+    limited = plan((0.001, 0.002, 0.01, 0.0, 1.0), (0.004, 0.002, 0.15, 0.1, 0.0), (0.008, 0.002, 0.02, 0.0, 1.0))
+    points = quantise(limited, SCALE)
+    x_rad = SCALE.angles(points.table[:, 0].astype(np.int64))
+    assert x_rad == pytest.approx([0.01, 0.02, 0.02], abs=1e-5)
+    last = quantise(plan((0.001, 0.002, 0.01, 0.0, 1.0), (0.004, 0.002, 0.15, 0.1, 0.0)), SCALE)
+    assert SCALE.angles(last.table[:, 0].astype(np.int64)) == pytest.approx([0.01, 0.01], abs=1e-5)

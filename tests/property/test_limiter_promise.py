@@ -1,0 +1,106 @@
+"""Whatever frames come, no cap is passed: the limiter's promise against an integrator that shares no code with it."""
+
+from math import inf
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from optodrive.limit.budget import Budget, Caps, Mirrors
+from optodrive.limit.corner import heat_bound
+from optodrive.limit.limiter import fired, fresh_state, limit, shifted
+from warmth import KINDS, as_plan, galvo_peak, random_model, sequence, truth, upper, within
+
+FULL_W = 2.45
+ROOMY = Caps(
+    absorber_k=1e4,
+    wall_k=1e4,
+    touch_k=1e4,
+    galvo_rad2_per_s4=inf,
+    pulse_energy_j=1e3,
+    pulse_width_s=0.050,
+    pulse_rest_s=5e-4,
+    pixel_mean_w=1e3,
+    pixel_window_s=1.0,
+    display_mean_w=1e3,
+    display_window_s=2.0,
+)
+
+
+def random_caps(rng):
+    """Heat caps low enough to be met within seconds; the others now and then."""
+    return ROOMY._replace(
+        absorber_k=rng.uniform(60.0, 380.0),
+        wall_k=rng.choice([rng.uniform(1.0, 15.0), 60.0]),
+        touch_k=rng.choice([rng.uniform(1.0, 20.0), 60.0]),
+        galvo_rad2_per_s4=rng.choice([inf, rng.uniform(3e3, 1e5) ** 2]),
+        pixel_mean_w=rng.choice([1e3, 1.3]),
+    )
+
+
+def budget_of(model, unsure, caps):
+    return Budget(caps, heat_bound(model, unsure, caps, FULL_W), Mirrors(4e-4, 100.0, 1.0, 0.0))
+
+
+def limited_in_pieces(rng, plan, budget, pixels):
+    """The plan limited piece by piece; a piece may be called off in the middle, its fired pulses count."""
+    state, kept, at = fresh_state(pixels), [], 0
+    while at < len(plan):
+        until = at + int(rng.integers(1, 120))
+        rows = slice(at, until)
+        piece = type(plan)(**{name: value[rows] for name, value in vars(plan).items()})
+        piece, after = limit(piece, state, budget)
+        if rng.random() < 0.2:
+            stop_s = float(rng.choice(piece.start_s))
+            kept.append((piece, piece.start_s < stop_s))
+            state = fired(piece, stop_s, state, budget)
+        else:
+            kept.append((piece, np.full(len(piece), True)))
+            state = after
+        state = shifted(shifted(state, 7.0), -7.0)
+        at = until
+    columns = {
+        name: np.concatenate([vars(piece)[name][fired_rows] for piece, fired_rows in kept]) for name in vars(plan)
+    }
+    return type(plan)(**columns)
+
+
+def passed(kind, seed, budget_from=budget_of):
+    """What a sequence does to its caps: name → largest value over cap, on a display drawn inside the uncertainty."""
+    rng = np.random.default_rng(seed)
+    display, model, unsure = random_model(rng)
+    caps = random_caps(rng)
+    rows = sequence(rng, kind, len(model.epsilon), rng.uniform(0.5, 4.0))
+    asked = as_plan(rows, FULL_W * rng.uniform(0.3, 1.0, len(rows)) ** rng.choice([0.0, 1.0]), display)
+    budget = budget_from(model, unsure, caps)
+    plan = limited_in_pieces(rng, asked, budget, len(model.epsilon))
+    if not len(plan):
+        return {}
+    real = truth(model, upper(unsure) if rng.random() < 0.3 else within(rng, unsure))
+    absorber, _, wall, touch = real.peaks(plan)
+    return {
+        "absorber": absorber / caps.absorber_k,
+        "wall": wall / caps.wall_k,
+        "touch": touch / caps.touch_k,
+        "galvo": galvo_peak(plan, budget) / caps.galvo_rad2_per_s4,
+    }
+
+
+def held(kind, seed):
+    for name, share in passed(kind, seed).items():
+        assert share <= 1 + 1e-6, f"{name} cap passed: {share}"
+
+
+@settings(max_examples=600, deadline=None)
+@given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**40))
+def test_no_sequence_passes_a_cap(kind, seed):
+    held(kind, seed)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@settings(max_examples=12_000, deadline=None)
+@given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**40))
+def test_no_sequence_of_ten_thousand_passes_a_cap(kind, seed):
+    held(kind, seed)

@@ -1,0 +1,284 @@
+"""A display's heat integrated step by step, and hostile sequences: written apart from the limiter and from physics."""
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+
+from optodrive.config import DisplaySection
+from optodrive.flow import EMPTY_PLAN, PulsePlan
+from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls
+from optodrive.neighbours import Neighbours
+
+
+@numba.njit(cache=False)
+def _rates(y, out, lit, power_w, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag):
+    """dy/dt of y [4, p]: absorber, gas, wall, touch surface."""
+    for i in range(y.shape[1]):
+        theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
+        mean = ambient_k + 0.5 * (theta + wall)
+        flow = (theta - wall) / (r * (mean / ambient_k) ** n)
+        drive = eps * power_w if i == lit else 0.0
+        out[0, i] = (drive - flow) / c
+        out[1, i] = (0.5 * (theta + wall) - gas) / tau_g
+        out[2, i] = 0.0
+        if cw > 0.0:
+            leaving = wall / rw + wall * rim[i] / rf
+            for k in range(4):
+                if beside[i, k] >= 0:
+                    leaving += (wall - y[2, beside[i, k]]) / rx
+            out[2, i] = (flow - leaving) / cw
+        out[3, i] = (fg * gas + fw * wall - touch) / lag if lag > 0.0 else 0.0
+
+
+@numba.njit(cache=False)
+def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim, lit_step, dark_step):
+    """Runge–Kutta of the fourth order between events; peak [4] takes the largest of each kind ever seen."""
+    eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
+    k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
+    now = 0.0
+    for row in range(len(start) + 1):
+        begin = start[row] if row < len(start) else until
+        for phase in range(2):
+            end = begin if phase == 0 else (begin + width[row] if row < len(start) else begin)
+            lit = pixel[row] if phase == 1 and row < len(start) else -1
+            watts = power[row] if phase == 1 and row < len(start) else 0.0
+            if end <= now:
+                continue
+            steps = int(np.ceil((end - now) / (lit_step if phase == 1 else dark_step)))
+            h = (end - now) / steps
+            for _ in range(steps):
+                _rates(y, k1, lit, watts, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag)
+                _rates(
+                    y + 0.5 * h * k1,
+                    k2,
+                    lit,
+                    watts,
+                    eps,
+                    r,
+                    c,
+                    ambient_k,
+                    n,
+                    tau_g,
+                    rw,
+                    cw,
+                    rx,
+                    rf,
+                    beside,
+                    rim,
+                    fg,
+                    fw,
+                    lag,
+                )
+                _rates(
+                    y + 0.5 * h * k2,
+                    k3,
+                    lit,
+                    watts,
+                    eps,
+                    r,
+                    c,
+                    ambient_k,
+                    n,
+                    tau_g,
+                    rw,
+                    cw,
+                    rx,
+                    rf,
+                    beside,
+                    rim,
+                    fg,
+                    fw,
+                    lag,
+                )
+                _rates(
+                    y + h * k3, k4, lit, watts, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag
+                )
+                for kind in range(4):
+                    for i in range(y.shape[1]):
+                        y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
+                        peak[kind] = max(peak[kind], y[kind, i])
+            now = end
+
+
+@dataclass(frozen=True)
+class Truth:
+    """One display as it really is: `numbers` for the integrator, and the lattice."""
+
+    numbers: tuple
+    beside: np.ndarray
+    rim: np.ndarray
+
+    def peaks(self, plan, dark_s=3.0):
+        """Largest absorber, gas, wall and touch rise, K, over the plan and dark_s after it."""
+        lag_s = self.numbers[5]  # the quickest node: steps beyond 2.8 of its time would not be stable
+        y, peak = np.zeros((4, len(self.rim))), np.zeros(4)
+        until = float(plan.start_s[-1] + plan.width_s[-1]) + dark_s
+        columns = (plan.start_s, plan.width_s, plan.pixel, plan.power_w)
+        _integrate(
+            y,
+            peak,
+            *(np.array(column) for column in columns),
+            until,
+            self.numbers,
+            self.beside,
+            self.rim,
+            min(1e-3, 0.5 * lag_s),
+            lag_s,
+        )
+        return peak
+
+
+def truth(model, factor=None):
+    """The display of a declared model, each parameter times its factor (exponent: plus)."""
+    f = dict.fromkeys(Uncertainty.__dataclass_fields__, 1.0) | {"exponent": 0.0} | (factor or {})
+    walls, touch = model.walls, model.touch
+    numbers = (
+        float(model.epsilon[0]) * f["absorbed_power"],
+        float(model.r_k_per_w[0]) * f["bridge_resistance"],
+        float(model.c_j_per_k[0]) * f["absorber_capacity"],
+        model.ambient_k,
+        max(0.0, model.exponent + f["exponent"]) if model.exponent else 0.0,
+        model.tau_g_s * f["gas_lag"],
+        walls.r_k_per_w * f["wall_resistance"] if walls else 1.0,
+        walls.c_j_per_k * f["wall_capacity"] if walls else 0.0,
+        walls.side_k_per_w * f["side_resistance"] if walls else 1.0,
+        walls.frame_k_per_w * f["side_resistance"] if walls else 1.0,
+        touch.gas_share * f["touch_share"] if touch else 0.0,
+        touch.wall_share * f["touch_share"] if touch else 0.0,
+        touch.lag_s * f["touch_lag"] if touch else 0.0,
+    )
+    return Truth(numbers, np.array(model.beside), np.array(model.frame_edges))
+
+
+def galvo_peak(plan, budget):
+    """Largest mean-square acceleration, rad²/s⁴, of either mirror: moves cut into slices, one leaky mean."""
+    mirrors, slices = budget.mirrors, 64
+    at, mean, clock, most = np.zeros(2), np.zeros(2), -np.inf, 0.0
+    for row in np.flatnonzero(plan.power_w > 0):
+        to = np.array([plan.x_rad[row], plan.y_rad[row]])
+        distance = np.abs(to - at)
+        if not distance.any():
+            continue
+        move = mirrors.settle_s + distance.max() / mirrors.slew_rad_per_s
+        begin = plan.start_s[row] - move
+        if clock > -np.inf:
+            mean = mean * np.exp(-max(0.0, begin - clock) / mirrors.mean_s)
+        squared = (4 * distance / move**2) ** 2
+        for _ in range(slices):
+            mean = mean + (squared - mean) * (move / slices / mirrors.mean_s)
+            most = max(most, mean.max())
+        at, clock = to, plan.start_s[row]
+    return most
+
+
+def small_lattice(rng):
+    """A few rows and columns, perhaps with a hole."""
+    rows, columns = int(rng.integers(1, 5)), int(rng.integers(2, 5))
+    missing = ((0, 0),) if rng.random() < 0.3 else ()
+    return DisplaySection(rows=rows, columns=columns, pitch_m=4e-3, missing=missing, bridge_width_m=4e-4)
+
+
+def random_model(rng):
+    """A declared model, terms left out now and then, and its uncertainty."""
+    display = small_lattice(rng)
+    neighbours = Neighbours.of(display)
+    pixels = len(neighbours)
+    walls = touch = None
+    if rng.random() < 0.85:
+        r_w = rng.uniform(3.0, 40.0)
+        sides = rng.random() < 0.8
+        walls = Walls(
+            r_w,
+            rng.uniform(0.4, 4.0) / r_w,
+            10 ** rng.uniform(2.0, 3.0) if sides else np.inf,
+            10 ** rng.uniform(2.0, 3.0) if sides else np.inf,
+        )
+    if rng.random() < 0.85:
+        touch = Touch(rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.5, 3.0))
+    r = rng.uniform(95, 382)
+    model = Declared(
+        epsilon=np.full(pixels, 0.66),
+        r_k_per_w=np.full(pixels, r),
+        c_j_per_k=np.full(pixels, rng.uniform(80e-6, 130e-6)),
+        tau_g_s=rng.uniform(1e-3, 5e-3),
+        ambient_k=293.15,
+        exponent=float(rng.choice([0.0, 0.05, 0.3, 1.0])),
+        beside=neighbours.beside,
+        frame_edges=neighbours.frame_edges,
+        walls=walls,
+        touch=touch,
+    )
+    unsure = Uncertainty(
+        absorbed_power=rng.uniform(0, 0.1),
+        bridge_resistance=rng.uniform(0, 0.1),
+        absorber_capacity=rng.uniform(0, 0.15),
+        exponent=rng.uniform(0, 0.05),
+        gas_lag=rng.uniform(0, 0.3),
+        wall_resistance=rng.uniform(0, 0.2),
+        wall_capacity=rng.uniform(0, 0.3),
+        side_resistance=rng.uniform(0, 0.3),
+        touch_share=rng.uniform(0, 0.1),
+        touch_lag=rng.uniform(0, 0.3),
+    )
+    return display, model, unsure
+
+
+def within(rng, unsure):
+    """A factor for each parameter inside its half-width: anywhere, or at an end."""
+    ends = rng.random() < 0.5
+    factor = {}
+    for name in Uncertainty.__dataclass_fields__:
+        half = getattr(unsure, name)
+        place = rng.choice([-1.0, 1.0]) if ends else rng.uniform(-1.0, 1.0)
+        factor[name] = half * place + (0.0 if name == "exponent" else 1.0)
+    return factor
+
+
+def upper(unsure):
+    """What heats most in the long run."""
+    high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "touch_share", "exponent")
+    return {name: getattr(unsure, name) + (0.0 if name == "exponent" else 1.0) for name in high}
+
+
+KINDS = ("hammer", "ring", "whole", "bursts", "scatter")
+
+
+def sequence(rng, kind, pixels, span_s=3.0):
+    """Pixels, starts and widths of a hostile sequence; whole microseconds, one beam, dark for moves."""
+    home = int(rng.integers(pixels))
+    ring = rng.permutation(pixels)[: int(rng.integers(2, 9))]
+    duty, width_most = rng.uniform(0.3, 1.0), rng.choice([2e-3, 15e-3, 50e-3])
+    now, rows, order = 0.001, [], 0
+    while now < span_s and len(rows) < 400:
+        pixel = {"hammer": home, "ring": int(ring[order % len(ring)]), "whole": order % pixels}.get(
+            kind, int(rng.integers(pixels))
+        )
+        if kind == "bursts":
+            pixel = home if rng.random() < 0.8 else pixel
+            if rng.random() < 0.06:
+                now += rng.choice([0.2, 1.0, 5.0])
+        width = round(rng.uniform(0.2, 1.0) * width_most * 5000) / 5000 or 2e-4
+        rows.append((pixel, now, width))
+        rest = 5.2e-4 if rng.random() < 0.5 else max(5.2e-4, width * (1 / duty - 1))
+        now = round((now + width + rest) * 1e6) * 1e-6
+        order += 1
+    return rows
+
+
+def as_plan(rows, power_w, display):
+    """A plan of (pixel, start_s, width_s) at one power or [n]."""
+    pixel, start, width = (np.array(column) for column in zip(*rows, strict=True))
+    n = len(rows)
+    side = int(np.ceil(np.sqrt(pixel.max() + 1)))
+    return PulsePlan(
+        **{
+            **{name: np.zeros(n, dtype=column.dtype) for name, column in vars(EMPTY_PLAN).items()},
+            "pixel": pixel.astype(np.int64),
+            "start_s": start.astype(float),
+            "width_s": width.astype(float),
+            "x_rad": (pixel % side - side / 2) * display.pitch_m / 0.44,
+            "y_rad": (pixel // side - side / 2) * display.pitch_m / 0.44,
+            "power_w": np.broadcast_to(np.asarray(power_w, dtype=float), n).copy(),
+        }
+    )
