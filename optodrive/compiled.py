@@ -42,6 +42,11 @@ CACHED = _writable(_FOLDER)
 numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 
+def cold() -> bool:
+    """Whether no machine code is kept yet for this state of the sources: the next use of kernels takes seconds."""
+    return not CACHED or not any(_FOLDER.iterdir())
+
+
 def kernel(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a function on its first use; the machine code is kept, so only the first run after a change pays."""
     compiled: Callable[P, T] = numba.njit(cache=CACHED, nogil=True, error_model="numpy")(function)

@@ -13,11 +13,17 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from scipy.integrate import solve_ivp
+from scipy.sparse import csr_array
 
 from optodrive.board.requirements import Requirements
 from optodrive.config import load_config
 from optodrive.flow import FrameSequence, TactileFrame
 from optodrive.limit.limiter import limit, verify
+from optodrive.neighbours import Neighbours
+from optodrive.physics.array import DisplayHeat
+from optodrive.physics.lattice import LatticeHeat, Modes, Walls, conductances_w_per_k
+from optodrive.physics.parameters import load_parameters
 from optodrive.pipeline import Display, prepare
 from optodrive.plan.scheduler import Scheduler
 from optodrive.simulator.run import execute
@@ -113,7 +119,119 @@ def bench_board():
     ]
 
 
-BENCHMARKS = {"plan": bench_plan, "wire": bench_wire, "board": bench_board}
+HOUR_S = 3600.0
+INTEGRATED = 300
+"""Pulses that the general integrator is given; it takes the same time for each."""
+
+
+def hour_of_frames():
+    """Columns of pulses: full frames at 50 µm as the planner makes them, one after the other for an hour."""
+    display, sequence = full_frame()
+    prepared = prepare(display, sequence, *display.at_rest())
+    plan, frames = prepared.plan, int(HOUR_S / prepared.duration_s)
+    begin_s = np.repeat(np.arange(frames) * prepared.duration_s, len(plan))
+    start_s = np.tile(plan.start_s, frames) + begin_s
+    return display, (np.tile(plan.pixel, frames), start_s, np.tile(plan.width_s, frames), np.tile(plan.power_w, frames))
+
+
+def seconds(work):
+    begin_s = time.process_time()
+    result = work()
+    return time.process_time() - begin_s, result
+
+
+def integrated(slope, count, columns):
+    """The state [variables × pixels] after the pulses, by solve_ivp from edge to edge; slope(light_w) makes dy/dt."""
+    state, now_s = np.zeros(count), 0.0
+    for pixel, start_s, width_s, power_w in zip(*columns, strict=True):
+        for light_w, to_s in ((0.0, start_s), (power_w, start_s + width_s)):
+            dydt = slope(int(pixel), light_w)
+            state = solve_ivp(dydt, (now_s, to_s), state, rtol=1e-8, atol=1e-8).y[:, -1]
+            now_s = to_s
+    return state
+
+
+def nominal_slope(pixel, count):
+    def of(index, light_w):
+        def slope(_, state):
+            theta, gas = state[:count], state[count:]
+            heating = -theta / pixel.tau_s
+            heating[index] += pixel.epsilon * light_w / pixel.c_j_per_k
+            return np.concatenate([heating, (theta / 2 - gas) / pixel.tau_g_s])
+
+        return slope
+
+    return of
+
+
+def wall_slope(pixel, walls, neighbours):
+    count, leak = len(neighbours), csr_array(conductances_w_per_k(walls, neighbours))
+
+    def of(index, light_w):
+        def slope(_, state):
+            theta, wall, gas = state[:count], state[count : 2 * count], state[2 * count :]
+            flow_w = (theta - wall) / pixel.r_k_per_w
+            heating = -flow_w / pixel.c_j_per_k
+            heating[index] += pixel.epsilon * light_w / pixel.c_j_per_k
+            warming = (flow_w - leak @ wall) / walls.c_j_per_k
+            return np.concatenate([heating, warming, ((theta + wall) / 2 - gas) / pixel.tau_g_s])
+
+        return slope
+
+    return of
+
+
+def hour_rows(name, make, columns, slope):
+    """One simulator against the clock, and a general integrator on the first pulses of the same list."""
+    first = [column[:INTEGRATED] for column in columns]
+    checked = make()
+    checked.pulses(*first)
+    heat = make()
+    ours_s, _ = seconds(lambda: heat.pulses(*columns))
+    rises_k = np.concatenate(rises_at_end(checked, first))
+    theirs_s, state = seconds(lambda: integrated(slope, len(rises_k), first))
+    ours_ms, theirs_ms = 1e3 * ours_s / len(columns[0]), 1e3 * theirs_s / INTEGRATED
+    apart_k = np.abs(rises_k - state).max()
+    return [
+        (f"{name}: one hour, every pulse's peaks", ours_s, "s CPU"),
+        (f"{name}: times real time", HOUR_S / ours_s, "×"),
+        (f"{name}: a pulse", ours_ms, "ms"),
+        (f"{name}: a pulse by solve_ivp, rtol 1e-8", theirs_ms, "ms"),
+        (f"{name}: solve_ivp takes longer", theirs_ms / ours_ms, "×"),
+        (f"{name}: largest difference to solve_ivp after {INTEGRATED} pulses", apart_k, "K"),
+    ]
+
+
+def rises_at_end(heat, columns):
+    """The rises [p] of each kind at the last pulse's end."""
+    end_s = float(columns[1][-1] + columns[2][-1])
+    if isinstance(heat, LatticeHeat):
+        return heat.rises(end_s)
+    each = [heat.rises(pixel, end_s) for pixel in range(len(heat.pixels))]
+    return tuple(np.array(each).T)
+
+
+def bench_hour():
+    """An hour of full frames on 1,511 pixels, each pulse simulated: the nominal pixel, and with walls. One run each."""
+    display, columns = hour_of_frames()
+    pixel, neighbours = display.pixels.each[0], Neighbours.of(display.config.display)
+    walls = Walls.of(load_parameters("extended"))
+    modes_s, modes = seconds(lambda: Modes.of(pixel, walls, neighbours))
+    count = len(display.pixels)
+    return [
+        ("pulses", len(columns[0]), "1"),
+        *hour_rows("nominal", lambda: DisplayHeat(display.pixels), columns, nominal_slope(pixel, count)),
+        ("walls and neighbours: the modes, once a display", modes_s, "s CPU"),
+        *hour_rows(
+            "walls and neighbours",
+            lambda: LatticeHeat(modes),
+            columns,
+            wall_slope(pixel, walls, neighbours),
+        ),
+    ]
+
+
+BENCHMARKS = {"plan": bench_plan, "wire": bench_wire, "board": bench_board, "hour": bench_hour}
 
 
 def main() -> int:

@@ -27,6 +27,14 @@ def print_json(document: dict[str, Any]) -> None:
     sys.stdout.write("\n")
 
 
+def announce_compilation() -> None:
+    """Say on stderr why the first run after an install or upgrade takes so long."""
+    from optodrive.compiled import cold
+
+    if cold():
+        print("optodrive: compiling kernels, half a minute, once", file=sys.stderr)
+
+
 @contextmanager
 def progress(label: str) -> Iterator[Callable[[float], None]]:
     """A bar on stderr, where that is a terminal; give it the share done, 0 to 1."""

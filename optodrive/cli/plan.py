@@ -10,6 +10,7 @@ from optodrive.cli.options import (
     JsonOption,
     PolicyOption,
     StrictOption,
+    announce_compilation,
     print_json,
     progress,
     report_lines,
@@ -39,6 +40,7 @@ def plan(
 
     display = Display.of(load_config(config))
     sequence = load_sequence(frames, display.config)
+    announce_compilation()
     with progress("planning") as done:
         prepared = prepare(display, sequence, *display.at_rest(), chosen(policy, strict), done)
     if out is not None:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption
+from optodrive.cli.options import ConfigOption, announce_compilation
 
 
 def register(app: typer.Typer) -> None:
@@ -25,4 +25,5 @@ def serve(
     loaded = load_config(config)
     if port is not None:
         loaded = loaded.model_copy(update={"daemon": loaded.daemon.model_copy(update={"port": port})})
+    announce_compilation()
     run(loaded)

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json, progress, report_lines
+from optodrive.cli.options import ConfigOption, JsonOption, announce_compilation, print_json, progress, report_lines
 from optodrive.cli.plan import FramesArgument
 from optodrive.errors import InputError
 
@@ -48,6 +48,7 @@ def simulate(
     display = Display.of(load_config(config))
     wanted = _wanted(pixels, len(display.layout))
     sequence = load_sequence(frames, display.config)
+    announce_compilation()
     with progress("planning") as done:
         prepared = prepare(display, sequence, *display.at_rest(), progress=done)
     with progress("simulating") as done:

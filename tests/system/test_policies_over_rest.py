@@ -1,0 +1,50 @@
+"""What a cap does not allow, over REST on the real board process: trimmed, delayed or refused as asked."""
+
+import pytest
+
+LOW = (("touch_max_c = 48.0", "touch_max_c = 23.0"),)
+FRAMES = {
+    "frames": [{"show_at_s": 0.1 * k, "duration_s": 0.1, "target_um": {"200": 300, "201": 300}} for k in range(6)]
+}
+
+
+@pytest.fixture
+def armed(make_daemon, make_board):
+    daemon = make_daemon(make_board(), replace=LOW)
+    daemon.arm()
+    return daemon
+
+
+def test_trim_names_pixel_cap_and_when_all_would_fit(armed):
+    shortfall = armed.call("POST", "/v1/plans", json=FRAMES, params={"dry_run": True})["summary"]["shortfall"]
+    assert shortfall["pixel"] in (200, 201)
+    assert shortfall["cap"] == "touch_temperature"
+    assert shortfall["margin_j"] > 0
+    assert 0 < shortfall["fits_later_s"] < 10
+
+
+def test_refuse_is_a_problem_document_and_nothing_moves(armed):
+    answer = armed.call("POST", "/v1/plans", status=409, json=FRAMES, params={"policy": "refuse"})
+    assert answer["code"] == "over_budget"
+    assert answer["cap"] == "touch_temperature"
+    assert answer["pixel"] in (200, 201)
+    assert "the whole fits" in answer["detail"]
+    assert armed.state()["totals"] == {"planned": 0, "sent": 0, "executed": 0}
+
+
+def test_delayed_frames_are_executed_as_tall_as_asked(armed):
+    plan = armed.call("POST", "/v1/plans", json=FRAMES, params={"policy": "delay"})["plan"]
+    answer = armed.finished(plan)
+    assert answer["status"] == "done", answer["error"]
+    assert answer["executed"] == 12
+    assert answer["summary"]["trimmed"]["pulses"] == 0
+    delays = answer["summary"]["delays"]
+    assert {delay["cap"] for delay in delays} == {"touch_temperature"}
+    # What was waited for in the plan was waited for on the board.
+    starts = answer["executed_pulses"]["start_s"]
+    assert starts[-1] > 0.5 + sum(delay["wait_s"] for delay in delays) - 0.1
+
+
+@pytest.mark.parametrize("wrong", [{"policy": "perhaps"}, {"policy": "delay", "strict": True}])
+def test_a_wrong_policy_is_refused(armed, wrong):
+    assert armed.call("POST", "/v1/plans", status=422, json=FRAMES, params=wrong)["code"] == "bad_input"
