@@ -1,0 +1,21 @@
+"""The wall at the bridge's far end is no sink: it warms, and cools to its surroundings more slowly."""
+
+from optodrive.physics.term import Flows, Term, TermParameter, Values, View
+
+
+class WallHeating(Term):
+    """C dw/dt = what the bridge brings − w / R; the bridge and the gas feel the wall's rise."""
+
+    key = "wall_heating"
+    parameters = (
+        TermParameter("resistance", "K/W", 1.0, 40.0, "a cell of the laminate to its surroundings, by its materials"),
+        TermParameter("capacity", "J/K", 2.5e-3, 10.0, "0.1 to 10 s with the resistance"),
+    )
+    heat_nodes = {"wall_k": "capacity"}  # noqa: RUF012 - a Mapping, never written to
+
+    def flow(self, values: Values, view: View, flows: Flows) -> None:
+        """Wall to ambient."""
+        flows.move("wall_k", None, view.rise_k["wall_k"] / values["resistance"])
+
+
+TERM = WallHeating()
