@@ -59,5 +59,5 @@ def vector_kernel(function: Callable[P, T]) -> Callable[P, T]:
     The last digits of a result then depend on the processor.
     """
     free = {"reassoc", "contract", "arcp"}
-    compiled: Callable[P, T] = numba.njit(cache=CACHED, error_model="numpy", fastmath=free)(function)
+    compiled: Callable[P, T] = numba.njit(cache=CACHED, nogil=True, error_model="numpy", fastmath=free)(function)
     return compiled

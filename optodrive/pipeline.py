@@ -11,7 +11,7 @@ import numpy as np
 
 from optodrive.config import Config, PixelLayout, pixel_layout
 from optodrive.errors import InputError, OverBudgetError, RefusedError
-from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain
+from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain, TactileFrame
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
@@ -139,10 +139,11 @@ def chosen(policy: Policy, strict: bool) -> Policy:
 
 
 def warm_up(display: Display) -> None:
-    """Plan one pulse for nobody, so that every kernel is compiled and loaded."""
-    laser = display.config.laser
-    pulse = PulseTrain(0, 0.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
-    prepare(display, FrameSequence(trains=(pulse,)), *display.at_rest())
+    """Plan a frame and a pulse for nobody, so that every kernel is compiled and loaded."""
+    laser, target_m = display.config.laser, np.zeros(len(display.pixels))
+    target_m[0] = 1e-6
+    pulse = PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
+    prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), (pulse,)), *display.at_rest())
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:

@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from optodrive.board.requirements import Requirements
 from optodrive.config import load_config
 from optodrive.flow import FrameSequence, TactileFrame
-from optodrive.limit.limiter import limit, verify
+from optodrive.limit.limiter import limit, shifted, verify
 from optodrive.neighbours import Neighbours
 from optodrive.physics.array import DisplayHeat
 from optodrive.physics.lattice import LatticeHeat, Modes, Walls, conductances_w_per_k
@@ -98,8 +98,7 @@ def bench_wire():
 
     def prove():
         decoded = decode(payload, scale)
-        pixel = plan.pixel[points.row[decoded.index]].tolist()
-        verify(pixel, decoded.start_s, decoded.width_s, decoded.power_w, budget, display.budget)
+        verify(plan.pixel[points.row[decoded.index]], decoded, budget, display.budget)
 
     return [
         ("pulses quantised a second", len(plan) / median_s(lambda: quantise(plan, scale)), "1/s"),
@@ -215,7 +214,7 @@ def bench_hour():
     """An hour of full frames on 1,511 pixels, each pulse simulated: the nominal pixel, and with walls. One run each."""
     display, columns = hour_of_frames()
     pixel, neighbours = display.pixels.each[0], Neighbours.of(display.config.display)
-    walls = Walls.of(load_parameters("extended"))
+    walls = Walls.of(load_parameters("surroundings"))
     modes_s, modes = seconds(lambda: Modes.of(pixel, walls, neighbours))
     count = len(display.pixels)
     return [
@@ -231,7 +230,37 @@ def bench_hour():
     ]
 
 
-BENCHMARKS = {"plan": bench_plan, "wire": bench_wire, "board": bench_board, "hour": bench_hour}
+def resident_mib():
+    """Memory the process holds now, MiB."""
+    fields = Path("/proc/self/statm").read_text().split()
+    return int(fields[1]) * resource.getpagesize() / 2**20
+
+
+def bench_limit():
+    """The limiter alone: a full frame, and a million pulses in pieces with the state carried on."""
+    rows = []
+    for height_um in (50, 400):
+        display, sequence = full_frame(height_m=height_um * 1e-6)
+        heat, state = display.at_rest()
+        piece = next(iter(Scheduler(display.machine, sequence).pieces(heat)))
+        limit_s = median_s(lambda piece=piece, state=state, budget=display.budget: limit(piece, state, budget))
+        rows.append((f"{height_um} µm: a full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
+    display, sequence = full_frame()
+    heat, state = display.at_rest()
+    piece = next(iter(Scheduler(display.machine, sequence).pieces(heat)))
+    period_s = float(piece.start_s[-1] + piece.width_s[-1]) + 1e-3
+    held_mib, count, begin_s = [], 0, time.process_time()
+    while count < 1_000_000:
+        state = shifted(limit(piece, state, display.budget)[1], -period_s)
+        count += len(piece)
+        held_mib.append(resident_mib())
+    rows.append(("a million pulses, frame after frame", time.process_time() - begin_s, "s"))
+    rows.append(("memory after 10,000 of them", held_mib[7], "MiB"))
+    rows.append(("memory after all of them", held_mib[-1], "MiB"))
+    return rows
+
+
+BENCHMARKS = {"plan": bench_plan, "limit": bench_limit, "wire": bench_wire, "board": bench_board, "hour": bench_hour}
 
 
 def main() -> int:

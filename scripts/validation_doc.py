@@ -14,6 +14,8 @@ Made by `scripts/validation-doc`; `optodrive validate` prints the same rows.
 `literal` is the set `paper_s1_literal`, Text S1 as it stands with nothing fitted. `calibrated` is what displays are
 driven with, fitted by `scripts/calibrate-parameters` on three facts, one a parameter: κ on `z_peak_w020`, τ_g on
 `dpp_200Hz`, φ on `F_peak_w020`. `eta_stroke` is made of two of them and counts as fitted. All else is predicted.
+`extended` is the model with terms, fitted by `scripts/calibrate-extended` on the same facts and the temperature of the
+same pixel; [extended-model.md](extended-model.md) says what each term gains.
 
 - Full power is 2.45 W, what the bolometer read, also where a figure says 2.5 W.
 - Ratio is model over measured, of temperatures by their rises above 20 °C; an upper bound has none.
@@ -23,6 +25,8 @@ driven with, fitted by `scripts/calibrate-parameters` on three facts, one a para
   nor τ_g's uncertainty takes it in.
 - `F_linear_in_P` and `z_repeat_w040` hold by construction: the model is linear and remembers nothing for 5 s.
 - The paper fitted R and C on the first 30 ms of the temperatures that are predicted here at 50 ms.
+- The extended set has the gas's rise from its force, by the gas law on the whole aperture, as the paper had it; the
+  other two say what their own gas does.
 - That the gas settles at half the absorber's rise is Text S1's; displacements fix only its product with κ.
 """
 

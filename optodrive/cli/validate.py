@@ -1,11 +1,21 @@
-"""The paper's facts against both parameter sets: rows, a table on the terminal, JSON."""
+"""The paper's facts against the parameter sets: rows, a table on the terminal, JSON."""
 
 from dataclasses import asdict, dataclass
 from math import isfinite
 from typing import Any, Literal
 
+from optodrive.physics.extended import outcomes
 from optodrive.physics.facts import Fact, paper_facts
-from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, REMARKS, SILENT, STANDS_ON_FITTED
+from optodrive.physics.paper import (
+    EXTENDED_FITTED_ON,
+    EXTENDED_STANDS_ON_FITTED,
+    FITTED_ON,
+    INPUTS,
+    OUTCOMES,
+    REMARKS,
+    SILENT,
+    STANDS_ON_FITTED,
+)
 from optodrive.physics.parameters import load_parameters
 
 MISS = 0.15
@@ -15,16 +25,18 @@ SCALES = {"m": (1e6, "Âµm"), "N": (1e3, "mN"), "J": (1e3, "mJ"), "J/K": (1e6, "Â
 """Display scale and unit of SI units whose numbers would be awkward."""
 
 
-HEADINGS = ("fact", "measured", "literal", "ratio", "calibrated", "ratio", "role")
-TABLE_WIDTH = 100
+Role = Literal["input", "fitted", "predicted"]
+HEADINGS = ("fact", "measured", "literal", "ratio", "calibrated", "ratio", "role", "extended", "ratio", "role")
+TABLE_WIDTH = 130
 """Narrower terminals wrap lines rather than lose digits."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One fact beside the literal and the calibrated model, SI; ratios are model over measured, None for a bound.
+    """One fact beside the three models, SI; ratios are model over measured, None for a bound.
 
-    role: whether the calibrated set was fitted on it, predicts it, or took it from the paper; remark: '' unless missed.
+    role, extended_role: whether that set was fitted on it, predicts it, or took it from the paper; remark: what there
+    is to say of the calibrated set, '' unless it misses.
     """
 
     fact: Fact
@@ -32,27 +44,45 @@ class Row:
     literal_ratio: float | None
     calibrated: float
     calibrated_ratio: float | None
-    role: Literal["input", "fitted", "predicted"]
+    role: Role
+    extended: float
+    extended_ratio: float | None
+    extended_role: Role
     remark: str
 
 
 def validate_table() -> list[Row]:
     """Every fact that a parameter set can speak to, in the order of the facts."""
     literal, calibrated = load_parameters("paper_s1_literal"), load_parameters("calibrated")
+    simulated = outcomes(load_parameters("extended"))
     models = INPUTS | OUTCOMES
     rows = []
     for name, fact in paper_facts().items():
         if name in models:
             said, fitted = models[name](literal), models[name](calibrated)
             remark = REMARKS[name] if fact.missed(fitted, MISS) else ""
-            rows.append(Row(fact, said, fact.ratio(said), fitted, fact.ratio(fitted), _role(name), remark))
+            extended = simulated.get(name, fitted)
+            rows.append(
+                Row(
+                    fact=fact,
+                    literal=said,
+                    literal_ratio=fact.ratio(said),
+                    calibrated=fitted,
+                    calibrated_ratio=fact.ratio(fitted),
+                    role=_role(name, {*FITTED_ON.values()} | STANDS_ON_FITTED),
+                    extended=extended,
+                    extended_ratio=fact.ratio(extended),
+                    extended_role=_role(name, {*EXTENDED_FITTED_ON.values()} | EXTENDED_STANDS_ON_FITTED),
+                    remark=remark,
+                )
+            )
     return rows
 
 
-def _role(name: str) -> Literal["input", "fitted", "predicted"]:
+def _role(name: str, shown: set[str]) -> Role:
     if name in INPUTS:
         return "input"
-    return "fitted" if name in FITTED_ON.values() or name in STANDS_ON_FITTED else "predicted"
+    return "fitted" if name in shown else "predicted"
 
 
 def validate(json: bool = False) -> None:
@@ -69,7 +99,8 @@ def validate(json: bool = False) -> None:
 def as_json(rows: list[Row]) -> dict[str, Any]:
     """The rows as plain data in SI units; a number that is not finite becomes null."""
     facts = [asdict(row.fact) | _plain(row) for row in rows]
-    return {"facts": facts, "silent": dict(SILENT), "fitted_on": dict(FITTED_ON)}
+    fitted = {"fitted_on": dict(FITTED_ON), "extended_fitted_on": dict(EXTENDED_FITTED_ON)}
+    return {"facts": facts, "silent": dict(SILENT)} | fitted
 
 
 def _plain(row: Row) -> dict[str, Any]:
@@ -91,6 +122,9 @@ def cells(row: Row) -> list[str]:
         f"{row.calibrated * scale:.3g}",
         _ratio(row.calibrated_ratio),
         row.role,
+        f"{row.extended * scale:.3g}",
+        _ratio(row.extended_ratio),
+        row.extended_role,
     ]
 
 
@@ -102,7 +136,7 @@ def _print_table(rows: list[Row]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title="The paper's facts, and what the two parameter sets make of them")
+    table = Table(title="The paper's facts, and what the parameter sets make of them")
     for heading in HEADINGS:
         table.add_column(heading, justify="left" if heading in ("fact", "role") else "right", no_wrap=True)
     for row in rows:

@@ -93,6 +93,21 @@ class DisplayHeat:
         peak_k, _ = cooling_peak(parameters, self._theta_k[pixel], self._gamma_k[pixel], within_s)
         return parameters.kappa_m_per_k * peak_k
 
+    def trace(self, pixel: int, pulses: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Absorber and gas rise, K, each [m], of a pixel at times t_s [m], increasing; the heat stays as it is.
+
+        pulses: [n, 3] start_s, width_s, power_w in order; ValueError for one, or a time, before the last event.
+        """
+        events_s = np.concatenate([[self._at_s[pixel]], pulses[:, 0] + pulses[:, 1]])
+        for asked_s, after_s in ((pulses[:, 0], events_s[:-1]), (t_s[:1], events_s[:1])):
+            early = np.flatnonzero(asked_s < after_s[: len(asked_s)] - TIME_ROUNDING_S)
+            if len(early):
+                raise ValueError(f"pixel {pixel} at {asked_s[early[0]]} s: its last event is at {after_s[early[0]]} s")
+        absorber_k, gas_k = np.zeros(len(t_s)), np.zeros(len(t_s))
+        start = self._at_s[pixel], self._theta_k[pixel], self._gamma_k[pixel]
+        _sample(self.pixels.each[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
+        return absorber_k, gas_k
+
 
 @kernel
 def _walk(
@@ -142,42 +157,46 @@ def _parameters(columns: FloatArray, i: int) -> Pixel:
     return Pixel(one[0], one[1], one[2], one[3], one[4], one[5])
 
 
-def pulse_peaks(
-    heat: DisplayHeat, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
-) -> FloatArray:
-    """[n] largest displacement, m, from each pulse's start to the next on its pixel, or for ever; heat is advanced.
-
-    All arrays [n], pulses of a pixel in order of time.
-    """
-    return heat.pulses(pixel, start_s, width_s, power_w).displacement_m
+@kernel
+def _sample(
+    one: Pixel,
+    end_s: float,
+    theta_k: float,
+    gamma_k: float,
+    pulses: FloatArray,
+    t_s: FloatArray,
+    absorber_k: FloatArray,
+    gas_k: FloatArray,
+) -> None:
+    """Fill in the rises of a pixel at t_s [m], through its pulses [n, 3], from those at its last event, end_s."""
+    begin_s, power_w, begin_theta_k, begin_gamma_k = end_s, 0.0, theta_k, gamma_k
+    upcoming = 0
+    for row in range(len(t_s)):
+        while upcoming < len(pulses) and t_s[row] >= pulses[upcoming, 0]:
+            dark_s = max(0.0, pulses[upcoming, 0] - end_s)
+            begin_theta_k, begin_gamma_k = advance(one, theta_k, gamma_k, 0.0, dark_s)
+            begin_s, power_w = pulses[upcoming, 0], pulses[upcoming, 2]
+            theta_k, gamma_k = advance(one, begin_theta_k, begin_gamma_k, power_w, pulses[upcoming, 1])
+            end_s = begin_s + pulses[upcoming, 1]
+            upcoming += 1
+        if t_s[row] < end_s:
+            lit_s = max(0.0, t_s[row] - begin_s)
+            absorber_k[row], gas_k[row] = advance(one, begin_theta_k, begin_gamma_k, power_w, lit_s)
+        else:
+            absorber_k[row], gas_k[row] = advance(one, theta_k, gamma_k, 0.0, t_s[row] - end_s)
 
 
 def pixel_trace(
     heat: DisplayHeat, pulses: Iterable[tuple[int, float, float, float]], pixels: list[int], t_s: FloatArray
 ) -> PixelTrace:
     """Exact values of some pixels at times t_s [m], increasing; pulses: (pixel, start_s, width_s, power_w) in order."""
-    absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
     own: dict[int, list[tuple[float, float, float]]] = {index: [] for index in pixels}
-    for index, start_s, width_s, power_w in pulses:
+    for index, *pulse in pulses:
         if index in own:
-            own[index].append((start_s, width_s, power_w))
+            own[index].append((pulse[0], pulse[1], pulse[2]))
+    absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
     for column, index in enumerate(pixels):
-        state = heat.copy()
-        parameters = heat.pixels.each[index]
-        events = iter([*own[index], (float("inf"), 0.0, 0.0)])
-        upcoming = next(events)
-        lit_from_s, lit_s, power_w = 0.0, 0.0, 0.0
-        begin = (0.0, 0.0)
-        for row, at_s in enumerate(t_s.tolist()):
-            while at_s >= upcoming[0]:
-                lit_from_s, lit_s, power_w = upcoming
-                begin = state.rises(index, lit_from_s)
-                state.pulse(index, lit_from_s, lit_s, power_w)
-                upcoming = next(events)
-            if at_s < lit_from_s + lit_s:
-                absorber_k[row, column], gas_k[row, column] = advance(parameters, *begin, power_w, at_s - lit_from_s)
-            else:
-                absorber_k[row, column], gas_k[row, column] = state.rises(index, at_s)
+        absorber_k[:, column], gas_k[:, column] = heat.trace(index, np.array(own[index]).reshape(-1, 3), t_s)
     each = [heat.pixels.each[index] for index in pixels]
     return PixelTrace(
         t_s=t_s,

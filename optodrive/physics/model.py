@@ -113,7 +113,7 @@ class Model:
         return Rates(np.stack([moves[name] for name in self.states]), absorbed_w, np.asarray(flows.left_w))
 
     def outputs(self, state_k: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Displacement, m, and blocked force, N, of states [s, p]: [p] each."""
+        """Displacement, m, and blocked force, N, of states [s, p] or [s, m, p]: the same without s."""
         view, pixels = self._view(state_k), self.pixels
         displacement_m = pixels.kappa_m_per_k * view.rise_k["gas_k"]
         force_n = pixels.phi_n_per_k * view.rise_k["gas_k"]
@@ -138,14 +138,15 @@ class Model:
             times_s.append(1.0 / float(rate))
         return min(times_s)
 
-    def trace(self, drives: Sequence[Drive], t_s: FloatArray) -> ModelTrace:
+    def trace(self, drives: Sequence[Drive], t_s: FloatArray, steps: int = STEPS) -> ModelTrace:
         """From rest at 0: states and outputs at t_s [m], increasing; drives in order of their starts.
 
-        Classical Runge–Kutta between the edges of the light, in steps of the quickest time constant over STEPS.
+        Classical Runge–Kutta between the edges of the light, in steps of the quickest time constant over `steps`; one
+        step is enough for what moves slowly in the dark.
         """
         edges_s = np.array([0.0, *(drive.start_s for drive in drives)])
         powers = [np.zeros(len(self.pixels)), *(drive.power_w for drive in drives)]
-        step_s = self._quickest_s / STEPS
+        step_s = self._quickest_s / steps
         state_k, now_s, heat_j = self.at_rest(), 0.0, np.zeros(2)
         kept, heats, edge = [], [], 0
         for until_s in t_s.tolist():
@@ -177,12 +178,12 @@ class Model:
         return state_k, heat_j
 
     def _told(self, t_s: FloatArray, states_k: FloatArray, heats_j: FloatArray) -> ModelTrace:
-        outputs = [self.outputs(state_k) for state_k in states_k]
+        displacement_m, force_n = self.outputs(states_k.transpose(1, 0, 2))
         return ModelTrace(
             t_s=t_s,
             rise_k={name: states_k[:, row] for row, name in enumerate(self.states)},
-            displacement_m=np.array([displacement_m for displacement_m, _ in outputs]),
-            force_n=np.array([force_n for _, force_n in outputs]),
+            displacement_m=displacement_m,
+            force_n=force_n,
             absorbed_j=heats_j[:, 0],
             left_j=heats_j[:, 1],
             stored_j=heats_j[:, 2],

@@ -20,6 +20,17 @@ FITTED_ON = {"kappa": "z_peak_w020", "tau_g": "dpp_200Hz", "phi": "F_peak_w020"}
 STANDS_ON_FITTED = {"eta_stroke"}
 """Outcomes made of fitted facts alone, hence no test of the set."""
 
+EXTENDED_FITTED_ON = {
+    "bridge_conductivity.exponent": "dT_peak_w020",
+    "gas_membrane.share": "z_peak_w020",
+    "tau_g": "dpp_200Hz",
+    "force_area.area": "F_peak_w020",
+}
+"""The extended set's parameters and their facts: the calibrated set's, and the temperature of the same pixel."""
+
+EXTENDED_STANDS_ON_FITTED = {"T_peak_w020", "dT_air_isometric", "dQ_air", "eta_stroke", "eta_qt", "eta_tm"}
+"""Outcomes that follow from these by arithmetic; the gas is had from the force as the paper had it."""
+
 
 def _rise_k(width_mm: float) -> Model:
     return lambda s: advance(s.pixel(width_mm * 1e-3), 0.0, 0.0, FULL_W, LONG_S)[0]

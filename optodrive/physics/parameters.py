@@ -9,9 +9,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
-from optodrive.errors import InputError
+from optodrive.errors import InputError, nearest
 from optodrive.flow import FloatArray, freeze_arrays
 from optodrive.physics.pixel import Pixel
+from optodrive.physics.terms import known_terms
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
@@ -34,7 +35,7 @@ class Parameter(BaseModel):
     """One number: value, unit, standard uncertainty (absent where the source gives none) and source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    value: Annotated[float, Field(gt=0)]
+    value: Annotated[float, Field(ge=0)]
     unit: str
     sigma: Annotated[float, Field(ge=0)] | None = None
     source: str
@@ -46,8 +47,12 @@ class _Units(BaseModel):
     def _units_are_si(self) -> Self:
         for name, unit in UNITS.items():
             parameter = getattr(self, name, None)
-            if parameter is not None and parameter.unit != unit:
+            if parameter is None:
+                continue
+            if parameter.unit != unit:
                 raise ValueError(f"{name} in {unit}, not in '{parameter.unit}'")
+            if parameter.value == 0.0:
+                raise ValueError(f"{name} greater than 0")
         return self
 
 
@@ -132,13 +137,37 @@ def load_parameters(name: str | Path) -> ParameterSet:
         path = shipped_path("parameters", f"{name}.toml")
     table = _with_base(path, read_toml(path))
     try:
-        return ParameterSet.model_validate(table)
+        parameters = ParameterSet.model_validate(table)
     except ValidationError as error:
         raise input_error(error, str(path), ParameterSet) from None
+    for key, values in parameters.terms.items():
+        _check_term(f"{path}: terms.{key}", key, values)
+        for need in known_terms()[key].needs:
+            if need not in parameters.terms:
+                raise InputError(f"{path}: terms.{key}", f"without {need}", f"terms.{need} beside it")
+    return parameters
+
+
+def _check_term(where: str, key: str, values: dict[str, Parameter]) -> None:
+    """A term must be known and have each of its parameters, in its unit and plausible range, and no other."""
+    if key not in known_terms():
+        raise InputError(where, key, f"a known term, {nearest(key, sorted(known_terms()))}")
+    wanted = {item.name: item for item in known_terms()[key].parameters}
+    for name, given in values.items():
+        if name not in wanted:
+            raise InputError(f"{where}.{name}", name, f"a parameter of it, {nearest(name, sorted(wanted))}")
+        item = wanted[name]
+        if given.unit != item.unit:
+            raise InputError(f"{where}.{name}.unit", given.unit, f"'{item.unit}'")
+        if not item.low <= given.value <= item.high:
+            raise InputError(f"{where}.{name}.value", given.value, f"{item.low:g} to {item.high:g} {item.unit}")
+    for name in wanted:
+        if name not in values:
+            raise InputError(f"{where}.{name}", None, "this parameter to be there")
 
 
 def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
-    """A set that names a base is the base with the set's own entries over it."""
+    """A set that names a base is the base with the set's own entries over it, its terms beside the base's."""
     check_format(path, table, FORMAT, VERSION)
     base = table.pop("base", None)
     if base is None:
@@ -146,7 +175,9 @@ def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     below = shipped_path("parameters", f"{base}.toml")
     if not below.is_file():
         raise InputError(f"{path}: base", base, "the name of a shipped parameter set")
-    return _with_base(below, read_toml(below)) | table
+    under = _with_base(below, read_toml(below))
+    terms = {**under.get("terms", {}), **table.get("terms", {})}
+    return {**under, **table, "terms": terms}
 
 
 def display_pixels(config: Config) -> PixelArray:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.physics.array import DisplayHeat, pulse_peaks
+from optodrive.physics.array import DisplayHeat
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
@@ -73,7 +73,7 @@ def test_read_only_and_narrow_columns_are_taken():
     pixel, start_s = np.array([0, 2], dtype=np.int32), np.array([0.0, 0.1])
     pixel.flags.writeable = start_s.flags.writeable = False
     half = np.array([0.01, 0.02], dtype=np.float32)
-    assert pulse_peaks(DisplayHeat(ARRAY), pixel, start_s, half, half).min() > 0
+    assert DisplayHeat(ARRAY).pulses(pixel, start_s, half, half).displacement_m.min() > 0
 
 
 def test_pixels_that_are_not_there_and_torn_columns_are_refused():

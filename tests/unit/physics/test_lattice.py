@@ -191,4 +191,4 @@ def test_times_before_the_last_event_and_pixels_that_are_not_are_refused():
 
 
 def test_walls_come_from_a_parameter_set():
-    assert Walls.of(load_parameters("extended")) == Walls(20.0, 0.06, 430.0, 430.0)
+    assert Walls.of(load_parameters("surroundings")) == Walls(20.0, 0.06, 430.0, 430.0)

@@ -72,7 +72,7 @@ def test_an_own_file_reads_like_a_shipped_one(tmp_path, text):
     [
         ('unit = "s"', 'unit = "ms"', "tau_g in s, not in 'ms'"),
         ('value = 382.0, unit = "K/W"', 'value = 382.0, unit = "W/K"', "bridge.0: got 'values that contradict'"),
-        ("value = 0.66", "value = -0.66", "epsilon.value: got -0.66, expected greater than 0"),
+        ("value = 0.66", "value = -0.66", "epsilon.value: got -0.66, expected greater than or equal to 0"),
         ("value = 0.66", "value = nan", "epsilon.value: got nan"),
         ("sigma = 0.007", "sigma = -1", "epsilon.sigma: got -1"),
         ("[phi]", "[psi]", "psi"),
@@ -95,7 +95,41 @@ def test_a_missing_value_is_named(tmp_path, text):
 
 
 def test_unknown_names_and_missing_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="calibrated, paper_s1_literal"):
+    with pytest.raises(InputError, match="calibrated, extended, paper_s1_literal, surroundings"):
         load_parameters("best")
     with pytest.raises(InputError, match="readable file"):
         load_parameters(tmp_path / "none.toml")
+
+
+TERM = """
+[terms.{term}.{name}]
+value = {value}
+unit = "{unit}"
+source = "here"
+"""
+WRONG_TERMS = {
+    "unknown term": (("wall_heeting", "resistance", 20.0, "K/W"), "a known term, nearest is 'wall_heating'"),
+    "unknown parameter": (("bridge_conductivity", "exponant", 0.1, "1"), "nearest is 'exponent'"),
+    "wrong unit": (("bridge_conductivity", "exponent", 0.1, "K"), "exponent.unit: got 'K', expected '1'"),
+    "out of range": (("bridge_conductivity", "exponent", 3.0, "1"), "expected 0 to 1.3 1"),
+    "missing parameter": (("wall_heating", "resistance", 20.0, "K/W"), "capacity: got None"),
+    "negative": (("bridge_conductivity", "exponent", -0.1, "1"), "greater than or equal to 0"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_TERMS)
+def test_wrong_terms_are_refused_in_one_line(case, tmp_path):
+    (term, name, value, unit), said = WRONG_TERMS[case]
+    path = tmp_path / "mine.toml"
+    head = 'format = "optodrive-parameters"\nversion = 1\nname = "mine"\nbase = "calibrated"\nclaims = "none"\n'
+    path.write_text(head + TERM.format(term=term, name=name, value=value, unit=unit))
+    with pytest.raises(InputError, match=said) as caught:
+        load_parameters(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_base_must_be_a_shipped_set(tmp_path):
+    path = tmp_path / "mine.toml"
+    path.write_text('format = "optodrive-parameters"\nversion = 1\nbase = "best"\n')
+    with pytest.raises(InputError, match="base: got 'best', expected the name of a shipped parameter set"):
+        load_parameters(path)

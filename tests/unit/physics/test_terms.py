@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 from optodrive.config import DisplaySection
 from optodrive.errors import InputError
 from optodrive.neighbours import Neighbours
+from optodrive.physics import terms
 from optodrive.physics.model import Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance
@@ -175,3 +176,25 @@ def test_every_file_of_the_package_is_a_term():
         for parameter in term.parameters:
             assert parameter.low < parameter.high
             assert parameter.source
+
+
+def test_a_new_term_is_a_new_file_and_nothing_else(tmp_path, monkeypatch):
+    (tmp_path / "leak.py").write_text(
+        "from optodrive.physics.term import Term, TermParameter\n"
+        "class Leak(Term):\n"
+        "    key = 'leak'\n"
+        "    parameters = (TermParameter('resistance', 'K/W', 1.0, 1e6, 'here'),)\n"
+        "    def flow(self, values, view, flows):\n"
+        "        flows.move('absorber_k', None, view.rise_k['absorber_k'] / values['resistance'])\n"
+        "TERM = Leak()\n"
+    )
+    monkeypatch.setattr(terms, "__path__", [*terms.__path__, str(tmp_path)])
+    known_terms.cache_clear()
+    try:
+        leaky = Model(PixelArray.uniform(PIXEL, 1), {"leak": {"resistance": PIXEL.r_k_per_w}}, AMBIENT_K)
+        traced = leaky.trace([Drive(0.0, np.array([2.0]))], np.array([0.5]))
+    finally:
+        monkeypatch.undo()
+        known_terms.cache_clear()
+    assert traced.rise_k["absorber_k"][0, 0] == pytest.approx(0.5 * PIXEL.epsilon * 2.0 * PIXEL.r_k_per_w)
+    assert traced.absorbed_j == pytest.approx(traced.stored_j + traced.left_j)
