@@ -1,14 +1,31 @@
 """A display's heat integrated step by step, and hostile sequences: written apart from the limiter and from physics."""
 
 from dataclasses import dataclass
+from math import inf
 
 import numba
 import numpy as np
 
 from optodrive.config import DisplaySection
 from optodrive.flow import EMPTY_PLAN, PulsePlan
+from optodrive.limit.budget import Caps
 from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls
 from optodrive.neighbours import Neighbours
+
+NO_CAPS = Caps(
+    absorber_k=1e6,
+    wall_k=1e6,
+    touch_k=1e6,
+    galvo_rad2_per_s4=inf,
+    pulse_energy_j=1e3,
+    pulse_width_s=0.050,
+    pulse_rest_s=5e-4,
+    pixel_mean_w=1e3,
+    pixel_window_s=1.0,
+    display_mean_w=1e3,
+    display_window_s=2.0,
+)
+"""Caps that do not bind."""
 
 
 @numba.njit(cache=False)
@@ -170,6 +187,16 @@ def galvo_peak(plan, budget):
             most = max(most, mean.max())
         at, clock = to, plan.start_s[row]
     return most
+
+
+def window_peak_w(plan, window_s):
+    """Largest mean power over any window, by the energy delivered at all its corners."""
+    edges_s = np.stack([plan.start_s, plan.start_s + plan.width_s], axis=1).ravel()
+    energy_j = np.repeat(np.cumsum(plan.power_w * plan.width_s), 2)
+    energy_j[::2] -= plan.power_w * plan.width_s
+    ends_s = np.concatenate([edges_s, edges_s + window_s])
+    inside_j = np.interp(ends_s, edges_s, energy_j) - np.interp(ends_s - window_s, edges_s, energy_j, left=0.0)
+    return inside_j.max() / window_s
 
 
 def small_lattice(rng):

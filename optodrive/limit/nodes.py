@@ -144,6 +144,8 @@ def _settle_all(heat: HeatBound, nodes: Nodes, from_s: float, to_s: float) -> No
 @kernel
 def exchange(heat: HeatBound, nodes: Nodes, to_s: float, pulse_width_s: float) -> None:
     """Let walls exchange heat up to to_s, in steps; afterwards inflow_w holds for one step and a pulse more."""
+    if heat.step_s == inf:  # no walls
+        return
     if nodes.exchanged_at_s[0] == -inf:
         nodes.exchanged_at_s[0] = to_s - heat.step_s
     step_s = heat.step_s

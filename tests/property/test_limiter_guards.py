@@ -1,33 +1,17 @@
 """Each guard of the limiter: how near it lets a hostile sequence come, and mutants that it would not survive."""
 
-from math import inf
-
 import numpy as np
 import pytest
 
 from displays import DISPLAYS
 from optodrive.guard import declared
-from optodrive.limit.budget import Budget, Caps
+from optodrive.limit.budget import Budget
 from optodrive.limit.corner import Uncertainty
 from optodrive.limit.limiter import fresh_state, limit
 from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.units import ZERO_CELSIUS_K
-from warmth import as_plan, galvo_peak, truth, upper
-
-ROOMY = Caps(
-    absorber_k=380.0,
-    wall_k=380.0,
-    touch_k=380.0,
-    galvo_rad2_per_s4=inf,
-    pulse_energy_j=1e3,
-    pulse_width_s=0.050,
-    pulse_rest_s=5e-4,
-    pixel_mean_w=1e3,
-    pixel_window_s=1.0,
-    display_mean_w=1e3,
-    display_window_s=2.0,
-)
+from warmth import NO_CAPS, as_plan, galvo_peak, truth, upper, window_peak_w
 
 
 def hammer(span_s, width_s=0.010, rest_s=5.2e-4, pixel=0):
@@ -57,16 +41,6 @@ def model_of(name):
     return declared(parameters, display.pixels, Neighbours.of(display.config.display), 20.0 + ZERO_CELSIUS_K)
 
 
-def window_peak_w(plan, window_s):
-    """Largest mean power over any window, by the energy delivered at all its corners."""
-    edges_s = np.stack([plan.start_s, plan.start_s + plan.width_s], axis=1).ravel()
-    energy_j = np.repeat(np.cumsum(plan.power_w * plan.width_s), 2)
-    energy_j[::2] -= plan.power_w * plan.width_s
-    ends_s = np.concatenate([edges_s, edges_s + window_s])
-    inside_j = np.interp(ends_s, edges_s, energy_j) - np.interp(ends_s - window_s, edges_s, energy_j, left=0.0)
-    return inside_j.max() / window_s
-
-
 def unchanged(budget):
     return budget
 
@@ -79,7 +53,7 @@ def share(guard, factor=None, mutate=unchanged, carry=kept):
     """Largest value that the sequence, a pause and the sequence again reach, over the guard's true cap."""
     name, binding, rows, pause_s = SCENARIOS[guard]
     display, model = DISPLAYS[name], model_of(name)
-    caps = ROOMY._replace(**binding)
+    caps = NO_CAPS._replace(**binding)
     budget = Budget(caps, display.budget.heat, display.budget.mirrors)
     pixels = len(model.epsilon)
     offset_s = rows[-1][1] + rows[-1][2] + pause_s

@@ -1,5 +1,6 @@
 """Each cap has a test that its removal breaks: `test_a_cap_taken_away_is_noticed` proves it."""
 
+from dataclasses import replace
 from math import inf
 from types import SimpleNamespace
 
@@ -8,25 +9,13 @@ import pytest
 
 from optodrive.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.flow import PulsePlan
-from optodrive.limit.budget import Budget, Caps, Mirrors
+from optodrive.limit.budget import Budget, Mirrors
 from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls, heat_bound, spread
 from optodrive.limit.limiter import fired, fresh_state, limit, shifted, verify, wait_s
 from optodrive.limit.windows import Chains, Pulses, allowed_w, append
+from warmth import NO_CAPS
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
-ROOMY_CAPS = Caps(
-    absorber_k=1e6,
-    wall_k=1e6,
-    touch_k=1e6,
-    galvo_rad2_per_s4=inf,
-    pulse_energy_j=1e3,
-    pulse_width_s=0.050,
-    pulse_rest_s=5e-4,
-    pixel_mean_w=1e3,
-    pixel_window_s=1.0,
-    display_mean_w=1e3,
-    display_window_s=2.0,
-)
 MODEL = Declared(
     epsilon=np.full(3, 0.66),
     r_k_per_w=np.full(3, 120.0 / 0.66),
@@ -43,7 +32,7 @@ MODEL = Declared(
 
 def roomy(**caps):
     """No cap binds but those given."""
-    caps = ROOMY_CAPS._replace(**caps)
+    caps = NO_CAPS._replace(**caps)
     return Budget(caps, heat_bound(MODEL, CERTAIN, caps, 2.45), Mirrors(4e-4, 100.0, 1.0, 0.0))
 
 
@@ -155,6 +144,17 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
     wall_k = budget.heat.wall_k_per_j[0] * limited.energy_j[0] * budget.heat.absorber_wall
     assert 149.95 < own_k + wall_k < 150.0  # the rest is what neighbours may send
     assert limited.headroom_k == pytest.approx([150.0, 0.0, 150.0], abs=1e-6)
+
+
+def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
+    caps = NO_CAPS._replace(absorber_k=150.0)
+    bare = replace(MODEL, walls=None, touch=None)
+    budget = Budget(caps, heat_bound(bare, CERTAIN, caps, 2.45), Mirrors(4e-4, 100.0, 1.0, 0.0))
+    gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
+    assert gentle.trimmed_j.sum() == 0
+    limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))
+    rise = 120.0 * limited.power_w * (1 - np.exp(-0.050 / 0.023))
+    assert rise == pytest.approx([150.0, 150.0], rel=1e-9)
 
 
 def test_a_pulse_wider_than_the_cap_is_refused_under_any_policy():
