@@ -67,8 +67,9 @@ def test_a_train_waits_pulse_by_pulse():
     assert len(result.plan) == 25
     assert not result.plan.trimmed_j.any()
     gaps = np.diff(result.plan.start_s)
-    assert gaps[0] == pytest.approx(0.04)
-    assert 0.1 < gaps[1:].min() < gaps.max() < 2.0
+    assert gaps[0] == pytest.approx(0.04)  # two pulses fit as they are
+    assert gaps[1:].min() > 0.04
+    assert gaps[3:] == pytest.approx(gaps[-1], rel=0.05)  # then it goes as fast as the surface cools
     assert [delay.source for delay in result.delays] == [0]
 
 
