@@ -44,7 +44,7 @@ numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 def cold() -> bool:
     """Whether no machine code is kept yet for this state of the sources: the next use of kernels takes seconds."""
-    return not CACHED or not any(_FOLDER.iterdir())
+    return not CACHED or not any(_FOLDER.glob("*/*.nbi"))
 
 
 def kernel(function: Callable[P, T]) -> Callable[P, T]:

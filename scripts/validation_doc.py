@@ -65,7 +65,7 @@ def document():
 
 def table(rows):
     """Rows under their headings."""
-    lines = [HEADINGS, ("---", "--:", "--:", "--:", "--:", "--:", "---"), *map(cells, rows)]
+    lines = [HEADINGS, ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:", "--:", "---"), *map(cells, rows)]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
