@@ -65,7 +65,8 @@ def summary(prepared: Prepared) -> dict[str, Any]:
             }
             for timing in prepared.frames
         ],
-        "late": [lateness(timing) for timing in prepared.frames if timing.late_s > 0],
+        # A frame that waited for a cap, or comes after one that did, is late for that and not for want of beam time.
+        "late": [lateness(timing) for timing in prepared.frames if timing.late_s > 0 and not prepared.delays],
         "train_late_s": prepared.train_late_s,
     }
 
@@ -78,7 +79,7 @@ def _shortfall(shortfall: Shortfall | None) -> dict[str, Any] | None:
 
 def _source(prepared: Prepared, source: int) -> str:
     frames = prepared.sequence.frames
-    return f"frame {frames[source].frame_id}" if source < len(frames) else f"train {source - len(frames)}"
+    return frames[source].frame_id if source < len(frames) else f"train {source - len(frames)}"
 
 
 def _trimmed(prepared: Prepared) -> dict[str, Any]:

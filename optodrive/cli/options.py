@@ -70,7 +70,8 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(f"                 {_shortfall(summary['shortfall'])}")
     else:
         lines.append("trimmed          nothing")
-    lines += [f"waited           {_waited(delay)}" for delay in summary["delays"]]
+    if summary["delays"]:
+        lines.append(f"waited           {_waited(summary['delays'])}")
     lines += [f"late             {sentence}" for sentence in summary["late"][:5]]
     if len(summary["late"]) > 5:
         lines.append(f"late             and {len(summary['late']) - 5} more frames")
@@ -89,5 +90,7 @@ def _shortfall(shortfall: dict[str, Any]) -> str:
     return f"first pixel {shortfall['pixel']}, {shortfall['margin_j'] * 1e3:.2f} mJ too much; all of it fits {fits}"
 
 
-def _waited(delay: dict[str, Any]) -> str:
-    return f"{delay['wait_s']:.3f} s in {delay['source']}, first for pixel {delay['pixel']}: {delay['cap']}"
+def _waited(delays: list[dict[str, Any]]) -> str:
+    first, whole_s = delays[0], sum(delay["wait_s"] for delay in delays)
+    where = f"{first['source']}, {first['wait_s']:.3f} s for pixel {first['pixel']} ({first['cap']})"
+    return f"{whole_s:.3f} s in {len(delays)} frames or trains, first in {where}"
