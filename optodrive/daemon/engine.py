@@ -4,6 +4,7 @@ Two threads. The engine's own loop talks to the board and renews its lease; it d
 works in the second thread, is idle or making progress. Callers on any thread get futures.
 """
 
+import gc
 import sys
 import threading
 from collections import deque
@@ -79,6 +80,9 @@ class Engine:
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         # A planner that compiles shows no progress, and would cost the lease.
         warm_up(self.display)
+        # A collection that walks through everything imported would stop the loop for more than half a lease.
+        gc.collect()
+        gc.freeze()
         self._session.connect()
         self._thread.start()
 
