@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
-from optodrive.errors import InputError, nearest
+from optodrive.errors import InputError
 from optodrive.flow import FloatArray, freeze_arrays
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.terms import known_terms
+from optodrive.physics.terms import check_needs, find_term
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
@@ -142,28 +142,18 @@ def load_parameters(name: str | Path) -> ParameterSet:
         raise input_error(error, str(path), ParameterSet) from None
     for key, values in parameters.terms.items():
         _check_term(f"{path}: terms.{key}", key, values)
-        for need in known_terms()[key].needs:
-            if need not in parameters.terms:
-                raise InputError(f"{path}: terms.{key}", f"without {need}", f"terms.{need} beside it")
+    check_needs(f"{path}: terms", parameters.terms)
     return parameters
 
 
 def _check_term(where: str, key: str, values: dict[str, Parameter]) -> None:
     """A term must be known and have each of its parameters, in its unit and plausible range, and no other."""
-    if key not in known_terms():
-        raise InputError(where, key, f"a known term, {nearest(key, sorted(known_terms()))}")
-    wanted = {item.name: item for item in known_terms()[key].parameters}
-    for name, given in values.items():
-        if name not in wanted:
-            raise InputError(f"{where}.{name}", name, f"a parameter of it, {nearest(name, sorted(wanted))}")
-        item = wanted[name]
+    for item in find_term(where, key, values).parameters:
+        given = values[item.name]
         if given.unit != item.unit:
-            raise InputError(f"{where}.{name}.unit", given.unit, f"'{item.unit}'")
+            raise InputError(f"{where}.{item.name}.unit", given.unit, f"'{item.unit}'")
         if not item.low <= given.value <= item.high:
-            raise InputError(f"{where}.{name}.value", given.value, f"{item.low:g} to {item.high:g} {item.unit}")
-    for name in wanted:
-        if name not in values:
-            raise InputError(f"{where}.{name}", None, "this parameter to be there")
+            raise InputError(f"{where}.{item.name}.value", given.value, f"{item.low:g} to {item.high:g} {item.unit}")
 
 
 def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:

@@ -1,9 +1,11 @@
 """Physical effects beyond the nominal pixel, one file each; a new file here is a new term, nothing else changes."""
 
+from collections.abc import Collection
 from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
+from optodrive.errors import InputError, nearest
 from optodrive.physics.term import Term
 
 
@@ -13,3 +15,25 @@ def known_terms() -> dict[str, Term]:
     modules = (import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
     terms: list[Term] = [module.TERM for module in modules]
     return {term.key: term for term in terms}
+
+
+def find_term(where: str, key: str, given: Collection[str]) -> Term:
+    """The term of a key, given parameters by these names; InputError unless they are its own, all of them."""
+    if key not in known_terms():
+        raise InputError(where, key, f"a known term, {nearest(key, sorted(known_terms()))}")
+    term, names = known_terms()[key], set(given)
+    wanted = [item.name for item in term.parameters]
+    for name in sorted(names.difference(wanted)):
+        raise InputError(f"{where}.{name}", name, f"a parameter of it, {nearest(name, sorted(wanted))}")
+    for name in wanted:
+        if name not in names:
+            raise InputError(f"{where}.{name}", None, "this parameter to be there")
+    return term
+
+
+def check_needs(where: str, keys: Collection[str]) -> None:
+    """InputError where a known term lacks one that it builds on."""
+    for key in keys:
+        for need in known_terms()[key].needs:
+            if need not in keys:
+                raise InputError(f"{where}.{key}", f"without {need}", f"terms.{need} beside it")

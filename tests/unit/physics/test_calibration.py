@@ -28,3 +28,13 @@ def test_the_validation_page_is_current(tmp_path):
     page = ROOT / "docs" / "validation.md"
     if (tmp_path / "page.md").read_text(encoding="utf-8") != page.read_text(encoding="utf-8"):
         pytest.fail("docs/validation.md is not current: run scripts/validation-doc")
+
+
+def test_every_row_of_the_page_has_the_columns_of_its_heading():
+    columns = None
+    for line in (ROOT / "docs" / "validation.md").read_text(encoding="utf-8").splitlines():
+        if not line.startswith("| "):
+            columns = None
+            continue
+        columns = columns or line.count(" |")
+        assert line.count(" |") == columns, line

@@ -111,7 +111,7 @@ def test_without_terms_it_is_the_nominal_pixel():
 )
 def test_a_term_at_its_limit_is_the_nominal_pixel(term):
     made = Model(PixelArray.uniform(PIXEL, 1), term, AMBIENT_K)
-    # A wall without resistance would move at once: its rate, not its motion, is looked at.
+    # This wall would move at once: its rate, not its motion, is looked at.
     nominal = Model(PixelArray.uniform(PIXEL, 1), {}, AMBIENT_K)
     state = np.zeros((len(made.states), 1))
     state[0], state[1] = 200.0, 80.0
@@ -120,6 +120,43 @@ def test_a_term_at_its_limit_is_the_nominal_pixel(term):
     if "wall_heating" in term:
         steady = 200.0 / PIXEL.r_k_per_w * 1e-6
         assert steady < 2e-6  # K: what the wall settles at
+
+
+def test_a_wall_that_hardly_resists_hardly_moves_the_pixel():
+    sunk = Model(PixelArray.uniform(PIXEL, 1), {"wall_heating": {"resistance": 1e-4, "capacity": 20.0}}, AMBIENT_K)
+    traced = sunk.trace([Drive(0.0, np.array([2.45]))], np.array([0.010, 0.040]))
+    for row, at_s in enumerate(traced.t_s):
+        absorber_k, gas_k = advance(PIXEL, 0.0, 0.0, 2.45, at_s)
+        assert traced.rise_k["absorber_k"][row, 0] == pytest.approx(absorber_k, rel=1e-6)
+        assert traced.rise_k["gas_k"][row, 0] == pytest.approx(gas_k, rel=2e-6)
+
+
+def test_walls_as_good_as_one_share_the_mean_power():
+    # The step must follow what neighbours exchange, far quicker here than anything a single pixel does.
+    wall = {"wall_heating": {"resistance": 20.0, "capacity": 0.0025}}
+    whole = Neighbours.of(DisplaySection(rows=2, columns=3, pitch_m=4e-3, bridge_width_m=4e-4))
+    sides = {"lateral_conduction": {"resistance": 0.05, "frame_resistance": 1e12}}
+    joined = Model(PixelArray.uniform(PIXEL, 6), wall | sides, AMBIENT_K, whole)
+    alone = Model(PixelArray.uniform(PIXEL, 1), wall, AMBIENT_K)
+    walls, one = (
+        made.trace([Drive(0.0, power_w)], np.array([0.002, 0.03])).rise_k["wall_k"]
+        for made, power_w in ((joined, np.array([2.4, 0, 0, 0, 0, 0])), (alone, np.array([0.4])))
+    )
+    assert walls.mean(axis=1) == pytest.approx(one[:, 0], rel=1e-6)
+    assert np.ptp(walls[-1]) < 0.05 * one[-1, 0]
+
+
+def test_variants_side_by_side_are_variants_by_themselves():
+    shares = np.array([0.2, 0.3, 0.45])
+    varied = {key: VALUES[key] for key in ("bridge_conductivity", "wall_heating", "touch_surface")}
+    membrane = VALUES["gas_membrane"]
+    together = Model(PixelArray.uniform(PIXEL, 3), varied | {"gas_membrane": membrane | {"share": shares}}, AMBIENT_K)
+    drive = [Drive(0.0, np.full(3, 2.0))]
+    heights_m = together.trace(drive, T_S).displacement_m
+    for column, share in enumerate(shares):
+        one = Model(PixelArray.uniform(PIXEL, 1), varied | {"gas_membrane": membrane | {"share": share}}, AMBIENT_K)
+        alone_m = one.trace([Drive(0.0, np.full(1, 2.0))], T_S).displacement_m
+        assert heights_m[:, column] == pytest.approx(alone_m[:, 0], rel=1e-9)
 
 
 def test_equal_walls_send_each_other_nothing():
@@ -142,9 +179,9 @@ def test_walls_far_apart_are_walls_alone():
 def test_the_membrane_balances_its_gas():
     made = model(["gas_membrane"])
     state = made.at_rest()
-    state[1] = [0.0, 1.0, 20.0, 100.0, 250.0]
+    state[1] = [-5.0, 0.0, 1.0, 20.0, 250.0]
     z_m = made.outputs(state)[0]
-    assert z_m[0] == 0.0
+    assert z_m[1] == 0.0
     assert (np.diff(z_m) > 0).all()
     e, nu, h, r = 50e3, 0.49, 0.25e-3, 1.5e-3
     held = 16 * e * h**3 * z_m / (3 * (1 - nu**2) * r**4) + 8 * e * h * z_m**3 / (3 * (1 - nu) * r**4)
@@ -160,6 +197,28 @@ def test_a_small_bulge_is_held_by_the_plate_and_the_gas_alone():
     e, nu, h, r = 50e3, 0.49, 0.25e-3, 1.5e-3
     stiffness = 16 * e * h**3 / (3 * (1 - nu**2) * r**4) + 101_325 * 0.5 * np.pi * r**2 / 7.8e-9
     assert made.outputs(state)[0] == pytest.approx(101_325 * 0.7e-6 / AMBIENT_K / stiffness, rel=1e-4)
+
+
+def test_the_whole_aperture_at_half_the_rise_is_the_force_of_text_s1():
+    aperture_m2 = np.pi * 1.5e-3**2
+    made = Model(PixelArray.uniform(PIXEL, 1), {"force_area": {"area": aperture_m2, "share": 0.5}}, 300.0)
+    state = made.at_rest()
+    state[1] = 116.0
+    assert made.outputs(state)[1] == pytest.approx(2.387e-3 * 116.0, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"wall_heeting": {}}, "a known term, nearest is 'wall_heating'"),
+        ({"touch_surface": {"lag": 1.0, "gas_share": 0.3, "wall_sharr": 0.4}}, "nearest is 'wall_share'"),
+        ({"wall_heating": {"resistance": 20.0}}, r"terms\.wall_heating\.capacity: got None"),
+    ],
+)
+def test_mistaken_values_are_refused_in_one_line(values, said):
+    with pytest.raises(InputError, match=said) as caught:
+        Model(PixelArray.uniform(PIXEL, 1), values, AMBIENT_K)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_term_without_the_one_it_builds_on_is_refused():
