@@ -38,7 +38,7 @@ def models(draw, keys):
 
 
 @pytest.mark.parametrize("keys", SUBSETS, ids="+".join)
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=4, deadline=None)
 @given(data=st.data(), power=POWERS, lit_s=st.floats(1e-3, 0.03))
 def test_energy_closes(keys, data, power, lit_s):
     made = data.draw(models(keys))
