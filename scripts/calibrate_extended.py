@@ -82,7 +82,7 @@ def gains():
             values, shown = fitted(base, terms, half)
             said = outcomes(made(base, terms, values))
             ratios = {fact: facts[fact].ratio(said[fact]) for fact in JUDGED}
-            unseen = [fact for fact in JUDGED if fact not in shown and fact != "N_50um"]
+            unseen = [fact for fact in JUDGED if fact not in HALVES[half] and fact != "N_50um"]
             error = float(np.sqrt(np.mean([np.log(ratios[fact]) ** 2 for fact in unseen])))
             told[f"{model}, {half} half"] = {"values": values, "ratios": ratios, "shown": shown, "error": error}
             print(model, half, values, f"{100 * error:.1f} %", file=sys.stderr)

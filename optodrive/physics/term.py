@@ -48,13 +48,12 @@ class Flows:
     left_w: FloatArray | float = 0.0
 
     def move(self, source: str | None, target: str | None, power_w: FloatArray) -> None:
-        """Let heat flow from a node to another, or to ambient (None)."""
-        if source is not None:
-            self.into_w[source] = self.into_w.get(source, 0.0) - power_w
-        if target is None:
-            self.left_w = self.left_w + power_w
-        else:
-            self.into_w[target] = self.into_w.get(target, 0.0) + power_w
+        """Let heat flow from a node to another; None is ambient, at either end."""
+        for node, gained_w in ((source, -power_w), (target, power_w)):
+            if node is None:
+                self.left_w = self.left_w + gained_w
+            else:
+                self.into_w[node] = self.into_w.get(node, 0.0) + gained_w
 
 
 class Term:
