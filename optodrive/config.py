@@ -79,8 +79,8 @@ class ScannerSection(Section):
 class UncertaintySection(Section):
     """Declared half-widths of the model's parameters, relative; exponent: absolute. The limiter counts them in full."""
 
-    absorbed_power: HalfWidth = 0.02
-    bridge_resistance: HalfWidth = 0.015
+    absorbed_power: HalfWidth = 0.03
+    bridge_resistance: HalfWidth = 0.02
     absorber_capacity: HalfWidth = 0.05
     exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
     gas_lag: HalfWidth = 0.25
@@ -88,7 +88,7 @@ class UncertaintySection(Section):
     wall_capacity: HalfWidth = 0.1
     side_resistance: HalfWidth = 0.1
     touch_share: HalfWidth = 0.02
-    touch_lag: HalfWidth = 0.05
+    touch_lag: HalfWidth = 0.1
 
 
 class LimitsSection(Section):

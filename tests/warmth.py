@@ -29,8 +29,9 @@ NO_CAPS = Caps(
 
 
 @numba.njit(cache=False)
-def _rates(y, out, lit, power_w, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag):
+def _rates(y, out, lit, power_w, numbers, beside, rim):
     """dy/dt of y [4, p]: absorber, gas, wall, touch surface."""
+    eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
     for i in range(y.shape[1]):
         theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
         mean = ambient_k + 0.5 * (theta + wall)
@@ -51,7 +52,6 @@ def _rates(y, out, lit, power_w, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf,
 @numba.njit(cache=False)
 def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim, lit_step, dark_step):
     """Runge–Kutta of the fourth order between events; peak [4] takes the largest of each kind ever seen."""
-    eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     now = 0.0
     for row in range(len(start) + 1):
@@ -65,52 +65,10 @@ def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim,
             steps = int(np.ceil((end - now) / (lit_step if phase == 1 else dark_step)))
             h = (end - now) / steps
             for _ in range(steps):
-                _rates(y, k1, lit, watts, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag)
-                _rates(
-                    y + 0.5 * h * k1,
-                    k2,
-                    lit,
-                    watts,
-                    eps,
-                    r,
-                    c,
-                    ambient_k,
-                    n,
-                    tau_g,
-                    rw,
-                    cw,
-                    rx,
-                    rf,
-                    beside,
-                    rim,
-                    fg,
-                    fw,
-                    lag,
-                )
-                _rates(
-                    y + 0.5 * h * k2,
-                    k3,
-                    lit,
-                    watts,
-                    eps,
-                    r,
-                    c,
-                    ambient_k,
-                    n,
-                    tau_g,
-                    rw,
-                    cw,
-                    rx,
-                    rf,
-                    beside,
-                    rim,
-                    fg,
-                    fw,
-                    lag,
-                )
-                _rates(
-                    y + h * k3, k4, lit, watts, eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, beside, rim, fg, fw, lag
-                )
+                _rates(y, k1, lit, watts, numbers, beside, rim)
+                _rates(y + 0.5 * h * k1, k2, lit, watts, numbers, beside, rim)
+                _rates(y + 0.5 * h * k2, k3, lit, watts, numbers, beside, rim)
+                _rates(y + h * k3, k4, lit, watts, numbers, beside, rim)
                 for kind in range(4):
                     for i in range(y.shape[1]):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])

@@ -5,7 +5,7 @@
     τ_g dγ_i/dt = (θ_i + w_i)/2 − γ_i                                          γ gas rise, K
     z_i = κ γ_i                                                                z displacement, m
 
-j are the pixels beside i, f_i its edges against the frame; resistances and sources in `extended.toml`.
+j are the pixels beside i, f_i its edges against the frame; resistances and sources in `surroundings.toml`.
 
 Every cell is the same, so the equations fall apart into the modes of the lattice: the eigenvectors of the walls'
 conductances. A mode is a cell by itself, with two rates of its own and the gas's, and between two events each of its
