@@ -138,7 +138,7 @@ class BudgetState:
 
     at_s: the time up to which the plan reached, on the budget's time line
     dark_since_s: [p] end of each pixel's last pulse; rise_k, spot_j, on_s: [p] then: bound on the absorber's rise over
-    its wall, leaky bucket of energy, light without a rest
+    its wall, leaky bucket of energy, light without a rest; least_k: [p] that rise at least
     wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]; inflow_w: [p] what neighbours send a
     wall at most, as of exchanged_at_s
     mirror_rad: [2] where the mirrors stand; acceleration2: [2] their mean-square acceleration, rad²/s⁴, at mirror_at_s
@@ -148,6 +148,7 @@ class BudgetState:
     at_s: float
     dark_since_s: FloatArray
     rise_k: FloatArray
+    least_k: FloatArray
     spot_j: FloatArray
     on_s: FloatArray
     wall_k: FloatArray

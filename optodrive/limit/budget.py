@@ -38,6 +38,10 @@ class HeatBound(NamedTuple):
     beside: [p, 4] neighbours, −1 for none; side_w_per_k: conductance to one, as counted for the colder of two
     step_s: walls exchange heat at such steps
     touch_lag_s, touch_k_per_j: [2]; touch_per_wall_k: steady touch surface over the wall's bound; touch_spread
+    least_k_per_w: [p] steady rise of an absorber over its wall per incident watt, at least; least_rate_per_s: [p, 2]
+    towards it while it warms, and while it cools; lost_k: by how much neighbours' heat may bring the rise below that
+    wall_flight, touch_flight: kelvin that wall and touch surface are below their bounds for each kelvin an absorber is
+    over its wall, by heat that counts as arrived; touch_lost_k: by how much less, through the gas
     power_max_w: the strongest pulse there can be
     """
 
@@ -59,6 +63,12 @@ class HeatBound(NamedTuple):
     touch_k_per_j: FloatArray
     touch_per_wall_k: float
     touch_spread: float
+    least_k_per_w: FloatArray
+    least_rate_per_s: FloatArray
+    lost_k: float
+    wall_flight: float
+    touch_flight: float
+    touch_lost_k: float
     power_max_w: float
 
 

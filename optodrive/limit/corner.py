@@ -99,8 +99,9 @@ def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: fl
     lag_max_s = float((r_high * c_high).max()) / slope_min
 
     epsilon_max = float(epsilon.max())
-    wall = _wall_bound(model, unsure, epsilon_max, float(c_high.max()), tau_max_s, lag_max_s)
-    touch = _touch_bound(model, unsure, epsilon_max * float(r_high.max()) * hottest, tau_max_s, wall)
+    wall = _wall_bound(model, unsure, epsilon_max, c_high, hottest, tau_max_s, lag_max_s)
+    touch = _touch_bound(model, unsure, epsilon_max, float(r_high.max()) * hottest, tau_max_s, wall)
+    least = _least(model, unsure, caps, c_low, c_high, wall, touch)
     bound = HeatBound(
         epsilon=epsilon,
         r_k_per_w=r_high,
@@ -120,6 +121,12 @@ def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: fl
         touch_k_per_j=touch.k_per_j,
         touch_per_wall_k=touch.per_wall_k,
         touch_spread=touch.spread,
+        least_k_per_w=least.k_per_w,
+        least_rate_per_s=least.rate_per_s,
+        lost_k=least.lost_k,
+        wall_flight=float(c_low.min()) / (wall.still_there * float(wall.j_per_k[1])),
+        touch_flight=float(c_low.min()) * float(touch.k_per_j[1]) / epsilon_max,
+        touch_lost_k=least.touch_lost_k,
         power_max_w=power_max_w,
     )
     for column in bound:
@@ -146,6 +153,7 @@ class _WallBound:
     side_w_per_k: float
     step_s: float
     rate_per_s: float
+    still_there: float
     absorber_wall: float
 
 
@@ -153,14 +161,15 @@ def _wall_bound(
     model: Declared,
     unsure: Uncertainty,
     epsilon: float,
-    c_absorber_j_per_k: float,
+    c_absorber_j_per_k: FloatArray,
+    hottest: float,
     tau_max_s: float,
     lag_max_s: float,
 ) -> _WallBound:
     pixels = len(model.epsilon)
     walls = model.walls
     if walls is None:
-        return _WallBound(np.ones(pixels), np.ones(2), np.zeros(2), 1.0, 0.0, inf, 0.0, 1.0)
+        return _WallBound(np.ones(pixels), np.ones(2), np.zeros(2), 1.0, 0.0, inf, 0.0, 1.0, 1.0)
     sides = np.count_nonzero(model.beside >= 0, axis=1)
 
     def leaving(own: float, side: float) -> FloatArray:
@@ -173,8 +182,7 @@ def _wall_bound(
     # All heat of a pulse is put into the wall at once though it comes over the absorber's time: with 1 / (1 − rate ×
     # time) more of it, the bound lies above the wall at every later moment.
     still_there = 1.0 - float(most.max()) / c_low * tau_max_s
-    rate_per_s = float(least.max()) / c_low
-    behind = 1.0 - rate_per_s * lag_max_s
+    behind = 1.0 - float(least.max()) / c_low * lag_max_s
     if min(still_there, behind) < 0.5:
         raise InputError(
             "terms.wall_heating",
@@ -182,15 +190,19 @@ def _wall_bound(
             f"more than twice the absorber's {max(tau_max_s, lag_max_s):.3g} s",
         )
     # A wall that cools takes its absorber's heat along.
-    capacities = np.array([c_low, walls.c_j_per_k * (1 + unsure.wall_capacity) + c_absorber_j_per_k])
+    carried = float(c_absorber_j_per_k.max()) / still_there
+    capacities = np.array([c_low, walls.c_j_per_k * (1 + unsure.wall_capacity) + carried])
+    # An absorber colder than its wall, because neighbours warm the wall, lags by more than a hot one does.
+    colder = 1 + carried / (c_low + carried) * (hottest - 1)
     return _WallBound(
         w_per_k=least,
         j_per_k=capacities,
         k_per_j=epsilon / capacities / still_there,
         spread=spread(capacities[1] / capacities[0]),
-        side_w_per_k=1 / (walls.side_k_per_w * (1 - unsure.side_resistance)),
-        step_s=STEP_SHARE / rate_per_s,
-        rate_per_s=rate_per_s,
+        side_w_per_k=colder / (walls.side_k_per_w * (1 - unsure.side_resistance)),
+        step_s=STEP_SHARE * c_low / float(least.max()),
+        rate_per_s=float(most.max()) / c_low,
+        still_there=still_there,
         absorber_wall=1.0 / behind,
     )
 
@@ -201,24 +213,65 @@ class _TouchBound:
     k_per_j: FloatArray
     per_wall_k: float
     spread: float
+    gas_s: float
 
 
 def _touch_bound(
-    model: Declared, unsure: Uncertainty, k_s_per_j: float, tau_max_s: float, wall: _WallBound
+    model: Declared, unsure: Uncertainty, epsilon: float, r_k_per_w: float, tau_max_s: float, wall: _WallBound
 ) -> _TouchBound:
-    """k_s_per_j: integral of the absorber's rise over its wall, per incident joule, at most."""
+    """A bound on s + c₁ u + c₂ h: touch surface, absorber over its wall, gas over the wall.
+
+    Its rate is no more than (drive − itself) / lag + what the pulse brings, if c₂ = gas share × τ_g / (lag − τ_g) and
+    c₁ = gas share / 2 × τ / lag / ((1 − τ_g / lag) (1 − τ / lag)). A wall that cools leaves both behind: the drive is
+    the wall × (both shares + (c₁ + c₂) lag × the wall's quickest rate).
+    """
     touch = model.touch
     if touch is None:
-        return _TouchBound(np.ones(2), np.zeros(2), 0.0, 1.0)
+        return _TouchBound(np.ones(2), np.zeros(2), 0.0, 1.0, 0.0)
     lags_s = touch.lag_s * np.array([1 - unsure.touch_lag, 1 + unsure.touch_lag])
     gas_share, wall_share = touch.gas_share * (1 + unsure.touch_share), touch.wall_share * (1 + unsure.touch_share)
     tau_g_s = model.tau_g_s * (1 + unsure.gas_lag)
     still_there = (1.0 - tau_max_s / lags_s[0]) * (1.0 - tau_g_s / lags_s[0])
     if still_there < 0.5 or lags_s[0] < tau_max_s:
         raise InputError("terms.touch_surface.lag", touch.lag_s, f"well above the absorber's {tau_max_s:.3g} s")
+    gas_s = gas_share * tau_g_s / (1.0 - tau_g_s / float(lags_s[0]))
+    absorber_s = 0.5 * gas_share * tau_max_s / still_there
     return _TouchBound(
         lag_s=lags_s,
-        k_per_j=0.5 * gas_share * k_s_per_j / lags_s / still_there,
-        per_wall_k=gas_share * wall.absorber_wall / (1 - wall.rate_per_s * tau_g_s) + wall_share,
+        k_per_j=0.5 * gas_share * epsilon * r_k_per_w / lags_s / still_there,
+        per_wall_k=gas_share + wall_share + (absorber_s + gas_s) * wall.rate_per_s,
         spread=spread(lags_s[1] / lags_s[0]),
+        gas_s=gas_s,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Least:
+    k_per_w: FloatArray
+    rate_per_s: FloatArray
+    lost_k: float
+    touch_lost_k: float
+
+
+def _least(
+    model: Declared,
+    unsure: Uncertainty,
+    caps: Caps,
+    c_low: FloatArray,
+    c_high: FloatArray,
+    wall: _WallBound,
+    touch: _TouchBound,
+) -> _Least:
+    """The lower corner of an absorber over its wall: a wall that nothing warms but the absorber's own heat."""
+    r_low = model.r_k_per_w * (1 - unsure.bridge_resistance)
+    both = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
+    rate_per_s = np.stack([both / (r_low * c_high), both / (r_low * c_low)], axis=1)
+    k_per_w = model.epsilon * (1 - unsure.absorbed_power) * r_low / both
+    if wall.side_w_per_k == 0.0:
+        return _Least(k_per_w, rate_per_s, 0.0, 0.0)
+    warmest_k = min(caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.spread) if touch.per_wall_k > 0.0 else inf)
+    inflow_k_per_s = 4 * wall.side_w_per_k * warmest_k / float(wall.j_per_k[0])
+    lost_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + unsure.gas_lag)
+    gas_lost_k = gas_lag_s * inflow_k_per_s + 0.5 * lost_k
+    touch_lost_k = touch.gas_s / float(touch.lag_s[0]) * gas_lost_k if touch.gas_s > 0.0 else 0.0
+    return _Least(k_per_w, rate_per_s, lost_k, touch_lost_k)

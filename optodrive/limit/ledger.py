@@ -19,6 +19,7 @@ def open_ledger(state: BudgetState, room: int) -> Ledger:
     pixels, past = len(state.rise_k), len(state.recent_start_s)
     nodes = Nodes(
         absorber_k=state.rise_k.copy(),
+        least_k=state.least_k.copy(),
         dark_since_s=state.dark_since_s.copy(),
         wall_k=state.wall_k.copy(),
         touch_k=state.touch_k.copy(),
@@ -73,6 +74,7 @@ def close_ledger(ledger: Ledger, budget: Budget) -> BudgetState:
         at_s=at_s,
         dark_since_s=nodes.dark_since_s,
         rise_k=nodes.absorber_k,
+        least_k=nodes.least_k,
         spot_j=spots.bucket_j,
         on_s=spots.on_s,
         wall_k=nodes.wall_k,

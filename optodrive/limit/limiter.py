@@ -86,6 +86,7 @@ def fresh_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
         at_s=at_s,
         dark_since_s=since_s,
         rise_k=zero(),
+        least_k=zero(),
         spot_j=zero(),
         on_s=zero(),
         wall_k=np.zeros((pixel_count, 2)),

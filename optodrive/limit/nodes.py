@@ -20,11 +20,13 @@ class Nodes(NamedTuple):
 
     absorber_k: [p] rise over the wall at the end of the pixel's last pulse, dark_since_s [p]
     wall_k, touch_k: [p, 2] with the least and the greatest capacity or lag, at nodes_at_s [p]
+    least_k: [p] the rise over the wall then, at least
     inflow_w: [p] what neighbours send at most until the next exchange
     exchanged_at_s: [1] when walls last exchanged heat; crude_k, firm_k: [p] scratch
     """
 
     absorber_k: FloatArray
+    least_k: FloatArray
     dark_since_s: FloatArray
     wall_k: FloatArray
     touch_k: FloatArray
@@ -65,6 +67,14 @@ def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float,
             return float(end_k)
         if left_s <= 0.0:
             return float(rise_k)
+
+
+@kernel
+def least_after_k(heat: HeatBound, pixel: int, least_k: float, power_w: float, time_s: float) -> float:
+    """Least rise over the wall after time_s at constant power."""
+    steady_k = heat.least_k_per_w[pixel] * power_w
+    rate = heat.least_rate_per_s[pixel, 0 if steady_k > least_k else 1]
+    return float(steady_k + (least_k - steady_k) * exp(-rate * time_s))
 
 
 @kernel
