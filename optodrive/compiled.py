@@ -42,6 +42,11 @@ CACHED = _writable(_FOLDER)
 numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
 
 
+def code_folder() -> Path | None:
+    """Where generated code may be kept beside its machine code, for this state of the sources."""
+    return _FOLDER if CACHED else None
+
+
 def cold() -> bool:
     """Whether no machine code is kept yet for this state of the sources: the next use of kernels takes seconds."""
     return not CACHED or not any(_FOLDER.glob("*/*.nbi"))

@@ -3,12 +3,16 @@
 import numpy as np
 
 from optodrive.config import Config
+from optodrive.errors import InputError
 from optodrive.limit.budget import Budget, Caps, Mirrors
 from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls, heat_bound
 from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
+from optodrive.physics.terms import known_terms
 from optodrive.units import ZERO_CELSIUS_K
 
+BOUNDED = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
+"""Terms that the bound on heat counts with."""
 ANGLE_CODES = 32_768
 """Steps of the converter over a mirror's range to one side."""
 
@@ -41,7 +45,15 @@ def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> B
 
 
 def declared(parameters: ParameterSet, pixels: PixelArray, neighbours: Neighbours, ambient_k: float) -> Declared:
-    """What the limiter takes from a parameter set: everything that moves heat."""
+    """What the limiter takes from a parameter set: everything that moves heat.
+
+    Raises InputError for a term that may make something warmer and that the bound does not know.
+    """
+    for key in parameters.terms:
+        if key not in BOUNDED and not known_terms()[key].never_warmer:
+            raise InputError(
+                f"terms.{key}", key, "a term that the limiter's bound holds for: it may warm what is capped"
+            )
     terms = {key: {name: item.value for name, item in values.items()} for key, values in parameters.terms.items()}
     wall, side, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
     walls = None

@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from optodrive.cli import config_cmd, control, plan, play, serve, simulate, validate_cmd
+from optodrive.cli import config_cmd, control, diagnose, plan, play, recording_cmd, serve, simulate, validate_cmd
 from optodrive.errors import OptodriveError
 
 UsageError: Any = typer.BadParameter.__bases__[0]
@@ -19,7 +19,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for module in (serve, control, play, plan, simulate, validate_cmd, config_cmd):
+for module in (serve, control, play, plan, simulate, recording_cmd, diagnose, validate_cmd, config_cmd):
     module.register(app)
 
 

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optodrive.errors import InputError
 from optodrive.flow import FloatArray
 from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
@@ -71,6 +72,9 @@ class Model:
             (find_term(f"terms.{key}", key, values[key]), values[key]) for key in values
         ]
         check_needs("terms", values)
+        for key in values:
+            if not find_term(f"terms.{key}", key, values[key]).whole_display:
+                raise InputError(f"terms.{key}", key, "a term that the model of a whole display knows")
         self._capacity_j_per_k: dict[str, FloatArray] = {"absorber_k": pixels.c_j_per_k}
         for term, own in self._terms:
             for node, name in term.heat_nodes.items():

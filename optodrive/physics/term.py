@@ -4,7 +4,7 @@ Heat sits in nodes (the absorber, walls) and flows between them and to ambient. 
 carry none in this uncoupled form: the absorber loses nothing to them.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -17,12 +17,52 @@ Values = Mapping[str, float]
 """A term's parameters, SI, by name."""
 
 
+ABSORBER, GAS, WALL, NEIGHBOUR, SHOWN, OWN = range(6)
+"""Rows of a single pixel's states in kernels: its own three, the absorber beside it, what a thermometer that lags
+shows, then each term's followers."""
+POWER_W, FULL_W, SINCE_S, DOSE, PIXEL, AMBIENT_K, FLOW_W, WALL_K, TIME_S, SESSION, MINE = range(11)
+"""What kernels are told beside the states.
+
+Commanded and full power, time since the gate opened, dose so far as a share of the recording's, the index of the pixel
+that is lit, ambient, the bridge's heat flow, its far end's rise, time in the run, and in the session from −1 to 1, and
+whether the light is on this very pixel.
+"""
+CONTEXT = 11
+
+Modifier = Callable[[FloatArray, FloatArray, int, FloatArray, float], float]
+Mover = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
+
+
+class Kernels(NamedTuple):
+    """A term in the compiled single pixel.
+
+    Each takes (v, y, s, c, x), v the term's parameters in order, y the states, s the row of its first follower, c the
+    context, x the value without the term; and returns it with the term.
+
+    light: W on the absorber; capacity: J/K; bridge: K/W; leaving: W from the absorber to the room; wall: rise of the
+    bridge's far end, K; rates: writes to x, dy/dt; lifts, pushes: the gas's rise that lifts the membrane, that pushes
+    a finger, K; reads: the rise that the thermometer shows, K; lag: the thermometer's, s
+    """
+
+    light: Modifier | None = None
+    capacity: Modifier | None = None
+    bridge: Modifier | None = None
+    leaving: Modifier | None = None
+    wall: Modifier | None = None
+    rates: Mover | None = None
+    lifts: Modifier | None = None
+    pushes: Modifier | None = None
+    reads: Modifier | None = None
+    lag: Modifier | None = None
+
+
 @dataclass(frozen=True)
 class TermParameter:
-    """A parameter of a term: its unit, the plausible range, and where the range comes from."""
+    """A parameter of a term: its unit, where a fit begins, the plausible range, and where the range comes from."""
 
     name: str
     unit: str
+    default: float
     low: float
     high: float
     source: str
@@ -61,6 +101,9 @@ class Term:
 
     key: its name in files; needs: keys of terms it builds on
     heat_nodes: states that store heat, and the parameter that is their capacity; followers: states that store none
+    kernels: the same for one compiled pixel; suspect: where in measured data it shows, for causes of a discrepancy;
+    by_run: whether repeats of one drive differ, by what came before or by the room;
+    quick: whether it moves within a gas time constant; never_warmer: nothing that can burn gets warmer by it
     """
 
     key: str
@@ -68,6 +111,17 @@ class Term:
     needs: tuple[str, ...] = ()
     heat_nodes: Mapping[str, str] = {}
     followers: tuple[str, ...] = ()
+    kernels: Kernels = Kernels()
+    suspect: str = ""
+    by_run: bool = False
+    quick: bool = False
+    never_warmer: bool = False
+
+    @property
+    def whole_display(self) -> bool:
+        """Whether the term acts in the model of a whole display, not in the compiled single pixel alone."""
+        hooks = ("bridge_k_per_w", "flow", "rates_k_per_s", "displacement_m", "force_n")
+        return any(getattr(type(self), name) is not getattr(Term, name) for name in hooks)
 
     def bridge_k_per_w(self, values: Values, view: View, r_k_per_w: FloatArray) -> FloatArray:
         """The bridge's resistance, given what it would be without the term: [p]."""

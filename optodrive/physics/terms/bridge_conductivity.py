@@ -1,14 +1,25 @@
 """Graphite conducts worse when hot: the bridge's resistance grows with its mean temperature."""
 
+from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import Term, TermParameter, Values, View
+from optodrive.physics.term import ABSORBER, AMBIENT_K, WALL_K, Kernels, Term, TermParameter, Values, View
+
+
+@kernel
+def bridge(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """R = R₀ (T / T₀)ⁿ."""
+    mean_k = c[AMBIENT_K] + 0.5 * (y[ABSORBER] + c[WALL_K])
+    return float(x * (mean_k / c[AMBIENT_K]) ** v[0])
 
 
 class BridgeConductivity(Term):
     """R = R₀ (T / T₀)ⁿ with T the mean of absorber and wall; n = 1 is k ~ 1/T (Text S2)."""
 
     key = "bridge_conductivity"
-    parameters = (TermParameter("exponent", "1", 0.0, 1.3, "k_xy = 3.6e5 / T is 1 (Text S2)"),)
+    parameters = (TermParameter("exponent", "1", 0.5, 0.0, 1.3, "k_xy = 3.6e5 / T is 1 (Text S2)"),)
+    kernels = Kernels(bridge=bridge)
+    by_run = True
+    suspect = "a ladder of powers held to the plateau"
 
     def bridge_k_per_w(self, values: Values, view: View, r_k_per_w: FloatArray) -> FloatArray:
         """[p] K/W."""

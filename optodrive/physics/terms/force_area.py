@@ -10,9 +10,10 @@ class ForceArea(Term):
     """F = A P_atm ΔT / T₀ with ΔT = the gas's rise; share as in gas_membrane."""
 
     key = "force_area"
+    never_warmer = True
     parameters = (
-        TermParameter("area", "m^2", 0.1e-6, 7.1e-6, "at most the aperture's 7.07 mm2"),
-        TermParameter("share", "1", 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
+        TermParameter("area", "m^2", 1e-6, 0.1e-6, 7.1e-6, "at most the aperture's 7.07 mm2"),
+        TermParameter("share", "1", 0.33, 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
     )
 
     def force_n(self, values: Values, view: View, force_n: FloatArray) -> FloatArray:

@@ -22,9 +22,10 @@ class GasMembrane(Term):
     """
 
     key = "gas_membrane"
+    never_warmer = True
     parameters = (
-        TermParameter("share", "1", 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
-        TermParameter("volume", "m^3", 6.0e-9, 9.0e-9, "7.1 to 7.8 uL (Text S3, Display fabrication)"),
+        TermParameter("share", "1", 0.33, 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
+        TermParameter("volume", "m^3", 7.8e-9, 6.0e-9, 9.0e-9, "7.1 to 7.8 uL (Text S3, Display fabrication)"),
     )
 
     def displacement_m(self, values: Values, view: View, displacement_m: FloatArray) -> FloatArray:

@@ -11,8 +11,8 @@ class LateralConduction(Term):
     key = "lateral_conduction"
     needs = ("wall_heating",)
     parameters = (
-        TermParameter("resistance", "K/W", 40.0, 10_000.0, "neighbours rise by 0.002 to 0.1 of a wall's rise"),
-        TermParameter("frame_resistance", "K/W", 40.0, 10_000.0, "as between neighbours"),
+        TermParameter("resistance", "K/W", 430.0, 40.0, 10_000.0, "neighbours rise by 0.002 to 0.1 of a wall's rise"),
+        TermParameter("frame_resistance", "K/W", 430.0, 40.0, 10_000.0, "as between neighbours"),
     )
 
     def flow(self, values: Values, view: View, flows: Flows) -> None:

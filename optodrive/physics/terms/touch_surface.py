@@ -9,9 +9,9 @@ class TouchSurface(Term):
 
     key = "touch_surface"
     parameters = (
-        TermParameter("gas_share", "1", 0.05, 0.6, "conduction through gas, membrane and finger in series"),
-        TermParameter("wall_share", "1", 0.1, 0.6, "conduction in the membrane to its rim"),
-        TermParameter("lag", "s", 0.3, 5.0, "heat capacity of the membrane over those conductances"),
+        TermParameter("gas_share", "1", 0.3, 0.05, 0.6, "conduction through gas, membrane and finger in series"),
+        TermParameter("wall_share", "1", 0.4, 0.1, 0.6, "conduction in the membrane to its rim"),
+        TermParameter("lag", "s", 1.2, 0.3, 5.0, "heat capacity of the membrane over those conductances"),
     )
     followers = ("touch_k",)
 

@@ -1,6 +1,14 @@
 """The wall at the bridge's far end is no sink: it warms, and cools to its surroundings more slowly."""
 
-from optodrive.physics.term import Flows, Term, TermParameter, Values, View
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import FLOW_W, WALL, Flows, Kernels, Term, TermParameter, Values, View
+
+
+@kernel
+def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
+    """C dw/dt = flow − w / R."""
+    x[WALL] = (c[FLOW_W] - y[WALL] / v[0]) / v[1]
 
 
 class WallHeating(Term):
@@ -8,10 +16,15 @@ class WallHeating(Term):
 
     key = "wall_heating"
     parameters = (
-        TermParameter("resistance", "K/W", 1.0, 40.0, "a cell of the laminate to its surroundings, by its materials"),
-        TermParameter("capacity", "J/K", 2.5e-3, 10.0, "0.1 to 10 s with the resistance"),
+        TermParameter(
+            "resistance", "K/W", 20.0, 1.0, 40.0, "a cell of the laminate to its surroundings, by its materials"
+        ),
+        TermParameter("capacity", "J/K", 0.06, 2.5e-3, 10.0, "0.1 to 10 s with the resistance"),
     )
     heat_nodes = {"wall_k": "capacity"}  # noqa: RUF012 - a Mapping, never written to
+
+    kernels = Kernels(rates=rates)
+    suspect = "trains of seconds, then the slow tail"
 
     def flow(self, values: Values, view: View, flows: Flows) -> None:
         """Wall to ambient."""

@@ -233,7 +233,7 @@ def test_every_file_of_the_package_is_a_term():
         assert term.key == key
         assert term.parameters
         for parameter in term.parameters:
-            assert parameter.low < parameter.high
+            assert parameter.low <= parameter.default <= parameter.high
             assert parameter.source
 
 
@@ -242,7 +242,7 @@ def test_a_new_term_is_a_new_file_and_nothing_else(tmp_path, monkeypatch):
         "from optodrive.physics.term import Term, TermParameter\n"
         "class Leak(Term):\n"
         "    key = 'leak'\n"
-        "    parameters = (TermParameter('resistance', 'K/W', 1.0, 1e6, 'here'),)\n"
+        "    parameters = (TermParameter('resistance', 'K/W', 100.0, 1.0, 1e6, 'here'),)\n"
         "    def flow(self, values, view, flows):\n"
         "        flows.move('absorber_k', None, view.rise_k['absorber_k'] / values['resistance'])\n"
         "TERM = Leak()\n"

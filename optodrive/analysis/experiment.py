@@ -1,0 +1,83 @@
+"""The experiment that separates two rivals most per second of lab time, over a finite grid of what a display can do."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from optodrive.analysis.dataset import PIXEL_KINDS, SIGNALS, Alike, Block, Dataset, RunInfo
+from optodrive.analysis.fit import Fit, Problem, jitter, slopes
+from optodrive.analysis.normal import normal, solve
+from optodrive.analysis.predict import predict
+from optodrive.flow import FloatArray, NextExperiment
+from optodrive.physics.forward import Scene
+
+REPEATS = 3
+SETUP_S = 2.0
+"""Between two runs."""
+SAMPLES = 400
+
+
+def next_experiment(problem: Problem, first: Fit, second: Fit, labels: tuple[str, str]) -> NextExperiment | None:
+    """The most telling run of the grid, repeated; None where no signal of a pixel is measured."""
+    kinds = tuple(kind for kind in problem.data.kinds() if kind in PIXEL_KINDS)
+    if not kinds:
+        return None
+    best: NextExperiment | None = None
+    for why, pulses, span_s in _grid(problem.data):
+        separation = _separation(problem, first, second, _imagined(pulses, span_s, kinds))
+        seconds = REPEATS * (span_s + SETUP_S)
+        if best is None or separation / seconds > best.separation / best.seconds:
+            signals = tuple(SIGNALS[kind] for kind in kinds)
+            text = f"{why}, {REPEATS} times: {labels[0]} and {labels[1]} differ most there"
+            best = NextExperiment(text, pulses, signals, separation, seconds)
+    return best
+
+
+def _grid(data: Dataset) -> Iterator[tuple[str, FloatArray, float]]:
+    full_w = max(scene.full_w for scene, _ in data.scenes)
+    for power_w in (0.25 * full_w, 0.5 * full_w, full_w):
+        for width_s in (0.002, 0.01, 0.05):
+            for lit in (0.0, 1.0):
+                where = "" if lit == 0.0 else " on the pixel beside it"
+                pulses = np.array([[0.02, width_s, power_w, lit]])
+                why = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{where}"
+                yield why, pulses, 0.02 + width_s + 0.25
+        for gap_s in (0.02, 0.06):
+            starts = 0.02 + np.arange(0.0, 3.0, 0.02 + gap_s)
+            pulses = np.array([[start, 0.02, power_w, 0.0] for start in starts])
+            yield f"3 s of 20 ms pulses, {gap_s * 1e3:g} ms apart, at {power_w:.2f} W", pulses, 4.0
+
+
+def _imagined(pulses: FloatArray, span_s: float, kinds: tuple[int, ...]) -> Dataset:
+    t_s = np.linspace(span_s / SAMPLES, span_s, SAMPLES)
+    blocks = tuple(
+        Block(0, kind, 0, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s, None) for row, kind in enumerate(kinds)
+    )
+    empty = np.zeros(0)
+    times = tuple(t_s if kind in kinds else empty for kind in PIXEL_KINDS)
+    scene = Scene(pulses, 0, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session=1.0)
+    place = {kind: row for row, kind in enumerate(kinds)}
+    rows = np.arange(SAMPLES)
+    alike = Alike(scene, tuple((kind, place[kind], rows) for kind in kinds))
+    places = (place.get(0, -1), place.get(1, -1), place.get(2, -1))
+    info = RunInfo("next", "next", 293.15, pulses, None, None)
+    return Dataset((info,), blocks, ((scene, places),), (alike,), np.zeros(SAMPLES * len(kinds)))
+
+
+def _separation(problem: Problem, first: Fit, second: Fit, data: Dataset) -> float:
+    """χ² between both predictions, what either could still be moved by taken out."""
+    here = predict(data, first.point, problem.epsilon)
+    there = predict(data, second.point, problem.epsilon)
+    shared = jitter(data, first.point, problem.epsilon, here)
+    imagined = Problem(data, problem.noise, problem.prior, problem.epsilon)
+    own = slopes(imagined, first.point, first.free, here)
+    other = slopes(imagined, second.point, second.free, there)
+    columns = np.column_stack([own, other, here - there])
+    gram = REPEATS * normal(data, columns, problem.noise, shared.power, shared.timing).total()
+    count = columns.shape[1] - 1
+    known = np.zeros((count, count))
+    width = own.shape[1]
+    known[:width, :width] = solve(first.covariance, np.eye(width))
+    known[width:, width:] = solve(second.covariance, np.eye(count - width))
+    cross = gram[:count, -1]
+    return float(gram[-1, -1] - cross @ solve(gram[:count, :count] + known, cross))

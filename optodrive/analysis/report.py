@@ -1,0 +1,121 @@
+"""The report: one HTML file that needs nothing beside itself. Numbers come from the answer, pictures from numbers."""
+
+from html import escape
+
+import numpy as np
+
+from optodrive.analysis.story import quantity, story
+from optodrive.flow import Course, Discrepancy, FloatArray
+
+STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1c1c1c; }
+h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
+table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
+th { border-bottom: 1px solid #999; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
+.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr)); gap: 1rem; }
+figure { margin: 0; } figcaption { font-size: .85rem; color: #444; }
+svg { width: 100%; height: auto; background: #fafafa; border: 1px solid #ddd; }
+.before { stroke: #c2571a; fill: none; } .after { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
+.other { fill: #b5b5b5; } text { font: 11px system-ui, sans-serif; fill: #333; }
+"""
+WIDTH, HEIGHT, EDGE = 320, 150, 26
+SHOWN = 24
+BARS = 14
+
+
+def report(found: Discrepancy, title: str) -> str:
+    """HTML."""
+    lines = [line for line in story(found) if line]
+    parts = [
+        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
+        f"<title>{escape(title)}: {escape(found.verdict)}</title><style>{STYLE}</style></head><body>",
+        f"<h1>{escape(lines[0])}</h1><p>{escape(title)}</p>",
+        *(f"<p>{escape(line)}</p>" for line in lines[1:]),
+        "<h2>Evidence for each cause</h2>",
+        _bars(found),
+        "<h2>Numbers</h2>",
+        _numbers(found),
+        "<h2>Residuals by experiment, before and after, in units of the noise of one sample</h2>",
+        "<p><span style='color:#c2571a'>nominal model</span>, <span style='color:#1a6fc2'>extended model</span></p>",
+        "<div class='grid'>",
+        *(_residuals(course) for course in _telling(found.courses)),
+        "</div>",
+        "<h2>Predicted against measured, extended model</h2><div class='grid'>",
+        *(_against(signal, found.courses) for signal in dict.fromkeys(course.signal for course in found.courses)),
+        "</div></body></html>",
+    ]
+    return "\n".join(parts)
+
+
+def _telling(courses: tuple[Course, ...]) -> list[Course]:
+    return sorted(courses, key=lambda item: -float((item.before**2).mean()))[:SHOWN]
+
+
+def _line(x: FloatArray, y: FloatArray, span: tuple[float, float, float, float], kind: str) -> str:
+    left, right, low, high = span
+    across = EDGE + (x - left) / max(right - left, 1e-12) * (WIDTH - EDGE - 6)
+    up = HEIGHT - 18 - (y - low) / max(high - low, 1e-12) * (HEIGHT - 26)
+    points = " ".join(f"{a:.1f},{b:.1f}" for a, b in zip(across, up, strict=True))
+    return f"<polyline class='{kind}' points='{points}'/>"
+
+
+def _residuals(course: Course) -> str:
+    most = float(max(np.abs(course.before).max(), np.abs(course.after).max(), 1.0))
+    span = (float(course.t_s[0]), float(course.t_s[-1]), -most, most)
+    lines = _line(course.t_s, course.before, span, "before") + _line(course.t_s, course.after, span, "after")
+    return (
+        f"<figure><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img'>{lines}"
+        f"<text x='2' y='14'>{most:.1f} σ</text><text x='2' y='{HEIGHT - 20}'>−{most:.1f}</text>"
+        f"<text x='{WIDTH - 60}' y='{HEIGHT - 4}'>{quantity(float(course.t_s[-1]), 's')}</text></svg>"
+        f"<figcaption>{escape(course.signal)}, {escape(course.group)}</figcaption></figure>"
+    )
+
+
+def _against(signal: str, courses: tuple[Course, ...]) -> str:
+    own = [course for course in courses if course.signal == signal]
+    measured = np.concatenate([course.measured for course in own])
+    scale = float(np.ptp(measured)) or 1.0
+    noise = np.concatenate([course.after for course in own])
+    unit = signal.rsplit("_", 1)[1]
+    # The residual is in σ; its size in the signal's unit follows from the courses themselves.
+    sigma = float(own[0].sigma)
+    predicted = measured - noise * sigma
+    low, high = float(measured.min()), float(measured.max())
+    x = EDGE + (predicted - low) / scale * (WIDTH - EDGE - 6)
+    y = HEIGHT - 18 - (measured - low) / scale * (HEIGHT - 26)
+    dots = "".join(
+        f"<circle cx='{a:.1f}' cy='{b:.1f}' r='1' class='bar'/>" for a, b in zip(x[::3], y[::3], strict=True)
+    )
+    ends = np.array([low, high])
+    return (
+        f"<figure><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img'>"
+        f"{_line(ends, ends, (low, high, low, high), 'before')}{dots}"
+        f"<text x='{EDGE}' y='{HEIGHT - 4}'>{quantity(low, unit)}</text>"
+        f"<text x='{WIDTH - 70}' y='{HEIGHT - 4}'>{quantity(high, unit)}</text></svg>"
+        f"<figcaption>{escape(signal)}: measured (up) against predicted</figcaption></figure>"
+    )
+
+
+def _bars(found: Discrepancy) -> str:
+    shown = sorted(found.candidates, key=lambda item: -item.statistic)[:BARS]
+    most = max([np.log10(1.0 + item.statistic) for item in shown], default=1.0) or 1.0
+    rows = []
+    for item in shown:
+        width = 260 * np.log10(1.0 + item.statistic) / most
+        kind = "bar" if item.verdict in ("named", "cannot be told apart") else "other"
+        rows.append(
+            f"<tr><td>{escape(item.label)}</td><td><svg viewBox='0 0 262 14' style='width:262px;border:0'>"
+            f"<rect class='{kind}' x='0' y='2' width='{width:.1f}' height='10'/></svg></td>"
+            f"<td class='n'>{item.statistic:.0f}</td><td>{escape(item.verdict)}</td></tr>"
+        )
+    head = "<tr><th>cause</th><th>likelihood ratio (log scale)</th><th></th><th></th></tr>"
+    return f"<table>{head}{''.join(rows)}</table>"
+
+
+def _numbers(found: Discrepancy) -> str:
+    rows = "".join(
+        f"<tr><td>{escape(name)}</td><td class='n'>{quantity(item.value, item.unit)}</td>"
+        f"<td class='n'>{quantity(item.low, item.unit)}</td><td class='n'>{quantity(item.high, item.unit)}</td></tr>"
+        for name, item in found.parameters.items()
+    )
+    return f"<table><tr><th>parameter</th><th>value</th><th>95 % from</th><th>to</th></tr>{rows}</table>"

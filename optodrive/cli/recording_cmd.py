@@ -1,0 +1,97 @@
+"""`optodrive recording convert | show`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optodrive.cli.options import JsonOption, print_json
+
+if TYPE_CHECKING:
+    from optodrive.flow import Measurement
+
+TABLE_WIDTH_MAX = 500
+"""The table is as wide as what it says, but no wider than this."""
+RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="An HDF5 file, or a folder of CSV files.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(help="Look into measured data, or turn one form of it into the other.", no_args_is_help=True)
+    group.command("convert")(convert)
+    group.command("show")(show)
+    app.add_typer(group, name="recording")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="An HDF5 file, or a folder of CSV files.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a new folder.")],
+    json: JsonOption = False,
+) -> None:
+    """Turn an HDF5 recording into a folder of CSV files, or the other way; every number stays exactly what it was."""
+    from optodrive.recording import convert_recording
+
+    measurement = convert_recording(source, target)
+    samples = sum(len(signal.t_s) for run in measurement.runs for signal in run.signals.values())
+    if json:
+        print_json({"written": str(target), "runs": len(measurement.runs), "samples": samples})
+    else:
+        print(f"runs             {len(measurement.runs)}")
+        print(f"samples          {samples}")
+        print(f"written          {target}")
+
+
+def show(
+    recording: RecordingArgument,
+    out: Annotated[Path | None, typer.Option("--out", metavar="picture.png", help="Draw every signal.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Check a recording whole, and show what each run holds."""
+    from optodrive.recording import read_recording
+    from optodrive.recording.summary import summary
+
+    measurement = read_recording(recording)
+    runs = summary(measurement)
+    drawn = None if out is None else _draw(out, measurement)
+    if json:
+        picture = None if out is None else {"file": str(out), "runs": drawn}
+        print_json({"recording": str(recording), "runs": runs, "picture": picture})
+        return
+    _print_table(runs)
+    if out is not None:
+        part = "" if drawn == len(runs) else f", the first {drawn} of {len(runs)} runs"
+        print(f"written          {out}{part}")
+
+
+def _draw(out: Path, measurement: "Measurement") -> int:
+    from optodrive.recording.picture import write_picture
+
+    return write_picture(out, measurement)
+
+
+def _print_table(runs: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in ("run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span"):
+        right = heading in ("pulses", "energy", "pixel", "samples", "missing")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
+    for run in runs:
+        for cells in _rows(run):
+            table.add_row(*(Text(cell) for cell in cells))
+    width = max(Console().width, Console(width=TABLE_WIDTH_MAX).measure(table).maximum)
+    Console(width=width, highlight=False).print(table)
+
+
+def _rows(run: dict[str, Any]) -> list[list[str]]:
+    energy = "" if run["energy_J"] is None else f"{run['energy_J']:.4g} J"
+    first = [run["run"], " ".join((run["group"] or "").split()), str(run["pulses"]), energy]
+    rows = []
+    for name, signal in run["signals"].items():
+        span = f"{signal['start_s']:g} to {signal['end_s']:g} s"
+        pixel = "" if name.startswith("mirror") else str(signal["pixel"])
+        rows.append([*first, name, pixel, str(signal["samples"]), str(signal["missing"]), span])
+        first = ["", "", "", ""]
+    return rows

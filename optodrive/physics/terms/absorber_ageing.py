@@ -1,0 +1,24 @@
+"""The absorber absorbs less with the light it has had."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import DOSE, Kernels, Term, TermParameter
+
+
+@kernel
+def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """1 − share × dose, dose as a share of the recording's."""
+    return float(x * (1.0 - v[0] * c[DOSE]))
+
+
+class AbsorberAgeing(Term):
+    """1 − share × dose, dose as a share of the recording's."""
+
+    key = "absorber_ageing"
+    parameters = (TermParameter("share", "1", 0.05, -0.3, 0.3, "lost over the recording's whole dose, 1 to 20 %"),)
+    kernels = Kernels(light=light)
+    by_run = True
+    suspect = "the same pulse early and late"
+
+
+TERM = AbsorberAgeing()

@@ -1,0 +1,30 @@
+"""The room moves while its stated temperature does not."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import SESSION, TIME_S, Kernels, Term, TermParameter
+
+
+@kernel
+def reads(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Ramp and parabola in the session's time, −1 to 1, and a rate in the run's."""
+    u = c[SESSION]
+    return float(x + v[0] + v[1] * u + v[2] * (1.5 * u * u - 0.5) + v[3] * c[TIME_S])
+
+
+class AmbientDrift(Term):
+    """Ramp and parabola in the session's time, −1 to 1, and a rate in the run's."""
+
+    key = "ambient_drift"
+    parameters = (
+        TermParameter("offset", "K", 0.5, -10.0, 10.0, "the room against what is stated, within 5 K"),
+        TermParameter("ramp", "K", 0.5, -10.0, 10.0, "over the recording, within 5 K"),
+        TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording"),
+        TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run"),
+    )
+    kernels = Kernels(reads=reads)
+    by_run = True
+    suspect = "baselines before the pulse"
+
+
+TERM = AmbientDrift()

@@ -1,0 +1,42 @@
+"""On one pixel part of the beam misses the absorber and warms its wall instead."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import MINE, PIXEL, POWER_W, Kernels, Term, TermParameter
+
+
+@kernel
+def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """1 − share on that pixel."""
+    return float(x * (1.0 - v[0]) if c[PIXEL] == v[1] else x)
+
+
+@kernel
+def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
+    """The wall warms towards resistance × what misses, while the light is on this pixel."""
+    missing_w = v[0] * c[POWER_W] if c[PIXEL] == v[1] and c[MINE] > 0.0 else 0.0
+    x[s] = (v[2] * missing_w - y[s]) / v[3]
+
+
+@kernel
+def wall(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Rise of the bridge's far end, K."""
+    return float(x + y[s])
+
+
+class BeamMisalignment(Term):
+    """P (1 − share) on one pixel; the rest warms its wall."""
+
+    key = "beam_misalignment"
+    parameters = (
+        TermParameter("share", "1", 0.1, 0.0, 0.5, "missing the absorber, 2 to 30 %"),
+        TermParameter("pixel", "1", 0.0, 0.0, 1e6, "the pixel's index"),
+        TermParameter("resistance", "K/W", 4.0, 0.01, 60.0, "the wall to its surroundings, 1 to 40 K/W"),
+        TermParameter("time", "s", 0.5, 0.02, 20.0, "the wall's, 0.1 to 10 s"),
+    )
+    followers = ("missed_k",)
+    kernels = Kernels(light=light, rates=rates, wall=wall)
+    suspect = "several pixels beside each other"
+
+
+TERM = BeamMisalignment()

@@ -1,0 +1,32 @@
+"""Graphite stores more heat when hot: its c_p rises 0.71 to 1.12 J/(g K) from 300 to 450 K."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import ABSORBER, Kernels, Term, TermParameter
+
+
+@kernel
+def capacity(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """C = C₀ (1 + slope θ), J/K."""
+    return float(x * (1.0 + v[0] * y[ABSORBER]))
+
+
+class HeatCapacity(Term):
+    """C = C₀ (1 + slope θ), J/K."""
+
+    key = "heat_capacity"
+    parameters = (
+        TermParameter(
+            "slope",
+            "1/K",
+            2e-3,
+            0.0,
+            4e-3,
+            "c_p of graphite, 300 to 450 K: 3.9e-3; less where other matter shares the heat",
+        ),
+    )
+    kernels = Kernels(capacity=capacity)
+    suspect = "initial slopes at several powers, plateaus unchanged"
+
+
+TERM = HeatCapacity()

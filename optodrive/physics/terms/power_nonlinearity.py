@@ -1,0 +1,30 @@
+"""Power is not proportional to what is commanded: a threshold, or a curve."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import FULL_W, POWER_W, Kernels, Term, TermParameter
+
+
+@kernel
+def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """Full power kept: (p − threshold) / (1 − threshold), then p (1 + curvature (1 − p))."""
+    if x <= 0.0:
+        return x
+    share, threshold = c[POWER_W] / c[FULL_W], v[0] / c[FULL_W]
+    left = max(0.0, (share - threshold) / (1.0 - threshold))
+    return float(x / share * left * (1.0 + v[1] * (1.0 - left)))
+
+
+class PowerNonlinearity(Term):
+    """Full power kept: (p − threshold) / (1 − threshold), then p (1 + curvature (1 − p))."""
+
+    key = "power_nonlinearity"
+    parameters = (
+        TermParameter("threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command"),
+        TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept"),
+    )
+    kernels = Kernels(light=light)
+    suspect = "a ladder of powers, shapes unchanged"
+
+
+TERM = PowerNonlinearity()

@@ -1,0 +1,38 @@
+"""The hot absorber radiates to the room."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import ABSORBER, AMBIENT_K, Kernels, Term, TermParameter
+
+STEFAN_BOLTZMANN = 5.670374e-8
+"""W/(m² K⁴)."""
+
+
+@kernel
+def leaving(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """εA σ (T⁴ − T₀⁴), W, on top of x."""
+    warm_k = c[AMBIENT_K] + y[ABSORBER]
+    return float(x + v[0] * STEFAN_BOLTZMANN * (warm_k**4 - c[AMBIENT_K] ** 4))
+
+
+class Radiation(Term):
+    """εA σ (T⁴ − T₀⁴), W, on top of x."""
+
+    key = "radiation"
+    parameters = (
+        TermParameter(
+            "emitting_area",
+            "m^2",
+            4e-6,
+            1e-7,
+            2e-5,
+            "both faces of a 2 mm x 1.5 mm absorber and its bridges, emissivity 0.5 to 0.9",
+        ),
+    )
+    kernels = Kernels(leaving=leaving)
+    by_run = True
+    never_warmer = True
+    suspect = "narrow bridges, hot, cooling that slows down"
+
+
+TERM = Radiation()

@@ -1,0 +1,28 @@
+"""The thermometer follows late."""
+
+from optodrive.compiled import kernel
+from optodrive.flow import FloatArray
+from optodrive.physics.term import Kernels, Term, TermParameter
+
+
+@kernel
+def lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+    """First order, s."""
+    return float(x + v[0])
+
+
+class SensorLag(Term):
+    """time · dT/dt = T_true − T, all of it later by delay_share × time (by `late_s` of what is observed)."""
+
+    key = "sensor_lag"
+    parameters = (
+        TermParameter("time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector"),
+        TermParameter("delay_share", "1", 0.0, 0.0, 1.0, "a delay beside it; 0.73 for an exposure's moving mean"),
+    )
+    kernels = Kernels(lag=lag)
+    quick = True
+    never_warmer = True
+    suspect = "edges of temperature against edges of displacement"
+
+
+TERM = SensorLag()

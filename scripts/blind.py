@@ -1,0 +1,137 @@
+"""The blind benchmark: hidden effects drawn from seeds, diagnosed through the library, scored. Prints the table.
+
+Development seeds begin at 9,000,000, report seeds at 1,000,000: nothing is tuned on the latter.
+"""
+
+import argparse
+import json
+import os
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT / "tests" / "blind"))
+
+FIRST = {"dev": 9_000_000, "report": 1_000_000}
+SAMPLES = 30_000
+
+
+def examine(task: tuple[str, int]) -> dict[str, Any]:
+    """One case: drawn, diagnosed, and once more after the experiment that the answer asks for."""
+    from blind_lab import draw
+    from blind_score import score
+
+    block, seed = task
+    with TemporaryDirectory() as folder:
+        try:
+            case = draw(block, seed, folder)
+        except RuntimeError as error:  # some seeds hide nothing that could be seen
+            return {"block": block, "seed": seed, "skipped": str(error)}
+        told = answered(case.path)
+        after, ask = None, told["next_experiment"]
+        if told["verdict"] == "ambiguous" and ask is not None:
+            after = answered(case.measure(ask["pulses"], ask["signals"], folder))
+        marked = score(case, told, after=after)
+    return {"score": marked, "baselines": baselines(told), "answer": told}
+
+
+def answered(path: Path) -> dict[str, Any]:
+    """The answer as the command line gives it."""
+    from optodrive.analysis.prior import prior_of
+    from optodrive.analysis.story import answer
+    from optodrive.analysis.study import diagnose
+    from optodrive.recording import read_recording
+
+    measurement = read_recording(path)
+    prior, epsilon, _ = prior_of(measurement, None)
+    return json.loads(json.dumps(answer(diagnose(measurement, 0, prior, epsilon))))
+
+
+def baselines(told: dict[str, Any]) -> dict[str, str]:
+    """What simpler rules would have named, from the same likelihood ratios; "" for nothing."""
+    from math import log
+
+    from optodrive.physics.terms import known_terms
+
+    def best(price: float) -> str:
+        worth = {
+            item["cause"]: item["statistic"] - price * len(known_terms()[item["cause"]].parameters) for item in rows
+        }
+        name = max(worth, key=worth.__getitem__)
+        return name if worth[name] > 0 else ""
+
+    rows = told["candidates"]
+    return {"largest R²": best(0.0), "AIC": best(2.0), "BIC": best(log(SAMPLES))}
+
+
+def compared(done: list[dict[str, Any]]) -> str:
+    """Simple rules beside the verdicts: they always name one."""
+    from blind_score import wilson
+
+    lines = [
+        "| rule | nulls left alone | one cause named alone | outside the catalogue left unnamed |",
+        "|---|---|---|---|",
+    ]
+    rules = {"this method": None, "largest R²": "largest R²", "AIC": "AIC", "BIC": "BIC"}
+    for name, rule in rules.items():
+        cells = []
+        for block in ("none", "single", "unknown"):
+            hits = []
+            for item in done:
+                marked = item["score"]
+                if marked.block != block or "sensor_scale" in marked.causes:
+                    continue
+                if rule is None:
+                    named = marked.named if marked.verdict == "cause" else ()
+                else:
+                    named = (item["baselines"][rule],) if item["baselines"][rule] else ()
+                hits.append(set(named) == set(marked.causes) if block == "single" else not named)
+            if not hits:
+                cells.append("–")
+                continue
+            low, high = wilson(sum(hits), len(hits))
+            cells.append(f"{sum(hits)}/{len(hits)} ({100 * low:.0f} to {100 * high:.0f} %)")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> None:
+    """Draw, diagnose, score, print; --keep writes every answer beside each other for a second look."""
+    from rich.console import Console
+    from rich.progress import track
+
+    from blind_score import table
+
+    parser = argparse.ArgumentParser(prog="scripts/bench blind")
+    parser.add_argument("--seeds", choices=tuple(FIRST), default="dev")
+    parser.add_argument("--nulls", type=int, default=24)
+    parser.add_argument("--cases", type=int, default=18, help="of each other block")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--keep", type=Path, help="folder for the answers")
+    chosen = parser.parse_args()
+    first = FIRST[chosen.seeds]
+    counts = {"none": chosen.nulls, "single": chosen.cases, "unknown": chosen.cases, "pair": chosen.cases}
+    tasks = [(block, first + row) for block, count in counts.items() for row in range(count)]
+    with ProcessPoolExecutor(chosen.workers) as pool:
+        done = list(
+            track(pool.map(examine, tasks), total=len(tasks), console=Console(stderr=True), description="blind")
+        )
+    if chosen.keep is not None:
+        chosen.keep.mkdir(parents=True, exist_ok=True)
+        for (block, seed), item in zip(tasks, done, strict=True):
+            if "answer" in item:
+                (chosen.keep / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
+    for item in done:
+        if "skipped" in item:
+            print(f"not drawn: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
+    told = [item for item in done if "score" in item]
+    print(table(item["score"] for item in told))
+    print(compared(told))
+
+
+if __name__ == "__main__":
+    main()
