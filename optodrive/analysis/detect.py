@@ -48,7 +48,7 @@ class Score:
 class Detection:
     """scores: the best start of every hypothesis, strongest first; p values of the best score and of the omnibus.
 
-    omnibus, bins: its χ² and degrees; gram: of all columns left beside the base (candidates, in scores' numbers)
+    omnibus, bins: its χ² and degrees
     """
 
     scores: tuple[Score, ...]
@@ -56,7 +56,6 @@ class Detection:
     omnibus: float
     bins: int
     p_omnibus: float
-    gram: FloatArray
 
 
 def detect(problem: Problem, base: Fit, found: list[Hypothesis], seed: int) -> Detection:
@@ -64,8 +63,9 @@ def detect(problem: Problem, base: Fit, found: list[Hypothesis], seed: int) -> D
     data = problem.data
     shared = jitter(data, base.point, problem.epsilon, base.prediction)
     known = slopes(problem, base.point, base.free, base.prediction)
-    trials = [(item, start, free) for item in found for start in _tried(item) for free in _own(item, start)]
-    extra = [_column(problem, base.point, item, start, name) - base.prediction for item, start, name in trials]
+    trials = [(item, start) for item in found for start in _tried(item)]
+    terms = [{**base.point.terms, item.key: start} for item, start in trials]
+    extra = [predict(data, Point(base.point.base, own), problem.epsilon) - base.prediction for own in terms]
     candidates = np.stack(extra, axis=1) if extra else np.zeros((len(data.value), 0))
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
@@ -78,27 +78,15 @@ def detect(problem: Problem, base: Fit, found: list[Hypothesis], seed: int) -> D
     omnibus, degrees = binned(problem, np.column_stack([known, residual]), shared)
     scores, p_score = _scores(trials, left, scale, own, seed)
     p_omnibus = float(chi_squared.sf(omnibus, degrees)) if degrees else 1.0
-    return Detection(tuple(scores), p_score, omnibus, degrees, p_omnibus, left)
+    return Detection(tuple(scores), p_score, omnibus, degrees, p_omnibus)
 
 
 def _tried(item: Hypothesis) -> tuple[dict[str, float], ...]:
     return item.starts[:1] if item.every else item.starts
 
 
-def _own(item: Hypothesis, start: dict[str, float]) -> list[str | None]:
-    """The columns of one start: one, or, for a linear hypothesis of several numbers, one each."""
-    if item.linear and item.degrees > 1:
-        return [name for name in start if start[name] != 0.0]
-    return [None]
-
-
-def _column(problem: Problem, point: Point, item: Hypothesis, start: dict[str, float], name: str | None) -> FloatArray:
-    del name
-    return predict(problem.data, Point(point.base, {**point.terms, item.key: start}), problem.epsilon)
-
-
 def _scores(
-    trials: list[tuple[Hypothesis, dict[str, float], str | None]],
+    trials: list[tuple[Hypothesis, dict[str, float]]],
     left: FloatArray,
     scale: FloatArray,
     own: FloatArray,
@@ -106,7 +94,7 @@ def _scores(
 ) -> tuple[list[Score], float]:
     sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
     joint: dict[str, list[int]] = {}
-    for column, (item, start, _) in enumerate(trials):
+    for column, (item, start) in enumerate(trials):
         if item.linear and item.degrees > 1:
             joint.setdefault(item.label, []).append(column)
             if len(joint[item.label]) == len(item.starts):

@@ -76,10 +76,10 @@ def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: 
         ]
     rmse = np.sqrt(sums[:, 1:] / sums[:, :1])
     generator = np.random.default_rng(seed)
-    both = np.stack([binned_before, binned_after])
+    both = np.stack([binned_before, binned_after])[:, binned_before[:, 1] > 0]
     count = both.shape[1]
     drawn = [_reduction(both[:, generator.integers(0, count, count)]) for _ in range(DRAWS)]
-    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    low, high = np.quantile(drawn, [0.025, 0.975])
     names = [SIGNALS[kind] for kind in kinds]
     columns = [dict(zip(names, rmse[:, column].tolist(), strict=True)) for column in range(3)]
     return Gain(columns[0], columns[1], columns[2], _reduction(both), float(low), float(high))

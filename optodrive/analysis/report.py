@@ -11,6 +11,7 @@ STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1c1c1c; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
 table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
+p { margin: .7rem 0 .2rem; } p.item { margin: 0 0 0 1.2rem; }
 th { border-bottom: 1px solid #999; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr)); gap: 1rem; }
 figure { margin: 0; } figcaption { font-size: .85rem; color: #444; }
@@ -30,7 +31,7 @@ def report(found: Discrepancy, title: str) -> str:
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         f"<title>{escape(title)}: {escape(found.verdict)}</title><style>{STYLE}</style></head><body>",
         f"<h1>{escape(lines[0])}</h1><p>{escape(title)}</p>",
-        *(f"<p>{escape(line)}</p>" for line in lines[1:]),
+        *(f"<p{_kind(line)}>{escape(line.strip())}</p>" for line in lines[1:]),
         "<h2>Evidence for each cause</h2>",
         _bars(found),
         "<h2>Numbers</h2>",
@@ -45,6 +46,11 @@ def report(found: Discrepancy, title: str) -> str:
         "</div></body></html>",
     ]
     return "\n".join(parts)
+
+
+def _kind(line: str) -> str:
+    """Lines of a list, and what belongs to the line above, stand closer."""
+    return " class='item'" if line.startswith(("- ", "  ")) else ""
 
 
 def _telling(courses: tuple[Course, ...]) -> list[Course]:
