@@ -13,6 +13,8 @@ from optodrive.analysis.predict import BASE, Point, predict
 from optodrive.flow import FloatArray
 
 BASE_STEP = 1e-3
+BASE_SPAN = 1.8
+"""Logarithm of the factor by which a base parameter may leave its prior: a gas ever quicker would take ever longer."""
 POWER_STEP, LATE_STEP_S = 5e-3, 1e-5
 ENOUGH = 0.02
 """A step that promises less χ² than this is the last."""
@@ -64,9 +66,11 @@ def jitter(data: Dataset, point: Point, epsilon: float, prediction: FloatArray) 
     return Jitter((stronger - prediction) / np.log1p(POWER_STEP), 0.5 * (later - sooner) / LATE_STEP_S)
 
 
-def moved(point: Point, free: Sequence[Free], step: FloatArray) -> Point:
+def moved(problem: Problem, point: Point, free: Sequence[Free], step: FloatArray) -> Point:
     """The point after a step in base and free numbers, within their ranges."""
-    base = tuple(np.add(point.base, np.clip(step[: len(BASE)], -0.5, 0.5)).tolist())
+    centre = np.array(problem.prior.mean)
+    reached = np.add(point.base, np.clip(step[: len(BASE)], -0.5, 0.5))
+    base = tuple(np.clip(reached, centre - BASE_SPAN, centre + BASE_SPAN).tolist())
     terms: Mapping[str, Mapping[str, float]] = point.terms
     for item, change in zip(free, step[len(BASE) :], strict=True):
         number = item.read(terms)
@@ -132,6 +136,6 @@ def fit(
             promised = float(right @ step)
             if min(promised, gained) < ENOUGH or (gained < np.inf and cost - 2.0 * promised > hopeless):
                 break
-        tried = moved(best.point, free, step)
+        tried = moved(problem, best.point, free, step)
         prediction = predict(data, tried, problem.epsilon)
     return best
