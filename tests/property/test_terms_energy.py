@@ -15,7 +15,7 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import known_terms
 
 LATTICE = Neighbours.of(DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4))
-TERMS = known_terms()
+TERMS = {key: term for key, term in known_terms().items() if term.whole_display}
 LAGS_S = st.floats(1e-3, 64e-3)
 SUBSETS = [
     keys
