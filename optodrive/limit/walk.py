@@ -12,7 +12,7 @@ from optodrive.limit.windows import Chains, Pulses, allowed_w, append
 
 ROUNDING = 1e-9
 """Relative excess that floating-point rounding may cause; anything larger is a real excess."""
-HALVINGS = 50
+HALVINGS = 32
 
 
 NOTHING, ABSORBER, WIDTH, ENERGY, SPOT, PIXEL_MEAN, DISPLAY_MEAN, WALL, TOUCH, GALVO, ORDER = range(11)
