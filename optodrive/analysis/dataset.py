@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optodrive.errors import InputError
-from optodrive.flow import FloatArray, IntArray, Measurement, Run, Signal
+from optodrive.flow import FloatArray, IntArray, Measurement, Run
 from optodrive.physics.forward import Scene
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
@@ -21,14 +21,13 @@ CORNER_S = 6e-5
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One signal of one run: kind as in SIGNALS, its place in the vector, sample times, the stated noise."""
+    """One signal of one run: kind as in SIGNALS, its place in the vector, sample times."""
 
     run: int
     kind: int
     pixel: int
     part: slice
     t_s: FloatArray
-    sigma: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,6 @@ class RunInfo:
     ambient_k: float
     pulses: FloatArray
     commands: FloatArray | None
-    width_m: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +98,7 @@ class Dataset:
                 continue
             count = block.part.stop - block.part.start
             moved[number] = len(blocks)
-            blocks.append(Block(new[block.run], block.kind, block.pixel, slice(at, at + count), block.t_s, block.sigma))
+            blocks.append(Block(new[block.run], block.kind, block.pixel, slice(at, at + count), block.t_s))
             values.append(self.value[block.part])
             at += count
         scenes = []
@@ -142,9 +140,7 @@ def dataset(measurement: Measurement) -> Dataset:
                 continue
             if kind in PIXEL_KINDS:
                 by_pixel.setdefault(signal.pixel, {})[kind] = len(blocks)
-            blocks.append(
-                Block(number, kind, signal.pixel, slice(at, at + len(value)), signal.t_s[good], _sigma(signal))
-            )
+            blocks.append(Block(number, kind, signal.pixel, slice(at, at + len(value)), signal.t_s[good]))
             values.append(value)
             at += len(value)
         for pixel, places in by_pixel.items():
@@ -192,20 +188,9 @@ def _off_corners(t_s: FloatArray, pulses: FloatArray) -> BoolArray:
     return np.asarray(np.minimum(t_s - edges_s[row - 1], edges_s[row] - t_s) > CORNER_S)
 
 
-def _sigma(signal: Signal) -> float | None:
-    return signal.sigma if signal.sigma is not None and signal.sigma > 0.0 else None
-
-
 def _info(run: Run) -> RunInfo:
-    width = run.attributes.get("bridge_width_m")
-    return RunInfo(
-        run.name,
-        str(run.attributes.get("group", run.name)),
-        run.ambient_k,
-        run.pulses,
-        run.commands,
-        float(width) if isinstance(width, (int, float)) else None,
-    )
+    group = str(run.attributes.get("group", run.name))
+    return RunInfo(run.name, group, run.ambient_k, run.pulses, run.commands)
 
 
 def _clock(runs: tuple[Run, ...]) -> FloatArray:
@@ -225,7 +210,6 @@ def _doses(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, float], li
     before: list[dict[int, float]] = [{} for _ in runs]
     for number in order.tolist():
         before[number] = dict(so_far)
-        for start_s, width_s, power_w, pixel in runs[number].pulses.tolist():
+        for _, width_s, power_w, pixel in runs[number].pulses.tolist():
             so_far[int(pixel)] = so_far.get(int(pixel), 0.0) + width_s * power_w
-            del start_s
     return so_far, before

@@ -50,9 +50,7 @@ def _grid(data: Dataset) -> Iterator[tuple[str, FloatArray, float]]:
 
 def _imagined(pulses: FloatArray, span_s: float, kinds: tuple[int, ...]) -> Dataset:
     t_s = np.linspace(span_s / SAMPLES, span_s, SAMPLES)
-    blocks = tuple(
-        Block(0, kind, 0, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s, None) for row, kind in enumerate(kinds)
-    )
+    blocks = tuple(Block(0, kind, 0, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s) for row, kind in enumerate(kinds))
     empty = np.zeros(0)
     times = tuple(t_s if kind in kinds else empty for kind in PIXEL_KINDS)
     scene = Scene(pulses, 0, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session=1.0)
@@ -60,7 +58,7 @@ def _imagined(pulses: FloatArray, span_s: float, kinds: tuple[int, ...]) -> Data
     rows = np.arange(SAMPLES)
     alike = Alike(scene, tuple((kind, place[kind], rows) for kind in kinds))
     places = (place.get(0, -1), place.get(1, -1), place.get(2, -1))
-    info = RunInfo("next", "next", 293.15, pulses, None, None)
+    info = RunInfo("next", "next", 293.15, pulses, None)
     return Dataset((info,), blocks, ((scene, places),), (alike,), np.zeros(SAMPLES * len(kinds)))
 
 

@@ -16,6 +16,7 @@ ALPHA = 0.001
 UNEVEN = 6.0
 """Repeats that differ by more than this do not repeat one experiment."""
 HOPELESS = 300.0
+"""A fit that does not promise to come within so much χ² of the best one is given up."""
 MOST = 9
 """So many of the strongest hypotheses are refitted."""
 ALIKE = 12.0
@@ -23,15 +24,15 @@ ALIKE = 12.0
 EXPLAINED = 0.9
 FORM = 0.985
 """A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
-PAIRS = 4
-BEGIN = 2
+PAIRS, BEGIN = 4, 2
+"""So many second causes are refitted beside each of so many best first ones."""
 
 Tick = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One or two hypotheses, refitted. bic: χ² and the price of the free numbers; rest: what detection finds beside."""
+    """One or two hypotheses, refitted. bic: χ² and the price of the free numbers."""
 
     hypotheses: tuple[Hypothesis, ...]
     fit: Fit
@@ -73,10 +74,10 @@ def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick
     """The verdict on one recording."""
     tick("looking for anything to explain")
     first = detect(problem, base, known, seed)
-    if not alarmed(first) and problem.noise.uneven <= UNEVEN:
-        return Verdict("none", (), None, (), first, None, 0.0)
     if problem.noise.uneven > UNEVEN:
         return Verdict("unexplained", (), None, (), first, None, 0.0)
+    if not alarmed(first):
+        return Verdict("none", (), None, (), first, None, 0.0)
     singles = _refitted(problem, base, (), first.scores, tick)
     if not singles:
         return Verdict("unexplained", (), None, (), first, None, 0.0)

@@ -62,9 +62,3 @@ def test_what_is_in_no_catalogue_is_not_all_named(answers):
 def test_of_two_causes_no_two_are_false(answers):
     for case, item in answers["pair"]:
         assert not item["causes"] or set(item["causes"]) & set(case.causes), what(answers["pair"])
-
-
-def test_every_answer_is_in_time(answers):
-    """Generous: these machines are noisy; the benchmark measures."""
-    slow = [item["seconds"] for told in answers.values() for _, item in told if item["seconds"] > 120]
-    assert not slow, f"BLIND_SEED={SEED}"
