@@ -1,21 +1,21 @@
 """Board time on the host's clock: each exchange brackets a tick, the narrowest bracket of the last few counts."""
 
-from collections import deque
-
 SAMPLES = 16
 DRIFT_MAX = 2e-4
 """Two crystals disagree by less than this; a bracket widens by it as it ages."""
 
 
 class ClockSync:
-    """Maps host seconds to board seconds (ticks over tick_hz)."""
+    """Maps host seconds to board seconds (ticks over tick_hz); one thread adds, any may ask."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[float, float, float]] = deque(maxlen=SAMPLES)
+        # Replaced, never changed: another thread may be walking through the samples.
+        self._samples: tuple[tuple[float, float, float], ...] = ()
 
     def add(self, sent_s: float, received_s: float, board_s: float) -> None:
         """Note an exchange: asked at sent_s, answered at received_s, the board read board_s in between."""
-        self._samples.append((received_s - sent_s, (sent_s + received_s) / 2, board_s))
+        sample = (received_s - sent_s, (sent_s + received_s) / 2, board_s)
+        self._samples = (*self._samples[1 - SAMPLES :], sample)
 
     @property
     def known(self) -> bool:
@@ -29,7 +29,8 @@ class ClockSync:
 
     def board_s(self, host_s: float) -> float:
         """The board's time at host_s, s; 0 before any exchange."""
-        if not self._samples:
+        samples = self._samples
+        if not samples:
             return 0.0
-        _, middle_s, board_s = min(self._samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
+        _, middle_s, board_s = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
         return board_s + (host_s - middle_s)

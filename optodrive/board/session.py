@@ -379,10 +379,10 @@ class Session:
     # --- figures ------------------------------------------------------------------------------------------------
 
     def link_figures(self) -> dict[str, Any]:
-        """Counters of the link, for people who wonder why it is slow or lost."""
-        counters = self._connection.counters
+        """Counters of the link, for people who wonder why it is slow or lost; any thread may ask."""
+        counters, round_trip_s = self._connection.counters, self._sync.round_trip_s
         return {
-            "round_trip_ms": None if self._sync.round_trip_s is None else self._sync.round_trip_s * 1e3,
+            "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
             "received_bad": counters.crc_errors + counters.format_errors,
             "retransmitted": counters.retransmitted,
             "naks": counters.naks,

@@ -1,5 +1,7 @@
 """The session against the simulated board, both real, over a link in memory and a clock moved by hand."""
 
+import sys
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -456,3 +458,31 @@ def test_clock_lets_an_old_narrow_bracket_go():
     late_s = 0.002 / DRIFT_MAX
     sync.add(late_s, late_s + 0.002, 100.0 + late_s + 0.001 + 0.001)
     assert sync.board_s(late_s) == pytest.approx(100.0 + late_s + 0.001)
+
+
+def test_another_thread_may_always_ask():
+    """What REST asks while the link comes and goes is answered, whatever the loop is doing to it."""
+    rig, errors, over = Rig(), [], threading.Event()
+
+    def ask():
+        try:
+            while not over.is_set():
+                rig.session.link_figures()
+                rig.session.board_s()
+                rig.session.board.figures()
+        except Exception as error:
+            errors.append(error)
+
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    asker = threading.Thread(target=ask)
+    asker.start()
+    try:
+        for _ in range(300):
+            rig.connect()
+            rig.session.drop()
+    finally:
+        over.set()
+        asker.join()
+        sys.setswitchinterval(interval_s)
+    assert not errors
