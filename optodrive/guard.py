@@ -1,5 +1,7 @@
 """The budget of a configuration: its caps, and the model in use with the uncertainty declared for it."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from optodrive.config import Config
@@ -8,6 +10,7 @@ from optodrive.limit.budget import Budget, Caps, Mirrors
 from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls, heat_bound
 from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
+from optodrive.physics.term import Most, Values, Warming
 from optodrive.physics.terms import known_terms
 from optodrive.units import ZERO_CELSIUS_K
 
@@ -20,10 +23,23 @@ ANGLE_CODES = 32_768
 def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
     """Caps, bound and mirrors; raises InputError where a bound cannot be given."""
     limits, scanner, ambient_c = config.limits, config.scanner, config.ambient_c
+    warming = warming_of(parameters, pixels, config)
+    base_c = ambient_c + warming.everywhere_k
+    for name, cap_c in (
+        ("absorber_max_c", limits.absorber_max_c),
+        ("wall_max_c", limits.wall_max_c),
+        ("touch_max_c", limits.touch_max_c),
+    ):
+        if cap_c <= base_c:
+            raise InputError(
+                f"limits.{name}",
+                cap_c,
+                f"more than {base_c:.1f} °C, to which the terms of {parameters.name} may warm it",
+            )
     caps = Caps(
-        absorber_k=limits.absorber_max_c - ambient_c,
-        wall_k=limits.wall_max_c - ambient_c,
-        touch_k=limits.touch_max_c - ambient_c,
+        absorber_k=limits.absorber_max_c - base_c,
+        wall_k=limits.wall_max_c - base_c,
+        touch_k=limits.touch_max_c - base_c,
         galvo_rad2_per_s4=limits.galvo_acceleration_rms_max_rad_per_s2**2,
         pulse_energy_j=limits.pulse_energy_max_j,
         pulse_width_s=limits.pulse_width_max_s,
@@ -33,7 +49,7 @@ def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> B
         display_mean_w=limits.display_mean_power_max_w,
         display_window_s=limits.display_mean_window_s,
     )
-    model = declared(parameters, pixels, Neighbours.of(config.display), ambient_c + ZERO_CELSIUS_K)
+    model = declared(parameters, pixels, Neighbours.of(config.display), ambient_c + ZERO_CELSIUS_K, warming)
     uncertainty = Uncertainty(**limits.uncertainty.model_dump())
     mirrors = Mirrors(
         settle_s=scanner.settle_s,
@@ -44,17 +60,59 @@ def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> B
     return Budget(caps, heat_bound(model, uncertainty, caps, config.laser.max_power_w), mirrors)
 
 
-def declared(parameters: ParameterSet, pixels: PixelArray, neighbours: Neighbours, ambient_k: float) -> Declared:
-    """What the limiter takes from a parameter set: everything that moves heat.
+def warming_of(parameters: ParameterSet, pixels: PixelArray, config: Config) -> Warming:
+    """What all terms together that the bound does not follow add to heat, at the most.
 
-    Raises InputError for a term that may make something warmer and that the bound does not know.
+    Raises InputError for a term that may make something warmer by nobody knows how much.
     """
-    for key in parameters.terms:
-        if key not in BOUNDED and not known_terms()[key].never_warmer:
+    terms = {key: parameters.term_values(key) for key in parameters.terms}
+    cap_k, full_w = config.limits.absorber_max_c - config.ambient_c, config.laser.max_power_w
+    light = _added(terms, Most(cap_k, 0.0, full_w))
+    c_j_per_k, r_k_per_w = float(pixels.c_j_per_k.max()) * light.capacity, float(pixels.r_k_per_w.max())
+    together_k = light.power * float(pixels.epsilon.max()) * full_w * r_k_per_w * _unsure(config, terms, light.capacity)
+    everywhere_k = _added(terms, Most(cap_k, together_k, full_w)).everywhere_k
+    # Absorbers pass what warms them on to walls and touch surfaces, and hold it back for a while: a little each.
+    more = 1.0
+    if "wall_heating" in terms:
+        more += 2.0 * c_j_per_k / terms["wall_heating"]["capacity"]
+    if "touch_surface" in terms:
+        touch = terms["touch_surface"]
+        more += touch["gas_share"] * r_k_per_w * c_j_per_k / touch["lag"]
+    return light._replace(everywhere_k=more * everywhere_k)
+
+
+def _added(terms: Mapping[str, Values], most: Most) -> Warming:
+    power = capacity = 1.0
+    everywhere_k = 0.0
+    for key in terms:
+        if key in BOUNDED:
+            continue
+        own = known_terms()[key].warming(terms[key], most)
+        if own is None:
             raise InputError(
                 f"terms.{key}", key, "a term that the limiter's bound holds for: it may warm what is capped"
             )
-    terms = {key: {name: item.value for name, item in values.items()} for key, values in parameters.terms.items()}
+        power, capacity, everywhere_k = power * own.power, capacity * own.capacity, everywhere_k + own.everywhere_k
+    return Warming(power, capacity, everywhere_k)
+
+
+def _unsure(config: Config, terms: Mapping[str, Values], capacity: float) -> float:
+    """By how much more than ε P R all absorbers together may rise: what is declared unsure, and hot bridges.
+
+    Their heat stays below ε P × the longest R C; as rises, divided by the least C.
+    """
+    unsure = config.limits.uncertainty
+    hottest = (config.limits.absorber_max_c + ZERO_CELSIUS_K) / (config.ambient_c + ZERO_CELSIUS_K)
+    exponent = terms["bridge_conductivity"]["exponent"] + unsure.exponent if "bridge_conductivity" in terms else 0.0
+    spread = (1 + unsure.absorber_capacity) / (1 - unsure.absorber_capacity) * capacity
+    return float((1 + unsure.absorbed_power) * (1 + unsure.bridge_resistance) * spread * hottest**exponent)
+
+
+def declared(
+    parameters: ParameterSet, pixels: PixelArray, neighbours: Neighbours, ambient_k: float, warming: Warming
+) -> Declared:
+    """What the limiter takes from a parameter set: everything that moves heat."""
+    terms = {key: parameters.term_values(key) for key in parameters.terms}
     wall, side, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
     walls = None
     if wall is not None:
@@ -65,9 +123,11 @@ def declared(parameters: ParameterSet, pixels: PixelArray, neighbours: Neighbour
             frame_k_per_w=side["frame_resistance"] if side else np.inf,
         )
     return Declared(
-        epsilon=pixels.epsilon,
+        epsilon=pixels.epsilon * warming.power,
         r_k_per_w=pixels.r_k_per_w,
         c_j_per_k=pixels.c_j_per_k,
+        hot_capacity=warming.capacity,
+        warmer_k=warming.everywhere_k,
         tau_g_s=float(pixels.tau_g_s.max()),
         ambient_k=ambient_k,
         exponent=terms.get("bridge_conductivity", {}).get("exponent", 0.0),

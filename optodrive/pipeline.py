@@ -15,9 +15,9 @@ from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, 
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
-from optodrive.physics.array import DisplayHeat
-from optodrive.physics.parameters import PixelArray, display_pixels, load_parameters
-from optodrive.plan.drive import DriveRange, reach_m
+from optodrive.physics.drive import DriveRange
+from optodrive.physics.heat import Heat, heat_at_rest
+from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels, load_parameters
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
@@ -33,6 +33,7 @@ class Display:
 
     config: Config
     layout: PixelLayout
+    parameters: ParameterSet
     pixels: PixelArray
     machine: Machine
     budget: Budget
@@ -41,7 +42,8 @@ class Display:
     def of(cls, config: Config) -> "Display":
         """Resolve a configuration."""
         layout = pixel_layout(config.display)
-        pixels = display_pixels(config)
+        parameters = load_parameters(config.pixel_model.parameters)
+        pixels = display_pixels(config, parameters)
         limits, laser, scanner = config.limits, config.laser, config.scanner
         machine = Machine(
             layout=layout,
@@ -49,17 +51,20 @@ class Display:
             moves=MoveModel(scanner.settle_s, scanner.slew_rad_per_s),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
         )
-        budget = budget_of(config, load_parameters(config.pixel_model.parameters), pixels)
-        return cls(config, layout, pixels, machine, budget)
+        return cls(config, layout, parameters, pixels, machine, budget_of(config, parameters, pixels))
 
     @property
     def ambient_k(self) -> float:
         """Ambient temperature, K."""
         return self.config.ambient_c + ZERO_CELSIUS_K
 
-    def at_rest(self) -> tuple[DisplayHeat, BudgetState]:
+    def heat_at_rest(self) -> Heat:
+        """Heat of a display that nobody has lit."""
+        return heat_at_rest(self.config, self.parameters)
+
+    def at_rest(self) -> tuple[Heat, BudgetState]:
         """Heat and budget of a display that nobody has lit."""
-        return DisplayHeat(self.pixels), fresh_state(len(self.pixels))
+        return self.heat_at_rest(), fresh_state(len(self.pixels))
 
 
 @dataclass(frozen=True)
@@ -116,7 +121,7 @@ class Prepared:
     frames: tuple[FrameTiming, ...]
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
-    heat: DisplayHeat
+    heat: Heat
     budget: BudgetState
 
     @property
@@ -150,8 +155,7 @@ def check_reach(display: Display, sequence: FrameSequence) -> None:
     """Refuse a target that the longest pulse at full power does not reach from rest."""
     if not sequence.frames:
         return
-    reach = {pixel: reach_m(pixel, display.machine.drive) for pixel in set(display.pixels.each)}
-    most_m = np.array([reach[pixel] for pixel in display.pixels.each])
+    most_m = display.heat_at_rest().reaches_m(display.machine.drive)
     laser, limits = display.config.laser, display.config.limits
     for frame in sequence.frames:
         beyond = np.flatnonzero(frame.target_m > most_m)
@@ -169,7 +173,7 @@ def check_reach(display: Display, sequence: FrameSequence) -> None:
 def prepare(
     display: Display,
     sequence: FrameSequence,
-    heat: DisplayHeat,
+    heat: Heat,
     budget: BudgetState,
     policy: Policy = "trim",
     progress: Progress | None = None,

@@ -7,7 +7,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from optodrive.config import load_config
 from optodrive.frames.patterns import build_pattern
-from optodrive.physics.array import DisplayHeat
 from optodrive.pipeline import Display, prepare
 from optodrive.simulator.run import execute
 from optodrive.simulator.truth import trace
@@ -74,7 +73,7 @@ def main():
     executed = execute(display, prepared)
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     peaks_um = np.zeros(len(display.layout))
-    np.maximum.at(peaks_um, executed.pixel, 1e6 * DisplayHeat(display.pixels).pulses(*columns).displacement_m)
+    np.maximum.at(peaks_um, executed.pixel, 1e6 * display.heat_at_rest().pulses(*columns).displacement_m)
     shown = int(executed.pixel[0])
     own = executed.pixel == shown
     image = Image.new("RGB", (2 * MARGIN + 21 * SCALE + 560, 2 * MARGIN + 21 * SCALE + 24), DARK)
@@ -82,7 +81,7 @@ def main():
     draw_display(draw, font, display.layout, peaks_um, (MARGIN, MARGIN))
     pulses = list(zip(executed.start_s[own], executed.width_s[own], strict=True))
     box = (MARGIN + 21 * SCALE + 70, MARGIN + 40, image.width - MARGIN, image.height - MARGIN - 40)
-    draw_trace(draw, font, trace(display.pixels, executed, [shown], 5e-4), pulses, box)
+    draw_trace(draw, font, trace(display.heat_at_rest(), executed, [shown], 5e-4), pulses, box)
     OUT.mkdir(parents=True, exist_ok=True)
     image.save(OUT / "braille.png", optimize=True)
     print(f"written {OUT / 'braille.png'}")

@@ -4,14 +4,24 @@ import json
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
+
+from optodrive.errors import InputError
+
+if TYPE_CHECKING:
+    from optodrive.config import Config
 
 ConfigOption = Annotated[
     str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else on stdout.")]
+ModelOption = Annotated[
+    Path | None,
+    typer.Option("--model", metavar="model.toml", help="Plan with this parameter set, as `diagnose` writes it."),
+]
 UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens.")]
 StrictOption = Annotated[bool, typer.Option("--strict", help="The same as --policy refuse.")]
 PolicyOption = Annotated[
@@ -19,6 +29,19 @@ PolicyOption = Annotated[
     typer.Option("--policy", help="What becomes of a frame that a cap does not allow as it is."),
 ]
 DEFAULT_URL = "http://127.0.0.1:8450"
+
+
+def configured(config: str | None, model: Path | None) -> "Config":
+    """The configuration, its pixels following the model where one is given; InputError with one line."""
+    from optodrive.config import load_config
+
+    loaded = load_config(config)
+    if model is None:
+        return loaded
+    if model.suffix != ".toml":
+        raise InputError("--model", str(model), "a .toml file")
+    section = loaded.pixel_model.model_copy(update={"parameters": str(model)})
+    return loaded.model_copy(update={"pixel_model": section})
 
 
 def print_json(document: dict[str, Any]) -> None:

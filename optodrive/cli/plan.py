@@ -8,9 +8,11 @@ import typer
 from optodrive.cli.options import (
     ConfigOption,
     JsonOption,
+    ModelOption,
     PolicyOption,
     StrictOption,
     announce_compilation,
+    configured,
     print_json,
     progress,
     report_lines,
@@ -28,17 +30,17 @@ def plan(
     frames: FramesArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row a pulse.")] = None,
     config: ConfigOption = None,
+    model: ModelOption = None,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames: pulses, beam-on share, duration, what was trimmed and why, predicted displacement."""
-    from optodrive.config import load_config
     from optodrive.frames.files import load_sequence
     from optodrive.pipeline import Display, chosen, prepare
     from optodrive.summary import summary, write_plan_csv
 
-    display = Display.of(load_config(config))
+    display = Display.of(configured(config, model))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
     with progress("planning") as done:

@@ -5,14 +5,25 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, announce_compilation, print_json, progress, report_lines
+from optodrive.cli.options import (
+    ConfigOption,
+    JsonOption,
+    ModelOption,
+    announce_compilation,
+    configured,
+    print_json,
+    progress,
+    report_lines,
+)
 from optodrive.cli.plan import FramesArgument
 from optodrive.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
+    from optodrive.config import Config
     from optodrive.flow import ExecutedPulses, PixelTrace
+    from optodrive.physics.heat import Heat
     from optodrive.pipeline import Display, Prepared
 
 PIXELS_MAX = 16
@@ -32,10 +43,14 @@ def simulate(
     noise: Annotated[float, typer.Option("--noise", help="Instrument noise, in units of what each states.")] = 0.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
     config: ConfigOption = None,
+    model: ModelOption = None,
+    truth: Annotated[
+        Path | None,
+        typer.Option("--truth", metavar="model.toml", help="What the simulated display really is; else as planned."),
+    ] = None,
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and measure what the pixels do."""
-    from optodrive.config import load_config
     from optodrive.frames.files import load_sequence
     from optodrive.pipeline import Display, prepare
     from optodrive.simulator.run import execute
@@ -45,7 +60,8 @@ def simulate(
         raise InputError("--dt", dt, "a time between 1e-6 and 1 s")
     if not 0.0 <= noise <= 1000.0:
         raise InputError("--noise", noise, "a factor between 0 and 1000")
-    display = Display.of(load_config(config))
+    display = Display.of(configured(config, model))
+    real = display.heat_at_rest() if truth is None else _really(configured(config, truth))
     wanted = _wanted(pixels, len(display.layout))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
@@ -54,10 +70,10 @@ def simulate(
     with progress("simulating") as done:
         executed = execute(display, prepared, done)
     looked_at = _tallest(prepared) if wanted is None else wanted
-    traced = trace(display.pixels, executed, looked_at, dt)
+    traced = trace(real, executed, looked_at, dt)
     if out is not None:
         _write(out, display, executed, traced, noise, seed)
-    report = _report(display, prepared, executed, traced)
+    report = _report(display, prepared, executed, traced, real)
     if json:
         print_json(report)
         return
@@ -71,6 +87,13 @@ def simulate(
         )
     if out is not None:
         print(f"written          {out}")
+
+
+def _really(config: "Config") -> "Heat":
+    from optodrive.physics.heat import heat_at_rest
+    from optodrive.physics.parameters import load_parameters
+
+    return heat_at_rest(config, load_parameters(config.pixel_model.parameters))
 
 
 def _wanted(pixels: str | None, count: int) -> list[int] | None:
@@ -103,14 +126,13 @@ def _write(
 
 
 def _report(
-    display: "Display", prepared: "Prepared", executed: "ExecutedPulses", traced: "PixelTrace"
+    display: "Display", prepared: "Prepared", executed: "ExecutedPulses", traced: "PixelTrace", real: "Heat"
 ) -> dict[str, Any]:
-    from optodrive.physics.array import DisplayHeat
     from optodrive.summary import pulse_columns, summary
     from optodrive.units import m_to_um
 
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    simulated_m = DisplayHeat(display.pixels).pulses(*columns).displacement_m
+    simulated_m = real.copy().pulses(*columns).displacement_m
     return {
         "summary": summary(prepared),
         "planned": len(prepared.plan),

@@ -2,6 +2,7 @@
 
 from dataclasses import asdict, dataclass
 from math import isfinite
+from pathlib import Path
 from typing import Any, Literal
 
 from optodrive.physics.extended import outcomes
@@ -27,13 +28,14 @@ SCALES = {"m": (1e6, "Âµm"), "N": (1e3, "mN"), "J": (1e3, "mJ"), "J/K": (1e6, "Â
 
 Role = Literal["input", "fitted", "predicted"]
 HEADINGS = ("fact", "measured", "literal", "ratio", "calibrated", "ratio", "role", "extended", "ratio", "role")
-TABLE_WIDTH = 130
+OWN_HEADINGS = ("model", "ratio")
+TABLE_WIDTH, OWN_WIDTH = 130, 18
 """Narrower terminals wrap lines rather than lose digits."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """One fact beside the three models, SI; ratios are model over measured, None for a bound.
+    """One fact beside the models, SI; ratios are model over measured, None for a bound; model: the user's own, if any.
 
     role, extended_role: whether that set was fitted on it, predicts it, or took it from the paper; remark: what there
     is to say of the calibrated set, '' unless it misses.
@@ -49,12 +51,16 @@ class Row:
     extended_ratio: float | None
     extended_role: Role
     remark: str
+    model: float | None = None
+    model_ratio: float | None = None
 
 
-def validate_table() -> list[Row]:
-    """Every fact that a parameter set can speak to, in the order of the facts."""
+def validate_table(own: Path | None = None) -> list[Row]:
+    """Every fact that a parameter set can speak to, in the order of the facts. own: a parameter file to hold beside."""
     literal, calibrated = load_parameters("paper_s1_literal"), load_parameters("calibrated")
     simulated = outcomes(load_parameters("extended"))
+    mine = None if own is None else load_parameters(own)
+    told = {} if mine is None else outcomes(mine)
     models = INPUTS | OUTCOMES
     rows = []
     for name, fact in paper_facts().items():
@@ -62,6 +68,7 @@ def validate_table() -> list[Row]:
             said, fitted = models[name](literal), models[name](calibrated)
             remark = REMARKS[name] if fact.missed(fitted, MISS) else ""
             extended = simulated.get(name, fitted)
+            value = None if mine is None else told.get(name, models[name](mine))
             rows.append(
                 Row(
                     fact=fact,
@@ -74,6 +81,8 @@ def validate_table() -> list[Row]:
                     extended_ratio=fact.ratio(extended),
                     extended_role=_role(name, {*EXTENDED_FITTED_ON.values()} | EXTENDED_STANDS_ON_FITTED),
                     remark=remark,
+                    model=value,
+                    model_ratio=None if value is None else fact.ratio(value),
                 )
             )
     return rows
@@ -85,9 +94,9 @@ def _role(name: str, shown: set[str]) -> Role:
     return "fitted" if name in shown else "predicted"
 
 
-def validate(json: bool = False) -> None:
-    """Print the table, or one JSON object."""
-    rows = validate_table()
+def validate(json: bool = False, model: Path | None = None) -> None:
+    """Print the table, or one JSON object. model: a parameter file to hold beside the shipped sets."""
+    rows = validate_table(model)
     if json:
         from optodrive.cli.options import print_json
 
@@ -125,6 +134,7 @@ def cells(row: Row) -> list[str]:
         f"{row.extended * scale:.3g}",
         _ratio(row.extended_ratio),
         row.extended_role,
+        *([] if row.model is None else [f"{row.model * scale:.3g}", _ratio(row.model_ratio)]),
     ]
 
 
@@ -137,11 +147,12 @@ def _print_table(rows: list[Row]) -> None:
     from rich.table import Table
 
     table = Table(title="The paper's facts, and what the parameter sets make of them")
-    for heading in HEADINGS:
+    own = rows[0].model is not None
+    for heading in HEADINGS + (OWN_HEADINGS if own else ()):
         table.add_column(heading, justify="left" if heading in ("fact", "role") else "right", no_wrap=True)
     for row in rows:
         table.add_row(*cells(row), style="bold" if row.remark else None)
-    console = Console(width=max(Console().width, TABLE_WIDTH))
+    console = Console(width=max(Console().width, TABLE_WIDTH + (OWN_WIDTH if own else 0)))
     console.print(table)
     console.print(f"Calibrated, off by more than {100 * MISS:.0f} %:")
     for row in rows:

@@ -8,7 +8,7 @@ import numpy as np
 
 from optodrive.errors import InputError
 from optodrive.flow import BudgetState, ExecutedPulses, FloatArray, IntArray
-from optodrive.physics.array import DisplayHeat
+from optodrive.physics.heat import Heat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
 from optodrive.units import m_to_um
@@ -34,7 +34,7 @@ class PlanRecord:
     name: str
     prepared: Prepared
     points: WirePoints
-    heat_before: DisplayHeat
+    heat_before: Heat
     budget_before: BudgetState
     start_s: float
     status: Status = "planned"

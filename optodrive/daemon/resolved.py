@@ -22,6 +22,7 @@ def resolved_config(display: Display) -> dict[str, Any]:
             "tau_g": pixel.tau_g_s,
             "kappa": pixel.kappa_m_per_k,
             "phi": pixel.phi_n_per_k,
+            "planner_terms": {key: display.parameters.term_values(key) for key in display.parameters.planner_terms},
             "units": {"R": "K/W", "C": "J/K", "epsilon": "1", "tau_g": "s", "kappa": "m/K", "phi": "N/K"},
         }
     )

@@ -4,22 +4,22 @@ from dataclasses import dataclass
 
 from optodrive.flow import BudgetState, ExecutedPulses
 from optodrive.limit.limiter import shifted
-from optodrive.physics.array import DisplayHeat
+from optodrive.physics.heat import Heat
 
 
 @dataclass(frozen=True, eq=False)
 class Thermal:
     """Heat and budget after everything planned so far; seconds of board time."""
 
-    heat: DisplayHeat
+    heat: Heat
     budget: BudgetState
 
-    def seen_from(self, start_s: float) -> tuple[DisplayHeat, BudgetState]:
+    def seen_from(self, start_s: float) -> tuple[Heat, BudgetState]:
         """Both on the time line of a plan that starts at start_s."""
         return self.heat.shifted(-start_s), shifted(self.budget, -start_s)
 
     @classmethod
-    def after_plan(cls, heat: DisplayHeat, budget: BudgetState, start_s: float) -> "Thermal":
+    def after_plan(cls, heat: Heat, budget: BudgetState, start_s: float) -> "Thermal":
         """What a plan leaves, given on its own time line, on the board's."""
         return cls(heat.shifted(start_s), shifted(budget, start_s))
 
@@ -28,7 +28,7 @@ class Thermal:
         return Thermal(self.heat.shifted(delay_s), shifted(self.budget, delay_s))
 
 
-def heated(before: DisplayHeat, executed: ExecutedPulses) -> DisplayHeat:
+def heated(before: Heat, executed: ExecutedPulses) -> Heat:
     """The heat of what was really executed, on the plan's time line as both arguments are."""
     heat = before.copy()
     heat.pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)

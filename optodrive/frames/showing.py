@@ -1,6 +1,5 @@
 """How long the beam needs for a picture, and pictures shown for a while: a membrane stays up only while it is hit."""
 
-from bisect import bisect_left
 from math import ceil
 
 import numpy as np
@@ -8,8 +7,9 @@ import numpy as np
 from optodrive.config import Config
 from optodrive.flow import FloatArray, FrameSequence, TactileFrame
 from optodrive.frames.lattice import Lattice
-from optodrive.physics.parameters import display_pixels
-from optodrive.physics.pixel import Pixel, advance, cooling_peak
+from optodrive.physics.drive import DriveRange
+from optodrive.physics.heat import heat_at_rest
+from optodrive.physics.parameters import load_parameters
 
 REFRESH_HZ = 10.0
 """A picture that stays is drawn again at most this often."""
@@ -25,15 +25,14 @@ class Beam:
         self.lattice = Lattice.of(config)
         self._scanner = config.scanner
         self._period_s = 1.0 / config.laser.pwm_hz
-        longest = int(config.limits.pulse_width_max_s * config.laser.pwm_hz + 1e-9)
-        pixel = display_pixels(config).each[0]
-        widths_s = [n * self._period_s for n in range(1, longest + 1)]
-        self._peaks_m = [_peak_m(pixel, config.laser.max_power_w, width_s) for width_s in widths_s]
+        laser = config.laser
+        self._drive = DriveRange.of(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
+        self._at_rest = heat_at_rest(config, load_parameters(config.pixel_model.parameters))
 
     def pulse_s(self, target_m: float) -> float:
         """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
-        periods = bisect_left(self._peaks_m, target_m * (1 - 1e-9)) + 1
-        return min(periods, len(self._peaks_m)) * self._period_s
+        pulse = self._at_rest.pulse_for_peak(0, 0.0, target_m, self._drive)
+        return self._drive.period_s * (1 if pulse is None else pulse[0])
 
     def picture_s(self, target_m: FloatArray) -> float:
         """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
@@ -51,11 +50,6 @@ class Beam:
         turns_s = steps_m / (2.0 * self._scanner.focal_length_m * self._scanner.slew_rad_per_s)
         moves_s = float(np.sum(turns_s)) + len(driven) * self._scanner.settle_s
         return ceil(RESERVE * (pulses_s + moves_s) * 1e3) / 1e3
-
-
-def _peak_m(pixel: Pixel, power_w: float, width_s: float) -> float:
-    theta_k, gamma_k = advance(pixel, 0.0, 0.0, power_w, width_s)
-    return pixel.kappa_m_per_k * cooling_peak(pixel, theta_k, gamma_k)[0]
 
 
 def hold(beam: Beam, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0) -> list[TactileFrame]:

@@ -58,6 +58,8 @@ class Declared:
     """The model in use. epsilon, r_k_per_w, c_j_per_k: [p]; exponent: of R = R₀ (T / T₀)ⁿ, T the bridge's mean.
 
     beside, frame_edges: [p, 4], [p] the lattice; walls, touch: None where the model has none
+    hot_capacity: factor by which a hot absorber may hold more than C; warmer_k: taken off the caps beforehand for what
+    else may warm the display
     """
 
     epsilon: FloatArray
@@ -70,6 +72,8 @@ class Declared:
     frame_edges: IntArray
     walls: Walls | None
     touch: Touch | None
+    hot_capacity: float = 1.0
+    warmer_k: float = 0.0
 
 
 def spread(ratio: float) -> float:
@@ -91,7 +95,7 @@ def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: fl
     epsilon = model.epsilon * (1 + unsure.absorbed_power)
     r_high = model.r_k_per_w * (1 + unsure.bridge_resistance)
     c_low = model.c_j_per_k * (1 - unsure.absorber_capacity)
-    c_high = model.c_j_per_k * (1 + unsure.absorber_capacity)
+    c_high = model.c_j_per_k * (1 + unsure.absorber_capacity) * model.hot_capacity
     knot_k, loss_k = _chords(model, unsure, caps)
     hottest = float(knot_k[-1] / loss_k[-1])
     tau_max_s = float((r_high * c_high).max()) * hottest
@@ -140,7 +144,7 @@ def _chords(model: Declared, unsure: Uncertainty, caps: Caps) -> tuple[FloatArra
     exponent = model.exponent + unsure.exponent if model.exponent > 0 else 0.0
     knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
     wall_k = caps.wall_k if np.isfinite(caps.wall_k) and model.walls is not None else 0.0
-    warmer = (model.ambient_k + wall_k + 0.5 * knot_k) / model.ambient_k
+    warmer = (model.ambient_k + model.warmer_k + wall_k + 0.5 * knot_k) / model.ambient_k
     return knot_k, knot_k * warmer**-exponent
 
 

@@ -1,12 +1,12 @@
 """A whole display, event by event: each pixel is advanced only when something is asked of it."""
 
-from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray, IntArray, PixelTrace
+from optodrive.physics.drive import DriveRange, pulse_for_peak, reach_m
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
@@ -87,6 +87,18 @@ class DisplayHeat:
             raise self._too_early(int(pixel[done]), float(start_s[done]))
         return peaks
 
+    def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
+        """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
+
+        A target beyond the longest pulse gets the longest pulse. ValueError for a time before the pixel's last event.
+        """
+        return pulse_for_peak(self.pixels.each[pixel], *self.rises(pixel, at_s), target_m, drive)
+
+    def reaches_m(self, drive: DriveRange) -> FloatArray:
+        """The largest displacement that one pulse can reach from rest, [p]."""
+        reach = {pixel: reach_m(pixel, drive) for pixel in set(self.pixels.each)}
+        return np.array([reach[pixel] for pixel in self.pixels.each])
+
     def peak_m(self, pixel: int, within_s: float = float("inf")) -> float:
         """Largest displacement, m, of a pixel from its last event on, within_s seconds at most."""
         parameters = self.pixels.each[pixel]
@@ -107,6 +119,24 @@ class DisplayHeat:
         start = self._at_s[pixel], self._theta_k[pixel], self._gamma_k[pixel]
         _sample(self.pixels.each[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
         return absorber_k, gas_k
+
+    def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
+        """Exact values of some pixels at times t_s [m], increasing.
+
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order, after each pixel's last event.
+        """
+        absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
+        for column, index in enumerate(pixels):
+            own = pulses[pulses[:, 3] == index, :3]
+            absorber_k[:, column], gas_k[:, column] = self.trace(index, own, t_s)
+        each = [self.pixels.each[index] for index in pixels]
+        return PixelTrace(
+            t_s=t_s,
+            pixel=np.array(pixels, dtype=np.int64),
+            absorber_k=absorber_k,
+            displacement_m=gas_k * np.array([item.kappa_m_per_k for item in each]),
+            force_n=gas_k * np.array([item.phi_n_per_k for item in each]),
+        )
 
 
 @kernel
@@ -184,25 +214,3 @@ def _sample(
             absorber_k[row], gas_k[row] = advance(one, begin_theta_k, begin_gamma_k, power_w, lit_s)
         else:
             absorber_k[row], gas_k[row] = advance(one, theta_k, gamma_k, 0.0, t_s[row] - end_s)
-
-
-def pixel_trace(
-    heat: DisplayHeat, pulses: Iterable[tuple[int, float, float, float]], pixels: list[int], t_s: FloatArray
-) -> PixelTrace:
-    """Exact values of some pixels at times t_s [m], increasing; pulses: (pixel, start_s, width_s, power_w) in order."""
-    own: dict[int, list[tuple[float, float, float]]] = {index: [] for index in pixels}
-    for index, *pulse in pulses:
-        if index in own:
-            own[index].append((pulse[0], pulse[1], pulse[2]))
-    absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
-    for column, index in enumerate(pixels):
-        absorber_k[:, column], gas_k[:, column] = heat.trace(index, np.array(own[index]).reshape(-1, 3), t_s)
-    each = [heat.pixels.each[index] for index in pixels]
-    return PixelTrace(
-        t_s=t_s,
-        pixel=np.array(pixels, dtype=np.int64),
-        absorber_k=absorber_k,
-        gas_k=gas_k,
-        displacement_m=gas_k * np.array([item.kappa_m_per_k for item in each]),
-        force_n=gas_k * np.array([item.phi_n_per_k for item in each]),
-    )

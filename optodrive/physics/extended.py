@@ -8,9 +8,10 @@ from math import pi
 
 import numpy as np
 
-from optodrive.flow import FloatArray
+from optodrive.flow import FloatArray, PixelTrace
 from optodrive.physics.facts import AMBIENT_C, paper_facts
-from optodrive.physics.model import Drive, Model, ModelTrace
+from optodrive.physics.forward import Active, Scene, observe
+from optodrive.physics.model import Drive, Model
 from optodrive.physics.paper import FULL_W, GAS_J_PER_K, LONG_S
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.pixel import Pixel
@@ -41,6 +42,11 @@ class _Stimulus:
         count = int((time_s + 1e-9) / period_s)
         return self.power_w if count < self.times and time_s + 1e-9 - count * period_s < self.on_s else 0.0
 
+    def pulses(self) -> FloatArray:
+        """[n, 4] start_s, width_s, power_w, pixel 0."""
+        period_s = self.on_s + self.off_s
+        return np.array([[k * period_s, self.on_s, self.power_w, 0.0] for k in range(self.times)])
+
     def edges_s(self) -> list[float]:
         """When the light changes."""
         period_s = self.on_s + self.off_s
@@ -52,13 +58,23 @@ def outcomes(parameters: ParameterSet) -> dict[str, float]:
     return _pulse_outcomes(parameters) | _train_outcomes(parameters) | {"z_repeat_w040": _spread_of_four_m(parameters)}
 
 
-def _run(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None) -> ModelTrace:
+def _run(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None) -> PixelTrace:
+    """By the terms that heights are planned with, where the set names them; else by all of its terms."""
     pixels = [parameters.pixel(stimulus.width_mm * 1e-3) for stimulus in stimuli]
+    index = np.arange(len(stimuli))
+    if parameters.planner_terms:
+        active = Active.of({key: parameters.term_values(key) for key in parameters.planner_terms})
+        seen = [
+            observe(Scene(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0), pixel, active)
+            for stimulus, pixel in zip(stimuli, pixels, strict=True)
+        ]
+        return PixelTrace(t_s, index, *(np.stack(signal, axis=1) for signal in zip(*seen, strict=True)))
     columns = (np.array([getattr(pixel, name) for pixel in pixels]) for name in Pixel._fields)
     model = Model.of(parameters, PixelArray(*columns), AMBIENT_K)
     edges_s = sorted({round(edge_s, 9) for stimulus in stimuli for edge_s in stimulus.edges_s()})
     drives = [Drive(at_s, np.array([stimulus.power_at_w(at_s) for stimulus in stimuli])) for at_s in edges_s]
-    return model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
+    traced = model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
+    return PixelTrace(t_s, index, traced.rise_k["absorber_k"], traced.displacement_m, traced.force_n)
 
 
 def _pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
@@ -73,7 +89,7 @@ def _pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
     t_s = np.arange(1.0, 0.1 / SAMPLE_S) * SAMPLE_S
     traced = _run(parameters, single + ladder, t_s)
     absorber_k, displacement_m, force_n = (
-        values.max(axis=0) for values in (traced.rise_k["absorber_k"], traced.displacement_m, traced.force_n)
+        values.max(axis=0) for values in (traced.absorber_k, traced.displacement_m, traced.force_n)
     )
     heights_m = displacement_m[len(single) :]
     absorbed_j = parameters.epsilon.value * FULL_W * LONG_S

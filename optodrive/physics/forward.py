@@ -181,7 +181,18 @@ def step(
 
 
 @kernel
-def _sample(rows: IntArray, room: FloatArray, at_s: float, h_s: float, sample_s: float) -> None:
+def step_s(pixel: Pixel, active: Active, since_s: float) -> float:
+    """How long the next step may be, so long after the light changed."""
+    most = LATE if since_s > SETTLED * pixel.tau_g_s else EARLY
+    return min(
+        LONGEST_S,
+        GROWTH * since_s + (FIRST_QUICK_S if active.quick else FIRST * pixel.tau_g_s),
+        most * pixel.tau_g_s,
+    )
+
+
+@kernel
+def sample(rows: IntArray, room: FloatArray, at_s: float, h_s: float, sample_s: float) -> None:
     """States at a time within the step, into row 7."""
     u = (sample_s - at_s) / h_s
     rest = 1.0 - u
@@ -221,7 +232,7 @@ def _fill(
 ) -> int:
     while index < len(t_s) and t_s[index] - late_s <= at_s + h_s:
         sample_s = max(at_s, t_s[index] - late_s)
-        _sample(active.rows, room, at_s, h_s, sample_s)
+        sample(active.rows, room, at_s, h_s, sample_s)
         c[TIME_S], c[SESSION] = t_s[index], span[2] + span[3] * t_s[index]
         out[index] = outputs(pixel, active, room[7], c, signal)
         index += 1
@@ -259,12 +270,7 @@ def _run(
         elif row < len(pulses):
             end_s = pulses[row, 0]
         since_s = now_s - edge_s
-        most = LATE if since_s > SETTLED * pixel.tau_g_s else EARLY
-        h_s = min(
-            LONGEST_S,
-            GROWTH * since_s + (FIRST_QUICK_S if active.quick else FIRST * pixel.tau_g_s),
-            most * pixel.tau_g_s,
-        )
+        h_s = step_s(pixel, active, since_s)
         last = now_s + 1.3 * h_s >= end_s
         if last:
             h_s = end_s - now_s

@@ -9,10 +9,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
-from optodrive.errors import InputError
+from optodrive.errors import InputError, nearest
 from optodrive.flow import FloatArray, freeze_arrays
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.terms import check_needs, find_term
+from optodrive.physics.terms import check_needs, find_term, known_terms
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
@@ -35,10 +35,16 @@ class Parameter(BaseModel):
     """One number: value, unit, standard uncertainty (absent where the source gives none) and source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-    value: Annotated[float, Field(ge=0)]
+    value: float
     unit: str
     sigma: Annotated[float, Field(ge=0)] | None = None
     source: str
+
+
+class Magnitude(Parameter):
+    """A number that cannot be negative."""
+
+    value: Annotated[float, Field(ge=0)]
 
 
 class _Units(BaseModel):
@@ -61,14 +67,15 @@ class Bridge(_Units):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     width_m: Annotated[float, Field(gt=0)]
-    R: Parameter
-    C: Parameter
+    R: Magnitude
+    C: Magnitude
 
 
 class ParameterSet(_Units):
     """A named set of pixel parameters; `claims` says what it stands for and what it does not.
 
     terms: what is added to the nominal pixel, by the keys of `optodrive.physics.terms`, and each term's parameters.
+    The limiter counts with all of them; planner_terms: those that heights are planned with.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -76,14 +83,19 @@ class ParameterSet(_Units):
     version: Literal[1]
     name: str
     claims: str
-    epsilon: Parameter
-    tau_g: Parameter
-    kappa: Parameter
-    phi: Parameter
-    R_width_product: Parameter
-    C_mean: Parameter
+    epsilon: Magnitude
+    tau_g: Magnitude
+    kappa: Magnitude
+    phi: Magnitude
+    R_width_product: Magnitude
+    C_mean: Magnitude
     bridge: tuple[Bridge, ...]
     terms: dict[str, dict[str, Parameter]] = {}
+    planner_terms: tuple[str, ...] = ()
+
+    def term_values(self, key: str) -> dict[str, float]:
+        """A term's parameters, SI, by name."""
+        return {name: item.value for name, item in self.terms[key].items()}
 
     def pixel(self, bridge_width_m: float) -> Pixel:
         """The pixel of a bridge width: its row of Table S3, or R = a / w and the mean C between rows."""
@@ -143,6 +155,11 @@ def load_parameters(name: str | Path) -> ParameterSet:
     for key, values in parameters.terms.items():
         _check_term(f"{path}: terms.{key}", key, values)
     check_needs(f"{path}: terms", parameters.terms)
+    for key in parameters.planner_terms:
+        if key not in parameters.terms:
+            raise InputError(f"{path}: planner_terms", key, f"a term of this set, {nearest(key, [*parameters.terms])}")
+        if not known_terms()[key].single_pixel:
+            raise InputError(f"{path}: planner_terms", key, "a term that heights can be planned with")
     return parameters
 
 
@@ -170,7 +187,7 @@ def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
     return {**under, **table, "terms": terms}
 
 
-def display_pixels(config: Config) -> PixelArray:
-    """The parameters of every pixel of the configured display."""
-    pixel = load_parameters(config.pixel_model.parameters).pixel(config.display.bridge_width_m)
+def display_pixels(config: Config, parameters: ParameterSet) -> PixelArray:
+    """The parameters of every pixel of a configured display."""
+    pixel = parameters.pixel(config.display.bridge_width_m)
     return PixelArray.uniform(pixel, len(pixel_layout(config.display)))

@@ -80,6 +80,25 @@ class View(NamedTuple):
         return self.rise_k.get("wall_k", np.zeros_like(self.rise_k["absorber_k"]))
 
 
+class Most(NamedTuple):
+    """The most there is: one absorber's rise; all absorbers' rises together, one beam's, K; the laser's power, W."""
+
+    absorber_k: float
+    together_k: float
+    full_w: float
+
+
+class Warming(NamedTuple):
+    """The most a term adds to what warms.
+
+    Factors on the power absorbed and on the heat capacity of a hot absorber; and what warms everything otherwise, K.
+    """
+
+    power: float = 1.0
+    capacity: float = 1.0
+    everywhere_k: float = 0.0
+
+
 @dataclass
 class Flows:
     """Heat on its way, W, each [p]: into a node, by its name; and to ambient for good."""
@@ -103,7 +122,8 @@ class Term:
     heat_nodes: states that store heat, and the parameter that is their capacity; followers: states that store none
     kernels: the same for one compiled pixel; suspect: where in measured data it shows, for causes of a discrepancy;
     by_run: whether repeats of one drive differ, by what came before or by the room;
-    quick: whether it moves within a gas time constant; never_warmer: nothing that can burn gets warmer by it
+    quick: whether it moves within a gas time constant; never_warmer: nothing that can burn gets warmer by it; for
+    other terms `warming` says by how much at most
     """
 
     key: str
@@ -122,6 +142,15 @@ class Term:
         """Whether the term acts in the model of a whole display, not in the compiled single pixel alone."""
         hooks = ("bridge_k_per_w", "flow", "rates_k_per_s", "displacement_m", "force_n")
         return any(getattr(type(self), name) is not getattr(Term, name) for name in hooks)
+
+    @property
+    def single_pixel(self) -> bool:
+        """Whether nothing of the term is lost in the compiled single pixel."""
+        return any(self.kernels) or not self.whole_display
+
+    def warming(self, values: Values, most: Most) -> Warming | None:
+        """What a bound on heat must add for the term; None where it cannot say, and the limiter refuses the term."""
+        return Warming() if self.never_warmer else None
 
     def bridge_k_per_w(self, values: Values, view: View, r_k_per_w: FloatArray) -> FloatArray:
         """The bridge's resistance, given what it would be without the term: [p]."""

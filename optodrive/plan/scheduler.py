@@ -11,8 +11,8 @@ import numpy as np
 
 from optodrive.config import PixelLayout
 from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
-from optodrive.physics.array import DisplayHeat
-from optodrive.plan.drive import DriveRange, pulse_for_peak
+from optodrive.physics.drive import DriveRange
+from optodrive.physics.heat import Heat
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import serpentine
@@ -92,7 +92,7 @@ class Scheduler:
         self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
         self.skipped: list[Skipped] = []
 
-    def pieces(self, heat: DisplayHeat) -> Pieces:
+    def pieces(self, heat: Heat) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
 
         What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came. A
@@ -167,14 +167,14 @@ class Scheduler:
         due_us = self.lead_us + pulse.nominal_us + now.waited_us
         return due_us < end_us + self._move_us(pixel, pulse.pixel)
 
-    def _frame(self, source: int, frame: TactileFrame, heat: DisplayHeat) -> Pieces:
+    def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
         """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
         order = self._order(frame)
         self._now.place = 0
         while (yield from self._offer(lambda: self._frame_rows(source, frame, order, heat))):
             pass
 
-    def _frame_rows(self, source: int, frame: TactileFrame, order: list[int], heat: DisplayHeat) -> list[_Row]:
+    def _frame_rows(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> list[_Row]:
         """The frame's rows from where it stands, up to the next train pulse or its own end."""
         now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
         rows: list[_Row] = []
@@ -182,8 +182,7 @@ class Scheduler:
             pixel = order[now.place]
             target_m = float(frame.target_m[pixel])
             start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel))
-            theta_k, gamma_k = heat.rises(pixel, start_us * 1e-6)
-            pulse = pulse_for_peak(heat.pixels.each[pixel], theta_k, gamma_k, target_m, drive)
+            pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
             if pulse is None:
                 self.skipped.append(Skipped(source, pixel, target_m))
                 now.skipped += 1

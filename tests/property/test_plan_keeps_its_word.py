@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from displays import DISPLAYS
 from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.physics.drive import reach_m
 from optodrive.pipeline import prepare
-from optodrive.plan.drive import reach_m
 
 STEP_S = 2e-5
 

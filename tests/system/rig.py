@@ -16,6 +16,7 @@ import httpx
 
 from optodrive.config import shipped_path
 
+OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
 
@@ -70,7 +71,7 @@ class Board:
 class Daemon:
     """`optodrive serve` on a board's port."""
 
-    def __init__(self, folder, port, name="display-437", replace=()):
+    def __init__(self, folder, port, name="display-437", replace=(), options=()):
         text = shipped_path(f"{name}.toml").read_text()
         text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
         for old, new in replace:
@@ -82,7 +83,7 @@ class Daemon:
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder)}
         with self.errors.open("a") as errors:
             self.process = subprocess.Popen(
-                [Path(sys.executable).with_name("optodrive"), "serve", "--config", self.config, "--port", "0"],
+                [OPTODRIVE, "serve", "--config", self.config, "--port", "0", *options],
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 env=environment,

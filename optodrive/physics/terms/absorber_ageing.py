@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import DOSE, Kernels, Term, TermParameter
+from optodrive.physics.term import DOSE, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -19,6 +19,10 @@ class AbsorberAgeing(Term):
     kernels = Kernels(light=light)
     by_run = True
     suspect = "the same pulse early and late"
+
+    def warming(self, values: Values, most: Most) -> Warming | None:
+        """As new at the most; where light is absorbed better and better, nobody knows where that ends."""
+        return Warming() if values["share"] >= 0.0 else None
 
 
 TERM = AbsorberAgeing()

@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import SESSION, TIME_S, Kernels, Term, TermParameter
+from optodrive.physics.term import SESSION, TIME_S, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -25,6 +25,10 @@ class AmbientDrift(Term):
     kernels = Kernels(reads=reads)
     by_run = True
     suspect = "baselines before the pulse"
+
+    def warming(self, values: Values, most: Most) -> Warming:
+        """A room as much warmer than stated as it ever was."""
+        return Warming(everywhere_k=abs(values["offset"]) + abs(values["ramp"]) + abs(values["bend"]))
 
 
 TERM = AmbientDrift()

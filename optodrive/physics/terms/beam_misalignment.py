@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import MINE, PIXEL, POWER_W, Kernels, Term, TermParameter
+from optodrive.physics.term import MINE, PIXEL, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -37,6 +37,10 @@ class BeamMisalignment(Term):
     followers = ("missed_k",)
     kernels = Kernels(light=light, rates=rates, wall=wall)
     suspect = "several pixels beside each other"
+
+    def warming(self, values: Values, most: Most) -> Warming:
+        """The wall under what misses at full power for ever."""
+        return Warming(everywhere_k=values["resistance"] * values["share"] * most.full_w)
 
 
 TERM = BeamMisalignment()

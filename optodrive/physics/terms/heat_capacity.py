@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import ABSORBER, Kernels, Term, TermParameter
+from optodrive.physics.term import ABSORBER, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -27,6 +27,10 @@ class HeatCapacity(Term):
     )
     kernels = Kernels(capacity=capacity)
     suspect = "initial slopes at several powers, plateaus unchanged"
+
+    def warming(self, values: Values, most: Most) -> Warming:
+        """Never less capacity than C₀; the most at the hottest."""
+        return Warming(capacity=1.0 + values["slope"] * most.absorber_k)
 
 
 TERM = HeatCapacity()

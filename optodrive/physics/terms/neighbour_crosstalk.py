@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import NEIGHBOUR, Kernels, Term, TermParameter
+from optodrive.physics.term import NEIGHBOUR, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -28,6 +28,10 @@ class NeighbourCrosstalk(Term):
     followers = ("crosstalk_k",)
     kernels = Kernels(rates=rates, wall=wall)
     suspect = "runs in which only a neighbour is lit"
+
+    def warming(self, values: Values, most: Most) -> Warming:
+        """All the heat that one beam leaves on a display, beside this very pixel."""
+        return Warming(everywhere_k=values["share"] * most.together_k)
 
 
 TERM = NeighbourCrosstalk()

@@ -2,7 +2,7 @@
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray
-from optodrive.physics.term import FULL_W, POWER_W, Kernels, Term, TermParameter
+from optodrive.physics.term import FULL_W, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
 
 
 @kernel
@@ -25,6 +25,10 @@ class PowerNonlinearity(Term):
     )
     kernels = Kernels(light=light)
     suspect = "a ladder of powers, shapes unchanged"
+
+    def warming(self, values: Values, most: Most) -> Warming:
+        """A threshold takes away; a curve gives the more, the weaker the light."""
+        return Warming(power=1.0 + max(0.0, values["curvature"]))
 
 
 TERM = PowerNonlinearity()

@@ -10,7 +10,7 @@ from optodrive.frames.lattice import Lattice
 from optodrive.frames.showcase import one_after_the_other, showcase
 from optodrive.frames.showing import RESERVE, Beam, end_s, hold, steps
 from optodrive.frames.sweeps import checker, circle, dot, edge, everything, ring_pixels, single, square
-from optodrive.physics.parameters import display_pixels
+from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel import advance, cooling_peak
 
 CONFIG = load_config("display-437")
@@ -35,7 +35,8 @@ def test_lattice_and_layout_are_inverse():
 
 @pytest.mark.parametrize("target_um", [5, 50, 150, 400])
 def test_the_shortest_pulse_that_reaches_a_height(target_um):
-    pixel, width_s = display_pixels(CONFIG).each[0], Beam(CONFIG).pulse_s(target_um * 1e-6)
+    pixel = load_parameters(CONFIG.pixel_model.parameters).pixel(CONFIG.display.bridge_width_m)
+    width_s = Beam(CONFIG).pulse_s(target_um * 1e-6)
 
     def peak_m(seconds):
         return pixel.kappa_m_per_k * cooling_peak(pixel, *advance(pixel, 0.0, 0.0, 2.45, seconds))[0]

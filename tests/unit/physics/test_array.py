@@ -3,12 +3,17 @@
 import numpy as np
 import pytest
 
-from optodrive.physics.array import DisplayHeat, pixel_trace
+from optodrive.physics.array import DisplayHeat
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak
 
 NARROW = Pixel(382.0, 81e-6, 0.66, 3e-3, 4e-6, 2e-4)
 WIDE = Pixel(95.0, 102e-6, 0.66, 5e-3, 3e-6, 3e-4)
+
+
+def columns_of(rows):
+    """(pixel, start_s, width_s, power_w) as traces take them."""
+    return np.array([(*pulse, pixel) for pixel, *pulse in rows], dtype=float).reshape(-1, 4)
 
 
 @pytest.fixture
@@ -111,12 +116,14 @@ def test_peaks_of_interleaved_trains_meet_a_dense_trace(pixels):
     heat = DisplayHeat(pixels)
     peaks = heat.pulses(*events(*rows)).displacement_m
     t_s = np.arange(0.0, 1.0, 5e-6)
-    trace = pixel_trace(DisplayHeat(pixels), rows, [0, 1], t_s)
+    trace = DisplayHeat(pixels).traces(columns_of(rows), [0, 1], t_s)
     for row, (pixel, start_s, _, _) in enumerate(rows):
         following = [later[1] for later in rows[row + 1 :] if later[0] == pixel]
         during = (t_s >= start_s) & (t_s <= (following[0] if following else np.inf))
         assert peaks[row] == pytest.approx(trace.displacement_m[during, pixel].max(), rel=1e-4), row
-    assert heat.rises(0, 0.5) == pytest.approx((trace.absorber_k[100_000, 0], trace.gas_k[100_000, 0]), rel=1e-9)
+    assert heat.rises(0, 0.5) == pytest.approx(
+        (trace.absorber_k[100_000, 0], trace.displacement_m[100_000, 0] / NARROW.kappa_m_per_k), rel=1e-9
+    )
 
 
 def test_peaks_of_no_pulses():
@@ -128,7 +135,7 @@ def test_peaks_of_no_pulses():
 def test_trace_is_exact_at_edges_and_between(pixels):
     rows = [(0, 0.001, 0.008, 2.45), (1, 0.010, 0.002, 2.45)]
     t_s = np.array([0.0, 0.001, 0.005, 0.009, 0.030])
-    trace = pixel_trace(DisplayHeat(pixels), rows, [1, 0], t_s)
+    trace = DisplayHeat(pixels).traces(columns_of(rows), [1, 0], t_s)
     lit = advance(NARROW, 0.0, 0.0, 2.45, 0.008)
     expected = [
         (0.0, 0.0),
@@ -137,11 +144,10 @@ def test_trace_is_exact_at_edges_and_between(pixels):
         lit,
         advance(NARROW, *lit, 0.0, 0.021),
     ]
-    got = np.stack([trace.absorber_k[:, 1], trace.gas_k[:, 1]], axis=1)
+    got = np.stack([trace.absorber_k[:, 1], trace.displacement_m[:, 1] / NARROW.kappa_m_per_k], axis=1)
     assert got == pytest.approx(np.array(expected), rel=1e-9, abs=1e-9)
     assert trace.pixel.tolist() == [1, 0]
-    assert trace.displacement_m[4] == pytest.approx(trace.gas_k[4] * [3e-6, 4e-6])
-    assert trace.force_n[4] == pytest.approx(trace.gas_k[4] * [3e-4, 2e-4])
+    assert trace.force_n[4] == pytest.approx(trace.displacement_m[4] * [3e-4 / 3e-6, 2e-4 / 4e-6])
     assert trace.displacement_m[4].min() > 0
 
 
@@ -149,24 +155,24 @@ def test_trace_leaves_the_heat_as_it_was(pixels):
     heat = DisplayHeat(pixels)
     heat.pulse(0, 0.0, 0.01, 2.45)
     before = heat.rises(0, 0.02)
-    trace = pixel_trace(heat, [(0, 0.02, 0.01, 2.45)], [0], np.array([0.02, 0.03]))
+    trace = heat.traces(columns_of([(0, 0.02, 0.01, 2.45)]), [0], np.array([0.02, 0.03]))
     assert trace.absorber_k[0, 0] == pytest.approx(before[0])
     assert heat.rises(0, 0.02) == before
 
 
 def test_a_pixel_looked_at_twice_shows_the_same_twice(pixels):
-    trace = pixel_trace(DisplayHeat(pixels), [(1, 0.0, 0.01, 2.45)], [1, 1], np.array([0.005, 0.02]))
-    assert trace.gas_k[:, 0].min() > 0
-    assert trace.gas_k[:, 0].tolist() == trace.gas_k[:, 1].tolist()
+    trace = DisplayHeat(pixels).traces(columns_of([(1, 0.0, 0.01, 2.45)]), [1, 1], np.array([0.005, 0.02]))
+    assert trace.displacement_m[:, 0].min() > 0
+    assert trace.displacement_m[:, 0].tolist() == trace.displacement_m[:, 1].tolist()
 
 
 def test_a_trace_that_begins_before_the_heat_or_crosses_pulses_is_refused(pixels):
     heat = DisplayHeat(pixels, at_s=5.0)
     with pytest.raises(ValueError, match="last event is at 5"):
-        pixel_trace(heat, [], [0], np.array([4.0, 6.0]))
+        heat.traces(columns_of([]), [0], np.array([4.0, 6.0]))
     with pytest.raises(ValueError, match=r"pixel 1 at 5\.9 s: its last event is at 6"):
-        pixel_trace(heat, [(1, 5.5, 0.5, 1.0), (1, 5.9, 0.5, 1.0)], [1], np.array([5.0, 7.0]))
-    assert pixel_trace(heat, [], [0], np.array([5.0, 6.0])).gas_k.tolist() == [[0.0], [0.0]]
+        heat.traces(columns_of([(1, 5.5, 0.5, 1.0), (1, 5.9, 0.5, 1.0)]), [1], np.array([5.0, 7.0]))
+    assert heat.traces(columns_of([]), [0], np.array([5.0, 6.0])).absorber_k.tolist() == [[0.0], [0.0]]
 
 
 def test_arrays_of_pixels():

@@ -60,7 +60,7 @@ def test_a_width_in_the_table_has_its_row_and_another_the_law():
 
 
 def test_a_displays_pixels():
-    assert len(display_pixels(load_config("display-437"))) == 437
+    assert len(display_pixels(load_config("display-437"), load_parameters("calibrated"))) == 437
 
 
 def test_an_own_file_reads_like_a_shipped_one(tmp_path, text):
@@ -113,7 +113,7 @@ WRONG_TERMS = {
     "wrong unit": (("bridge_conductivity", "exponent", 0.1, "K"), "exponent.unit: got 'K', expected '1'"),
     "out of range": (("bridge_conductivity", "exponent", 3.0, "1"), "expected 0 to 1.3 1"),
     "missing parameter": (("wall_heating", "resistance", 20.0, "K/W"), "capacity: got None"),
-    "negative": (("bridge_conductivity", "exponent", -0.1, "1"), "greater than or equal to 0"),
+    "negative": (("bridge_conductivity", "exponent", -0.1, "1"), "exponent.value: got -0.1, expected 0 to 1.3"),
 }
 
 

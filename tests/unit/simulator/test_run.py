@@ -37,7 +37,7 @@ def test_what_the_limiter_passes_is_no_fault_on_the_board(any_display, width_s, 
 def test_instruments_read_the_trace_with_their_stated_noise(display):
     prepared = prepare(display, sequence(display, 3), *display.at_rest())
     executed = execute(display, prepared)
-    traced = trace(display.pixels, executed, [0, 2], 1e-3)
+    traced = trace(display.heat_at_rest(), executed, [0, 2], 1e-3)
     pulses = np.zeros((1, 4))
     exact = measure(traced, pulses, 293.15, 4e-4, 0.0, 0)
     assert [run.name for run in exact.runs] == ["pixel-0", "pixel-2"]

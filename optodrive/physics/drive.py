@@ -1,4 +1,4 @@
-"""Target height to pulse: whole PWM periods at full power, the remainder made up by duty."""
+"""Target height to pulse, for the nominal pixel: whole PWM periods at full power, the remainder made up by duty."""
 
 from dataclasses import dataclass
 

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from optodrive.physics.drive import DriveRange, pulse_for_peak, pulse_peak, reach_m
 from optodrive.physics.pixel import Pixel, advance
-from optodrive.plan.drive import DriveRange, pulse_for_peak, pulse_peak, reach_m
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
 DRIVE = DriveRange.of(2.45, 5000.0, 0.050)

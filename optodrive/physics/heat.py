@@ -1,0 +1,48 @@
+"""The heat of a display, as planner, daemon and simulation see it: of nominal pixels, or of pixels with terms."""
+
+from typing import Protocol, Self
+
+from optodrive.config import Config
+from optodrive.flow import FloatArray, IntArray, PixelTrace
+from optodrive.neighbours import Neighbours
+from optodrive.physics.array import DisplayHeat, Peaks
+from optodrive.physics.drive import DriveRange
+from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels
+from optodrive.units import ZERO_CELSIUS_K
+
+
+class Heat(Protocol):
+    """Mutable; pixels carry their own time, all on one time line. See `DisplayHeat`."""
+
+    pixels: PixelArray
+
+    def copy(self) -> Self:
+        """An independent copy."""
+
+    def shifted(self, offset_s: float) -> Self:
+        """A copy on a time line whose zero lies offset_s earlier."""
+
+    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> Peaks:
+        """Light pixels one after the other, all [n]; what each pulse brings its pixel to."""
+
+    def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
+        """PWM periods and duty of the shortest pulse whose peak is target_m; None where none is needed."""
+
+    def reaches_m(self, drive: DriveRange) -> FloatArray:
+        """The largest displacement that one pulse can reach from rest, [p]."""
+
+    def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
+        """What some pixels do at times t_s [m] under pulses [n, 4]: start_s, width_s, power_w, pixel."""
+
+
+def heat_at_rest(config: Config, parameters: ParameterSet) -> Heat:
+    """A configured display that nobody has lit, with the terms that the parameter set plans with."""
+    pixels = display_pixels(config, parameters)
+    values = {key: parameters.term_values(key) for key in parameters.planner_terms}
+    if not values:
+        return DisplayHeat(pixels)
+    # The stepped pixel is compiled code of its own, which nobody needs without terms.
+    from optodrive.physics.extended_heat import ExtendedHeat
+
+    ambient_k = config.ambient_c + ZERO_CELSIUS_K
+    return ExtendedHeat(pixels, values, ambient_k, config.laser.max_power_w, Neighbours.of(config.display))
