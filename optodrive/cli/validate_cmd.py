@@ -1,8 +1,12 @@
 """`optodrive validate`."""
 
+from pathlib import Path
+from typing import Annotated
+
 import typer
 
 from optodrive.cli.options import JsonOption
+from optodrive.errors import InputError
 
 
 def register(app: typer.Typer) -> None:
@@ -10,8 +14,28 @@ def register(app: typer.Typer) -> None:
     app.command("validate")(validate)
 
 
-def validate(json: JsonOption = False) -> None:
+def validate(
+    json: JsonOption = False,
+    diagnose: Annotated[
+        bool,
+        typer.Option(
+            "--diagnose", help="Name what Text S1 gets wrong in the paper's numbers, and what mending it gains."
+        ),
+    ] = False,
+    model: Annotated[
+        Path | None, typer.Option("--model", metavar="model.toml", help="Hold this parameter set beside the others.")
+    ] = None,
+) -> None:
     """Hold the models against every fact of the paper they can speak to."""
+    if diagnose and model is not None:
+        raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose begins from Text S1")
+    if model is not None and model.suffix != ".toml":
+        raise InputError("--model", str(model), "a .toml file")
+    if diagnose:
+        from optodrive.cli.validate_diagnose import diagnose as tell
+
+        tell(json)
+        return
     from optodrive.cli.validate import validate as print_table
 
-    print_table(json)
+    print_table(json, model)

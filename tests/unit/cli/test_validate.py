@@ -61,3 +61,20 @@ def test_it_loads_nothing_heavy():
         "import sys; import optodrive.cli.validate as v; v.validate(True); assert 'scipy.optimize' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=30)
+
+
+def test_a_model_of_ones_own_stands_beside_the_others(tmp_path):
+    path = tmp_path / "model.toml"
+    path.write_text(
+        'format = "optodrive-parameters"\nversion = 1\nname = "mine"\nbase = "calibrated"\nclaims = "none"\n'
+        'planner_terms = ["laser_turn_on"]\n'
+        '[terms.laser_turn_on.time]\nvalue = 2e-3\nunit = "s"\nsource = "here"\n'
+    )
+    rows = {row.fact.id: row for row in validate_table(path)}
+    assert rows["R_w020"].model == rows["R_w020"].calibrated
+    # The light comes 2 ms late: a 50 ms pulse hardly knows; one that lifts 50 µm takes 2 ms longer.
+    assert rows["z_peak_w020"].model == pytest.approx(rows["z_peak_w020"].calibrated, rel=0.03)
+    width_s = 1.0 / rows["N_50um"].model - 1.0 / rows["N_50um"].calibrated
+    assert width_s == pytest.approx(1.6e-3, abs=0.4e-3)
+    assert cells(rows["R_w020"])[-2:] == ["382", "1.00"]
+    assert rows["z_repeat_w040"].model_ratio is None
