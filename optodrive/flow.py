@@ -194,11 +194,12 @@ class ExecutedPulses:
 
 @dataclass(frozen=True, eq=False)
 class PixelTrace:
-    """What pixels do in time. t_s [m]; absorber_k (rise above ambient), displacement_m, force_n: [m, p]."""
+    """What pixels do in time. t_s [m]; absorber_k, gas_k (rises above ambient), displacement_m, force_n: [m, p]."""
 
     t_s: FloatArray
     pixel: IntArray
     absorber_k: FloatArray
+    gas_k: FloatArray
     displacement_m: FloatArray
     force_n: FloatArray
 

@@ -134,6 +134,7 @@ class DisplayHeat:
             t_s=t_s,
             pixel=np.array(pixels, dtype=np.int64),
             absorber_k=absorber_k,
+            gas_k=gas_k,
             displacement_m=gas_k * np.array([item.kappa_m_per_k for item in each]),
             force_n=gas_k * np.array([item.phi_n_per_k for item in each]),
         )

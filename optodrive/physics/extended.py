@@ -5,10 +5,11 @@ Every stimulus is a column of one run: pixels side by side, each with its own br
 
 from dataclasses import dataclass
 from math import pi
+from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.flow import FloatArray, PixelTrace
+from optodrive.flow import FloatArray
 from optodrive.physics.facts import AMBIENT_C, paper_facts
 from optodrive.physics.forward import Active, Scene, observe
 from optodrive.physics.model import Drive, Model
@@ -53,28 +54,35 @@ class _Stimulus:
         return [k * period_s + edge_s for k in range(self.times) for edge_s in (0.0, self.on_s)]
 
 
+class _Told(NamedTuple):
+    """What the columns of a run do: [m, columns]."""
+
+    absorber_k: FloatArray
+    displacement_m: FloatArray
+    force_n: FloatArray
+
+
 def outcomes(parameters: ParameterSet) -> dict[str, float]:
     """Every outcome of `paper.OUTCOMES`, SI (temperatures in °C as the paper has them), by fact."""
     return _pulse_outcomes(parameters) | _train_outcomes(parameters) | {"z_repeat_w040": _spread_of_four_m(parameters)}
 
 
-def _run(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None) -> PixelTrace:
+def _run(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None) -> _Told:
     """By the terms that heights are planned with, where the set names them; else by all of its terms."""
     pixels = [parameters.pixel(stimulus.width_mm * 1e-3) for stimulus in stimuli]
-    index = np.arange(len(stimuli))
     if parameters.planner_terms:
         active = Active.of({key: parameters.term_values(key) for key in parameters.planner_terms})
         seen = [
             observe(Scene(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0), pixel, active)
             for stimulus, pixel in zip(stimuli, pixels, strict=True)
         ]
-        return PixelTrace(t_s, index, *(np.stack(signal, axis=1) for signal in zip(*seen, strict=True)))
+        return _Told(*(np.stack(signal, axis=1) for signal in zip(*seen, strict=True)))
     columns = (np.array([getattr(pixel, name) for pixel in pixels]) for name in Pixel._fields)
     model = Model.of(parameters, PixelArray(*columns), AMBIENT_K)
     edges_s = sorted({round(edge_s, 9) for stimulus in stimuli for edge_s in stimulus.edges_s()})
     drives = [Drive(at_s, np.array([stimulus.power_at_w(at_s) for stimulus in stimuli])) for at_s in edges_s]
     traced = model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
-    return PixelTrace(t_s, index, traced.rise_k["absorber_k"], traced.displacement_m, traced.force_n)
+    return _Told(traced.rise_k["absorber_k"], traced.displacement_m, traced.force_n)
 
 
 def _pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:

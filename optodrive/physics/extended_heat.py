@@ -27,6 +27,7 @@ from optodrive.physics.term import (
     POWER_W,
     Values,
 )
+from optodrive.physics.terms import known_terms
 
 MISALIGNED, CROSSTALK = "beam_misalignment", "neighbour_crosstalk"
 DISPLACEMENT = 1
@@ -122,16 +123,19 @@ class ExtendedHeat:
         """
         if self._states.any():
             raise ValueError("a display with terms is traced from rest only")
+        # What lifts the membrane does not act back on the gas: without it the membrane shows the gas's own rise.
+        bare = {key: own for key, own in self._values.items() if known_terms()[key].kernels.lifts is None}
+        ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
         columns = []
         for index in pixels:
-            beside = [index, *self._beside[index].tolist()]
-            own = pulses[np.isin(pulses[:, 3], beside)]
-            times = (t_s, t_s, t_s)
-            ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
-            scene = Scene(own, index, ambient_k, times, dose_before=1.0, full_w=full_w)
-            columns.append(observe(scene, self.pixels.each[index], self._active))
-        absorber_k, displacement_m, force_n = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
-        return PixelTrace(t_s, np.array(pixels, dtype=np.int64), absorber_k, displacement_m, force_n)
+            own = pulses[np.isin(pulses[:, 3], [index, *self._beside[index].tolist()])]
+            scene = Scene(own, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
+            one = self.pixels.each[index]
+            absorber_k, displacement_m, force_n = observe(scene, one, self._active)
+            gas_k = observe(scene, one, Active.of(bare))[1] / one.kappa_m_per_k
+            columns.append((absorber_k, gas_k, displacement_m, force_n))
+        signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
+        return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)
 
     def _shortest(
         self, pixel: int, state: FloatArray, dark_s: float, wait_s: float, target_m: float, drive: DriveRange

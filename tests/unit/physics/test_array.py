@@ -144,10 +144,11 @@ def test_trace_is_exact_at_edges_and_between(pixels):
         lit,
         advance(NARROW, *lit, 0.0, 0.021),
     ]
-    got = np.stack([trace.absorber_k[:, 1], trace.displacement_m[:, 1] / NARROW.kappa_m_per_k], axis=1)
+    got = np.stack([trace.absorber_k[:, 1], trace.gas_k[:, 1]], axis=1)
     assert got == pytest.approx(np.array(expected), rel=1e-9, abs=1e-9)
     assert trace.pixel.tolist() == [1, 0]
-    assert trace.force_n[4] == pytest.approx(trace.displacement_m[4] * [3e-4 / 3e-6, 2e-4 / 4e-6])
+    assert trace.displacement_m[4] == pytest.approx(trace.gas_k[4] * [3e-6, 4e-6])
+    assert trace.force_n[4] == pytest.approx(trace.gas_k[4] * [3e-4, 2e-4])
     assert trace.displacement_m[4].min() > 0
 
 

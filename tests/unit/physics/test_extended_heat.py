@@ -159,6 +159,10 @@ def test_traces_are_taken_from_rest_and_show_every_pixel_asked_for():
     own = columns[0] == 5
     expected = heat.copy().pulses(*(column[own] for column in columns)).displacement_m.max()
     assert traced.displacement_m[:, 0].max() == pytest.approx(expected, rel=1e-3)
+    stiff = traced.displacement_m[:, 0] < 0.995 * PIXEL.kappa_m_per_k * traced.gas_k[:, 0]
+    assert stiff.any()
+    nominal = DisplayHeat(ARRAY).traces(pulses, [5, 0], t_s)
+    assert traced.gas_k == pytest.approx(nominal.gas_k, rel=1e-3, abs=1e-3)
     heat.pulses(*columns)
     with pytest.raises(ValueError, match="from rest"):
         heat.traces(pulses, [5], t_s)
