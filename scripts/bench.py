@@ -260,7 +260,68 @@ def bench_limit():
     return rows
 
 
-BENCHMARKS = {"plan": bench_plan, "limit": bench_limit, "wire": bench_wire, "board": bench_board, "hour": bench_hour}
+DISPLAY_PIXELS, DISPLAY_WORKERS = 100, 2
+HIDDEN = (
+    {"laser_droop": {"share": 0.1, "time": 0.05, "spread": 1.0}},
+    {"bridge_conductivity": {"exponent": 0.4}},
+    {"gas_leak": {"rate": 4.0}},
+    {"heat_capacity": {"slope": 2e-3}},
+)
+"""On four pixels of ten, one each; the others have nothing hidden."""
+
+
+def bench_display():
+    """A recording of 100 pixels, 15 runs each, diagnosed pixel by pixel on two worker processes. One run."""
+    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+    from display_lab import display_lab
+    from optodrive.analysis.display import PixelTask, diagnose_pixel, warm
+    from optodrive.analysis.workers import crew, done
+    from optodrive.recording import DisplayRuns, write_recording
+
+    hidden = {pixel: HIDDEN[pixel % 10] if pixel % 10 < len(HIDDEN) else {} for pixel in range(DISPLAY_PIXELS)}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "display.h5"
+        write_recording(path, display_lab(hidden, seed=4000))
+        file_mib = path.stat().st_size / 2**20
+        warm()
+        begin_s = time.monotonic()
+        runs = DisplayRuns.open([path])
+        opened_s = time.monotonic()
+        tasks = [PixelTask(item.pixel, item.read) for item in runs.pixels]
+        with crew(workers=DISPLAY_WORKERS) as client:
+            ready_s = time.monotonic()
+            answers = {task.pixel: answer for task, answer, _ in done(client, diagnose_pixel, tasks)}
+            end_s = time.monotonic()
+            largest_mib = max(client.run(peak_mib).values())
+    named = [answers[pixel].found.causes == tuple(terms) for pixel, terms in hidden.items()]
+    busy_s = sum(answer.found.seconds for answer in answers.values())
+    return [
+        ("pixels, 15 runs each", len(answers), "1"),
+        ("size of the recording", file_mib, "MiB"),
+        ("answers that are right", sum(named), "1"),
+        ("the whole diagnosis", end_s - begin_s, "s"),
+        ("of it, looking into the recording", opened_s - begin_s, "s"),
+        ("of it, starting two workers", ready_s - opened_s, "s"),
+        ("a pixel, of the whole", (end_s - begin_s) / len(answers), "s"),
+        ("a pixel, on its worker", busy_s / len(answers), "s"),
+        ("share of the workers' time that is diagnosis", busy_s / DISPLAY_WORKERS / (end_s - ready_s), "1"),
+        ("largest memory of a worker", largest_mib, "MiB"),
+    ]
+
+
+def peak_mib():
+    """The most memory this process ever held, MiB."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+
+BENCHMARKS = {
+    "plan": bench_plan,
+    "limit": bench_limit,
+    "wire": bench_wire,
+    "board": bench_board,
+    "hour": bench_hour,
+    "display": bench_display,
+}
 
 
 def main() -> int:

@@ -7,15 +7,21 @@ BASE = "surroundings"
 UNITS = {"tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
-def model_toml(found: Discrepancy, recording: str, width_m: float) -> str:
-    """TOML of format optodrive-parameters, version 1; width_m: of the bridge the recording was made with."""
+def model_toml(found: Discrepancy, recording: str, width_m: float, what: str = "") -> str:
+    """TOML of format optodrive-parameters, version 1.
+
+    width_m: of the bridge the recording was made with; what: the numbers are, where they are not of one fit
+    """
     base, source = found.base, f'source = "fitted on {_plain(recording)}"'
+    claim = "; ".join(part for part in (f"Fitted on {_plain(recording)}", what, f"verdict: {found.verdict}") if part)
+    planned = ", ".join(f'"{key}"' for key in found.terms)
     lines = [
         'format = "optodrive-parameters"',
         "version = 1",
         'name = "diagnosed"',
         f'base = "{BASE}"',
-        f'claims = "Fitted on {_plain(recording)}; verdict: {found.verdict}. For other bridge widths: R by 1 / width."',
+        f"planner_terms = [{planned}]",
+        f'claims = "{claim}. For other bridge widths: R by 1 / width."',
         "",
     ]
     for name, unit in UNITS.items():

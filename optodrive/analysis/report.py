@@ -4,21 +4,10 @@ from html import escape
 
 import numpy as np
 
+from optodrive.analysis.page import page, table
 from optodrive.analysis.story import quantity, story
 from optodrive.flow import Course, Discrepancy, FloatArray
 
-STYLE = """
-body { font: 16px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #1c1c1c; }
-h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2rem; }
-table { border-collapse: collapse; } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top; }
-p { margin: .7rem 0 .2rem; } p.item { margin: 0 0 0 1.2rem; }
-th { border-bottom: 1px solid #999; } td.n { text-align: right; font-variant-numeric: tabular-nums; }
-.grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr)); gap: 1rem; }
-figure { margin: 0; } figcaption { font-size: .85rem; color: #444; }
-svg { width: 100%; height: auto; background: #fafafa; border: 1px solid #ddd; }
-.before { stroke: #c2571a; fill: none; } .after { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
-.other { fill: #b5b5b5; } text { font: 11px system-ui, sans-serif; fill: #333; }
-"""
 WIDTH, HEIGHT, EDGE = 320, 150, 26
 SHOWN = 24
 BARS = 14
@@ -26,12 +15,7 @@ BARS = 14
 
 def report(found: Discrepancy, title: str) -> str:
     """HTML."""
-    lines = [line for line in story(found) if line]
     parts = [
-        "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
-        f"<title>{escape(title)}: {escape(found.verdict)}</title><style>{STYLE}</style></head><body>",
-        f"<h1>{escape(lines[0])}</h1><p>{escape(title)}</p>",
-        *(f"<p{_kind(line)}>{escape(line.strip())}</p>" for line in lines[1:]),
         "<h2>Evidence for each cause</h2>",
         _bars(found),
         "<h2>Numbers</h2>",
@@ -43,14 +27,9 @@ def report(found: Discrepancy, title: str) -> str:
         "</div>",
         "<h2>Predicted against measured, extended model</h2><div class='grid'>",
         *(_against(signal, found.courses) for signal in dict.fromkeys(course.signal for course in found.courses)),
-        "</div></body></html>",
+        "</div>",
     ]
-    return "\n".join(parts)
-
-
-def _kind(line: str) -> str:
-    """Lines of a list, and what belongs to the line above, stand closer."""
-    return " class='item'" if line.startswith(("- ", "  ")) else ""
+    return page(title, found.verdict, story(found), parts)
 
 
 def _telling(courses: tuple[Course, ...]) -> list[Course]:
@@ -109,19 +88,17 @@ def _bars(found: Discrepancy) -> str:
     for item in shown:
         width = 260 * np.log10(1.0 + item.statistic) / most
         kind = "bar" if item.verdict in ("named", "cannot be told apart") else "other"
-        rows.append(
-            f"<tr><td>{escape(item.label)}</td><td><svg viewBox='0 0 262 14' style='width:262px;border:0'>"
-            f"<rect class='{kind}' x='0' y='2' width='{width:.1f}' height='10'/></svg></td>"
-            f"<td class='n'>{item.statistic:.0f}</td><td>{escape(item.verdict)}</td></tr>"
+        bar = (
+            "<svg viewBox='0 0 262 14' style='width:262px;border:0'>"
+            f"<rect class='{kind}' x='0' y='2' width='{width:.1f}' height='10'/></svg>"
         )
-    head = "<tr><th>cause</th><th>likelihood ratio (log scale)</th><th></th><th></th></tr>"
-    return f"<table>{head}{''.join(rows)}</table>"
+        rows.append((escape(item.label), bar, f"{item.statistic:.0f}", escape(item.verdict)))
+    return table(("cause", "likelihood ratio (log scale)", "", ""), rows, frozenset({2}))
 
 
 def _numbers(found: Discrepancy) -> str:
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td><td class='n'>{quantity(item.value, item.unit)}</td>"
-        f"<td class='n'>{quantity(item.low, item.unit)}</td><td class='n'>{quantity(item.high, item.unit)}</td></tr>"
+    rows = (
+        (escape(name), *(quantity(value, item.unit) for value in (item.value, item.low, item.high)))
         for name, item in found.parameters.items()
     )
-    return f"<table><tr><th>parameter</th><th>value</th><th>95 % from</th><th>to</th></tr>{rows}</table>"
+    return table(("parameter", "value", "95 % from", "to"), rows, frozenset({1, 2, 3}))

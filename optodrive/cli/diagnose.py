@@ -2,8 +2,9 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -13,7 +14,9 @@ from optodrive.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optodrive.flow import Discrepancy, Measurement
+    from optodrive.config import Config
+    from optodrive.flow import Measurement
+    from optodrive.recording import DisplayRuns
 
 RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING…", help="HDF5 files or CSV folders.")]
 STDOUT = "-"
@@ -24,6 +27,16 @@ DEFAULT_WIDTH_M = 0.4e-3
 def register(app: typer.Typer) -> None:
     """Add the command."""
     app.command("diagnose")(diagnose)
+
+
+@dataclass(frozen=True)
+class _Told:
+    """An answer in all its forms; model: None where there is none to write."""
+
+    document: dict[str, Any]
+    story: list[str]
+    report: str
+    model: str | None
 
 
 def diagnose(
@@ -37,32 +50,85 @@ def diagnose(
     ] = None,
     seed: Annotated[int, typer.Option("--seed", min=0, help="Of the draws behind p values and intervals.")] = 0,
     config: ConfigOption = None,
+    workers: Annotated[
+        int | None,
+        typer.Option("--workers", min=1, help="Processes for a recording of many pixels; all cores without it."),
+    ] = None,
+    dask: Annotated[
+        str | None, typer.Option("--dask", metavar="ADDRESS", help="A Dask scheduler for many pixels: tcp://host:8786.")
+    ] = None,
 ) -> None:
     """Name what the simulation gets wrong in measured data, and what mending it gains."""
     _check_extra()
-    from optodrive.analysis.prior import prior_of
-    from optodrive.analysis.story import answer, story
-    from optodrive.analysis.study import diagnose as study
+    from optodrive.analysis.display import TOGETHER
     from optodrive.config import load_config
+    from optodrive.recording import DisplayRuns
 
     _check_targets(json, out)
+    if dask is not None and workers is not None:
+        raise InputError("--workers", workers, "no such option beside --dask: a cluster has its own workers")
+    settings = None if config is None else load_config(config)
+    runs = DisplayRuns.open(recordings)
+    title = ", ".join(path.name for path in recordings)
+    if len(runs.pixels) > TOGETHER:
+        told = _each(runs, title, seed, settings, dask, workers)
+    else:
+        told = _together(recordings, title, seed, settings)
+    _give(told, out, json)
+
+
+def _together(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _Told:
+    """One pixel, or a few as one set of numbers."""
+    from optodrive.analysis.model_file import model_toml
+    from optodrive.analysis.prior import prior_of
+    from optodrive.analysis.report import report
+    from optodrive.analysis.story import answer, story
+    from optodrive.analysis.study import diagnose as study
+
     measurement = _joined(recordings)
-    prior, epsilon, width_m = prior_of(measurement, None if config is None else load_config(config))
+    prior, epsilon, width_m = prior_of(measurement, config)
     announce_compilation()
     with _ticking() as tick:
         found = study(measurement, seed, prior, epsilon, tick)
-    document = answer(found)
+    model = model_toml(found, title, width_m or DEFAULT_WIDTH_M) if found.base else None
+    return _Told(answer(found), story(found), report(found, title), model)
+
+
+def _each(
+    runs: "DisplayRuns", title: str, seed: int, config: "Config | None", dask: str | None, workers: int | None
+) -> _Told:
+    """Many pixels, each for itself."""
+    from optodrive.analysis.display_report import display_report
+    from optodrive.analysis.display_story import display_answer, display_story
+    from optodrive.analysis.model_file import model_toml
+    from optodrive.cli.diagnose_display import diagnose_display
+
+    announce_compilation()
+    found = diagnose_display(runs, seed, config, dask, workers)
+    middle, width_m, what = found.model()
+    model = None if middle is None else model_toml(middle, title, width_m or DEFAULT_WIDTH_M, what)
+    return _Told(display_answer(found), display_story(found), display_report(found, title, config), model)
+
+
+def _give(told: _Told, out: Path | None, json: str | None) -> None:
+    """Files, each whole, then words."""
     if json is not None and json != STDOUT:
-        _write(Path(json), _text(document))
+        _write(Path(json), _text(told.document))
     if out is not None:
-        _write_folder(out, found, recordings, width_m or DEFAULT_WIDTH_M)
+        out.mkdir(parents=True, exist_ok=True)
+        _write(out / "report.html", told.report)
+        _write(out / "diagnosis.json", _text(told.document))
+        if told.model is not None:
+            _write(out / "model.toml", told.model)
+        else:  # one of an earlier answer would be taken for this one's
+            (out / "model.toml").unlink(missing_ok=True)
     if json == STDOUT:
-        print_json(document)
+        print_json(told.document)
         return
-    for line in story(found):
+    for line in told.story:
         print(line)
     if out is not None:
-        print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if found.base else ""))
+        print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if told.model is not None else ""))
 
 
 def _check_extra() -> None:
@@ -103,19 +169,6 @@ def _write(path: Path, text: str) -> None:
 
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-def _write_folder(out: Path, found: "Discrepancy", recordings: list[Path], width_m: float) -> None:
-    from optodrive.analysis.model_file import model_toml
-    from optodrive.analysis.report import report
-    from optodrive.analysis.story import answer
-
-    title = ", ".join(path.name for path in recordings)
-    out.mkdir(parents=True, exist_ok=True)
-    _write(out / "report.html", report(found, title))
-    _write(out / "diagnosis.json", _text(answer(found)))
-    if found.base:
-        _write(out / "model.toml", model_toml(found, title, width_m))
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from optodrive.recording.form import FORMAT, SIGNALS, VERSION
 from optodrive.recording.index import RecordingIndex, RunIndex, SignalIndex
+from optodrive.recording.pixels import DisplayRuns, PixelRuns
 from optodrive.recording.read import read_recording, read_runs
 from optodrive.recording.write import convert_recording, write_recording
 
@@ -9,6 +10,8 @@ __all__ = [
     "FORMAT",
     "SIGNALS",
     "VERSION",
+    "DisplayRuns",
+    "PixelRuns",
     "RecordingIndex",
     "RunIndex",
     "SignalIndex",

@@ -45,6 +45,7 @@ class Hdf5Tree:
         self._h5 = h5py_module()
         self._path = path
         self._room = Room()
+        self._last: tuple[str, Any] | None = None
         if not trusted:
             try_out(path)
         with refusing(str(path), "a readable HDF5 file"):
@@ -105,7 +106,9 @@ class Hdf5Tree:
         return int(self._series(run, signal)[0].shape[0])
 
     def _run(self, run: str) -> Any:
-        return self._group(self.where(run), self._group(self.where(), self._file, "runs"), run)
+        if self._last is None or self._last[0] != run:  # one after the other: the way from the root is long
+            self._last = run, self._group(self.where(run), self._group(self.where(), self._file, "runs"), run)
+        return self._last[1]
 
     def _signal(self, run: str, signal: str) -> Any:
         return self._group(self.where(run, signal), self._run(run), signal)

@@ -1,6 +1,7 @@
 """Recordings as one HDF5 file: round trips, and every refusal by its place."""
 
 import contextlib
+import dataclasses
 import os
 
 import h5py
@@ -381,6 +382,12 @@ def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
     for program in ("_confine(1)\nwhile True: pass", "import os; os.abort()"):
         monkeypatch.setattr(trial, "_PROGRAM", f"from optodrive.recording.trial import _confine\n{program}")
         assert "hangs or crashes" in refusal(path)
+
+
+def test_a_sound_file_of_many_runs_may_take_its_time(path, monkeypatch):
+    monkeypatch.setattr(trial, "CPU_S", 1)
+    write_recording(path, Measurement(tuple(dataclasses.replace(ONE, name=f"run-{number}") for number in range(900))))
+    trial.try_out(path)
 
 
 def test_a_file_is_tried_out_once(path, monkeypatch):

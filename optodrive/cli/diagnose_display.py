@@ -1,0 +1,76 @@
+"""`optodrive diagnose` of many pixels: tasks go out, answers come in, a bar counts them."""
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+from optodrive.errors import InputError
+from optodrive.recording.form import Words
+
+if TYPE_CHECKING:
+    from optodrive.analysis.display import DisplayAnswer
+    from optodrive.config import Config
+    from optodrive.recording import DisplayRuns
+
+LINES = 10
+"""Of progress, where stderr is no terminal."""
+
+
+def diagnose_display(
+    runs: "DisplayRuns", seed: int, config: "Config | None", dask: str | None, workers: int | None
+) -> "DisplayAnswer":
+    """Every pixel for itself, on local processes or a cluster; InputError where not one has an answer."""
+    from optodrive.analysis.display import DisplayAnswer, PixelAnswer, PixelTask, diagnose_pixel, warm
+    from optodrive.analysis.workers import crew, done
+
+    began_s = perf_counter()
+    tasks = [PixelTask(item.pixel, item.read, seed, config) for item in runs.pixels]
+    if runs.mirrors is not None:
+        tasks.append(PixelTask(None, runs.mirrors.read, seed, config))
+    if dask is None:
+        warm()
+    pixels: list[PixelAnswer] = []
+    mirrors: PixelAnswer | None = None
+    with _counting(len(runs.pixels)) as count, crew(dask, workers, most=len(tasks)) as client:
+        for task, result, error in done(client, diagnose_pixel, tasks):
+            answer = result or PixelAnswer(task.pixel, None, error)
+            if task.pixel is None:
+                mirrors = answer
+            else:
+                pixels.append(answer)
+                count(len(pixels))
+    pixels.sort(key=lambda item: item.pixel or 0)
+    if all(item.found is None for item in pixels):
+        first = f"one at least; pixel {pixels[0].pixel}: {pixels[0].error}"
+        raise InputError("diagnose", Words(f"no answer for any of {len(pixels)} pixels"), first)
+    return DisplayAnswer(tuple(pixels), mirrors, perf_counter() - began_s)
+
+
+@contextmanager
+def _counting(pixels: int) -> Iterator[Callable[[int], None]]:
+    """A bar that counts pixels on stderr, or a few lines where that is no terminal."""
+    if not sys.stderr.isatty():
+        steps = {pixels * (step + 1) // LINES for step in range(LINES)}
+
+        def line(count: int) -> None:
+            if pixels >= 2 * LINES and count in steps:
+                print(f"optodrive: {count} of {pixels} pixels", file=sys.stderr)
+
+        yield line
+        return
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (TextColumn("pixels"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("pixels", total=pixels)
+        yield lambda count: bar.update(task, completed=count)

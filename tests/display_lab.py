@@ -1,0 +1,18 @@
+"""A recording of many pixels by the small lab: each pixel has its own runs, and some have something hidden."""
+
+from dataclasses import replace
+
+from labs import lab
+from optodrive.flow import Measurement
+
+
+def display_lab(hidden, seed=0, **design):
+    """hidden: pixel → terms; design: as lab has it."""
+    runs = []
+    for pixel, terms in hidden.items():
+        for run in lab(seed + pixel, terms, **design).runs:
+            pulses = run.pulses.copy()
+            pulses[:, 3] = pixel
+            signals = {name: replace(signal, pixel=pixel) for name, signal in run.signals.items()}
+            runs.append(replace(run, name=f"pixel{pixel}-{run.name}", pulses=pulses, signals=signals))
+    return Measurement(tuple(runs))
