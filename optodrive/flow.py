@@ -282,10 +282,15 @@ class CandidateCause:
 
 @dataclass(frozen=True, eq=False)
 class NextExperiment:
-    """The experiment that tells rivals apart. pulses: [n, 4]; separation: χ² between them; seconds: of lab time."""
+    """The experiment that tells rivals apart.
+
+    pulses: [n, 4]; pixel: the one to look at; repeats: how often; separation: χ² between rivals; seconds: of lab time
+    """
 
     why: str
     pulses: FloatArray
+    pixel: int
+    repeats: int
     signals: tuple[str, ...]
     separation: float
     seconds: float

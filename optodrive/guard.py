@@ -10,7 +10,7 @@ from optodrive.limit.budget import Budget, Caps, Mirrors
 from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls, heat_bound
 from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
-from optodrive.physics.term import Most, Values, Warming
+from optodrive.physics.term import NO_WARMING, Most, Values, Warming
 from optodrive.physics.terms import known_terms
 from optodrive.units import ZERO_CELSIUS_K
 
@@ -109,7 +109,11 @@ def _unsure(config: Config, terms: Mapping[str, Values], capacity: float) -> flo
 
 
 def declared(
-    parameters: ParameterSet, pixels: PixelArray, neighbours: Neighbours, ambient_k: float, warming: Warming
+    parameters: ParameterSet,
+    pixels: PixelArray,
+    neighbours: Neighbours,
+    ambient_k: float,
+    warming: Warming = NO_WARMING,
 ) -> Declared:
     """What the limiter takes from a parameter set: everything that moves heat."""
     terms = {key: parameters.term_values(key) for key in parameters.terms}

@@ -86,6 +86,10 @@ class Dataset:
             found.setdefault(run.group, []).append(number)
         return found
 
+    def contrasts(self) -> int:
+        """So many runs repeat an earlier one: what the noise model is estimated from."""
+        return len(self.runs) - len(self.groups())
+
     def only(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
         """The same with these runs, and kinds of signals, alone; doses and session times stay as they were."""
         new = {old: number for number, old in enumerate(runs)}

@@ -1,31 +1,28 @@
 """Is there anything to explain, and where? Candidates by score, and an omnibus over bins, both against the noise model.
 
 Every candidate is a column beside the base fit, at a finite size; its likelihood ratio follows from one matrix of all
-columns. The omnibus asks whether whitened residuals agree with zero in bins of group × signal × time after an edge.
-The level of the best of all candidates comes from draws of the same matrix (bounded numbers and time constants that
-vanish with their effect have no textbook distribution).
+columns. The level of the best of all candidates comes from draws of the same matrix (bounded numbers and time constants
+that vanish with their effect have no textbook distribution). The noise model is an estimate itself, from as many
+contrasts as runs repeat others: ratios are judged as F with so many degrees below, not as χ².
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.stats import chi2 as chi_squared
+from scipy.stats import f as fisher
 
 from optodrive.analysis.causes import Hypothesis
-from optodrive.analysis.dataset import Dataset
-from optodrive.analysis.fit import Fit, Jitter, Problem, jitter, slopes
-from optodrive.analysis.noise import whiten
+from optodrive.analysis.dataset import MIRROR_KINDS, Dataset
+from optodrive.analysis.fit import Fit, Problem, jitter, slopes
 from optodrive.analysis.normal import normal, projected, solve
+from optodrive.analysis.omnibus import binned
 from optodrive.analysis.predict import BASE, Point, predict
-from optodrive.flow import FloatArray, IntArray
+from optodrive.flow import FloatArray
 
-AFTER_S = np.geomspace(5e-4, 1.0, 9)
-"""Edges of the omnibus' bins: time after an edge of the light."""
-SPAN = 4
-"""Bins over a whole run, for what is slower."""
 DRAWS = 4000
-RIDGE = 1e-4
+PRIOR, SURE = 6, 10_000
+"""What is known of a lab's noise beforehand counts as so many contrasts; degrees where there is nothing to learn."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +45,7 @@ class Score:
 class Detection:
     """scores: the best start of every hypothesis, strongest first; p values of the best score and of the omnibus.
 
-    omnibus, bins: its χ² and degrees
+    omnibus, bins: its χ² and degrees; left: χ² of what the fit leaves
     """
 
     scores: tuple[Score, ...]
@@ -56,13 +53,18 @@ class Detection:
     omnibus: float
     bins: int
     p_omnibus: float
+    left: float
 
 
-def detect(problem: Problem, base: Fit, found: list[Hypothesis], seed: int) -> Detection:
-    """Score every hypothesis beside a fit (nominal, or with terms already in it)."""
+def detect(
+    problem: Problem, base: Fit, found: list[Hypothesis], seed: int, beside: FloatArray | None = None
+) -> Detection:
+    """Score every hypothesis beside a fit (nominal, or with terms already in it), and beside more columns [m, k]."""
     data = problem.data
     shared = jitter(data, base.point, problem.epsilon, base.prediction)
     known = slopes(problem, base.point, base.free, base.prediction)
+    if beside is not None:
+        known = np.column_stack([known, beside])
     trials = [(item, start) for item in found for start in _tried(item)]
     terms = [{**base.point.terms, item.key: start} for item, start in trials]
     extra = [predict(data, Point(base.point.base, own), problem.epsilon) - base.prediction for own in terms]
@@ -75,10 +77,16 @@ def detect(problem: Problem, base: Fit, found: list[Hypothesis], seed: int) -> D
     total[range(len(BASE)), range(len(BASE))] += 1.0 / np.square(problem.prior.sigma)
     left = projected(total, list(range(width)), list(range(width, len(total))))
     own = np.diag(left) / np.maximum(np.diag(total)[width:], 1e-300)
-    omnibus, degrees = binned(problem, np.column_stack([known, residual]), shared)
-    scores, p_score = _scores(trials, left, scale, own, seed)
-    p_omnibus = float(chi_squared.sf(omnibus, degrees)) if degrees else 1.0
-    return Detection(tuple(scores), p_score, omnibus, degrees, p_omnibus)
+    found_bins = binned(problem, np.column_stack([known, residual]), shared)
+    scores, p_score = _scores(trials, left, scale, own, seed, sureness(data))
+    rest = float(left[-1, -1])
+    return Detection(tuple(scores), p_score, found_bins.chi2, found_bins.degrees, found_bins.p_value(), rest)
+
+
+def sureness(data: Dataset) -> int:
+    """Degrees of freedom of the noise model; a mirror's is held above what repeats show, and thus sure."""
+    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds())
+    return SURE if mirrors or not data.contrasts() else PRIOR + data.contrasts()
 
 
 def _tried(item: Hypothesis) -> tuple[dict[str, float], ...]:
@@ -91,6 +99,7 @@ def _scores(
     scale: FloatArray,
     own: FloatArray,
     seed: int,
+    contrasts: int,
 ) -> tuple[list[Score], float]:
     sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
     joint: dict[str, list[int]] = {}
@@ -113,7 +122,7 @@ def _scores(
         score = Score(item, start, ratio, amplitudes, places, seen, float(own[last]))
         if item.label not in best or ratio > best[item.label].ratio:
             best[item.label] = score
-    observed = max(_surprise(score.ratio, len(score.columns)) for score in best.values())
+    observed = max(_surprise(score.ratio, len(score.columns), contrasts) for score in best.values())
     generator = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
@@ -137,8 +146,8 @@ def _scores(
     return sorted(best.values(), key=lambda score: -score.ratio), float(p)
 
 
-def _surprise(ratio: float, degrees: int) -> float:
-    return float(-chi_squared.logsf(ratio, degrees))
+def _surprise(ratio: float, degrees: int, contrasts: int) -> float:
+    return float(-fisher.logsf(ratio / degrees, degrees, contrasts))
 
 
 def _ratio(gram: FloatArray, right: FloatArray, places: list[int], either_sign: bool) -> tuple[float, FloatArray]:
@@ -147,102 +156,3 @@ def _ratio(gram: FloatArray, right: FloatArray, places: list[int], either_sign: 
     if not either_sign and amplitude[0] <= 0.0:
         return 0.0, np.zeros(len(places))
     return float(right[places] @ amplitude), amplitude
-
-
-def binned(problem: Problem, columns: FloatArray, shared: Jitter) -> tuple[float, int]:
-    """χ² of the last of columns [m, k] in the omnibus' bins beside the others, and its degrees of freedom."""
-    data, noise, kinds = problem.data, problem.noise, problem.data.kinds()
-    labels, width = bins(data), columns.shape[1]
-    count = int(labels.max()) + 1
-    total = np.zeros((width + count, width + count))
-    if width > len(BASE):
-        total[range(len(BASE)), range(len(BASE))] = 1.0 / np.square(problem.prior.sigma)
-    by_run: dict[int, list[int]] = {}
-    for place, block in enumerate(data.blocks):
-        by_run.setdefault(block.run, []).append(place)
-    for places in by_run.values():
-        own = _binned_rows(np.concatenate([labels[data.blocks[place].part] for place in places]))
-        size = 2 + len(kinds)
-        gram = np.zeros((width + len(own) + size, width + len(own) + size))
-        for place in places:
-            block = data.blocks[place]
-            part, kind = block.part, kinds.index(block.kind)
-            local = _binned_rows(labels[part])
-            indicators = (labels[part][:, None] == local).astype(np.float64)
-            jitters = np.column_stack(
-                [
-                    noise.power * shared.power[part],
-                    noise.timing_s * shared.timing[part],
-                    np.full(part.stop - part.start, noise.baseline[block.kind]),
-                ]
-            )
-            whitened, _ = whiten(block.t_s, np.hstack([columns[part], indicators, jitters]), noise.coloured[block.kind])
-            where = np.concatenate(
-                [
-                    np.arange(width),
-                    width + np.searchsorted(own, local),
-                    width + len(own) + np.array([0, 1, 2 + kind]),
-                ]
-            )
-            gram[np.ix_(where, where)] += whitened.T @ whitened
-        kept = width + len(own)
-        inner = gram[kept:, kept:] + np.eye(size)
-        reduced = gram[:kept, :kept] - gram[:kept, kept:] @ np.linalg.solve(inner, gram[kept:, :kept])
-        where = np.concatenate([np.arange(width), width + own])
-        total[np.ix_(where, where)] += reduced
-    out, last = list(range(width - 1)), width - 1
-    left = projected(total, out, [*range(width, width + count), last])
-    among, right = left[:-1, :-1], left[:-1, -1]
-    spread = np.sqrt(np.diag(among))
-    seen = spread > 1e-9 * spread.max(initial=0.0)
-    alike = (among / spread / spread[:, None])[np.ix_(seen, seen)] + RIDGE * np.eye(int(seen.sum()))
-    parts = (right / spread)[seen]
-    return float(parts @ cho_solve(cho_factor(alike), parts)), int(seen.sum())
-
-
-def by_group(problem: Problem, residual: FloatArray, shared: Jitter) -> FloatArray:
-    """χ² of a residual in each group's bins, and its degrees: [groups, 2]."""
-    data = problem.data
-    out = []
-    for runs in data.groups().values():
-        own = data.only(runs)
-        part = np.concatenate([np.arange(b.part.start, b.part.stop) for b in data.blocks if b.run in runs])
-        here = Jitter(shared.power[part], shared.timing[part])
-        out.append(binned(replace(problem, data=own), residual[part][:, None], here))
-    return np.array(out, dtype=np.float64)
-
-
-def _binned_rows(labels: IntArray) -> IntArray:
-    return np.asarray(np.unique(labels[labels >= 0]))
-
-
-def bins(data: Dataset) -> IntArray:
-    """[m] the omnibus' bin of each sample, −1 for none: group × signal × pixel × (log time after an edge, time)."""
-    names: dict[tuple[object, ...], int] = {}
-    label = np.full(len(data.value), -1, dtype=np.int64)
-    for block in data.blocks:
-        run = data.runs[block.run]
-        edges_s, rising = _edges(run.pulses, run.commands if block.kind >= 3 else None)
-        row = np.searchsorted(edges_s, block.t_s, side="right") - 1
-        after_s = block.t_s - edges_s[np.maximum(row, 0)]
-        slot = np.searchsorted(AFTER_S, after_s)
-        long = len(run.pulses) > 2
-        span_s = max(float(block.t_s[-1] - block.t_s[0]), 1e-9)
-        piece = ((block.t_s - block.t_s[0]) / span_s * SPAN).astype(int).clip(0, SPAN - 1) if long else 0 * slot
-        order = np.where(row < 0, -1, np.where(rising[np.maximum(row, 0)], 0, 1) + 2 * (0 if long else 1) * (row // 2))
-        keys = zip(order.tolist(), slot.tolist(), piece.tolist(), strict=True)
-        for at, key in enumerate(keys, start=block.part.start):
-            whole = (run.group, block.kind, block.pixel, *key)
-            label[at] = names.setdefault(whole, len(names))
-    return label
-
-
-def _edges(pulses: FloatArray, commands: FloatArray | None) -> tuple[FloatArray, np.ndarray]:
-    if commands is not None:
-        return commands[:, 0], np.arange(len(commands)) % 2 == 0
-    edges_s = np.concatenate([pulses[:, 0], pulses[:, 0] + pulses[:, 1]])
-    order = np.argsort(edges_s, kind="stable")
-    rising = np.concatenate([np.ones(len(pulses), dtype=bool), np.zeros(len(pulses), dtype=bool)])
-    if not len(edges_s):
-        return np.zeros(1), np.ones(1, dtype=bool)
-    return edges_s[order], rising[order]

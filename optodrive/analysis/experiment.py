@@ -1,5 +1,6 @@
 """The experiment that separates two rivals most per second of lab time, over a finite grid of what a display can do."""
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -19,41 +20,51 @@ SAMPLES = 400
 
 def next_experiment(problem: Problem, first: Fit, second: Fit, labels: tuple[str, str]) -> NextExperiment | None:
     """The most telling run of the grid, repeated; None where no signal of a pixel is measured."""
-    kinds = tuple(kind for kind in problem.data.kinds() if kind in PIXEL_KINDS)
+    data = problem.data
+    kinds = tuple(kind for kind in data.kinds() if kind in PIXEL_KINDS)
     if not kinds:
         return None
+    pixel = Counter(block.pixel for block in data.blocks if block.kind in PIXEL_KINDS).most_common(1)[0][0]
     best: NextExperiment | None = None
-    for why, pulses, span_s in _grid(problem.data):
-        separation = _separation(problem, first, second, _imagined(pulses, span_s, kinds))
+    for why, pulses, span_s in _grid(data, pixel):
+        separation = _separation(problem, first, second, _imagined(pulses, pixel, span_s, kinds))
         seconds = REPEATS * (span_s + SETUP_S)
         if best is None or separation / seconds > best.separation / best.seconds:
             signals = tuple(SIGNALS[kind] for kind in kinds)
-            text = f"{why}, {REPEATS} times: {labels[0]} and {labels[1]} differ most there"
-            best = NextExperiment(text, pulses, signals, separation, seconds)
+            text = f"{why}, {REPEATS} times, pixel {pixel} looked at: {labels[0]} and {labels[1]} differ most there"
+            best = NextExperiment(text, pulses, pixel, REPEATS, signals, separation, seconds)
     return best
 
 
-def _grid(data: Dataset) -> Iterator[tuple[str, FloatArray, float]]:
+def _grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray, float]]:
+    beside = next((other for other in _lit(data) if other != pixel), pixel + 1)
     full_w = max(scene.full_w for scene, _ in data.scenes)
     for power_w in (0.25 * full_w, 0.5 * full_w, full_w):
         for width_s in (0.002, 0.01, 0.05):
-            for lit in (0.0, 1.0):
-                where = "" if lit == 0.0 else " on the pixel beside it"
+            for lit in (pixel, beside):
+                where = "" if lit == pixel else f" on pixel {lit} beside it"
                 pulses = np.array([[0.02, width_s, power_w, lit]])
                 why = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{where}"
                 yield why, pulses, 0.02 + width_s + 0.25
         for gap_s in (0.02, 0.06):
             starts = 0.02 + np.arange(0.0, 3.0, 0.02 + gap_s)
-            pulses = np.array([[start, 0.02, power_w, 0.0] for start in starts])
+            pulses = np.array([[start, 0.02, power_w, pixel] for start in starts])
             yield f"3 s of 20 ms pulses, {gap_s * 1e3:g} ms apart, at {power_w:.2f} W", pulses, 4.0
 
 
-def _imagined(pulses: FloatArray, span_s: float, kinds: tuple[int, ...]) -> Dataset:
+def _lit(data: Dataset) -> list[int]:
+    """Pixels that got light, the most often lit first."""
+    return [pixel for pixel, _ in Counter(int(lit) for run in data.runs for lit in run.pulses[:, 3]).most_common()]
+
+
+def _imagined(pulses: FloatArray, pixel: int, span_s: float, kinds: tuple[int, ...]) -> Dataset:
     t_s = np.linspace(span_s / SAMPLES, span_s, SAMPLES)
-    blocks = tuple(Block(0, kind, 0, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s) for row, kind in enumerate(kinds))
+    blocks = tuple(
+        Block(0, kind, pixel, slice(row * SAMPLES, (row + 1) * SAMPLES), t_s) for row, kind in enumerate(kinds)
+    )
     empty = np.zeros(0)
     times = tuple(t_s if kind in kinds else empty for kind in PIXEL_KINDS)
-    scene = Scene(pulses, 0, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session=1.0)
+    scene = Scene(pulses, pixel, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session=1.0)
     place = {kind: row for row, kind in enumerate(kinds)}
     rows = np.arange(SAMPLES)
     alike = Alike(scene, tuple((kind, place[kind], rows) for kind in kinds))

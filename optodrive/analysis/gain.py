@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.analysis.dataset import SIGNALS, Dataset
-from optodrive.analysis.detect import by_group
 from optodrive.analysis.fit import Problem, jitter
+from optodrive.analysis.omnibus import by_group
 from optodrive.analysis.predict import Point, predict
 from optodrive.flow import FloatArray, Gain
 

@@ -12,12 +12,12 @@ from math import cos, exp, log, pi, sin, sqrt
 import numpy as np
 from scipy.optimize import minimize
 
-from optodrive.analysis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
+from optodrive.analysis.contrast import Contrast, as_contrasts, contrasts
+from optodrive.analysis.dataset import PIXEL_KINDS, Dataset
 from optodrive.compiled import kernel
-from optodrive.flow import FloatArray, IntArray
+from optodrive.flow import FloatArray
 
 EPS = 1e-12
-ARRIVED_S = 4e-3
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class Coloured:
 class NoiseModel:
     """coloured: by kind of signal; power: relative; timing: s; baseline: by kind; measured: from repeats.
 
-    uneven: by how many of its own σ the worst pair of repeats differs more than this model has it
+    uneven: by how many of its own σ the worst pair of repeats differs more than this model has it; unsteady: likewise
+    what repeats differ by as if the power changed within pulses
     """
 
     coloured: dict[int, Coloured]
@@ -43,6 +44,7 @@ class NoiseModel:
     baseline: dict[int, float]
     measured: bool
     uneven: float = 0.0
+    unsteady: float = 0.0
 
 
 @kernel
@@ -116,93 +118,28 @@ def whiten(t_s: FloatArray, columns: FloatArray, noise: Coloured) -> tuple[Float
     return out, logdet
 
 
-@dataclass(frozen=True, eq=False)
-class _Contrast:
-    """Difference between repeats in one kind of signal: number of its pair; [n] and [n, 3] power, timing, baseline."""
-
-    pair: int
-    kind: int
-    t_s: FloatArray
-    value: FloatArray
-    jitter: FloatArray
-
-
-def _contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[_Contrast]:
-    """Helmert contrasts between the runs of each group, on the samples that all of them have."""
-    found: list[_Contrast] = []
-    blocks: dict[tuple[int, int, int], int] = {
-        (block.run, block.kind, block.pixel): number for number, block in enumerate(data.blocks)
-    }
-    pair = 0
-    for runs in data.groups().values():
-        for later in range(1, len(runs)):
-            used = False
-            for number, kind, pixel in list(blocks):
-                if number != runs[later]:
-                    continue
-                places = [blocks.get((run, kind, pixel)) for run in runs[: later + 1]]
-                if any(place is None for place in places):
-                    continue
-                members = [data.blocks[place] for place in places if place is not None]
-                common = _common(members[0].t_s, [member.t_s for member in members[1:]])
-                if common is None:
-                    continue
-                commands = data.runs[number].commands
-                if kind in MIRROR_KINDS and commands is not None:
-                    common = _at_rest(members[0].t_s, common, commands[:, 0])
-                scale = sqrt(later / (later + 1.0))
-                weights = [*([scale / later] * later), -scale]
-                rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
-                value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
-                last = rows[-1]
-                jitter = np.stack([power[last], timing[last], np.ones(len(last))], axis=1)
-                found.append(_Contrast(pair, kind, members[-1].t_s[common[-1]], value, jitter))
-                used = True
-            pair += used
-    return found
-
-
-def _at_rest(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
-    """Rows at which mirrors have long arrived: what a lag makes of jitter is no noise of the instrument."""
-    times = t_s[common[0]]
-    row = np.searchsorted(steps_s, times, side="right") - 1
-    kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > ARRIVED_S)
-    return [rows[kept] for rows in common] if kept.sum() >= 16 else common
-
-
-def _common(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
-    """Rows of each time axis that all of them share, to 0.1 µs; None for fewer than 16."""
-    keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
-    shared = keys[0]
-    for key in keys[1:]:
-        shared = np.intersect1d(shared, key, assume_unique=True)
-    if len(shared) < 16:
-        return None
-    return [np.searchsorted(key, shared).astype(np.int64) for key in keys]
-
-
 def estimate(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
     """The noise model by maximum likelihood of the contrasts; without repeats, of the residuals themselves.
 
     power, timing: [m] the prediction's change with the logarithm of the power, and with a delay, per second.
     """
-    contrasts = _contrasts(data, residual, power, timing)
+    found = contrasts(data, residual, power, timing)
     coloured: dict[int, Coloured] = {}
     for kind in data.kinds():
-        own = [item for item in contrasts if item.kind == kind]
+        own = [item for item in found if item.kind == kind]
         if not own:
-            own = _as_contrasts(data, residual, power, timing, kind)
+            own = as_contrasts(data, residual, power, timing, kind)
         coloured[kind] = _fit_coloured(own)
-    if not contrasts:
+    if not found:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
-    power_sigma, timing_s, baseline = _fit_jitter(contrasts, coloured, data.kinds())
+    power_sigma, timing_s, baseline = _fit_jitter(found, coloured, data.kinds())
     model = NoiseModel(coloured, power_sigma, timing_s, baseline, True)
     return replace(
-        model, uneven=max((_unevenness(item, model) for item in contrasts if item.kind in PIXEL_KINDS), default=0.0)
+        model, uneven=max((_unevenness(item, model) for item in found if item.kind in PIXEL_KINDS), default=0.0)
     )
 
 
-def _unevenness(contrast: _Contrast, model: NoiseModel) -> float:
+def _unevenness(contrast: Contrast, model: NoiseModel) -> float:
     """χ² of a contrast, its jitters allowed for, in σ above what it should be."""
     size = np.array([model.power, model.timing_s, model.baseline[contrast.kind]])
     columns = np.column_stack([contrast.value, contrast.jitter * size])
@@ -212,25 +149,13 @@ def _unevenness(contrast: _Contrast, model: NoiseModel) -> float:
     return float((gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:]) - count) / sqrt(2.0 * count))
 
 
-def _as_contrasts(
-    data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
-) -> list[_Contrast]:
-    found = []
-    for block in data.blocks:
-        if block.kind == kind:
-            part = block.part
-            jitter = np.stack([power[part], timing[part], np.ones(part.stop - part.start)], axis=1)
-            found.append(_Contrast(block.run, kind, block.t_s, residual[part], jitter))
-    return found
-
-
 def _minimise(function: Callable[[FloatArray], float], start: FloatArray, step: float, evaluations: int) -> FloatArray:
     simplex = np.vstack([start, *(start + step * row for row in np.eye(len(start)))])
     options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.01, "fatol": 0.05}
     return np.asarray(minimize(function, start, method="Nelder-Mead", options=options).x)
 
 
-def _fit_coloured(contrasts: list[_Contrast]) -> Coloured:
+def _fit_coloured(contrasts: list[Contrast]) -> Coloured:
     """One kind's noise, each contrast's jitters projected out."""
     steps = np.concatenate([np.diff(item.value) for item in contrasts])
     spread = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
@@ -261,7 +186,7 @@ def _fit_coloured(contrasts: list[_Contrast]) -> Coloured:
     return read(other) if cost(other) < cost(best) - 6.0 else read(best)
 
 
-def _swing(contrasts: list[_Contrast], dt_s: float) -> float:
+def _swing(contrasts: list[Contrast], dt_s: float) -> float:
     """Angular frequency of the strongest swing: the peak of the mean spectrum over its own smooth course."""
     count, power = 256, np.zeros(129)
     for item in contrasts:
@@ -280,10 +205,10 @@ def _scaled(jitter: FloatArray) -> FloatArray:
 
 
 def _fit_jitter(
-    contrasts: list[_Contrast], coloured: dict[int, Coloured], kinds: list[int]
+    contrasts: list[Contrast], coloured: dict[int, Coloured], kinds: list[int]
 ) -> tuple[float, float, dict[int, float]]:
     """σ of power (relative), timing (s) and baselines, by the likelihood of what each contrast shows of them."""
-    pairs: dict[int, list[_Contrast]] = {}
+    pairs: dict[int, list[Contrast]] = {}
     for item in contrasts:
         pairs.setdefault(item.pair, []).append(item)
     grams = []

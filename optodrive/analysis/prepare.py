@@ -8,6 +8,7 @@ from optodrive.analysis.dataset import MIRROR_KINDS, Dataset
 from optodrive.analysis.fit import Fit, Prior, Problem, fit, jitter
 from optodrive.analysis.noise import Coloured, NoiseModel, estimate
 from optodrive.analysis.predict import Point
+from optodrive.analysis.unsteady import unsteadiness
 
 EPSILON = 0.66
 BROAD = Prior((np.log(150.0), np.log(101e-6), np.log(3e-3), np.log(4e-6), np.log(2.3e-4)), (0.7, 0.16, 0.5, 0.5, 0.5))
@@ -29,11 +30,18 @@ def prepare(
     problem = Problem(data, crude, prior, epsilon)
     tries = [fit(problem, Point((float(np.log(r)), *prior.mean[1:]), known), iterations=3) for r in STARTS_R]
     base = fit(problem, min(tries, key=lambda item: item.chi2).point, iterations=10)
-    shared = jitter(data, base.point, epsilon, base.prediction)
-    noise = estimate(data, data.value - base.prediction, shared.power, shared.timing)
+    problem = with_noise(problem, base, timing_s)
+    base = fit(problem, base.point)
+    return replace(problem, noise=replace(problem.noise, unsteady=unsteadiness(problem, base))), base
+
+
+def with_noise(problem: Problem, fitted: Fit, timing_s: float) -> Problem:
+    """The same with the noise that repeats show, jitters acting along the slopes of this fit."""
+    data = problem.data
+    shared = jitter(data, fitted.point, problem.epsilon, fitted.prediction)
+    noise = estimate(data, data.value - fitted.prediction, shared.power, shared.timing)
     noise = replace(noise, timing_s=max(noise.timing_s, timing_s), coloured=_believable(data, noise.coloured))
-    problem = replace(problem, noise=noise)
-    return problem, fit(problem, base.point)
+    return replace(problem, noise=noise)
 
 
 def _believable(data: Dataset, coloured: dict[int, Coloured]) -> dict[int, Coloured]:

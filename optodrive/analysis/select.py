@@ -7,7 +7,8 @@ import numpy as np
 
 from optodrive.analysis.causes import Hypothesis
 from optodrive.analysis.detect import Detection, Score, detect
-from optodrive.analysis.fit import Fit, Problem, fit
+from optodrive.analysis.fit import Fit, Problem, fit, jitter
+from optodrive.analysis.form import bent
 from optodrive.analysis.normal import normal
 from optodrive.analysis.predict import Point, predict
 
@@ -15,12 +16,19 @@ ALPHA = 0.001
 """Level of the whole family. False alarms are to stay below 1 %, and the noise model is itself an estimate."""
 UNEVEN = 6.0
 """Repeats that differ by more than this do not repeat one experiment."""
+UNSTEADY = 10.0
+"""Likewise, as if the power changed within pulses."""
 HOPELESS = 300.0
 """A fit that does not promise to come within so much χ² of the best one is given up."""
 MOST = 9
 """So many of the strongest hypotheses are refitted."""
-ALIKE = 12.0
-"""Rivals whose χ² is within this of the best one's, degrees of freedom counted as by BIC, cannot be told apart."""
+ALIKE = 10.0
+"""Rivals whose BIC is within this of the best one's cannot be told apart: odds of less than about 150.
+
+No more, or a rival that only imitates the best one with a number more, which costs ln samples, would stay for ever.
+"""
+SAME = 9.0
+"""Predictions that differ by less χ² than this are one prediction."""
 EXPLAINED = 0.9
 FORM = 0.985
 """A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
@@ -70,11 +78,21 @@ def alarmed(found: Detection) -> bool:
     return min(found.p_score, found.p_omnibus) < 0.5 * ALPHA
 
 
+def unrepeated(problem: Problem) -> bool:
+    """Whether repeats differ by more than noise and jitters."""
+    return problem.noise.uneven > UNEVEN or problem.noise.unsteady > UNSTEADY
+
+
+def leading(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick: Tick) -> Candidate | None:
+    """The best of the strongest, refitted; None where none is worth it."""
+    return next(iter(_refitted(problem, base, (), detect(problem, base, known, seed).scores, tick)), None)
+
+
 def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick: Tick) -> Verdict:
     """The verdict on one recording."""
     tick("looking for anything to explain")
     first = detect(problem, base, known, seed)
-    if problem.noise.uneven > UNEVEN:
+    if unrepeated(problem):
         return Verdict("unexplained", (), None, (), first, None, 0.0)
     if not alarmed(first):
         return Verdict("none", (), None, (), first, None, 0.0)
@@ -83,21 +101,34 @@ def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick
         return Verdict("unexplained", (), None, (), first, None, 0.0)
     best = singles[0]
     tick(f"what {best.label} leaves")
-    rest = detect(problem, best.fit, [item for item in known if item.key not in best.causes], seed)
+    others = [item for item in known if item.key not in best.causes]
+    rest = detect(problem, best.fit, others, seed)
     alone = _explained(rest, base, best)
     if not alarmed(rest) and alone >= EXPLAINED:
         return _named(problem, singles, first, rest, alone)
-    pairs = [item for item in _pairs(problem, base, known, singles, rest, seed, tick) if _needed(item, singles)]
+    shape = bent(problem, best.fit, best.hypotheses)
+    formed = detect(problem, best.fit, others, seed, shape)
+    if not alarmed(formed) and alone >= EXPLAINED:
+        return _named(problem, singles, first, rest, alone)
+    price = rest.left - formed.left - shape.shape[1] * np.log(len(problem.data.value))
+    found = _pairs(problem, base, known, singles, rest, seed, tick)
+    pairs = [item for item in found if _needed(item, singles, price)]
     if pairs:
-        tick(f"what {pairs[0].label} leave")
-        others = [item for item in known if item.key not in pairs[0].causes]
-        after = detect(problem, pairs[0].fit, others, seed)
-        together = _explained(after, base, pairs[0])
+        both = pairs[0]
+        tick(f"what {both.label} leave")
+        others = [item for item in known if item.key not in both.causes]
+        after = detect(problem, both.fit, others, seed)
+        together = _explained(after, base, both)
         # Beside a cause in another form than its term's, a second one patches: it must leave nothing to be believed.
         if not alarmed(after) or (together >= FORM > alone):
             return _named(problem, pairs, first, after, together)
+        if together >= EXPLAINED and not alarmed(
+            detect(problem, both.fit, others, seed, bent(problem, both.fit, both.hypotheses))
+        ):
+            return _named(problem, pairs, first, after, together)
     # Where only one cause is known at all, no other can be taken for it.
-    if alone >= (FORM if len({item.key for item in known}) > 1 else EXPLAINED):
+    enough = FORM if len({item.key for item in known}) > 1 else EXPLAINED
+    if alone >= EXPLAINED and max(alone, _explained(formed, base, best)) >= enough:
         return _named(problem, singles, first, rest, alone)
     return Verdict("unexplained", (), None, (*pairs, *singles), first, rest, alone)
 
@@ -182,14 +213,29 @@ def _pairs(
     return list(unique.values())
 
 
-def _needed(both: Candidate, singles: list[Candidate]) -> bool:
-    """Whether the pair beats every single one by more than chance among so many pairs, and by more than its price."""
-    return singles[0].bic - both.bic > ALIKE
+def _needed(both: Candidate, singles: list[Candidate], bending: float) -> bool:
+    """Whether the pair beats every single one by more than chance among so many pairs, and by more than its price.
+
+    bending: what the best single cause would gain by another form, its price paid; a second cause must do better.
+    """
+    return singles[0].bic - both.bic > ALIKE + max(0.0, bending)
+
+
+def _imitates(problem: Problem, rival: Candidate, best: Candidate) -> bool:
+    """Whether a rival of more numbers, one of them at its end, says what the best one says."""
+    terms = rival.fit.point.terms
+    if len(rival.fit.free) <= len(best.fit.free) or not any(
+        not item.parameter.low < terms[item.key][item.names[0]] < item.parameter.high for item in rival.fit.free
+    ):
+        return False
+    shared = jitter(problem.data, best.fit.point, problem.epsilon, best.fit.prediction)
+    apart = (rival.fit.prediction - best.fit.prediction)[:, None]
+    return float(normal(problem.data, apart, problem.noise, shared.power, shared.timing).total()[0, 0]) < SAME
 
 
 def _named(problem: Problem, ranked: list[Candidate], first: Detection, rest: Detection, explained: float) -> Verdict:
     best = ranked[0]
-    rivals = [item for item in ranked if item.bic - best.bic < ALIKE]
+    rivals = [item for item in ranked if item.bic - best.bic < ALIKE and not _imitates(problem, item, best)]
     keys = list(dict.fromkeys(key for item in rivals for key in item.causes))
     if len({frozenset(item.causes) for item in rivals}) > 1:
         return Verdict("ambiguous", tuple(keys), best, tuple(ranked), first, rest, explained)

@@ -129,7 +129,11 @@ def _gained(found: Discrepancy) -> list[str]:
 
 
 def _once(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
-    return sorted(candidates, key=lambda item: item.label)
+    """By label, each once: what pixels and mirrors both show is said of the pixels."""
+    first: dict[str, CandidateCause] = {}
+    for item in candidates:
+        first.setdefault(item.label, item)
+    return [first[label] for label in sorted(first)]
 
 
 def answer(found: Discrepancy) -> dict[str, Any]:
@@ -169,6 +173,8 @@ def answer(found: Discrepancy) -> dict[str, Any]:
         else {
             "why": ask.why,
             "pulses": ask.pulses.tolist(),
+            "pixel": ask.pixel,
+            "repeats": ask.repeats,
             "signals": list(ask.signals),
             "expected_separation": ask.separation,
             "seconds": ask.seconds,

@@ -1,22 +1,24 @@
 """A recording to its answer: pixels and mirrors each for themselves, joined; nothing here knows files or words."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import exp
 from time import perf_counter
 
 import numpy as np
 from scipy.stats import chi2 as chi_squared
+from scipy.stats import t as student
 
 from optodrive.analysis.causes import Free, Hypothesis, hypotheses
 from optodrive.analysis.dataset import SIGNALS, Dataset, dataset
-from optodrive.analysis.detect import Score
+from optodrive.analysis.detect import Score, sureness
 from optodrive.analysis.experiment import next_experiment
 from optodrive.analysis.fit import Fit, Prior, Problem, fit
 from optodrive.analysis.gain import heldout, split
 from optodrive.analysis.predict import BASE, UNITS, predict
-from optodrive.analysis.prepare import BROAD, EPSILON, prepare
-from optodrive.analysis.select import ALIKE, UNEVEN, Candidate, Verdict, select
+from optodrive.analysis.prepare import BROAD, EPSILON, prepare, with_noise
+from optodrive.analysis.select import ALIKE, UNEVEN, UNSTEADY, Candidate, Verdict, leading, select, unrepeated
+from optodrive.analysis.unsteady import unsteadiness
 from optodrive.flow import CandidateCause, Course, Discrepancy, Estimate, Gain, Measurement, NextExperiment
 
 VISIBLE = 30.0
@@ -107,6 +109,14 @@ def _study(
     here, held = data.only(fitted), data.only(held_runs)
     tick("noise and nominal model")
     problem, base = prepare(here, prior, epsilon, timing_s, late_s)
+    if unrepeated(problem):
+        # A jitter acts along the slopes of the true model: a large cause moves them, and repeats seem to differ.
+        lead = leading(problem, base, known, seed, tick)
+        if lead is not None:
+            other = with_noise(problem, lead.fit, timing_s)
+            other = replace(other, noise=replace(other.noise, unsteady=unsteadiness(other, lead.fit)))
+            if not unrepeated(other):
+                problem, base = other, fit(other, base.point)
     verdict = select(problem, base, known, seed, tick)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
@@ -119,6 +129,13 @@ def _study(
     gain = None if chosen is None else heldout(problem, held, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
     final = fit(everything, start.point, start.free, iterations=6)
+    if verdict.verdict == "none" and held_runs:
+        # What only the hottest runs show is seen with them alone: nothing is held out then.
+        wider = select(everything, final, known, seed, tick)
+        if wider.verdict != "none":
+            problem, base, held, verdict = everything, final, data.only([]), wider
+            if wider.chosen is not None:
+                final = wider.chosen.fit
     ask = _asked(problem, verdict, tick)
     return _Half(data, held, problem, base, verdict, final, gain, _candidates(verdict, gains), ask)
 
@@ -148,12 +165,13 @@ def _estimates(half: _Half) -> dict[str, Estimate]:
     final = half.final
     sigma = np.sqrt(np.maximum(np.diag(final.covariance), 0.0))
     out: dict[str, Estimate] = {}
+    reach = float(student.ppf(0.975, sureness(half.data)))
     if any(kind < 3 for kind in half.data.kinds()):
         for row, name in enumerate(BASE):
-            log_value, width = final.point.base[row], 1.96 * float(sigma[row])
+            log_value, width = final.point.base[row], reach * float(sigma[row])
             out[name] = Estimate(exp(log_value), UNITS[name], exp(log_value - width), exp(log_value + width))
     for row, free in enumerate(final.free, start=len(BASE)):
-        number, width = free.read(final.point.terms), 1.96 * float(min(sigma[row], 50.0))
+        number, width = free.read(final.point.terms), reach * float(min(sigma[row], 50.0))
         ends = (number - width, number + width)
         value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
         for name in free.names:
@@ -243,6 +261,8 @@ def _remarks(halves: list[_Half]) -> tuple[str, ...]:
                 "Runs that should repeat one experiment differ by far more than noise and jitter: something "
                 "changes from run to run."
             )
+        if half.problem.noise.unsteady > UNSTEADY:
+            out.append("Repeats differ more while lit: the power is unsteady within pulses.")
         if not half.problem.noise.measured:
             out.append("No run repeats another: the noise is a guess, so nothing is named for certain.")
         if half.verdict.chosen is not None and half.verdict.rest is not None:

@@ -99,6 +99,9 @@ class Warming(NamedTuple):
     everywhere_k: float = 0.0
 
 
+NO_WARMING = Warming()
+
+
 @dataclass
 class Flows:
     """Heat on its way, W, each [p]: into a node, by its name; and to ambient for good."""
@@ -150,7 +153,7 @@ class Term:
 
     def warming(self, values: Values, most: Most) -> Warming | None:
         """What a bound on heat must add for the term; None where it cannot say, and the limiter refuses the term."""
-        return Warming() if self.never_warmer else None
+        return NO_WARMING if self.never_warmer else None
 
     def bridge_k_per_w(self, values: Values, view: View, r_k_per_w: FloatArray) -> FloatArray:
         """The bridge's resistance, given what it would be without the term: [p]."""

@@ -102,7 +102,7 @@ def _laser_droop(rng: Rng, scene: Scene) -> Effect:
         "droop_s": (tau, slow),
         "droop_by_power": by_power,
     }
-    textbook = share == 1.0 and not by_power
+    textbook = share == 1.0 and by_power  # the term's share is that of the full power, and follows it
     return Effect("laser_droop", form, {"depth": depth, "tau": tau}, changes, textbook)
 
 

@@ -24,7 +24,7 @@ BASE_BY_CONVENTION = ("power_nonlinearity", "sensor_scale", "beam_misalignment",
 # Names an answer may use for a size; only these are compared, and only where the form is the textbook one.
 NAMES: dict[str, tuple[str, ...]] = {
     "bridge_conductivity.n": ("n", "exponent"),
-    "heat_capacity.c": ("c",),
+    "heat_capacity.c": ("c", "slope"),
     "radiation.eps_A": ("eps_A", "eps_a", "area", "emitting_area", "epsilon_A"),
     "wall_heating.R_w": ("R_w", "r_w", "R", "resistance"),
     "wall_heating.tau_w": ("tau_w", "tau"),
@@ -40,6 +40,9 @@ NAMES: dict[str, tuple[str, ...]] = {
     "mirror_lag.hz": ("hz", "frequency", "f_n", "natural_hz"),
     "mirror_lag.zeta": ("zeta", "damping"),
 }
+
+# Sizes that an answer may state in another unit: c per 100 K is a slope per kelvin.
+UNITS = {"heat_capacity.slope": 0.01}
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,8 @@ def _covered(case: Any, answer: Mapping[str, Any]) -> tuple[dict[str, bool], dic
             continue
         for size, truth in effect.sizes.items():
             for alias in NAMES.get(f"{effect.key}.{size}", ()):
-                held = _inside(parameters, f"{effect.key}.{alias}", truth)
+                name = f"{effect.key}.{alias}"
+                held = _inside(parameters, name, truth * UNITS.get(name, 1.0))
                 if held is not None:
                     terms[f"{effect.key}.{size}"] = held
                     break

@@ -245,6 +245,10 @@ def test_score_of_one_cause():
     assert alone.gain == pytest.approx(0.9 / 0.95)
     assert alone.worse is False
     assert not score(case_of("single", "gas_leak", textbook=False), said("cause", "gas_leak")).term_inside
+    warm = case_of("single", "heat_capacity")
+    warm.effects[0].sizes["c"] = 0.2
+    slope = {"heat_capacity.slope": {"value": 2.1e-3, "ci95": [1.9e-3, 2.3e-3]}}
+    assert score(warm, said("cause", "heat_capacity", parameters=slope)).term_inside == {"heat_capacity.c": True}
     two = score(case, said("ambiguous", "gas_leak", "radiation"), after=said("cause", "gas_leak"))
     assert (two.alone, two.in_set, two.right, two.misnamed, two.resolved) == (False, True, None, False, True)
     three = score(case, said("ambiguous", "gas_leak", "radiation", "hum"), after=said("ambiguous", "gas_leak"))

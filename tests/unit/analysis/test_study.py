@@ -7,9 +7,9 @@ import pytest
 
 from labs import lab
 from optodrive.analysis.dataset import dataset
-from optodrive.analysis.detect import bins
 from optodrive.analysis.gain import split
 from optodrive.analysis.model_file import model_toml
+from optodrive.analysis.omnibus import bins
 from optodrive.analysis.report import report
 from optodrive.analysis.story import answer, quantity, story
 from optodrive.analysis.study import diagnose
