@@ -15,17 +15,23 @@ BARS = 14
 
 def report(found: Discrepancy, title: str) -> str:
     """HTML."""
+    nominal = "<span style='color:#c2571a'>nominal model</span>"
+    lines, name = (
+        (f"{nominal}, <span style='color:#1a6fc2'>extended model</span>", "extended model")
+        if found.terms
+        else (nominal, "nominal model")
+    )
     parts = [
         "<h2>Evidence for each cause</h2>",
         _bars(found),
         "<h2>Numbers</h2>",
         _numbers(found),
-        "<h2>Residuals by experiment, before and after, in units of the noise of one sample</h2>",
-        "<p><span style='color:#c2571a'>nominal model</span>, <span style='color:#1a6fc2'>extended model</span></p>",
+        "<h2>Residuals by experiment, in units of the noise of one sample</h2>",
+        f"<p>{lines}</p>",
         "<div class='grid'>",
-        *(_residuals(course) for course in _telling(found.courses)),
+        *(_residuals(course, bool(found.terms)) for course in _telling(found.courses)),
         "</div>",
-        "<h2>Predicted against measured, extended model</h2><div class='grid'>",
+        f"<h2>Predicted against measured, {name}</h2><div class='grid'>",
         *(_against(signal, found.courses) for signal in dict.fromkeys(course.signal for course in found.courses)),
         "</div>",
     ]
@@ -44,10 +50,11 @@ def _line(x: FloatArray, y: FloatArray, span: tuple[float, float, float, float],
     return f"<polyline class='{kind}' points='{points}'/>"
 
 
-def _residuals(course: Course) -> str:
+def _residuals(course: Course, extended: bool) -> str:
     most = float(max(np.abs(course.before).max(), np.abs(course.after).max(), 1.0))
     span = (float(course.t_s[0]), float(course.t_s[-1]), -most, most)
-    lines = _line(course.t_s, course.before, span, "before") + _line(course.t_s, course.after, span, "after")
+    lines = _line(course.t_s, course.before, span, "before")
+    lines += _line(course.t_s, course.after, span, "after") if extended else ""
     return (
         f"<figure><svg viewBox='0 0 {WIDTH} {HEIGHT}' role='img'>{lines}"
         f"<text x='2' y='14'>{most:.1f} σ</text><text x='2' y='{HEIGHT - 20}'>−{most:.1f}</text>"

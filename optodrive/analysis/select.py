@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.analysis.causes import Hypothesis
+from optodrive.analysis.causes import Free, Hypothesis
 from optodrive.analysis.detect import Detection, Score, detect
 from optodrive.analysis.fit import Fit, Problem, fit, jitter
 from optodrive.analysis.form import bent
@@ -32,6 +32,8 @@ SAME = 9.0
 EXPLAINED = 0.9
 FORM = 0.985
 """A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
+NEAREST, AGAIN = 6, 6
+"""So many starts are tried of a hypothesis with many, each fitted again so often at most."""
 PAIRS, BEGIN = 4, 2
 """So many second causes are refitted beside each of so many best first ones."""
 
@@ -161,23 +163,40 @@ def _refitted(
         free = (*base.free, *score.hypothesis.free)
         start = _start(base.point, score)
         if score.hypothesis.every:
-            # Jitters act along the slopes of where a fit began: only the second one has them right.
-            start = fit(problem, _nearest(problem, base, score.hypothesis), free).point
-        result = fit(problem, start, free, hopeless=hopeless)
+            result = _settled(problem, base, score.hypothesis, free)
+        else:
+            result = fit(problem, start, free, hopeless=hopeless)
         hopeless = min(hopeless, result.chi2 + HOPELESS)
         found.append(Candidate((*before, score.hypothesis), result, result.chi2 + len(free) * np.log(samples)))
     return sorted(found, key=lambda item: item.bic)
 
 
-def _nearest(problem: Problem, base: Fit, item: Hypothesis) -> Point:
-    """The start that comes nearest to the data as it is."""
+def _settled(problem: Problem, base: Fit, item: Hypothesis, free: Sequence[Free]) -> Fit:
+    """The best of fits from the nearest starts, each done again until it stays.
+
+    Jitters act along the slopes of where a fit began: only one that began where it ended has them right.
+    """
+    found: list[Fit] = []
+    for point in _nearest(problem, base, item):
+        result = fit(problem, point, free)
+        for _ in range(AGAIN):
+            before, result = result, fit(problem, result.point, free)
+            if abs(before.chi2 - result.chi2) < 1.0:
+                found.append(result)
+                break
+    return min(found, key=lambda one: one.chi2) if found else result
+
+
+def _nearest(problem: Problem, base: Fit, item: Hypothesis) -> list[Point]:
+    """The starts that come nearest to the data as it is."""
     still = np.zeros(len(problem.data.value))
 
     def cost(point: Point) -> float:
         residual = problem.data.value - predict(problem.data, point, problem.epsilon)
         return float(normal(problem.data, residual[:, None], problem.noise, still, still).total()[0, 0])
 
-    return min((Point(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts), key=cost)
+    points = (Point(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts)
+    return sorted(points, key=cost)[:NEAREST]
 
 
 def _excess(found: Detection) -> float:

@@ -268,9 +268,10 @@ def _remarks(halves: list[_Half]) -> tuple[str, ...]:
         if half.verdict.chosen is not None and half.verdict.rest is not None:
             rest = half.verdict.rest
             if half.verdict.verdict == "cause" and rest.p_omnibus < 1e-3:
+                causes = " and ".join(half.verdict.causes)
                 out.append(
-                    f"{1 - half.verdict.explained:.1%} of what was wrong stays: the cause acts in a form a little "
-                    "other than the term's."
+                    f"{causes}: {1 - half.verdict.explained:.1%} of what was wrong stays, for the cause acts in a form "
+                    "a little other than the term's."
                 )
         out += _at_an_end(half.final)
     return tuple(dict.fromkeys(out))
