@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from math import ceil
 
 import numpy as np
 
@@ -12,14 +13,17 @@ from optodrive.analysis.predict import predict
 from optodrive.flow import FloatArray, NextExperiment
 from optodrive.physics.forward import Scene
 
-REPEATS = 3
+REPEATS, MOST = 3, 30
+"""How often an experiment is done, at least and at most."""
+ENOUGH = 24.0
+"""χ² between rivals that tells them apart."""
 SETUP_S = 2.0
 """Between two runs."""
 SAMPLES = 400
 
 
 def next_experiment(problem: Problem, first: Fit, second: Fit, labels: tuple[str, str]) -> NextExperiment | None:
-    """The most telling run of the grid, repeated; None where no signal of a pixel is measured."""
+    """The most telling run of the grid, repeated until it tells; None where no signal is measured, or none would."""
     data = problem.data
     kinds = tuple(kind for kind in data.kinds() if kind in PIXEL_KINDS)
     if not kinds:
@@ -27,12 +31,16 @@ def next_experiment(problem: Problem, first: Fit, second: Fit, labels: tuple[str
     pixel = Counter(block.pixel for block in data.blocks if block.kind in PIXEL_KINDS).most_common(1)[0][0]
     best: NextExperiment | None = None
     for why, pulses, span_s in _grid(data, pixel):
-        separation = _separation(problem, first, second, _imagined(pulses, pixel, span_s, kinds))
-        seconds = REPEATS * (span_s + SETUP_S)
-        if best is None or separation / seconds > best.separation / best.seconds:
-            signals = tuple(SIGNALS[kind] for kind in kinds)
-            text = f"{why}, {REPEATS} times, pixel {pixel} looked at: {labels[0]} and {labels[1]} differ most there"
-            best = NextExperiment(text, pulses, pixel, REPEATS, signals, separation, seconds)
+        imagined = _imagined(pulses, pixel, span_s, kinds)
+        once = _separation(problem, first, second, imagined, REPEATS) / REPEATS
+        repeats = max(REPEATS, ceil(min(ENOUGH / max(once, 1e-9), MOST)))
+        separation = _separation(problem, first, second, imagined, repeats)
+        seconds = repeats * (span_s + SETUP_S)
+        if separation < ENOUGH / 2 or (best is not None and seconds >= best.seconds):
+            continue
+        signals = tuple(SIGNALS[kind] for kind in kinds)
+        text = f"{why}, {repeats} times, pixel {pixel} looked at: {labels[0]} and {labels[1]} differ there"
+        best = NextExperiment(text, pulses, pixel, repeats, signals, separation, seconds)
     return best
 
 
@@ -73,7 +81,7 @@ def _imagined(pulses: FloatArray, pixel: int, span_s: float, kinds: tuple[int, .
     return Dataset((info,), blocks, ((scene, places),), (alike,), np.zeros(SAMPLES * len(kinds)))
 
 
-def _separation(problem: Problem, first: Fit, second: Fit, data: Dataset) -> float:
+def _separation(problem: Problem, first: Fit, second: Fit, data: Dataset, repeats: int) -> float:
     """χ² between both predictions, what either could still be moved by taken out."""
     here = predict(data, first.point, problem.epsilon)
     there = predict(data, second.point, problem.epsilon)
@@ -82,7 +90,7 @@ def _separation(problem: Problem, first: Fit, second: Fit, data: Dataset) -> flo
     own = slopes(imagined, first.point, first.free, here)
     other = slopes(imagined, second.point, second.free, there)
     columns = np.column_stack([own, other, here - there])
-    gram = REPEATS * normal(data, columns, problem.noise, shared.power, shared.timing).total()
+    gram = repeats * normal(data, columns, problem.noise, shared.power, shared.timing).total()
     count = columns.shape[1] - 1
     known = np.zeros((count, count))
     width = own.shape[1]

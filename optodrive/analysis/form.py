@@ -1,8 +1,8 @@
 """The same cause in another form than its term's: how its effect may bend before another cause is looked for.
 
-A droop need not follow the power, wear need not be even, a rise need not be exponential. What a fitted cause leaves is
-first compared with its own effect, growing or fading with power, with dose and over the session, and with its term at
-other times.
+A droop need not follow the power, wear need not be even, a rise need not be exponential, an emissivity may grow with the
+temperature. What a fitted cause leaves is first compared with its own effect, growing or fading with power, with heat,
+with dose and over the session, with its term at other times, and with the term's other sides.
 """
 
 from collections.abc import Sequence
@@ -15,10 +15,14 @@ from optodrive.analysis.predict import Point, predict
 from optodrive.flow import FloatArray
 
 
-def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis]) -> FloatArray:
-    """[m, k] columns beside a fit that has these hypotheses in it."""
+def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis], known: Sequence[Hypothesis]) -> FloatArray:
+    """[m, k] columns beside a fit that has these hypotheses, of all those known, in it."""
     data, terms = problem.data, fitted.point.terms
-    power, dose, session = (np.zeros(len(data.value)) for _ in range(3))
+    power, dose, session, heat = (np.zeros(len(data.value)) for _ in range(4))
+    for block in data.blocks:
+        own = fitted.prediction[block.part]
+        most = max(float(np.ptp(fitted.prediction[item.part])) for item in data.blocks if item.kind == block.kind)
+        heat[block.part] = (own - own.min()) / max(most, 1e-300)
     for scene, places in data.scenes:
         for place in places:
             if place >= 0:
@@ -30,7 +34,12 @@ def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis]) -> Flo
     for item in hypotheses:
         others = {key: own for key, own in terms.items() if key != item.key}
         effect = fitted.prediction - predict(data, Point(fitted.point.base, others), problem.epsilon)
-        columns += [effect * power, effect * dose, effect * session]
+        columns += [effect * power, effect * dose, effect * session, effect * heat]
+        for side in known:
+            if side.key == item.key and side.label != item.label:
+                sizes = {free.names[0]: side.starts[0][free.names[0]] for free in side.free}
+                there = Point(fitted.point.base, {**terms, item.key: {**terms[item.key], **sizes}})
+                columns.append(predict(data, there, problem.epsilon) - fitted.prediction)
         for start in () if item.linear or item.every else item.starts:
             there = Point(fitted.point.base, {**others, item.key: start})
             columns.append(predict(data, there, problem.epsilon) - fitted.prediction)

@@ -29,7 +29,8 @@ No more, or a rival that only imitates the best one with a number more, which co
 """
 SAME = 9.0
 """Predictions that differ by less χ² than this are one prediction."""
-EXPLAINED = 0.9
+EXPLAINED, MAINLY = 0.9, 0.5
+"""A cause is named for so much of the excess; for less, if other forms of it take the rest."""
 FORM = 0.985
 """A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
 NEAREST, AGAIN = 6, 6
@@ -108,9 +109,9 @@ def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick
     alone = _explained(rest, base, best)
     if not alarmed(rest) and alone >= EXPLAINED:
         return _named(problem, singles, first, rest, alone)
-    shape = bent(problem, best.fit, best.hypotheses)
+    shape = bent(problem, best.fit, best.hypotheses, known)
     formed = detect(problem, best.fit, others, seed, shape)
-    if not alarmed(formed) and alone >= EXPLAINED:
+    if not alarmed(formed) and alone >= MAINLY and max(alone, _explained(formed, base, best)) >= EXPLAINED:
         return _named(problem, singles, first, rest, alone)
     price = rest.left - formed.left - shape.shape[1] * np.log(len(problem.data.value))
     found = _pairs(problem, base, known, singles, rest, seed, tick)
@@ -125,7 +126,7 @@ def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick
         if not alarmed(after) or (together >= FORM > alone):
             return _named(problem, pairs, first, after, together)
         if together >= EXPLAINED and not alarmed(
-            detect(problem, both.fit, others, seed, bent(problem, both.fit, both.hypotheses))
+            detect(problem, both.fit, others, seed, bent(problem, both.fit, both.hypotheses, known))
         ):
             return _named(problem, pairs, first, after, together)
     # Where only one cause is known at all, no other can be taken for it.

@@ -70,6 +70,8 @@ def story(found: Discrepancy) -> list[str]:
         unseen = [item.label for item in found.candidates if item.verdict == "this data cannot show it"]
         if unseen:
             lines.append(f"This data cannot show: {', '.join(unseen)}.")
+    if found.verdict == "ambiguous" and found.next_experiment is None:
+        lines.append("No pulse or train on a pixel, repeated up to 30 times, would tell them apart at this noise.")
     if found.next_experiment is not None:
         ask = found.next_experiment
         lines += [

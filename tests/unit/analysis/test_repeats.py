@@ -10,7 +10,8 @@ from optodrive.analysis import select
 from optodrive.analysis.causes import Free
 from optodrive.analysis.dataset import dataset
 from optodrive.analysis.detect import SURE, _surprise
-from optodrive.analysis.fit import Fit, jitter
+from optodrive.analysis.experiment import next_experiment
+from optodrive.analysis.fit import Fit, fit, jitter
 from optodrive.analysis.form import bent
 from optodrive.analysis.gain import split
 from optodrive.analysis.noise import Coloured
@@ -120,7 +121,7 @@ def test_a_droop_that_does_not_follow_the_power_is_still_a_droop():
 
 def test_no_cause_has_no_other_form():
     problem, base = prepare(dataset(lab(25, {}, ("short", "strong"))))
-    assert bent(problem, base, ()).shape == (len(problem.data.value), 0)
+    assert bent(problem, base, (), ()).shape == (len(problem.data.value), 0)
 
 
 def test_what_only_the_runs_held_out_show_is_not_overlooked():
@@ -163,3 +164,24 @@ def test_the_experiment_says_which_pixel_and_no_size_is_said_twice(hopping):
     twice = tuple(CandidateCause("gas_leak", "gas_leak", 1.0, 1.0, None, "", size) for size in ("rate 1", "rate 2"))
     lines = story(replace(hopping, verdict="none", candidates=twice))
     assert [line for line in lines if "gas_leak" in line] == ["- gas_leak: rate 1"]
+
+
+def rivals_of(runs, near, far):
+    """Two models beside one quiet recording, as candidates that fit it alike."""
+    problem, base = prepare(dataset(runs))
+    fits = []
+    for terms in (near, far):
+        point, key = Point(base.point.base, terms), next(iter(terms))
+        free = tuple(Free(key, (name,)) for name in terms[key])
+        fits.append(fit(problem, point, free, iterations=1))
+    return next_experiment(problem, *fits, ("the one", "the other"))
+
+
+def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_must():
+    quiet = lab(27, {}, ("short", "strong"))
+    alike = rivals_of(quiet, {"gas_leak": {"rate": 0.1}}, {"gas_leak": {"rate": 0.1001}})
+    assert alike is None
+    told = rivals_of(quiet, {"gas_leak": {"rate": 0.02}}, {"wall_heating": {"resistance": 6.0, "capacity": 0.05}})
+    assert told.separation >= 12.0
+    assert 3 <= told.repeats <= 30
+    assert f"{told.repeats} times" in told.why
