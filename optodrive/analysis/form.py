@@ -1,8 +1,8 @@
 """The same cause in another form than its term's: how its effect may bend before another cause is looked for.
 
-A droop need not follow the power, wear need not be even, a rise need not be exponential, an emissivity may grow with the
-temperature. What a fitted cause leaves is first compared with its own effect, growing or fading with power, with heat,
-with dose and over the session, with its term at other times, and with the term's other sides.
+A droop need not follow the power, wear need not be even, a rise need not be exponential, an emissivity may grow with
+the temperature. What a fitted cause leaves is first compared with its own effect, growing or fading with power, with
+heat, with dose and over the session, with its term at other times, and with the term's other sides.
 """
 
 from collections.abc import Sequence
