@@ -185,7 +185,13 @@ def prepare(
     "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
     """
     check_reach(display, sequence)
-    scheduler = Scheduler(display.machine, sequence, train_piece=1 if policy == "delay" else TRAIN_PIECE)
+    done = 0.0
+
+    def tick() -> None:
+        if progress is not None:
+            progress(done)
+
+    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick)
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
     delays: list[Delay] = []
@@ -204,14 +210,14 @@ def prepare(
         if shortfall is None and passed.trimmed_j.any():
             shortfall = _shortfall(piece, passed, state, display.budget)
         state = after
-        working.pulses(passed.pixel, passed.start_s, passed.width_s, passed.power_w)
+        working.pulses(passed.pixel, passed.start_s, passed.width_s, passed.power_w, tick)
         limited.append(passed)
-        if progress is not None:
-            progress(_share_done(sequence, passed))
+        done = _share_done(sequence, passed)
+        tick()
         piece = next(pieces, None)
     plan = joined(limited, state, display.budget)
     after_heat = heat.copy()
-    predicted_m = after_heat.pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w).displacement_m
+    predicted_m = after_heat.pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, tick).displacement_m
     lead_s = scheduler.lead_us * 1e-6
     prepared = Prepared(
         sequence=sequence,

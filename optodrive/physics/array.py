@@ -1,5 +1,6 @@
 """A whole display, event by event: each pixel is advanced only when something is asked of it."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,10 @@ from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 TIME_ROUNDING_S = 1e-9
+
+
+def nothing() -> None:
+    """Done while something takes its time, where nobody asked for more."""
 
 
 class Peaks(NamedTuple):
@@ -75,9 +80,17 @@ class DisplayHeat:
         """Light a pixel from start_s for width_s at the mean incident power power_w."""
         self.pulses(np.array([pixel]), np.array([start_s]), np.array([width_s]), np.array([power_w]))
 
-    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> Peaks:
+    def pulses(
+        self,
+        pixel: IntArray,
+        start_s: FloatArray,
+        width_s: FloatArray,
+        power_w: FloatArray,
+        tick: Callable[[], None] = nothing,
+    ) -> Peaks:
         """Light pixels one after the other; all [n], pulses of a pixel in order of time, power the mean incident one.
 
+        tick is not needed here: a million pulses take a fifth of a second.
         ValueError for a pulse that starts before its pixel's last event; those before it have been.
         """
         columns = kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)

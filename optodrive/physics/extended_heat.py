@@ -3,14 +3,14 @@
 The terms are taken as a recording left them: ageing at the whole of its dose, a drifting room where it is stated.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray, IntArray, PixelTrace
 from optodrive.neighbours import Neighbours
-from optodrive.physics.array import TIME_ROUNDING_S, Peaks, kernel_columns
+from optodrive.physics.array import TIME_ROUNDING_S, Peaks, kernel_columns, nothing
 from optodrive.physics.chains import STATES
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.forward import Active, Scene, observe, outputs, sample, step, step_s
@@ -35,6 +35,8 @@ DISPLACEMENT = 1
 SETTLED_SHARE, SETTLED = 0.7, 8.0
 """In the dark a membrane below this share of its largest displacement so many gas time constants later is past it."""
 AT_REST_K = 1e-6
+PIECE = 128
+"""Pulses or pixels between two ticks: a tenth of a second on a slow machine."""
 CLOSE = 1e-5
 """A peak this close to its target, relative, is there."""
 
@@ -77,18 +79,33 @@ class ExtendedHeat:
         twin._dark_s, twin._states = self._dark_s.copy(), self._states.copy()
         return twin
 
-    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> Peaks:
+    def pulses(
+        self,
+        pixel: IntArray,
+        start_s: FloatArray,
+        width_s: FloatArray,
+        power_w: FloatArray,
+        tick: Callable[[], None] = nothing,
+    ) -> Peaks:
         """Light pixels one after the other; all [n], pulses in order of time, power the mean incident one.
 
-        ValueError for a pulse that starts before its pixel's last event, or that of one beside it where they exchange
-        heat; those before it have been.
+        tick is called again and again meanwhile. ValueError for a pulse that starts before its pixel's last event, or
+        that of one beside it where they exchange heat; those before it have been.
         """
         columns = kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
         peaks = Peaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
         display = (self._columns, self._at_s, self._dark_s, self._states, self._beside)
-        done = _walk(*display, self._active, self._context, *columns, *peaks)
-        if done < len(pixel):
-            raise self._too_early(int(pixel[done]), float(start_s[done]))
+        last = np.full(len(self.pixels), -1)
+        for begin in range(0, len(pixel), PIECE):
+            end = min(begin + PIECE, len(pixel))
+            done = _walk(*display, self._active, self._context, *columns, *peaks, last, begin, end)
+            if done < end:
+                raise self._too_early(int(pixel[done]), float(start_s[done]))
+            tick()
+        for begin in range(0, len(self.pixels), PIECE):
+            end = min(begin + PIECE, len(self.pixels))
+            _glow(self._columns, self._states, self._active, self._context, last, begin, end, peaks.displacement_m)
+            tick()
         return peaks
 
     def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
@@ -237,15 +254,18 @@ def _walk(
     power_w: FloatArray,
     peak_m: FloatArray,
     peak_k: FloatArray,
+    last: IntArray,
+    begin: int,
+    end: int,
 ) -> int:
-    """Heat by the pulses [n], fill in their peaks [n]; the number of pulses that did not come too early.
+    """Heat by the pulses begin to end, fill in their peaks [n]; the first that came too early, or end.
 
     columns: [p, 6] the fields of `Pixel`; at_s, dark_s, states: [p], [p], [p, STATES] the last event, how long it had
-    been dark before it, and the states then; beside: [p, k] pixels that feel this one's light, −1 for none.
+    been dark before it, and the states then; beside: [p, k] pixels that feel this one's light, −1 for none;
+    last: [p] each pixel's last pulse so far, −1 for none.
     """
-    last = np.full(len(at_s), -1)
     room, c = np.zeros((8, states.shape[1])), context.copy()
-    for row in range(len(pixel)):
+    for row in range(begin, end):
         for side in range(-1, beside.shape[1]):
             i = pixel[row] if side < 0 else beside[pixel[row], side]
             if i >= 0 and start_s[row] - at_s[i] < -TIME_ROUNDING_S:
@@ -271,13 +291,28 @@ def _walk(
                 peak_m[last[i]] = max(peak_m[last[i]], lit_m)
             states[i] = room[0]
             at_s[i], dark_s[i] = start_s[row] + width_s[row], 0.0
-    for i in range(len(at_s)):
+    return end
+
+
+@kernel
+def _glow(
+    columns: FloatArray,
+    states: FloatArray,
+    active: Active,
+    context: FloatArray,
+    last: IntArray,
+    begin: int,
+    end: int,
+    peak_m: FloatArray,
+) -> None:
+    """What the last pulses of the pixels begin to end still bring in the dark after them."""
+    room, c = np.zeros((8, states.shape[1])), context.copy()
+    for i in range(begin, end):
         if last[i] >= 0:
             room[0] = states[i]
             c[PIXEL], c[MINE] = i, 1.0
             glow_m = _afterglow_m(_one(columns, i), active, c, room, 0.0, np.inf)
             peak_m[last[i]] = max(peak_m[last[i]], glow_m)
-    return len(pixel)
 
 
 @kernel

@@ -1,11 +1,12 @@
 """The heat of a display, as planner, daemon and simulation see it: of nominal pixels, or of pixels with terms."""
 
+from collections.abc import Callable
 from typing import Protocol, Self
 
 from optodrive.config import Config
 from optodrive.flow import FloatArray, IntArray, PixelTrace
 from optodrive.neighbours import Neighbours
-from optodrive.physics.array import DisplayHeat, Peaks
+from optodrive.physics.array import DisplayHeat, Peaks, nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels
 from optodrive.units import ZERO_CELSIUS_K
@@ -22,8 +23,15 @@ class Heat(Protocol):
     def shifted(self, offset_s: float) -> Self:
         """A copy on a time line whose zero lies offset_s earlier."""
 
-    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> Peaks:
-        """Light pixels one after the other, all [n]; what each pulse brings its pixel to."""
+    def pulses(
+        self,
+        pixel: IntArray,
+        start_s: FloatArray,
+        width_s: FloatArray,
+        power_w: FloatArray,
+        tick: Callable[[], None] = nothing,
+    ) -> Peaks:
+        """Light pixels one after the other, all [n]; what each pulse brings its pixel to. tick: called meanwhile."""
 
     def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
         """PWM periods and duty of the shortest pulse whose peak is target_m; None where none is needed."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from optodrive.config import PixelLayout
 from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
+from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
 from optodrive.plan.field import IdealField
@@ -19,6 +20,9 @@ from optodrive.plan.order import serpentine
 
 TRAIN_PIECE = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
+
+TICK = 16
+"""Pulses of a frame between two ticks."""
 
 Pieces = Generator[PulsePlan, int | None, None]
 """Yields pieces of a plan; takes how much later, µs, the last one must come, or None where it may stay."""
@@ -77,14 +81,22 @@ class _Cursor:
 class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
+    tick: called again and again while a frame is planned.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
     skipped: pixels that needed no pulse, so far.
     """
 
-    def __init__(self, machine: Machine, sequence: FrameSequence, train_piece: int = TRAIN_PIECE) -> None:
+    def __init__(
+        self,
+        machine: Machine,
+        sequence: FrameSequence,
+        train_piece: int = TRAIN_PIECE,
+        tick: Callable[[], None] = nothing,
+    ) -> None:
         self._machine = machine
         self._sequence = sequence
         self._train_piece = train_piece
+        self._tick = tick
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = _train_pulses(sequence.trains, len(sequence.frames))
@@ -182,6 +194,8 @@ class Scheduler:
             pixel = order[now.place]
             target_m = float(frame.target_m[pixel])
             start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel))
+            if now.place % TICK == 0:
+                self._tick()
             pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
             if pulse is None:
                 self.skipped.append(Skipped(source, pixel, target_m))

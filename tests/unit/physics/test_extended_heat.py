@@ -5,6 +5,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.neighbours import Neighbours
+from optodrive.physics import extended_heat
 from optodrive.physics.array import DisplayHeat
 from optodrive.physics.chains import TERMS
 from optodrive.physics.drive import DriveRange
@@ -166,3 +167,13 @@ def test_traces_are_taken_from_rest_and_show_every_pixel_asked_for():
     heat.pulses(*columns)
     with pytest.raises(ValueError, match="from rest"):
         heat.traces(pulses, [5], t_s)
+
+
+def test_it_ticks_while_it_works_and_pieces_change_nothing(monkeypatch):
+    columns, ticks = some_pulses(8, count=300), []
+    whole = extended("gas_leak").pulses(*columns)
+    monkeypatch.setattr(extended_heat, "PIECE", 7)
+    pieces = extended("gas_leak").pulses(*columns, lambda: ticks.append(1))
+    assert len(ticks) == 43 + 3
+    assert pieces.displacement_m.tolist() == whole.displacement_m.tolist()
+    assert pieces.absorber_k.tolist() == whole.absorber_k.tolist()
