@@ -64,7 +64,7 @@ def detect(
     shared = jitter(data, base.point, problem.epsilon, base.prediction)
     known = slopes(problem, base.point, base.free, base.prediction)
     if beside is not None:
-        known = np.column_stack([known, beside])
+        known = np.column_stack([known, beside / np.abs(beside).max(axis=0, initial=1e-300)])
     trials = [(item, start) for item in found for start in _tried(item)]
     terms = [{**base.point.terms, item.key: start} for item, start in trials]
     extra = [predict(data, Point(base.point.base, own), problem.epsilon) - base.prediction for own in terms]

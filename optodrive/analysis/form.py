@@ -10,9 +10,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from optodrive.analysis.causes import Hypothesis
-from optodrive.analysis.fit import Fit, Problem
+from optodrive.analysis.fit import Fit, Problem, jitter, slopes
+from optodrive.analysis.normal import normal, solve
 from optodrive.analysis.predict import Point, predict
 from optodrive.flow import FloatArray
+
+WEAK = 0.02
+"""Less power than this share of the full one counts as this."""
+BENT = 0.3
+"""Standard deviation of how much of a cause's effect takes another form."""
 
 
 def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis], known: Sequence[Hypothesis]) -> FloatArray:
@@ -34,7 +40,7 @@ def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis], known:
     for item in hypotheses:
         others = {key: own for key, own in terms.items() if key != item.key}
         effect = fitted.prediction - predict(data, Point(fitted.point.base, others), problem.epsilon)
-        columns += [effect * power, effect * dose, effect * session, effect * heat]
+        columns += [effect * power, effect / np.maximum(power, WEAK), effect * dose, effect * session, effect * heat]
         for side in known:
             if side.key == item.key and side.label != item.label:
                 sizes = {free.names[0]: side.starts[0][free.names[0]] for free in side.free}
@@ -43,5 +49,24 @@ def bent(problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis], known:
         for start in () if item.linear or item.every else item.starts:
             there = Point(fitted.point.base, {**others, item.key: start})
             columns.append(predict(data, there, problem.epsilon) - fitted.prediction)
-    seen = [column / np.abs(column).max() for column in columns if np.abs(column).max(initial=0.0) > 0.0]
+    seen = [column for column in columns if np.abs(column).max(initial=0.0) > 0.0]
     return np.stack(seen, axis=1) if seen else np.zeros((len(data.value), 0))
+
+
+def covariance(
+    problem: Problem, fitted: Fit, hypotheses: Sequence[Hypothesis], known: Sequence[Hypothesis]
+) -> FloatArray:
+    """[k, k] of a fit's numbers where each cause may also act in other forms, by `BENT` of its effect."""
+    shape = bent(problem, fitted, hypotheses, known)
+    if not shape.shape[1]:
+        return fitted.covariance
+    data = problem.data
+    shared = jitter(data, fitted.point, problem.epsilon, fitted.prediction)
+    own = slopes(problem, fitted.point, fitted.free, fitted.prediction)
+    count, forms = own.shape[1], shape.shape[1]
+    total = normal(data, np.hstack([own, shape]), problem.noise, shared.power, shared.timing).total()
+    base = len(problem.prior.sigma)
+    weights = np.concatenate(
+        [1.0 / np.square(problem.prior.sigma), np.zeros(count - base), np.full(forms, 1.0 / BENT**2)]
+    )
+    return solve(total + np.diag(weights), np.eye(count + forms))[:count, :count]

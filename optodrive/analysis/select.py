@@ -16,7 +16,7 @@ ALPHA = 0.001
 """Level of the whole family. False alarms are to stay below 1 %, and the noise model is itself an estimate."""
 UNEVEN = 6.0
 """Repeats that differ by more than this do not repeat one experiment."""
-UNSTEADY = 10.0
+UNSTEADY = 25.0
 """Likewise, as if the power changed within pulses."""
 HOPELESS = 300.0
 """A fit that does not promise to come within so much χ² of the best one is given up."""

@@ -14,12 +14,13 @@ from optodrive.analysis.dataset import SIGNALS, Dataset, dataset
 from optodrive.analysis.detect import Score, sureness
 from optodrive.analysis.experiment import next_experiment
 from optodrive.analysis.fit import Fit, Prior, Problem, fit
+from optodrive.analysis.form import covariance
 from optodrive.analysis.gain import heldout, split
 from optodrive.analysis.predict import BASE, UNITS, predict
 from optodrive.analysis.prepare import BROAD, EPSILON, prepare, with_noise
 from optodrive.analysis.select import ALIKE, UNEVEN, UNSTEADY, Candidate, Verdict, leading, select, unrepeated
 from optodrive.analysis.unsteady import unsteadiness
-from optodrive.flow import CandidateCause, Course, Discrepancy, Estimate, Gain, Measurement, NextExperiment
+from optodrive.flow import CandidateCause, Course, Discrepancy, Estimate, FloatArray, Gain, Measurement, NextExperiment
 
 VISIBLE = 30.0
 """A likelihood ratio that is found nine times in ten."""
@@ -32,7 +33,7 @@ Tick = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class _Half:
-    """Pixels or mirrors: everything found about them."""
+    """Pixels or mirrors: everything found about them. covariance: of the final numbers, other forms allowed."""
 
     data: Dataset
     held: Dataset
@@ -40,6 +41,7 @@ class _Half:
     base: Fit
     verdict: Verdict
     final: Fit
+    covariance: FloatArray
     gain: Gain | None
     candidates: tuple[CandidateCause, ...]
     ask: NextExperiment | None
@@ -137,7 +139,9 @@ def _study(
             if wider.chosen is not None:
                 final = wider.chosen.fit
     ask = _asked(problem, verdict, tick)
-    return _Half(data, held, problem, base, verdict, final, gain, _candidates(verdict, gains), ask)
+    named = () if verdict.chosen is None else verdict.chosen.hypotheses
+    unsure = covariance(everything, final, named, known)
+    return _Half(data, held, problem, base, verdict, final, unsure, gain, _candidates(verdict, gains), ask)
 
 
 def _late_s(halves: list[_Half]) -> float:
@@ -163,7 +167,7 @@ def _joined(halves: list[_Half]) -> tuple[str, tuple[str, ...]]:
 
 def _estimates(half: _Half) -> dict[str, Estimate]:
     final = half.final
-    sigma = np.sqrt(np.maximum(np.diag(final.covariance), 0.0))
+    sigma = np.sqrt(np.maximum(np.diag(half.covariance), 0.0))
     out: dict[str, Estimate] = {}
     reach = float(student.ppf(0.975, sureness(half.data)))
     if any(kind < 3 for kind in half.data.kinds()):

@@ -19,6 +19,9 @@ from optodrive.physics.pixel import Pixel
 SLICE_S = 0.012
 """About a thermal time: what is quicker is smoothed, what is slower spans several slices."""
 
+ANY_POWER = 1.0
+"""A run as a whole may have any power here: wear and drift between repeats are no unsteadiness."""
+
 
 def unsteadiness(problem: Problem, base: Fit) -> float:
     """Score of a variance of the slices' powers beside the noise model, in its own σ."""
@@ -37,7 +40,7 @@ def unsteadiness(problem: Problem, base: Fit) -> float:
         size = 2 + len(PIXEL_KINDS)
         gram = np.zeros((count + size, count + size))
         for item in own:
-            sigma = np.array([noise.power, noise.timing_s, noise.baseline[item.kind]])
+            sigma = np.array([ANY_POWER, noise.timing_s, noise.baseline[item.kind]])
             light = _responses(scenes[item.block], slices, item, pixel)
             columns = np.column_stack([item.value, light, item.jitter * sigma])
             whitened, _ = whiten(item.t_s, columns, noise.coloured[item.kind])
