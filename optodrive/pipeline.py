@@ -20,6 +20,7 @@ from optodrive.physics.heat import Heat, heat_at_rest
 from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels, load_parameters
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
+from optodrive.plan.order import warm as warm_order
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
 
@@ -145,6 +146,7 @@ def chosen(policy: Policy, strict: bool) -> Policy:
 
 def warm_up(display: Display) -> None:
     """Plan a frame and a pulse for nobody, so that every kernel is compiled and loaded."""
+    warm_order()
     laser, target_m = display.config.laser, np.zeros(len(display.pixels))
     target_m[0] = 1e-6
     pulse = PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)

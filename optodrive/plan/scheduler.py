@@ -16,7 +16,7 @@ from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
-from optodrive.plan.order import serpentine
+from optodrive.plan.order import visiting_order
 
 TRAIN_PIECE = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
@@ -141,9 +141,10 @@ class Scheduler:
         )
 
     def _order(self, frame: TactileFrame) -> list[int]:
-        layout = self._machine.layout
-        order = serpentine(np.flatnonzero(frame.target_m > 0), layout.row, layout.column)
-        return [int(pixel) for pixel in order]
+        layout, driven = self._machine.layout, np.flatnonzero(frame.target_m > 0)
+        mirrors = np.array(self._x_rad), np.array(self._y_rad)
+        order: list[int] = visiting_order(driven, layout.row, layout.column, *mirrors, self._now.lit).tolist()
+        return order
 
     def _place(self, pixel: int, width_us: int, power_w: float, wanted_us: int, target_m: float, source: int) -> _Row:
         now = self._now
