@@ -17,7 +17,7 @@ from optodrive.flow import FloatArray
 
 WEAK = 0.02
 """Less power than this share of the full one counts as this."""
-BENT = 0.3
+BENT = 0.2
 """Standard deviation of how much of a cause's effect takes another form."""
 
 
@@ -60,7 +60,11 @@ def covariance(
     shape = bent(problem, fitted, hypotheses, known)
     if not shape.shape[1]:
         return fitted.covariance
-    data = problem.data
+    data, point = problem.data, fitted.point
+    bare = {key: own for key, own in point.terms.items() if key not in {item.key for item in hypotheses}}
+    effect = fitted.prediction - predict(data, Point(point.base, bare), problem.epsilon)
+    # How large the effect is, is the number itself: another form is what differs from that.
+    shape = shape - np.outer(effect, effect @ shape / max(float(effect @ effect), 1e-300))
     shared = jitter(data, fitted.point, problem.epsilon, fitted.prediction)
     own = slopes(problem, fitted.point, fitted.free, fitted.prediction)
     count, forms = own.shape[1], shape.shape[1]

@@ -78,7 +78,7 @@ def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: 
     generator = np.random.default_rng(seed)
     both = np.stack([binned_before, binned_after])[:, binned_before[:, 1] > 0]
     count = both.shape[1]
-    drawn = [_reduction(both[:, generator.integers(0, count, count)]) for _ in range(DRAWS)]
+    drawn = [max(-1.0, _reduction(both[:, generator.integers(0, count, count)])) for _ in range(DRAWS)]
     low, high = np.quantile(drawn, [0.025, 0.975])
     names = [SIGNALS[kind] for kind in kinds]
     columns = [dict(zip(names, rmse[:, column].tolist(), strict=True)) for column in range(3)]

@@ -173,19 +173,20 @@ def _refitted(
 
 
 def _settled(problem: Problem, base: Fit, item: Hypothesis, free: Sequence[Free]) -> Fit:
-    """The best of fits from the nearest starts, each done again until it stays.
+    """The best place that fits from the nearest starts come to, each begun again where it ended until it stays.
 
-    Jitters act along the slopes of where a fit began: only one that began where it ended has them right.
+    Jitters act along the slopes of where a fit began: a place is judged by a fit that begins there.
     """
     found: list[Fit] = []
     for point in _nearest(problem, base, item):
-        result = fit(problem, point, free)
         for _ in range(AGAIN):
-            before, result = result, fit(problem, result.point, free)
-            if abs(before.chi2 - result.chi2) < 1.0:
-                found.append(result)
+            came = fit(problem, point, free)
+            there = fit(problem, came.point, free, iterations=1)
+            found.append(there)
+            if abs(there.chi2 - came.chi2) < 1.0:
                 break
-    return min(found, key=lambda one: one.chi2) if found else result
+            point = there.point
+    return min(found, key=lambda one: one.chi2)
 
 
 def _nearest(problem: Problem, base: Fit, item: Hypothesis) -> list[Point]:

@@ -10,7 +10,7 @@ from scipy.stats import chi2 as chi_squared
 from scipy.stats import t as student
 
 from optodrive.analysis.causes import Free, Hypothesis, hypotheses
-from optodrive.analysis.dataset import SIGNALS, Dataset, dataset
+from optodrive.analysis.dataset import MIRROR_KINDS, SIGNALS, Dataset, dataset
 from optodrive.analysis.detect import Score, sureness
 from optodrive.analysis.experiment import next_experiment
 from optodrive.analysis.fit import Fit, Prior, Problem, fit
@@ -131,6 +131,9 @@ def _study(
     gain = None if chosen is None else heldout(problem, held, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
     final = fit(everything, start.point, start.free, iterations=6)
+    if all(kind in MIRROR_KINDS for kind in data.kinds()):  # jitters may lead astray: each place by its own slopes
+        places = (start.point, final.point)
+        final = min((fit(everything, place, start.free, iterations=1) for place in places), key=lambda one: one.chi2)
     if verdict.verdict == "none" and held_runs:
         # What only the hottest runs show is seen with them alone: nothing is held out then.
         wider = select(everything, final, known, seed, tick)
@@ -178,6 +181,7 @@ def _estimates(half: _Half) -> dict[str, Estimate]:
         number, width = free.read(final.point.terms), reach * float(min(sigma[row], 50.0))
         ends = (number - width, number + width)
         value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
+        low, high = max(low, free.parameter.low), min(high, free.parameter.high)
         for name in free.names:
             out[f"{free.key}.{name}"] = Estimate(value, free.parameter.unit, low, high)
     return out
