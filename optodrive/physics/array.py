@@ -173,7 +173,7 @@ def _walk(
     last = np.full(len(at_s), -1)
     for row in range(len(pixel)):
         i = pixel[row]
-        one = _parameters(columns, i)
+        one = one_pixel(columns, i)
         dark_s = start_s[row] - at_s[i]
         if dark_s < -TIME_ROUNDING_S:
             return row
@@ -189,14 +189,15 @@ def _walk(
         last[i] = row
     for i in range(len(at_s)):
         if last[i] >= 0:
-            one = _parameters(columns, i)
+            one = one_pixel(columns, i)
             glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
             peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
     return len(pixel)
 
 
 @kernel
-def _parameters(columns: FloatArray, i: int) -> Pixel:
+def one_pixel(columns: FloatArray, i: int) -> Pixel:
+    """A row of [p, 6], the fields of `Pixel`."""
     one = columns[i]
     return Pixel(one[0], one[1], one[2], one[3], one[4], one[5])
 
