@@ -127,6 +127,7 @@ def dataset(measurement: Measurement) -> Dataset:
     span = max(float(clock.max() - clock.min()), 1e-9)
     full_w = max([FULL_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
     total_j, before_j = _doses(runs, order)
+    whole_j = max([1e-12, *total_j.values()])  # a joule wears one pixel as it wears another
     blocks: list[Block] = []
     scenes: list[tuple[Scene, tuple[int, int, int]]] = []
     values: list[FloatArray] = []
@@ -155,8 +156,8 @@ def dataset(measurement: Measurement) -> Dataset:
                 pixel=pixel,
                 ambient_k=run.ambient_k,
                 t_s=(times[0], times[1], times[2]),
-                dose_before=before_j[number].get(pixel, 0.0) / max(total_j.get(pixel, 0.0), 1e-12),
-                dose_per_j=1.0 / max(total_j.get(pixel, 0.0), 1e-12),
+                dose_before=before_j[number].get(pixel, 0.0) / whole_j,
+                dose_per_j=1.0 / whole_j,
                 session=float(2.0 * (clock[number] - clock.min()) / span - 1.0),
                 session_per_s=2.0 / span if timed else 0.0,
                 full_w=full_w,

@@ -54,8 +54,9 @@ class Scene:
     """One run as seen from one pixel.
 
     pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam; t_s: samples of temperature, displacement
-    and force, increasing; dose_before: of the recording's whole dose, what earlier runs took; dose_per_j; session,
-    session_per_s: the run's time in the session, −1 to 1; full_w: the laser's full power
+    and force, increasing; dose_before: what earlier runs gave this pixel, as a share of the most that any pixel had in
+    the recording; dose_per_j; session, session_per_s: the run's time in the session, −1 to 1; full_w: the laser's full
+    power
     """
 
     pulses: FloatArray
@@ -280,7 +281,7 @@ def _run(
             index[0] = _fill(pixel, active, c, room, now_s, h_s, t_s[0], late_s[0], span, 0, index[0], out[0])
             index[1] = _fill(pixel, active, c, room, now_s, h_s, t_s[1], late_s[1], span, 1, index[1], out[1])
             index[2] = _fill(pixel, active, c, room, now_s, h_s, t_s[2], late_s[2], span, 2, index[2], out[2])
-            dose += c[POWER_W] * h_s * span[1]
+            dose += c[MINE] * c[POWER_W] * h_s * span[1]
             fresh = False
             for state in active.rows:
                 room[0, state], room[1, state] = room[2, state], room[3, state]
