@@ -52,7 +52,7 @@ def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: 
     """Both models on held-out runs; None where there are none, or where they show nothing of what is wrong.
 
     The reduction is of residuals averaged over repeats in bins of time: what a model misses is far below the noise of
-    one sample.
+    one sample. Its interval is cut at −1: draws of groups that hardly show the effect give any number.
     """
     if not len(data.value):
         return None

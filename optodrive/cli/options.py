@@ -31,6 +31,13 @@ PolicyOption = Annotated[
 DEFAULT_URL = "http://127.0.0.1:8450"
 
 
+def model_file(path: Path) -> Path:
+    """The file itself; InputError for another kind, which would be taken for the name of a shipped set."""
+    if path.suffix != ".toml":
+        raise InputError("--model", str(path), "a .toml file")
+    return path
+
+
 def configured(config: str | None, model: Path | None) -> "Config":
     """The configuration, its pixels following the model where one is given; InputError with one line."""
     from optodrive.config import load_config
@@ -38,9 +45,7 @@ def configured(config: str | None, model: Path | None) -> "Config":
     loaded = load_config(config)
     if model is None:
         return loaded
-    if model.suffix != ".toml":
-        raise InputError("--model", str(model), "a .toml file")
-    section = loaded.pixel_model.model_copy(update={"parameters": str(model)})
+    section = loaded.pixel_model.model_copy(update={"parameters": str(model_file(model))})
     return loaded.model_copy(update={"pixel_model": section})
 
 

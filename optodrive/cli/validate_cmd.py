@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import JsonOption
+from optodrive.cli.options import JsonOption, model_file
 from optodrive.errors import InputError
 
 
@@ -29,8 +29,6 @@ def validate(
     """Hold the models against every fact of the paper they can speak to."""
     if diagnose and model is not None:
         raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose begins from Text S1")
-    if model is not None and model.suffix != ".toml":
-        raise InputError("--model", str(model), "a .toml file")
     if diagnose:
         from optodrive.cli.validate_diagnose import diagnose as tell
 
@@ -38,4 +36,4 @@ def validate(
         return
     from optodrive.cli.validate import validate as print_table
 
-    print_table(json, model)
+    print_table(json, None if model is None else model_file(model))

@@ -106,9 +106,15 @@ class ExtendedHeat:
         """
         if at_s < self._at_s[pixel] - TIME_ROUNDING_S:
             raise self._too_early(pixel, at_s)
-        return self._shortest(
-            pixel, self._states[pixel], self._dark_s[pixel], at_s - self._at_s[pixel], target_m, drive
-        )
+        context, one = self._context.copy(), self.pixels.each[pixel]
+        context[PIXEL], context[MINE] = pixel, 1.0
+        room, lit = np.zeros((8, STATES)), np.zeros((drive.max_periods + 1, STATES))
+        room[0] = self._states[pixel]
+        dark_s, wait_s = float(self._dark_s[pixel]), max(0.0, float(at_s - self._at_s[pixel]))
+        carry(one, self._active, context, True, room, 0.0, dark_s, wait_s)
+        span = (drive.max_power_w, drive.period_s, drive.max_periods)
+        periods, duty = shortest(one, self._active, context, room, lit, dark_s + wait_s, target_m, *span)
+        return (periods, duty) if periods else None
 
     def reaches_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
@@ -144,19 +150,6 @@ class ExtendedHeat:
             columns.append((absorber_k, gas_k, displacement_m, force_n))
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)
-
-    def _shortest(
-        self, pixel: int, state: FloatArray, dark_s: float, wait_s: float, target_m: float, drive: DriveRange
-    ) -> tuple[int, float] | None:
-        context, one = self._context.copy(), self.pixels.each[pixel]
-        context[PIXEL], context[MINE] = pixel, 1.0
-        room = np.zeros((8, STATES))
-        room[0] = state
-        carry(one, self._active, context, True, room, 0.0, dark_s, max(0.0, wait_s))
-        lit = np.zeros((drive.max_periods + 1, STATES))
-        span = (drive.max_power_w, drive.period_s, drive.max_periods)
-        periods, duty = shortest(one, self._active, context, room, lit, dark_s + wait_s, target_m, *span)
-        return (periods, duty) if periods else None
 
     def _too_early(self, pixel: int, at_s: float) -> ValueError:
         return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
