@@ -53,9 +53,6 @@ def show(remote: Remote, pattern: str) -> dict:
             time.sleep(0.05)
             answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
             bar.update(task, completed=answer["executed"])
-    while answer["status"] == "done" and answer["simulated_max_um"] is None:
-        time.sleep(0.02)
-        answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
     return answer
 
 

@@ -330,7 +330,8 @@ class Engine:
         scale = self._session.scale
         executed = job.executed(record.prepared.plan, scale.full_power_w, scale.tick_s)
         record.executed = executed
-        record.end(status, error)
+        if status != "done":
+            record.end(status, error)
         if len(executed):
             record.executed_rows = job.rows_executed()
             last = int(record.executed_rows[-1])
@@ -346,10 +347,15 @@ class Engine:
         self._bookkeeper.submit(self._simulate, record)
 
     def _simulate(self, record: PlanRecord) -> None:
+        """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
         executed = record.executed
-        if executed is not None:
-            columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-            record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
+        try:
+            if executed is not None:
+                columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+                record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
+        finally:
+            if not record.ended:
+                record.end("done", None)
 
     def _rewind(self, record: PlanRecord, executed: ExecutedPulses | None) -> None:
         """Nothing after `record` will run, nor what it has not fired: heat and budget forget both."""
