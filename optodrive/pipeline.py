@@ -179,8 +179,11 @@ def prepare(
     budget: BudgetState,
     policy: Policy = "trim",
     progress: Progress | None = None,
+    standing_on: int | None = None,
 ) -> Prepared:
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
+
+    standing_on: the pixel the mirrors stand on as the plan begins; None where that is not known.
 
     Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
     frame as a whole. Raises InputError for a target out of reach, RefusedError for what no policy lets pass: under
@@ -193,7 +196,7 @@ def prepare(
         if progress is not None:
             progress(done)
 
-    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick)
+    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick, standing_on)
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
     delays: list[Delay] = []

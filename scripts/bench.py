@@ -94,7 +94,7 @@ def bench_wire():
     plan = prepare(display, sequence, heat, budget).plan
     scale = Requirements.of(display.config).scale
     points = quantise(plan, scale)
-    payload = b"".join(body for _, body, _ in points.frames(0))
+    payload = points.payload()
 
     def prove():
         decoded = decode(payload, scale)

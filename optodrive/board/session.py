@@ -5,16 +5,17 @@ repeated by itself: a reconnect ends in DISARMED.
 """
 
 import secrets
-from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from math import inf
 from typing import Any
 
 from optodrive.board.clocksync import ClockSync
 from optodrive.board.faults import hint
 from optodrive.board.job import Job
 from optodrive.board.requirements import Requirements
+from optodrive.board.stream import PointStream
 from optodrive.clock import Clock
 from optodrive.errors import InputError, LinkError, NotReadyError
 from optodrive.transport.base import Transport
@@ -31,8 +32,8 @@ CLOCK_EVERY_S = 1.0
 CLOCK_FIRST = 8
 SILENCE_S = 2.0
 """A board that answers nothing for this long counts as lost."""
-GAP_AFTER_S = 0.1
-WATERMARK_POINTS = 48
+FOLLOW_S = 0.01
+"""Points that follow others must be on their way so long before those end."""
 LEASED = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
@@ -70,14 +71,11 @@ class Session:
         self._connection = HostConnection()
         self._sync = ClockSync()
         self._clock_asked_s: dict[int, float] = {}
-        self._job: Job | None = None
-        self._frames: deque[tuple[int, bytes, int]] = deque()
-        self._next_index = 0
+        self._points = PointStream()
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
         self._arm_nonce: int | None = None
-        self._lease_sent_s = self._status_asked_s = self._clock_sent_s = self._heard_s = self._gap_asked_s = 0.0
-        self._jobs = 0
+        self._lease_sent_s = self._status_asked_s = self._clock_sent_s = self._heard_s = 0.0
         self._queue_points = 0
         self.board = BoardView()
         self.connected = False
@@ -100,7 +98,7 @@ class Session:
     @property
     def ready(self) -> bool:
         """Whether a job may begin now."""
-        return self.board.state == "ARMED" and self._job is None and self.quiet
+        return self.board.state == "ARMED" and not self._points and self.quiet
 
     @property
     def quiet(self) -> bool:
@@ -142,7 +140,7 @@ class Session:
 
     def _greet(self) -> None:
         """Begin a session: whatever the board did, it ends, and leads to DISARMED."""
-        self._end_job()
+        self._points.clear()
         self._hello_sent_s = self._clock.now_s()
         self._connection.hello(secrets.randbits(32))
 
@@ -154,7 +152,7 @@ class Session:
         self._requirements.check(peer)
         self.board.uid, self.board.firmware = peer.uid.hex(), peer.firmware
         self._queue_points = peer.queue_points
-        self._next_index = 0
+        self._points.restart()
         self._connection.send(self._requirements.limits())
         self._ask_status()
 
@@ -286,8 +284,7 @@ class Session:
     def _take_executed(self, message: m.Executed, now_s: float) -> None:
         # What is done makes room: a small queue would run dry before an ACK or a STATUS tells.
         self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
-        if self._job is not None:
-            self._job.note(message)
+        self._points.note(message)
 
     # --- orders -------------------------------------------------------------------------------------------------
 
@@ -297,14 +294,14 @@ class Session:
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
         self._refusal = None
-        self._end_job()
+        self._points.clear()
         self._arm_nonce = secrets.randbits(32)
         self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
 
     def disarm(self) -> None:
         """Disarm; from FAULT, acknowledge the fault."""
         self._refusal = None
-        self._end_job()
+        self._points.clear()
         self._connection.send(m.ClearFault() if self.board.state == "FAULT" else m.Disarm())
 
     def abort(self) -> None:
@@ -315,7 +312,7 @@ class Session:
 
     def flush(self) -> None:
         """Drop what is queued; the board stays armed."""
-        self._end_job()
+        self._points.clear()
         self._connection.send(m.Flush())
 
     def take_refusal(self) -> str | None:
@@ -325,56 +322,23 @@ class Session:
 
     # --- streaming ----------------------------------------------------------------------------------------------
 
-    def begin(self, points: WirePoints, start_s: float) -> Job:
-        """Begin to stream a plan whose zero is at the board's time start_s."""
-        self._jobs += 1
-        job = Job(self._jobs, points, self._next_index, max(1, round(start_s / self.scale.tick_s)))
-        self._frames = deque(points.frames(self._next_index))
-        self._next_index = job.end_index
-        self._job = job
-        return job
+    def begin(self, points: WirePoints, start_s: float, ahead_s: float = inf) -> Job:
+        """Begin to stream a plan whose zero is at the board's time start_s, as Job says."""
+        return self._points.begin(points, max(1, round(start_s / self.scale.tick_s)), ahead_s / self.scale.tick_s)
 
-    def _end_job(self) -> None:
-        if self._job is not None:
-            self._next_index = self._job.next_to_send
-        self._job = None
-        self._frames.clear()
+    def follow(self, points: WirePoints, keep: int, ahead_s: float) -> Job | None:
+        """Cut the last job after `keep` points and go on without a pause; None where that is too late."""
+        tick_s = self.scale.tick_s
+        return self._points.follow(points, keep, ahead_s / tick_s, (self.board_s() + FOLLOW_S) / tick_s)
 
     def _stream(self) -> None:
-        job = self._job
-        if job is None:
+        if not self._points:
             return
-        if self.board.state in ("DISARMED", "FAULT"):  # it ended by itself: send no more of it, but hear the rest
-            self._fill_gaps(job)
-            return
-        link = self._connection
-        while self._frames and link.outstanding < link.window:
-            first_index, payload, count = self._frames[0]
-            done_index = max(job.first_index, self.board.done_index)
-            if job.next_to_send + count - done_index > self._queue_points:
-                break
-            self._frames.popleft()
-            link.send(m.Data(first_index, payload))
-            job.next_to_send = first_index + count
-            if not job.started:
-                watermark = min(WATERMARK_POINTS, job.end_index - job.first_index)
-                link.send(m.Start(job.job_id, job.first_index, job.start_tick, watermark))
-                job.started = True
-        if not self._frames and not job.end_sent and link.outstanding < link.window:
-            link.send(m.End(job.job_id, job.end_index))
-            job.end_sent = True
-        self._fill_gaps(job)
-        if job.finished and self.board.state == "ARMED":
-            self._job = None
-
-    def _fill_gaps(self, job: Job) -> None:
-        """Ask again for reports that were lost: the board has done more than it was heard to say."""
-        missing = job.first_missing
-        now_s = self._clock.now_s()
-        if missing is None or missing >= self.board.done_index or now_s - self._gap_asked_s < GAP_AFTER_S:
-            return
-        self._gap_asked_s = now_s
-        self._connection.send(m.GetExecuted(first_index=missing))
+        if self.board.state not in ("DISARMED", "FAULT"):  # else it ended by itself: send no more, but hear the rest
+            now_tick = self.board_s() / self.scale.tick_s
+            self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
+        self._points.fill_gaps(self._connection, self.board.done_index, self._clock.now_s())
+        self._points.forget_finished(self.board.state == "ARMED")
 
     # --- figures ------------------------------------------------------------------------------------------------
 

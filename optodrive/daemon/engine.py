@@ -7,37 +7,49 @@ works in the second thread, is idle or making progress. Callers on any thread ge
 import gc
 import sys
 import threading
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from queue import Empty, SimpleQueue
+from typing import NamedTuple, TypeVar
 
 from optodrive.board.faults import hint
-from optodrive.board.job import Job
 from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
 from optodrive.clock import Clock
-from optodrive.daemon.plans import PlanBook, PlanRecord, Status
-from optodrive.daemon.thermal import Thermal, heated
+from optodrive.daemon.plans import PlanBook, PlanRecord
+from optodrive.daemon.programme import Programme
 from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
-from optodrive.flow import BudgetState, ExecutedPulses, FrameSequence
-from optodrive.limit.limiter import Policy, fired, verify
+from optodrive.flow import BudgetState, FrameSequence
+from optodrive.limit.limiter import Policy, verify
 from optodrive.pipeline import Display, prepare, warm_up
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
 
 TURN_S = 0.002
 IDLE_TURN_S = 0.01
-START_LEAD_S = 0.05
-"""A plan starts so long after it is ready and the one before it has ended: its first points must be there in time."""
 PLANNER_STALL_S = 2.0
 """A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
 SWITCH_INTERVAL_S = 2e-4
 RECONNECT_S = 1.0
 QUEUE_MAX = 50
-DELAY_NOTICED_S = 1e-5
+PLANNING_GUESS_S = 0.01
+ALLOWANCE = 1.5
+"""A streamed plan is given so many times as long to be made as the last one took."""
+LOOP_TIMEOUT_S = 5.0
+T = TypeVar("T")
+
+
+class _Order(NamedTuple):
+    """What a caller asks for; arrived_s: board time."""
+
+    build: Callable[[], FrameSequence]
+    name: str
+    dry_run: bool
+    policy: Policy
+    streamed: bool
+    arrived_s: float
 
 
 class Engine:
@@ -52,23 +64,20 @@ class Engine:
         self.on_failure: Callable[[], None] = lambda: None
         self._clock = clock
         self._session = Session(transport, clock, Requirements.of(display.config))
-        self._thermal = Thermal(*display.at_rest())
         self._book = PlanBook()
-        self._waiting: deque[PlanRecord] = deque()
-        self._running: tuple[PlanRecord, Job] | None = None
+        self._bookkeeper = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
+        self._programme = Programme(display, self._session, self._book, self._bookkeeper)
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waits = Waits()
         self._ids = count(1)
         self._lock = threading.RLock()
         self._closing = threading.Event()
         self._planner = ThreadPoolExecutor(1, thread_name_prefix="planner")
-        self._bookkeeper = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
         self._plans_pending = 0
         self._progress_at_s = clock.now_s()
         self._link_error: str | None = None
         self._retry_at_s = 0.0
-        self._queue_end_s = 0.0
-        self._totals = {"planned": 0, "sent": 0, "executed": 0}
+        self._planning_s = PLANNING_GUESS_S
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
     # --- life ---------------------------------------------------------------------------------------------------
@@ -115,12 +124,12 @@ class Engine:
         if not self._session.connected:
             self._reconnect()
             return
-        busy = self._running is not None or self._waits or self._waiting
+        busy = self._programme.busy or self._waits
         self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner_alive())
         refusal = self._session.take_refusal()
         self._settle_waits(refusal)
-        self._follow_job(refusal)
-        self._start_next()
+        self._programme.follow_jobs(refusal)
+        self._programme.start_next()
 
     def _obey(self) -> None:
         while True:
@@ -139,7 +148,7 @@ class Engine:
     def _link_lost(self, error: OptodriveError) -> None:
         self._link_error = str(error)
         self._session.drop()
-        self._fail_all(str(error))
+        self._programme.fail_all(str(error))
         self._retry_at_s = self._clock.now_s() + RECONNECT_S
 
     def _reconnect(self) -> None:
@@ -155,10 +164,7 @@ class Engine:
             self._retry_at_s = self._clock.now_s() + RECONNECT_S
             return
         # The board may have restarted its clock: what is known of heat moves onto the new one.
-        with self._lock:
-            delay_s = self._session.board_s() - before_s
-            self._thermal = self._thermal.later(delay_s)
-            self._queue_end_s = 0.0
+        self._programme.board_restarted(self._session.board_s() - before_s)
         self._link_error = None
 
     # --- commands from any thread -------------------------------------------------------------------------------
@@ -186,7 +192,7 @@ class Engine:
                 future.set_exception(error)
                 return
             if what != "arm":
-                self._fail_all(f"ended by {what}")
+                self._programme.fail_all(f"ended by {what}")
             self._waits.add(states, what, self._clock.now_s(), future)
 
         self._commands.put(obey)
@@ -202,25 +208,38 @@ class Engine:
     # --- plans --------------------------------------------------------------------------------------------------
 
     def submit(
-        self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, policy: Policy = "trim"
+        self,
+        build: Callable[[], FrameSequence],
+        name: str,
+        dry_run: bool = False,
+        policy: Policy = "trim",
+        streamed: bool = False,
     ) -> "Future[Answer]":
-        """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when."""
+        """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when.
+
+        streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
+        """
+        order = _Order(build, name, dry_run, policy, streamed and not dry_run, self._session.board_s())
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
             self._plans_pending += 1
-        return self._planner.submit(self._plan, build, name, dry_run, policy)
+        return self._planner.submit(self._plan, order)
 
-    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, policy: Policy) -> Answer:
+    def _plan(self, order: "_Order") -> Answer:
         try:
             self._note_progress(0.0)
-            sequence = build()
+            sequence = order.build()
+            allowance_s = ALLOWANCE * self._planning_s
             while True:
-                if not dry_run:
+                if not order.dry_run:
                     self._require_armed()
-                answer = self._planned(sequence, name, dry_run, policy)
-                if answer is not None:
-                    return answer
+                if order.streamed:
+                    self._in_loop(self._programme.make_way).result(LOOP_TIMEOUT_S)
+                record = self._planned(sequence, order, allowance_s)
+                if record is not None:
+                    return record.answer(self._session.board_s())
+                allowance_s *= 2.0
         finally:
             with self._lock:
                 self._plans_pending -= 1
@@ -235,39 +254,51 @@ class Engine:
         if board.state not in ("ARMED", "RUNNING", "HOLD"):
             fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
-        if len(self._waiting) >= QUEUE_MAX:
+        if len(self._programme.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
 
-    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, policy: Policy) -> Answer | None:
+    def _planned(self, sequence: FrameSequence, order: "_Order", allowance_s: float) -> PlanRecord | None:
         """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
-        with self._lock:
-            thermal, start_s = self._thermal, self._earliest_start_s()
-        heat, budget = thermal.seen_from(start_s)
-        prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
+        began_s = self._clock.now_s()
+        basis = self._programme.basis(order.streamed, allowance_s)
+        heat, budget = basis.heat, basis.budget
+        prepared = prepare(self.display, sequence, heat, budget, order.policy, self._note_progress, basis.standing_on)
         points = quantise(prepared.plan, self._session.scale)
-        record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, budget, start_s)
+        record = PlanRecord(
+            plan_id=f"p{next(self._ids)}",
+            name=order.name,
+            prepared=prepared,
+            points=points,
+            heat_before=heat,
+            budget_before=budget,
+            start_s=basis.start_s,
+            arrived_s=order.arrived_s,
+            streamed=order.streamed,
+        )
         self._prove(record, budget)
-        if dry_run:
-            return record.answer(self._session.board_s())
-        with self._lock:
-            if self._thermal is not thermal:  # a plan before this one came late or failed, or the board restarted
-                return None
-            record.start_s = max(start_s, self._earliest_start_s())
-            self._thermal = Thermal.after_plan(prepared.heat, prepared.budget, record.start_s)
-            self._queue_end_s = record.start_s + prepared.duration_s
-            self._totals["planned"] += len(prepared.plan)
-            self._book.add(record)
-            record.status = "queued"
-            self._waiting.append(record)
-        return record.answer(self._session.board_s())
+        self._planning_s = self._clock.now_s() - began_s
+        if order.dry_run:
+            return record
+        taken = self._in_loop(lambda: self._programme.take(record, basis)).result(LOOP_TIMEOUT_S)
+        return record if taken else None
 
-    def _earliest_start_s(self) -> float:
-        return max(self._queue_end_s, self._session.board_s()) + START_LEAD_S
+    def _in_loop(self, action: Callable[[], T]) -> "Future[T]":
+        """Do something in the loop's thread, which owns the session."""
+        future: Future[T] = Future()
+
+        def obey() -> None:
+            try:
+                future.set_result(action())
+            except OptodriveError as error:
+                future.set_exception(error)
+
+        self._commands.put(obey)
+        return future
 
     def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
         points, plan = record.points, record.prepared.plan
-        decoded = decode(b"".join(payload for _, payload, _ in points.frames(0)), self._session.scale)
+        decoded = decode(points.payload(), self._session.scale)
         verify(plan.pixel[points.row[decoded.index]], decoded, budget, self.display.budget)
 
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
@@ -276,106 +307,13 @@ class Engine:
 
     def cancel(self, plan_id: str) -> "Future[Answer]":
         """Take a plan out of the queue, or end it dark; the board stays armed."""
-        future: Future[Answer] = Future()
 
-        def obey() -> None:
-            try:
-                record = self._book.find(plan_id)
-                if record in self._waiting:
-                    self._waiting.remove(record)
-                    record.end("cancelled", "taken out of the queue")
-                elif self._running is not None and self._running[0] is record:
-                    self._session.flush()
-                    self._finish("cancelled", "ended while it ran")
-                future.set_result(record.answer(self._session.board_s()))
-            except OptodriveError as error:
-                future.set_exception(error)
+        def end() -> Answer:
+            record = self._book.find(plan_id)
+            self._programme.cancel(record)
+            return record.answer(self._session.board_s())
 
-        self._commands.put(obey)
-        return future
-
-    # --- running them -------------------------------------------------------------------------------------------
-
-    def _start_next(self) -> None:
-        if self._running is not None or not self._waiting or not self._session.ready:
-            return
-        record = self._waiting.popleft()
-        if not len(record.prepared.plan):
-            record.end("done", None)
-            return
-        record.status = "running"
-        self._running = record, self._session.begin(record.points, record.start_s)
-
-    def _follow_job(self, refusal: str | None) -> None:
-        board = self._session.board
-        if board.state in ("FAULT", "DISARMED", "ARMING", "BOOT") and (self._running or self._waiting):
-            why = f"{board.fault}: {hint(board.fault)}" if board.fault else self._session.last_reason
-            self._fail_all(f"the board went to {board.state} ({why})")
-        if self._running is None:
-            return
-        record, job = self._running
-        self._totals["sent"] += job.sent_rows - record.sent
-        self._totals["executed"] += job.executed_rows - record.executed_count
-        record.sent, record.executed_count = job.sent_rows, job.executed_rows
-        if job.finished:
-            self._finish("done", None)
-        elif refusal is not None:
-            self._session.flush()
-            self._finish("failed", f"the board refused a part of it ({refusal})")
-
-    def _finish(self, status: Status, error: str | None) -> None:
-        """End the running plan: what was executed is taken over, a delay moves everything after it."""
-        assert self._running is not None  # noqa: S101 - callers have just looked
-        (record, job), self._running = self._running, None
-        scale = self._session.scale
-        executed = job.executed(record.prepared.plan, scale.full_power_w, scale.tick_s)
-        record.executed = executed
-        if status != "done":
-            record.end(status, error)
-        if len(executed):
-            record.executed_rows = job.rows_executed()
-            last = int(record.executed_rows[-1])
-            record.delay_s = float(executed.start_s[-1] - record.prepared.plan.start_s[last])
-        with self._lock:
-            if record.delay_s > DELAY_NOTICED_S:
-                self._thermal = self._thermal.later(record.delay_s)
-                self._queue_end_s += record.delay_s
-                for waiting in self._waiting:
-                    waiting.start_s += record.delay_s
-            if status != "done" and not self._waiting:
-                self._rewind(record, executed)
-        self._bookkeeper.submit(self._simulate, record)
-
-    def _simulate(self, record: PlanRecord) -> None:
-        """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
-        executed = record.executed
-        try:
-            if executed is not None:
-                columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-                record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
-        finally:
-            if not record.ended:
-                record.end("done", None)
-
-    def _rewind(self, record: PlanRecord, executed: ExecutedPulses | None) -> None:
-        """Nothing after `record` will run, nor what it has not fired: heat and budget forget both."""
-        dark_s = self._session.board_s() + self.display.config.board.lease_s
-        until_s = dark_s - record.start_s
-        budget = fired(record.prepared.plan, until_s, record.budget_before, self.display.budget)
-        heat = record.heat_before if executed is None else heated(record.heat_before, executed)
-        self._thermal = Thermal.after_plan(heat, budget, record.start_s)
-        self._queue_end_s = max(dark_s, self._thermal.budget.at_s)
-
-    def _fail_all(self, why: str) -> None:
-        with self._lock:
-            waiting = list(self._waiting)
-            self._waiting.clear()
-            if self._running is not None:
-                self._finish("failed", why)
-            elif waiting:
-                self._rewind(waiting[0], None)
-        for record in waiting:
-            record.end("failed", why)
+        return self._in_loop(end)
 
     # --- what can be seen from outside --------------------------------------------------------------------------
 
@@ -391,7 +329,8 @@ class Engine:
 
     def snapshot(self) -> Answer:
         """Everything GET /v1/state answers."""
-        running = self._running
+        programme = self._programme
+        running = next(iter(programme.running.copy()), None)
         return {
             "display": self.display.config.name,
             "pixels": len(self.display.layout),
@@ -403,12 +342,12 @@ class Engine:
             },
             "board": self._session.board.figures(),
             "queue": {
-                "waiting": len(self._waiting),
-                "running": None if running is None else running[0].plan_id,
+                "waiting": len(programme.waiting),
+                "running": None if running is None else running.record.plan_id,
                 "plans": [
                     {"plan": item.plan_id, "name": item.name, "status": item.status} for item in self._book.recent()
                 ],
             },
-            "totals": dict(self._totals),
+            "totals": dict(programme.totals),
             "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},
         }

@@ -19,7 +19,7 @@ PULSES_KEPT = 1_000_000
 """Ended plans are forgotten beyond so many plans or pulses."""
 RECENT = 20
 
-Status = Literal["planned", "queued", "running", "done", "failed", "cancelled"]
+Status = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
 
 
 @dataclass
@@ -28,6 +28,8 @@ class PlanRecord:
 
     start_s: board time of its zero; heat_before, budget_before: what it was planned from, on its own time line
     executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
+    streamed: a newer plan may take the place of what has not left, dropped pulses then
+    arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
     """
 
     plan_id: str
@@ -37,6 +39,8 @@ class PlanRecord:
     heat_before: Heat
     budget_before: BudgetState
     start_s: float
+    arrived_s: float
+    streamed: bool = False
     status: Status = "planned"
     error: str | None = None
     sent: int = 0
@@ -45,11 +49,15 @@ class PlanRecord:
     simulated_m: FloatArray | None = None
     executed_count: int = 0
     delay_s: float = 0.0
+    dropped: int = 0
+    planned_after_s: float | None = None
+    first_byte_after_s: float | None = None
+    first_light_after_s: float | None = None
 
     @property
     def ended(self) -> bool:
         """Whether nothing more will happen to it."""
-        return self.status in ("done", "failed", "cancelled")
+        return self.status in ("done", "superseded", "failed", "cancelled")
 
     def end(self, status: Status, error: str | None) -> None:
         """Nothing more will happen to it."""
@@ -66,6 +74,12 @@ class PlanRecord:
             "planned": len(self.prepared.plan),
             "sent": self.sent,
             "executed": self.executed_count,
+            "dropped": self.dropped,
+            "latency": {
+                "planned_s": self.planned_after_s,
+                "first_byte_s": self.first_byte_after_s,
+                "first_light_s": self.first_light_after_s,
+            },
             "summary": summary(self.prepared),
             "pulses": pulse_columns(self.prepared) if pulses else None,
             "simulated_max_um": None,

@@ -82,7 +82,9 @@ class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
     tick: called again and again while a frame is planned.
-    lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
+    standing_on: the pixel the mirrors stand on as the plan begins.
+    lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are;
+    none where it is known on which pixel they stand.
     skipped: pixels that needed no pulse, so far.
     """
 
@@ -92,6 +94,7 @@ class Scheduler:
         sequence: FrameSequence,
         train_piece: int = TRAIN_PIECE,
         tick: Callable[[], None] = nothing,
+        standing_on: int | None = None,
     ) -> None:
         self._machine = machine
         self._sequence = sequence
@@ -100,8 +103,12 @@ class Scheduler:
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = _train_pulses(sequence.trains, len(sequence.frames))
-        self._now = _Cursor()
-        self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
+        self._now = _Cursor(lit=standing_on)
+        self.lead_us = (
+            0
+            if standing_on is not None
+            else machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
+        )
         self.skipped: list[Skipped] = []
 
     def pieces(self, heat: Heat) -> Pieces:

@@ -6,7 +6,6 @@ import numpy as np
 
 from optodrive.errors import LocalProtocolError
 from optodrive.flow import FloatArray, IntArray, LimitedPlan, freeze_arrays
-from optodrive.wire.messages import POINTS_MAX
 
 CENTRE_CODE = 32768
 CODE_MAX = 65535
@@ -49,14 +48,17 @@ class WirePoints:
     def __len__(self) -> int:
         return len(self.row)
 
-    def frames(self, first_index: int) -> list[tuple[int, bytes, int]]:
-        """The points cut into DATA frames: index of the first, bytes, count."""
-        cuts = range(0, len(self), POINTS_MAX)
-        pieces = [self.table[at : at + POINTS_MAX] for at in cuts]
-        return [
-            (first_index + at, piece.astype("<u2").tobytes(), len(piece))
-            for at, piece in zip(cuts, pieces, strict=True)
-        ]
+    def payload(self, first: int = 0, count: int | None = None) -> bytes:
+        """The bytes of points first to first + count, or to the last, as DATA carries them."""
+        return self.table[first : None if count is None else first + count].astype("<u2").tobytes()
+
+    def ends(self) -> IntArray:
+        """When each point ends, ticks from the plan's zero, [n]."""
+        return np.cumsum(self.table[:, 2:4].astype(np.int64).sum(axis=1))
+
+    def up_to(self, row: int) -> int:
+        """How many points there are before the darkness that leads to the plan's pulse `row`."""
+        return int(np.searchsorted(np.maximum.accumulate(self.row), row - 1)) + 1 if row else 0
 
 
 @dataclass(frozen=True, eq=False)

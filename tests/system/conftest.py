@@ -1,5 +1,10 @@
 import pytest
 
+from optodrive.clock import MonotonicClock
+from optodrive.config import load_config
+from optodrive.daemon.engine import Engine
+from optodrive.pipeline import Display
+from optodrive.transport.simulated import SimulatedBoard
 from rig import Board, Daemon
 
 
@@ -37,3 +42,22 @@ def board(make_board):
 @pytest.fixture
 def daemon(make_daemon, board):
     return make_daemon(board)
+
+
+@pytest.fixture
+def transport():
+    return SimulatedBoard("", 1_000_000)
+
+
+@pytest.fixture
+def engine(transport):
+    engine = Engine(Display.of(load_config()), transport, MonotonicClock())
+    engine.start()
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def armed(engine):
+    engine.arm().result(10)
+    return engine

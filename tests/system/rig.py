@@ -19,6 +19,7 @@ from optodrive.config import shipped_path
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
+ENDED = ("done", "superseded", "failed", "cancelled")
 
 
 def wait_for(condition, what, patience_s=PATIENCE_S):
@@ -30,6 +31,22 @@ def wait_for(condition, what, patience_s=PATIENCE_S):
             return value
         time.sleep(0.005)
     raise AssertionError(f"waited {patience_s} s in vain for {what}")
+
+
+def ended(engine, answer):
+    """A plan of an engine in this process, once it has ended."""
+
+    def look():
+        record = engine.plan(answer["plan"])
+        return record if record["status"] in ENDED else None
+
+    return wait_for(look, "the plan's end")
+
+
+def events(transport, kind):
+    """What a simulated board in this process wrote to its log."""
+    lines = transport.log.read_text().splitlines()
+    return [event for event in map(json.loads, lines) if event["event"] == kind]
 
 
 class Board:
@@ -121,7 +138,7 @@ class Daemon:
     def finished(self, plan):
         def ended():
             answer = self.call("GET", f"/v1/plans/{plan}")
-            return answer if answer["status"] in ("done", "failed", "cancelled") else None
+            return answer if answer["status"] in ENDED else None
 
         return wait_for(ended, f"plan {plan} to end")
 

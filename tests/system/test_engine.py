@@ -7,33 +7,10 @@ import time
 import numpy as np
 import pytest
 
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.daemon.engine import PLANNER_STALL_S, Engine
+from optodrive.daemon.engine import PLANNER_STALL_S
 from optodrive.errors import InputError, NotReadyError, RefusedError
 from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.pipeline import Display
-from optodrive.transport.simulated import SimulatedBoard
-from rig import wait_for
-
-
-@pytest.fixture
-def transport():
-    return SimulatedBoard("", 1_000_000)
-
-
-@pytest.fixture
-def engine(transport):
-    engine = Engine(Display.of(load_config()), transport, MonotonicClock())
-    engine.start()
-    yield engine
-    engine.close()
-
-
-@pytest.fixture
-def armed(engine):
-    engine.arm().result(10)
-    return engine
+from rig import ended, events, wait_for
 
 
 def frame(height_um=100.0, pixel=17, duration_s=0.05):
@@ -44,19 +21,6 @@ def frame(height_um=100.0, pixel=17, duration_s=0.05):
 
 def train(seconds):
     return FrameSequence((), (PulseTrain(200, 0.0, seconds, 0.01, 0.01, 1.0),))
-
-
-def ended(engine, answer):
-    def look():
-        record = engine.plan(answer["plan"])
-        return record if record["status"] in ("done", "failed", "cancelled") else None
-
-    return wait_for(look, "the plan's end")
-
-
-def events(transport, kind):
-    lines = transport.log.read_text().splitlines()
-    return [event for event in map(json.loads, lines) if event["event"] == kind]
 
 
 def test_a_planner_that_hangs_costs_the_lease(armed, transport):

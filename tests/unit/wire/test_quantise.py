@@ -5,7 +5,6 @@ import pytest
 
 from optodrive.errors import LocalProtocolError
 from optodrive.flow import EMPTY_PLAN, LimitedPlan
-from optodrive.wire.messages import POINTS_MAX
 from optodrive.wire.quantise import CENTRE_CODE, DARK_STEP_TICKS, WireScale, decode, quantise
 
 SCALE = WireScale(rad_per_code=0.1745 / 32767, full_power_w=2.45, tick_s=1e-6)
@@ -33,7 +32,7 @@ def plan(*pulses):
 
 
 def payload(points):
-    return b"".join(frame for _, frame, _ in points.frames(0))
+    return points.payload()
 
 
 def back(limited):
@@ -109,20 +108,25 @@ def test_a_pulse_of_no_power_is_dark_for_as_long():
     assert decode(payload(points), SCALE).start_s == pytest.approx([0.101], abs=1e-12)
 
 
-def test_frames_hold_whole_points_and_count_on_from_an_index():
+def test_payloads_hold_whole_points():
     points = quantise(random_plan(100), SCALE)
-    frames = points.frames(1000)
-    counts = [count for _, _, count in frames]
-    assert counts == [POINTS_MAX] * (len(points) // POINTS_MAX) + [len(points) % POINTS_MAX]
-    assert [index for index, _, _ in frames] == [1000 + POINTS_MAX * k for k in range(len(frames))]
-    assert [len(payload) for _, payload, _ in frames] == [10 * count for count in counts]
-    assert payload(points)[:10] == points.table[0].astype("<u2").tobytes()
+    assert len(points.payload()) == 10 * len(points)
+    assert points.payload(3, 4) == points.payload()[30:70]
+    assert points.payload()[:10] == points.table[0].astype("<u2").tobytes()
+
+
+def test_points_know_where_they_end_and_where_a_pulse_begins():
+    limited = plan((0.001, 0.05, 0.1, 0, 1.0), (0.3, 0.05, 0.1, 0, 0.0), (0.4, 0.05, 0.1, 0, 1.0))
+    points = quantise(limited, SCALE)
+    assert points.row.tolist() == [0, -1, -1, -1, -1, 1, 2]
+    assert points.ends()[[0, 5, 6]].tolist() == [51_000, 350_000, 450_000]
+    assert [points.up_to(row) for row in range(4)] == [0, 1, 6, 7]
 
 
 def test_an_empty_plan_has_no_points():
     points = quantise(plan(), SCALE)
     assert len(points) == 0
-    assert points.frames(0) == []
+    assert points.payload() == b""
     assert len(decode(b"", SCALE).index) == 0
 
 

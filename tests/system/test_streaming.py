@@ -1,0 +1,98 @@
+"""Frames that keep coming: the newest wins, what has left stays, and every frame says what became of it."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from rig import ended, events, wait_for
+
+
+def frame(pixels, height_um=100.0):
+    target = np.zeros(437)
+    target[list(pixels)] = height_um * 1e-6
+    return FrameSequence((TactileFrame("f", 0.0, 10.0, target),))
+
+
+def stream(engine, sequence):
+    return engine.submit(lambda: sequence, "stream", streamed=True).result(10)
+
+
+def test_the_newest_frame_wins_without_a_pause(armed, transport):
+    """Sixty pixels a frame take 0.4 s of light; a new frame comes when a third of the last one has left."""
+    answers = []
+    for k in range(5):
+        answers.append(stream(armed, frame(range(60 * k, 60 * k + 60))))
+        wait_for(lambda: armed.plan(answers[-1]["plan"])["executed"] >= 12, "a part of the frame")
+    records = [ended(armed, answer) for answer in answers]
+    assert [record["status"] for record in records] == ["superseded"] * 4 + ["done"]
+    for record in records:
+        assert record["executed"] + record["dropped"] == record["planned"] == 60
+        assert record["executed_complete"]
+        assert record["latency"]["first_light_s"] > record["latency"]["planned_s"] > 0
+    assert all(10 <= record["executed"] < 60 for record in records[:4])
+    pulses = events(transport, "pulse")
+    assert len(pulses) == sum(record["executed"] for record in records)
+    assert [pulse["index"] for pulse in pulses] == sorted({pulse["index"] for pulse in pulses})
+    # One job from START to END: between frames the beam is dark for no longer than a move takes.
+    gaps_us = [after["on_us"] - before["off_us"] for before, after in pairwise(pulses)]
+    assert max(gaps_us) < 3_000
+    assert armed.snapshot()["board"]["underruns"] == 0
+
+
+def test_heights_come_out_as_asked_across_frames(armed):
+    """The same pixels again and again: each frame is planned from the heat that the frames before really left."""
+    answers = []
+    for height_um in (100.0, 250.0, 120.0, 300.0):
+        answers.append(stream(armed, frame(range(20), height_um)))
+        wait_for(lambda: armed.plan(answers[-1]["plan"])["executed"] >= 4, "a part of the frame")
+    heights = [ended(armed, answer) for answer in answers]
+    for record, height_um in zip(heights, (100.0, 250.0, 120.0, 300.0), strict=True):
+        simulated_um = np.array(record["executed_pulses"]["simulated_um"])
+        assert simulated_um == pytest.approx(height_um, rel=0.01)
+
+
+def test_an_empty_frame_ends_what_was_shown(armed, transport):
+    first = stream(armed, frame(range(100)))
+    wait_for(lambda: armed.plan(first["plan"])["executed"] >= 5, "a part of the frame")
+    nothing = stream(armed, frame(()))
+    assert ended(armed, first)["status"] == "superseded"
+    assert ended(armed, nothing)["status"] == "done"
+    assert 5 <= len(events(transport, "pulse")) < 60
+    wait_for(lambda: armed.board_state == "ARMED", "the job's end")
+    assert ended(armed, stream(armed, frame((3,))))["executed"] == 1
+
+
+def test_a_frame_takes_the_place_of_plans_that_run_or_wait(armed, transport):
+    train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
+    running = armed.submit(lambda: train, "train").result(10)
+    waiting = armed.submit(lambda: frame(range(50)), "waiting").result(10)
+    wait_for(lambda: armed.plan(running["plan"])["executed"] >= 3, "a part of the train")
+    newest = ended(armed, stream(armed, frame(range(5), 200.0)))
+    assert newest["status"] == "done"
+    assert [armed.plan(answer["plan"])["status"] for answer in (running, waiting)] == ["superseded"] * 2
+    assert newest["executed_pulses"]["simulated_um"] == pytest.approx([200.0] * 5, rel=0.01)
+    assert len(events(transport, "pulse")) < 100
+
+
+def test_a_plan_after_a_stream_waits_for_its_end(armed):
+    first = stream(armed, frame(range(30)))
+    second = armed.submit(lambda: frame(range(30)), "second").result(10)
+    records = [ended(armed, answer) for answer in (first, second)]
+    assert [record["status"] for record in records] == ["done", "done"]
+    for record in records:
+        assert record["executed_pulses"]["simulated_um"] == pytest.approx([100.0] * 30, rel=0.01)
+
+
+def test_a_stop_ends_a_stream_dark_and_the_heat_is_remembered(armed, transport):
+    first = stream(armed, frame(range(60), 300.0))
+    wait_for(lambda: armed.plan(first["plan"])["executed"] >= 5, "a part of the frame")
+    second = stream(armed, frame(range(60, 120), 300.0))
+    armed.stop().result(10)
+    for answer in (first, second):
+        assert ended(armed, answer)["status"] in ("failed", "superseded")
+    count = len(events(transport, "pulse"))
+    armed.arm().result(10)
+    assert len(events(transport, "pulse")) == count
+    assert ended(armed, stream(armed, frame(range(60), 300.0)))["status"] == "done"
