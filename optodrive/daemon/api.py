@@ -6,7 +6,7 @@ from concurrent.futures import Future
 from math import inf
 from typing import Annotated, Any
 
-from fastapi import FastAPI, Path, Query, Request
+from fastapi import FastAPI, Path, Query, Request, WebSocket
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
@@ -15,6 +15,7 @@ from starlette.middleware import Middleware
 from optodrive import __version__
 from optodrive.daemon.auth import BodyTooLargeError, Guard, problem
 from optodrive.daemon.engine import Engine
+from optodrive.daemon.live import LiveStream
 from optodrive.daemon.resolved import resolved_config
 from optodrive.errors import (
     BoardFaultError,
@@ -54,6 +55,7 @@ ERRORS: dict[int | str, dict[str, Any]] = {
 }
 PlanId = Annotated[str, Path(max_length=40)]
 DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")]
+Newest = Annotated[bool, Query(description="take the place of everything that has not left for the board yet")]
 Strict = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="what becomes of a frame that a cap does not allow as it is")]
 
@@ -100,13 +102,24 @@ def make_app(engine: Engine, token: str) -> FastAPI:
 
     @app.post("/v1/plans", status_code=201, openapi_extra=_json_body("FRAMES.json: frames and trains"))
     async def push(
-        request: Request, dry_run: DryRun = False, strict: Strict = False, policy: PolicyQuery = "trim"
+        request: Request,
+        dry_run: DryRun = False,
+        strict: Strict = False,
+        policy: PolicyQuery = "trim",
+        newest: Newest = False,
     ) -> Answer:
         """Plan frames and trains, and show them."""
         body = await request.body()
         return await _result(
-            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, chosen(policy, strict))
+            engine.submit(
+                lambda: parse_sequence(body, display.config, "body"), "push", dry_run, chosen(policy, strict), newest
+            )
         )
+
+    @app.websocket("/v1/stream")
+    async def stream(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
+        """Frames in, the newest wins; what became of each out."""
+        await LiveStream(engine, socket, policy, problem_of).run()
 
     @app.get("/v1/plans/{plan_id}")
     async def plan(plan_id: PlanId, pulses: Annotated[bool, Query(description="list every pulse")] = True) -> Answer:
@@ -152,6 +165,20 @@ async def _result(future: "Future[Answer]") -> Answer:
     return await asyncio.wrap_future(future)
 
 
+def problem_of(error: OptodriveError) -> Answer:
+    """An error as a problem document."""
+    status = next((status for kind, status in STATUS if isinstance(error, kind)), 500)
+    if error.code in ("no_plan", "unknown_pattern"):
+        status = 404
+    more: Answer = {}
+    if isinstance(error, InputError):
+        more = {"where": error.where, "value": abbreviate(error.value), "expected": error.expected}
+    if isinstance(error, OverBudgetError):
+        later_s = error.earliest_s if error.earliest_s < inf else None
+        more = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": later_s}
+    return problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more)
+
+
 def _add_error_answers(app: FastAPI) -> None:
     def answer(document: dict[str, object]) -> JSONResponse:
         status = document["status"]
@@ -162,16 +189,7 @@ def _add_error_answers(app: FastAPI) -> None:
 
     @on(OptodriveError)
     async def _known(request: Request, error: OptodriveError) -> JSONResponse:
-        status = next((status for kind, status in STATUS if isinstance(error, kind)), 500)
-        if error.code in ("no_plan", "unknown_pattern"):
-            status = 404
-        more: dict[str, object] = {}
-        if isinstance(error, InputError):
-            more = {"where": error.where, "value": abbreviate(error.value), "expected": error.expected}
-        if isinstance(error, OverBudgetError):
-            later_s = error.earliest_s if error.earliest_s < inf else None
-            more = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": later_s}
-        return answer(problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more))
+        return answer(problem_of(error))
 
     @on(RequestValidationError)
     async def _invalid(request: Request, error: RequestValidationError) -> JSONResponse:

@@ -40,7 +40,8 @@ class Guard:
         headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
         refusal = self._refusal(scope["path"], headers)
         if refusal is not None:
-            await _answer(send, refusal)
+            prefix = "websocket.http" if scope["type"] == "websocket" else "http"
+            await _answer(send, refusal, prefix)
             return
         bounded = _BoundedBody(receive, self._body_max_bytes)
         await self._app(scope, bounded, send)
@@ -96,12 +97,12 @@ class _BoundedBody:
         return message
 
 
-async def _answer(send: Send, document: dict[str, object]) -> None:
+async def _answer(send: Send, document: dict[str, object], prefix: str) -> None:
     body = json.dumps(document).encode()
     headers = [(b"content-type", b"application/problem+json"), (b"content-length", str(len(body)).encode())]
     if document["status"] == 401:
         headers.append((b"www-authenticate", b"Bearer"))
     if document["status"] == 413:
         headers.append((b"connection", b"close"))
-    await send({"type": "http.response.start", "status": document["status"], "headers": headers})
-    await send({"type": "http.response.body", "body": body})
+    await send({"type": f"{prefix}.response.start", "status": document["status"], "headers": headers})
+    await send({"type": f"{prefix}.response.body", "body": body})

@@ -13,6 +13,8 @@ from itertools import count
 from queue import Empty, SimpleQueue
 from typing import NamedTuple, TypeVar
 
+import numpy as np
+
 from optodrive.board.faults import hint
 from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
@@ -21,7 +23,8 @@ from optodrive.daemon.plans import PlanBook, PlanRecord
 from optodrive.daemon.programme import Programme
 from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
-from optodrive.flow import BudgetState, FrameSequence
+from optodrive.flow import BudgetState, FrameSequence, TactileFrame
+from optodrive.frames.live import unseen_first
 from optodrive.limit.limiter import Policy, verify
 from optodrive.pipeline import Display, prepare, warm_up
 from optodrive.transport.base import Transport
@@ -214,12 +217,15 @@ class Engine:
         dry_run: bool = False,
         policy: Policy = "trim",
         streamed: bool = False,
+        arrived_s: float | None = None,
     ) -> "Future[Answer]":
         """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when.
 
         streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
+        arrived_s: board time at which it was asked for, if not now
         """
-        order = _Order(build, name, dry_run, policy, streamed and not dry_run, self._session.board_s())
+        arrived_s = self.board_s() if arrived_s is None else arrived_s
+        order = _Order(build, name, dry_run, policy, streamed and not dry_run, arrived_s)
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
@@ -262,6 +268,8 @@ class Engine:
         began_s = self._clock.now_s()
         basis = self._programme.basis(order.streamed, allowance_s)
         heat, budget = basis.heat, basis.budget
+        if basis.seen_m is not None and len(sequence.frames) == 1 and not sequence.trains:
+            sequence = unseen_first(sequence, basis.seen_m)
         prepared = prepare(self.display, sequence, heat, budget, order.policy, self._note_progress, basis.standing_on)
         points = quantise(prepared.plan, self._session.scale)
         record = PlanRecord(
@@ -274,6 +282,7 @@ class Engine:
             start_s=basis.start_s,
             arrived_s=order.arrived_s,
             streamed=order.streamed,
+            seen_m=basis.seen_m,
         )
         self._prove(record, budget)
         self._planning_s = self._clock.now_s() - began_s
@@ -300,6 +309,20 @@ class Engine:
         points, plan = record.points, record.prepared.plan
         decoded = decode(points.payload(), self._session.scale)
         verify(plan.pixel[points.row[decoded.index]], decoded, budget, self.display.budget)
+
+    def board_s(self) -> float:
+        """The board's time now, s."""
+        return self._session.board_s()
+
+    def ending(self, plan_id: str) -> "Future[None]":
+        """Done when nothing more will happen to a plan; InputError (no_plan) where there is none."""
+        return self._book.find(plan_id).ending
+
+    def drop(self, plan_id: str | None) -> None:
+        """Let what has not left of a stream's last plan go, if it is still being shown; whoever sent it is gone."""
+        nothing = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
+        if plan_id is not None and not self.ending(plan_id).done():
+            self.submit(lambda: FrameSequence((nothing,)), "end of stream", streamed=True)
 
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
         """A plan by its id; InputError (no_plan) where there is none."""

@@ -1,7 +1,8 @@
 """A submitted plan through its life: queued, running, then done, failed or cancelled."""
 
 import threading
-from dataclasses import dataclass
+from concurrent.futures import Future
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -30,6 +31,8 @@ class PlanRecord:
     executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
     streamed: a newer plan may take the place of what has not left, dropped pulses then
     arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
+    seen_m: [p] heights that a stream's sweep over the display had shown before it, NaN where none
+    ending: done when nothing more will happen to it
     """
 
     plan_id: str
@@ -53,6 +56,8 @@ class PlanRecord:
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
+    seen_m: FloatArray | None = None
+    ending: "Future[None]" = field(default_factory=Future)
 
     @property
     def ended(self) -> bool:
@@ -62,6 +67,7 @@ class PlanRecord:
     def end(self, status: Status, error: str | None) -> None:
         """Nothing more will happen to it."""
         self.status, self.error = status, error
+        self.ending.set_result(None)
 
     def answer(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
         """The plan as REST answers it; pulses: list them one by one."""

@@ -17,7 +17,7 @@ from optodrive.board.job import Job
 from optodrive.board.session import Session
 from optodrive.daemon.plans import PlanBook, PlanRecord, Status
 from optodrive.daemon.thermal import Thermal, heated
-from optodrive.flow import BudgetState
+from optodrive.flow import BudgetState, FloatArray
 from optodrive.limit.limiter import fired, shifted
 from optodrive.physics.heat import Heat
 from optodrive.pipeline import Display
@@ -43,6 +43,7 @@ class Basis:
 
     thermal: what was known; a plan made from anything else is of no use
     after: the running plan that it cuts short, before row `cut`; standing_on: the pixel the mirrors stand on then
+    seen_m: [p] heights that a stream's sweep over the display has shown by then, NaN where none
     """
 
     thermal: Thermal
@@ -52,6 +53,7 @@ class Basis:
     after: PlanRecord | None = None
     cut: int = 0
     standing_on: int | None = None
+    seen_m: FloatArray | None = None
 
 
 class Programme:
@@ -111,6 +113,7 @@ class Programme:
             after=record,
             cut=cut,
             standing_on=int(plan.pixel[cut - 1]),
+            seen_m=_seen_m(record, cut),
         )
 
     # --- taking plans on ----------------------------------------------------------------------------------------
@@ -220,9 +223,9 @@ class Programme:
             record.executed_rows = job.rows_executed()
             last = int(record.executed_rows[-1])
             record.delay_s = float(executed.start_s[-1] - record.prepared.plan.start_s[last])
-        if status != "done":
+        if status in ("failed", "cancelled"):
             record.end(status, error)
-        self._bookkeeper.submit(simulate, record)
+        self._bookkeeper.submit(simulate, record, status, error)
 
     def _move_later(self, delay_s: float) -> None:
         with self.lock:
@@ -283,7 +286,16 @@ class Programme:
             self._queue_end_s = 0.0
 
 
-def simulate(record: PlanRecord) -> None:
+def _seen_m(record: PlanRecord, cut: int) -> FloatArray:
+    """What a sweep over the display has shown when a plan of it is cut; a sweep that is through begins anew."""
+    plan = record.prepared.plan
+    seen_m = np.full(len(record.heat_before.pixels), np.nan) if record.seen_m is None else record.seen_m.copy()
+    seen_m[plan.pixel[:cut]] = plan.target_m[:cut]
+    left = plan.pixel[cut:]
+    return seen_m if bool((seen_m[left] != plan.target_m[cut:]).any()) else np.full(len(seen_m), np.nan)
+
+
+def simulate(record: PlanRecord, status: Status, error: str | None) -> None:
     """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
     executed = record.executed
     try:
@@ -292,4 +304,4 @@ def simulate(record: PlanRecord) -> None:
             record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
     finally:
         if not record.ended:
-            record.end("done", None)
+            record.end(status, error)

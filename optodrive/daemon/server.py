@@ -44,10 +44,17 @@ def run(config: Config) -> None:
                 access_log=False,
                 server_header=False,
                 timeout_graceful_shutdown=GRACE_S,
+                ws="websockets-sansio",
+                ws_max_size=config.daemon.body_max_bytes,
             )
         )
+
+        def leave(*_: object) -> None:
+            engine.stop()  # dark first: the server may wait for callers that are slow to go
+            server.should_exit = True
+
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, lambda *_: setattr(server, "should_exit", True))
+            signal.signal(number, leave)
         print(f"optodrive: {config.name} on http://{config.daemon.host}:{port}, token in {path}", flush=True)
         print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
         engine.on_failure = lambda: setattr(server, "should_exit", True)

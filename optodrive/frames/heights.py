@@ -31,7 +31,7 @@ def _frame(entry: object, where: str, position: int, names: dict[str, int]) -> T
     show_at_s = time_at(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = time_at(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
-    return TactileFrame(frame_id, show_at_s, duration_s, _targets_m(table["target_um"], f"{where}.target_um", names))
+    return TactileFrame(frame_id, show_at_s, duration_s, targets_m(table["target_um"], f"{where}.target_um", names))
 
 
 def _frame_id(value: object, where: str) -> str:
@@ -50,7 +50,7 @@ def _check_follows(before: TactileFrame, frame: TactileFrame, where: str, before
         raise InputError(f"{where}.show_at_s", frame.show_at_s, expected, code="bad_time")
 
 
-def _targets_m(value: object, where: str, names: dict[str, int]) -> FloatArray:
+def targets_m(value: object, where: str, names: dict[str, int]) -> FloatArray:
     """Heights in µm, by pixel or a list of all, as metres [p]."""
     if isinstance(value, dict):
         for key in value:

@@ -96,3 +96,18 @@ def test_a_stop_ends_a_stream_dark_and_the_heat_is_remembered(armed, transport):
     armed.arm().result(10)
     assert len(events(transport, "pulse")) == count
     assert ended(armed, stream(armed, frame(range(60), 300.0)))["status"] == "done"
+
+
+def test_every_pixel_has_its_turn_when_frames_outrun_the_light(armed):
+    """Each of these frames has time for a few of its hundred pixels; together they show them all, once."""
+    whole = frame(range(100), 60.0)
+    shown = []
+    for _ in range(40):
+        answer = stream(armed, whole)
+        shown.append(answer["plan"])
+        wait_for(lambda: armed.plan(shown[-1])["executed"] >= 4, "a part of the frame")
+        if len(shown) > 3 and sum(armed.plan(plan)["executed"] for plan in shown) >= 100:
+            break
+    ended(armed, stream(armed, frame(())))
+    pixels = [pixel for plan in shown for pixel in ended(armed, {"plan": plan})["executed_pulses"]["pixel"]]
+    assert len(set(pixels[:100])) >= 98  # a pixel or two are lit on the way again where a sweep begins anew

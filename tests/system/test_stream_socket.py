@@ -1,0 +1,142 @@
+"""The WebSocket of a real daemon: frames in, what became of them out, and who may."""
+
+import json
+import struct
+from socket import create_connection
+
+import numpy as np
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from rig import TOKEN, wait_for
+
+PIXELS = 437
+
+
+@pytest.fixture
+def daemon(make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    daemon.arm()
+    return daemon
+
+
+def socket(daemon, token=TOKEN, host="127.0.0.1", **headers):
+    headers = {"Authorization": f"Bearer {token}", **headers}
+    link = create_connection(("127.0.0.1", daemon.client.base_url.port))
+    return connect(f"ws://{host}/v1/stream", sock=link, additional_headers=headers, proxy=None, max_size=None)
+
+
+def binary(number, pixels, height_um=80.0):
+    heights = np.zeros(PIXELS, dtype="<u2")
+    heights[list(pixels)] = round(height_um * 10)
+    return struct.pack("<4sI", b"ODF1", number) + heights.tobytes()
+
+
+def until(stream, wanted):
+    """Answers up to the first that has all of `wanted`."""
+    answers = []
+    while True:
+        answers.append(json.loads(stream.recv(timeout=20)))
+        if wanted.items() <= answers[-1].items():
+            return answers
+
+
+def test_a_frame_is_planned_then_done_and_says_how_long_it_took(daemon):
+    with socket(daemon) as stream:
+        stream.send('{"frame": 3, "target_um": {"17": 120, "18": 90}}')
+        planned, done = until(stream, {"frame": 3, "status": "done"})
+        assert planned["status"] == "planned"
+        assert planned["pulses"] == done["executed"] == 2
+        assert done["simulated_max_um"] == pytest.approx(120, rel=0.01)
+        latency = done["latency"]
+        assert 0 < latency["planned_s"] < latency["first_byte_s"] < latency["first_light_s"] < 1.0
+
+
+def test_frames_faster_than_light_are_superseded_and_say_so(daemon):
+    with socket(daemon) as stream:
+        for number in range(60):
+            stream.send(binary(number, range(100)))
+        stream.send(binary(60, range(5)))
+        answers = until(stream, {"frame": 60, "status": "done"})
+        ends = {}
+        for answer in answers:
+            if answer["status"] != "planned":
+                assert answer["frame"] not in ends
+                ends[answer["frame"]] = answer
+        assert sorted(ends) == list(range(61))
+        assert all(ends[number]["status"] == "superseded" for number in range(60))
+        unplanned = [answer for answer in ends.values() if answer.get("by")]
+        assert unplanned
+        for answer in ends.values():
+            if answer["plan"] is not None:
+                assert answer["planned"] == answer["executed"] + answer["dropped"]
+    assert daemon.state()["board"]["underruns"] == 0
+
+
+def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
+    with socket(daemon) as stream:
+        stream.send('{"target_um": {"9999": 1}}')
+        (refused,) = until(stream, {"status": "refused"})
+        assert refused["error"]["code"] == "unknown_pixel"
+        stream.send('{"frame": 1, "target_um": {"17": 9000}}')
+        (refused,) = until(stream, {"status": "refused"})
+        assert refused["error"]["code"] == "target_out_of_reach"
+        stream.send(binary(2, [3]))
+        until(stream, {"frame": 2, "status": "done"})
+
+
+def test_a_caller_that_leaves_takes_the_light_with_it(daemon):
+    with socket(daemon) as stream:
+        stream.send(binary(0, range(400), 100.0))  # three seconds of light
+        wait_for(lambda: daemon.state()["totals"]["executed"], "the first light")
+    wait_for(lambda: daemon.board_state() == "ARMED", "the board to rest", patience_s=1.5)
+    assert daemon.state()["totals"]["executed"] < 200
+
+
+def test_sigterm_ends_it_dark_at_once_though_a_caller_stays(make_board, make_daemon):
+    board = make_board()
+    daemon = make_daemon(board)
+    daemon.arm()
+    with socket(daemon) as stream:
+        stream.send(binary(0, range(400), 100.0))
+        wait_for(lambda: len(board.of("pulse")) > 20, "pulses")
+        daemon.process.terminate()
+        signalled_us = board.events()[-1]["t_us"]
+        wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
+        assert board.of("state")[-1]["reason"] == "abort"
+        assert board.of("gate")[-1]["on"] is False
+        assert board.of("gate")[-1]["t_us"] < signalled_us + 100_000  # the server itself waits for callers for seconds
+        assert daemon.process.wait(timeout=15) == 0
+    assert "Traceback" not in daemon.errors.read_text()
+
+
+def test_without_arming_a_frame_is_refused(make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    with socket(daemon) as stream:
+        stream.send(binary(0, [1]))
+        (refused,) = until(stream, {"status": "refused"})
+        assert refused["error"]["status"] == 409
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"token": "wrong"}, 401),
+        ({"Origin": "http://elsewhere.example"}, 403),
+        ({"host": "elsewhere.example"}, 421),
+    ],
+)
+def test_a_stream_is_guarded_as_every_route(daemon, headers, status):
+    with pytest.raises(InvalidStatus) as refused:
+        socket(daemon, **headers)
+    assert refused.value.response.status_code == status
+
+
+def test_rest_has_the_newest_win_too(daemon):
+    frames = {"frames": [{"show_at_s": 0, "duration_s": 9, "target_um": [100.0] * PIXELS}]}
+    first = daemon.call("POST", "/v1/plans", json=frames)
+    frames["frames"][0]["target_um"] = {"5": 100}
+    second = daemon.call("POST", "/v1/plans", params={"newest": True}, json=frames)
+    assert daemon.finished(second["plan"])["status"] == "done"
+    assert daemon.call("GET", f"/v1/plans/{first['plan']}")["status"] == "superseded"
