@@ -5,6 +5,7 @@ The engine, `optodrive plan` and `optodrive simulate` all come through here.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from math import ceil, inf
 
 import numpy as np
@@ -62,6 +63,11 @@ class Display:
     def heat_at_rest(self) -> Heat:
         """Heat of a display that nobody has lit."""
         return heat_at_rest(self.config, self.parameters)
+
+    @cached_property
+    def reach_m(self) -> FloatArray:
+        """The largest displacement that one pulse can reach from rest, [p]."""
+        return self.heat_at_rest().reaches_m(self.machine.drive)
 
     def at_rest(self) -> tuple[Heat, BudgetState]:
         """Heat and budget of a display that nobody has lit."""
@@ -155,9 +161,7 @@ def warm_up(display: Display) -> None:
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
     """Refuse a target that the longest pulse at full power does not reach from rest."""
-    if not sequence.frames:
-        return
-    most_m = display.heat_at_rest().reaches_m(display.machine.drive)
+    most_m = display.reach_m
     laser, limits = display.config.laser, display.config.limits
     for frame in sequence.frames:
         beyond = np.flatnonzero(frame.target_m > most_m)

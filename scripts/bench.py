@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from bench_stream import bench_stream
 from rich.console import Console
 from rich.table import Table
 from scipy.integrate import solve_ivp
@@ -321,6 +322,7 @@ BENCHMARKS = {
     "board": bench_board,
     "hour": bench_hour,
     "display": bench_display,
+    "stream": bench_stream,
 }
 
 

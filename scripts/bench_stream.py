@@ -1,0 +1,205 @@
+"""Continuous use: how soon a changed frame is planned, its first byte leaves and its first light falls, under load.
+
+A daemon on its simulated board, frames of 200 pixels at 20 a second, while other callers ask for the state as fast as
+they can; and the same bodies at the same rate to a bare FastAPI in a process of its own, under the same load: that
+share is not ours.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+
+import httpx
+import numpy as np
+
+RUNS = 50
+PIXELS, ACTIVE, RATE_HZ, SECONDS, CALLERS = 1511, 200, 20.0, 15.0, 4
+TOKEN = "a-token-for-a-benchmark"
+
+BARE = """
+import sys
+import uvicorn
+from fastapi import FastAPI, Request
+
+app = FastAPI()
+
+@app.post("/v1/plans")
+async def push(request: Request):
+    return {"bytes": len(await request.body())}
+
+@app.get("/v1/state")
+async def state():
+    return {}
+
+uvicorn.run(app, port=int(sys.argv[1]), log_level="warning", access_log=False)
+"""
+
+
+def random_frame(rng):
+    pixels = rng.choice(PIXELS, ACTIVE, replace=False)
+    return {str(pixel): 60.0 for pixel in pixels.tolist()}
+
+
+def planning_rows():
+    """CPU time of everything between a frame and its proven bytes: plan, limit, predict, quantise, decode, verify."""
+    from optodrive.board.requirements import Requirements
+    from optodrive.config import load_config
+    from optodrive.flow import FrameSequence, TactileFrame
+    from optodrive.limit.limiter import verify
+    from optodrive.pipeline import Display, prepare
+    from optodrive.wire.quantise import decode, quantise
+
+    display = Display.of(load_config("display-1511"))
+    scale = Requirements.of(display.config).scale
+    rng = np.random.default_rng(5)
+    heat, budget = display.at_rest()
+    rows, times = [], []
+    for active in (10, 50, ACTIVE, PIXELS):
+        times.clear()
+        for _ in range(RUNS):
+            target = np.zeros(PIXELS)
+            target[rng.choice(PIXELS, active, replace=False)] = 60e-6
+            sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
+            begin_s = time.process_time()
+            prepared = prepare(display, sequence, heat, budget, standing_on=7)
+            points = quantise(prepared.plan, scale)
+            decoded = decode(points.payload(), scale)
+            verify(prepared.plan.pixel[points.row[decoded.index]], decoded, budget, display.budget)
+            times.append(time.process_time() - begin_s)
+        rows.append(
+            (f"a changed frame of {active} pixels: planned, limited, proven", 1e3 * statistics.median(times), "ms")
+        )
+    return rows
+
+
+class Load:
+    """Callers that ask for the state as fast as they are answered."""
+
+    def __init__(self, url):
+        self._url = url
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=self._ask, daemon=True) for _ in range(CALLERS)]
+        self.asked = 0
+
+    def _ask(self):
+        with httpx.Client(base_url=self._url, headers={"Authorization": f"Bearer {TOKEN}"}) as client:
+            while not self._stop.is_set():
+                client.get("/v1/state")
+                self.asked += 1
+
+    def __enter__(self):
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_):
+        self._stop.set()
+        for thread in self._threads:
+            thread.join()
+
+
+def pushed(url):
+    """Round trips of frames pushed at the rate, s, and the daemon's own answers."""
+    rng = np.random.default_rng(7)
+    trips, answers = [], []
+    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:
+        next_s = time.monotonic()
+        for _ in range(int(RATE_HZ * SECONDS)):
+            body = json.dumps({"frames": [{"show_at_s": 0, "duration_s": 60, "target_um": random_frame(rng)}]})
+            begin_s = time.monotonic()
+            response = client.post("/v1/plans", params={"newest": True}, content=body)
+            trips.append(time.monotonic() - begin_s)
+            response.raise_for_status()
+            answers.append(response.json())
+            next_s = max(next_s + 1 / RATE_HZ, time.monotonic())
+            time.sleep(max(0.0, next_s - time.monotonic()))
+        return (
+            trips,
+            answers,
+            client.get("/v1/state").json(),
+            [client.get(f"/v1/plans/{answer['plan']}", params={"pulses": False}).json() for answer in answers[-190:]]
+            if "plan" in answers[0]
+            else [],
+        )
+
+
+def in_a_process(arguments, environment, ready):
+    process = subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
+    return process, ready(process)
+
+
+def wait_for_bare(port):
+    def ready(_):
+        while True:
+            try:
+                httpx.get(f"http://127.0.0.1:{port}/v1/state")
+                return f"http://127.0.0.1:{port}"
+            except httpx.ConnectError:
+                time.sleep(0.05)
+
+    return ready
+
+
+def of_daemon(process):
+    return process.stdout.readline().split(" on ")[1].split(",")[0]
+
+
+def percentiles(name, values, unit="ms"):
+    return [
+        (f"{name}, {label}", 1e3 * float(np.percentile(values, at)), unit)
+        for label, at in (("median", 50), ("p99", 99))
+    ]
+
+
+def bench_stream():
+    """Rows of the table."""
+    rows = planning_rows()
+    with tempfile.TemporaryDirectory() as folder:
+        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": folder}
+        script = Path(folder) / "bare.py"
+        script.write_text(BARE)
+        bare, url = in_a_process([sys.executable, script, "8459"], environment, wait_for_bare(8459))
+        try:
+            with Load(url):
+                bare_trips, *_ = pushed(url)
+        finally:
+            bare.terminate()
+        optodrive = Path(sys.executable).with_name("optodrive")
+        command = [optodrive, "serve", "--config", "display-1511", "--port", "0"]
+        daemon, url = in_a_process(command, environment, of_daemon)
+        try:
+            httpx.post(f"{url}/v1/arm", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=10).raise_for_status()
+            with Load(url) as load:
+                trips, _, state, plans = pushed(url)
+        finally:
+            daemon.terminate()
+    ended = [plan for plan in plans if plan["latency"]["first_light_s"] is not None]
+    rows += [("callers besides, questions answered a second", load.asked / SECONDS, "1/s")]
+    rows += percentiles("a frame's round trip over REST", trips)
+    rows += percentiles("the same to a bare FastAPI", bare_trips)
+    for key, name in (
+        ("planned_s", "arrival to plan taken on"),
+        ("first_byte_s", "arrival to first byte to the board"),
+        ("first_light_s", "arrival to first light"),
+    ):
+        rows += percentiles(name, [plan["latency"][key] for plan in ended])
+    rows += [
+        (
+            "share of the p99 to the first byte that a bare FastAPI takes too",
+            float(np.percentile(bare_trips, 99) / np.percentile([p["latency"]["first_byte_s"] for p in ended], 99)),
+            "1",
+        ),
+        (
+            "frames that gave way to a newer one before they were through",
+            sum(p["status"] == "superseded" for p in plans) / len(plans),
+            "1",
+        ),
+        ("times the board ran out of points", state["board"]["underruns"], "1"),
+    ]
+    return rows
