@@ -115,7 +115,8 @@ def pushed(url):
             begin_s = time.monotonic()
             response = client.post("/v1/plans", params={"newest": True}, content=body)
             trips.append(time.monotonic() - begin_s)
-            response.raise_for_status()
+            if response.is_error:
+                raise RuntimeError(response.text)
             answers.append(response.json())
             next_s = max(next_s + 1 / RATE_HZ, time.monotonic())
             time.sleep(max(0.0, next_s - time.monotonic()))

@@ -240,7 +240,7 @@ class Engine:
             while True:
                 if not order.dry_run:
                     self._require_armed()
-                if order.streamed:
+                if order.streamed and self._programme.in_the_way:
                     self._in_loop(self._programme.make_way).result(LOOP_TIMEOUT_S)
                 record = self._planned(sequence, order, allowance_s)
                 if record is not None:

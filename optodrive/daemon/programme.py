@@ -57,7 +57,7 @@ class Basis:
 
 
 class Programme:
-    """Basis and `busy` may be asked for by any thread; everything else belongs to the loop that owns the session."""
+    """Basis, `busy` and `in_the_way` may be asked for by any thread; everything else belongs to the loop that owns the session."""
 
     def __init__(self, display: Display, session: Session, book: PlanBook, bookkeeper: Executor) -> None:
         self.lock = threading.RLock()
@@ -146,6 +146,12 @@ class Programme:
         before.dropped = len(before.prepared.plan) - cut
         self.running.append(Run(record, job))
         return True
+
+    @property
+    def in_the_way(self) -> bool:
+        """Whether a plan that is newer must first have others give way."""
+        with self.lock:
+            return bool(self.waiting) or any(not run.record.streamed for run in self.running)
 
     def make_way(self) -> None:
         """Let what waits, and what runs as a whole, give way to a plan that is newer."""
