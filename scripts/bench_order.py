@@ -1,0 +1,163 @@
+"""The scheduler against the physical limit: a naive order, a strong solver's order, ours, and the floor that optics set.
+
+Every order is drawn with the same pulses: from rest, one after the other, each the shortest that reaches its height from
+the heat there is when its turn comes. The naive order goes row by row, and waits 0.4 ms and the way at the slew rate at
+each move, for the mirrors to settle. The solver is LKH (elkai), on the very times that our moves take. The floor is
+light alone: the same pulses without moves, and without rounding to whole PWM periods.
+"""
+
+import time
+
+import elkai
+import numpy as np
+
+from optodrive.config import load_config
+from optodrive.flow import FrameSequence, TactileFrame
+from optodrive.frames.patterns import build_pattern
+from optodrive.pipeline import Display, prepare
+from optodrive.plan.order import visiting_order
+
+NAIVE_SETTLE_S = 4e-4
+LKH_RUNS = 10
+CALM_US = 1_000_000
+"""A stay after which every move is calm."""
+EXPERIMENTS = tuple(f"experiment-{k}" for k in range(1, 7))
+
+
+class Bench:
+    """A display at rest, its mirrors, and the times its moves take."""
+
+    def __init__(self, name):
+        self.display = Display.of(load_config(name))
+        machine = self.display.machine
+        self.layout, self.moves, self.drive = machine.layout, machine.moves, machine.drive
+        self.x_rad, self.y_rad = (machine.field.mirror_rad(at_m) for at_m in (self.layout.x_m, self.layout.y_m))
+
+    def move_us(self, origin, pixel, lit_us=CALM_US):
+        if origin is None:
+            return self.moves.lead_us
+        return self.moves.time_us(self.x_rad[pixel] - self.x_rad[origin], self.y_rad[pixel] - self.y_rad[origin], lit_us)
+
+    def naive_us(self, origin, pixel, _lit_us=0):
+        if origin is None:
+            return self.moves.lead_us
+        way = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))
+        return 1e6 * (NAIVE_SETTLE_S + way / self.display.config.scanner.slew_rad_per_s)
+
+    # --- orders -------------------------------------------------------------------------------------------------
+
+    def rows(self, active, _origin):
+        return active
+
+    def ours(self, active, origin):
+        return visiting_order(active, self.layout.row, self.layout.column, self.x_rad, self.y_rad, origin)
+
+    def solver(self, active, origin):
+        """LKH's shortest open path, by the times of our moves; from the origin if there is one."""
+        if len(active) < 3:
+            return active
+        nodes = active if origin is None else np.concatenate([[origin], active])
+        times = [[self.move_us(a, b) for b in nodes.tolist()] for a in nodes.tolist()]
+        # A place that costs nothing to go to joins the ends; with an origin, nothing but that may follow it.
+        far = 10 * max(map(max, times)) * len(nodes)
+        matrix = [[0] * (len(nodes) + 1)]
+        for k, row in enumerate(times):
+            matrix.append([0 if origin is None or k else far, *row])
+        if origin is not None:
+            matrix[0][2:] = [far] * (len(nodes) - 1)
+            for row in matrix[2:]:
+                row[0] = 0
+            matrix[1][0] = far
+        tour = elkai.DistanceMatrix(matrix).solve_tsp(runs=LKH_RUNS)[:-1]
+        begin = tour.index(0)
+        path = nodes[np.array(tour[begin + 1 :] + tour[:begin]) - 1]
+        return path if origin is None else path[1:]
+
+    # --- drawing ------------------------------------------------------------------------------------------------
+
+    def drawn(self, frames, order_of, move_us):
+        """Total time, light, moves (s), pulses, and the light that rounding to PWM periods added."""
+        heat = self.display.heat_at_rest()
+        now_us, standing, lit_us = 0, None, CALM_US
+        light_us, exact_us, moves_us, count = 0, 0.0, 0, 0
+        for target_m in frames:
+            for pixel in order_of(np.flatnonzero(target_m > 0), standing).tolist():
+                move = move_us(standing, pixel, lit_us)
+                pulse = heat.pulse_for_peak(pixel, (now_us + move) * 1e-6, float(target_m[pixel]), self.drive)
+                if pulse is None:
+                    continue
+                width_us = round(pulse[0] * self.drive.period_s * 1e6)
+                power_w = pulse[1] * self.drive.max_power_w
+                start_s = np.array([(now_us + move) * 1e-6])
+                heat.pulses(np.array([pixel]), start_s, np.array([width_us * 1e-6]), np.array([power_w]))
+                now_us += move + width_us
+                moves_us, light_us, count = moves_us + move, light_us + width_us, count + 1
+                exact_us += (pulse[0] - 1 + pulse[1]) * self.drive.period_s * 1e6
+                standing, lit_us = pixel, width_us
+        return {"total_s": now_us * 1e-6, "light_s": light_us * 1e-6, "exact_s": exact_us * 1e-6, "count": count}
+
+
+def cases(bench):
+    """Name to frames, each [p] metres, drawn one after the other."""
+    layout, count = bench.layout, len(bench.layout)
+    rng = np.random.default_rng(11)
+
+    def some(pixels, height_m=50e-6):
+        target_m = np.zeros(count)
+        target_m[pixels] = height_m
+        return target_m
+
+    yield from ((f"full, {height} µm", [np.full(count, height * 1e-6)]) for height in (50, 100, 400))
+    yield from ((f"{n} at random, 50 µm", [some(rng.choice(count, n, replace=False))]) for n in (10, 50, 200))
+    yield "diagonal band, 50 µm", [some(np.flatnonzero(np.abs(layout.row - layout.column) < 2))]
+    corners = [(5, 5), (8, 30), (30, 12), (33, 33), (20, 20)]
+    near = [(np.abs(layout.row - r) < 3) & (np.abs(layout.column - c) < 3) for r, c in corners]
+    yield "five clusters, 50 µm", [some(np.flatnonzero(np.any(near, axis=0)))]
+    for name, pattern, given in (("moving edge", "edge", {}), ("braille, optodrive", "text", {"text": "optodrive"})):
+        sequence = build_pattern(pattern, given, bench.display.config)
+        yield name, [frame.target_m for frame in sequence.frames]
+
+
+def case_rows(bench, name, frames):
+    naive = bench.drawn(frames, bench.rows, bench.naive_us)
+    begin_s = time.process_time()
+    strong = bench.drawn(frames, bench.solver, bench.move_us)
+    strong_s = time.process_time() - begin_s
+    ours = bench.drawn(frames, bench.ours, bench.move_us)
+    floor = bench.drawn(frames, bench.ours, lambda *_: 0)["exact_s"]
+    moves = ours["total_s"] - ours["light_s"]
+    yield f"{name}: pixels shown", ours["count"], "1"
+    yield f"{name}: pixels a second, naive", naive["count"] / naive["total_s"], "1/s"
+    yield f"{name}: pixels a second, ours", ours["count"] / ours["total_s"], "1/s"
+    yield f"{name}: beam-on share, naive", naive["light_s"] / naive["total_s"], "1"
+    yield f"{name}: beam-on share, solver's order", strong["light_s"] / strong["total_s"], "1"
+    yield f"{name}: beam-on share, ours", ours["light_s"] / ours["total_s"], "1"
+    yield f"{name}: time over the floor, naive", naive["total_s"] / floor, "×"
+    yield f"{name}: time over the floor, solver's order", strong["total_s"] / floor, "×"
+    yield f"{name}: time over the floor, ours", ours["total_s"] / floor, "×"
+    yield f"{name}: ours over the solver's", ours["total_s"] / strong["total_s"], "×"
+    yield f"{name}: of what is over the floor, moves", moves / (ours["total_s"] - floor), "1"
+    yield f"{name}: of what is over the floor, whole PWM periods", (ours["light_s"] - ours["exact_s"]) / (ours["total_s"] - floor), "1"
+    yield f"{name}: of what is over the floor, heat that left while others were lit", (ours["exact_s"] - floor) / (ours["total_s"] - floor), "1"
+    yield f"{name}: the solver's time", strong_s, "s CPU"
+    if len(frames) == 1:
+        sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, frames[0]),))
+        prepared = prepare(bench.display, sequence, *bench.display.at_rest())
+        assert abs(prepared.duration_s - ours["total_s"]) < 1e-6 or prepared.shortfall is not None, "not what is planned"
+
+
+def experiment_rows(display, name):
+    sequence = build_pattern(name, {}, display.config)
+    prepared = prepare(display, sequence, *display.at_rest())
+    plan = prepared.plan
+    yield f"{name}: pulses", len(plan), "1"
+    yield f"{name}: beam-on share, as the stimulus asks", float(plan.width_s.sum()) / prepared.duration_s, "1"
+    yield f"{name}: the latest pulse comes late by", 1e3 * prepared.train_late_s, "ms"
+
+
+def bench_order():
+    """Rows of the table."""
+    bench = Bench("display-1511")
+    rows = [row for name, frames in cases(bench) for row in case_rows(bench, name, frames)]
+    display = Display.of(load_config("display-437"))
+    return [*rows, *(row for name in EXPERIMENTS for row in experiment_rows(display, name))]
