@@ -268,8 +268,8 @@ class Engine:
         began_s = self._clock.now_s()
         basis = self._programme.basis(order.streamed, allowance_s)
         heat, budget = basis.heat, basis.budget
-        if basis.seen_m is not None and len(sequence.frames) == 1 and not sequence.trains:
-            sequence = unseen_first(sequence, basis.seen_m)
+        if basis.seen is not None and len(sequence.frames) == 1 and not sequence.trains:
+            sequence = unseen_first(sequence, basis.seen)
         prepared = prepare(self.display, sequence, heat, budget, order.policy, self._note_progress, basis.standing_on)
         points = quantise(prepared.plan, self._session.scale)
         record = PlanRecord(
@@ -282,7 +282,7 @@ class Engine:
             start_s=basis.start_s,
             arrived_s=order.arrived_s,
             streamed=order.streamed,
-            seen_m=basis.seen_m,
+            seen=basis.seen,
         )
         self._prove(record, budget)
         self._planning_s = self._clock.now_s() - began_s

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from optodrive.errors import InputError
-from optodrive.flow import BudgetState, ExecutedPulses, FloatArray, IntArray
+from optodrive.flow import BoolArray, BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.heat import Heat
 from optodrive.pipeline import Prepared
 from optodrive.summary import PULSES_LISTED_MAX, pulse_columns, summary
@@ -31,7 +31,7 @@ class PlanRecord:
     executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
     streamed: a newer plan may take the place of what has not left, dropped pulses then
     arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
-    seen_m: [p] heights that a stream's sweep over the display had shown before it, NaN where none
+    seen: [p] pixels that a stream's sweep over the display had lit before it
     ending: done when nothing more will happen to it
     """
 
@@ -56,7 +56,7 @@ class PlanRecord:
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
-    seen_m: FloatArray | None = None
+    seen: BoolArray | None = None
     ending: "Future[None]" = field(default_factory=Future)
 
     @property

@@ -17,7 +17,7 @@ from optodrive.board.job import Job
 from optodrive.board.session import Session
 from optodrive.daemon.plans import PlanBook, PlanRecord, Status
 from optodrive.daemon.thermal import Thermal, heated
-from optodrive.flow import BudgetState, FloatArray
+from optodrive.flow import BoolArray, BudgetState
 from optodrive.limit.limiter import fired, shifted
 from optodrive.physics.heat import Heat
 from optodrive.pipeline import Display
@@ -43,7 +43,7 @@ class Basis:
 
     thermal: what was known; a plan made from anything else is of no use
     after: the running plan that it cuts short, before row `cut`; standing_on: the pixel the mirrors stand on then
-    seen_m: [p] heights that a stream's sweep over the display has shown by then, NaN where none
+    seen: [p] pixels that a stream's sweep over the display has lit by then
     """
 
     thermal: Thermal
@@ -53,11 +53,11 @@ class Basis:
     after: PlanRecord | None = None
     cut: int = 0
     standing_on: int | None = None
-    seen_m: FloatArray | None = None
+    seen: BoolArray | None = None
 
 
 class Programme:
-    """Basis, `busy` and `in_the_way` may be asked for by any thread; everything else belongs to the loop that owns the session."""
+    """Any thread may ask for `basis`, `busy`, `in_the_way`; all else belongs to the loop that owns the session."""
 
     def __init__(self, display: Display, session: Session, book: PlanBook, bookkeeper: Executor) -> None:
         self.lock = threading.RLock()
@@ -113,7 +113,7 @@ class Programme:
             after=record,
             cut=cut,
             standing_on=int(plan.pixel[cut - 1]),
-            seen_m=_seen_m(record, cut),
+            seen=_seen(record, cut),
         )
 
     # --- taking plans on ----------------------------------------------------------------------------------------
@@ -292,13 +292,12 @@ class Programme:
             self._queue_end_s = 0.0
 
 
-def _seen_m(record: PlanRecord, cut: int) -> FloatArray:
-    """What a sweep over the display has shown when a plan of it is cut; a sweep that is through begins anew."""
-    plan = record.prepared.plan
-    seen_m = np.full(len(record.heat_before.pixels), np.nan) if record.seen_m is None else record.seen_m.copy()
-    seen_m[plan.pixel[:cut]] = plan.target_m[:cut]
-    left = plan.pixel[cut:]
-    return seen_m if bool((seen_m[left] != plan.target_m[cut:]).any()) else np.full(len(seen_m), np.nan)
+def _seen(record: PlanRecord, cut: int) -> BoolArray:
+    """What a sweep over the display has lit when a plan of it is cut; a sweep that is through begins anew."""
+    pixel = record.prepared.plan.pixel
+    seen = np.zeros(len(record.heat_before.pixels), dtype=np.bool_) if record.seen is None else record.seen.copy()
+    seen[pixel[:cut]] = True
+    return seen if not seen[pixel[cut:]].all() else np.zeros_like(seen)
 
 
 def simulate(record: PlanRecord, status: Status, error: str | None) -> None:

@@ -5,7 +5,7 @@ import struct
 import numpy as np
 
 from optodrive.errors import InputError
-from optodrive.flow import FloatArray, FrameSequence, TactileFrame
+from optodrive.flow import BoolArray, FloatArray, FrameSequence, TactileFrame
 from optodrive.frames.fields import decode_json, table_at
 from optodrive.frames.heights import targets_m
 
@@ -54,14 +54,13 @@ def _from_text(message: str, expected_number: int, pixel_count: int) -> tuple[in
     return number, targets_m(table["target_um"], "frame.target_um", names)
 
 
-def unseen_first(sequence: FrameSequence, seen_m: FloatArray) -> FrameSequence:
-    """A stream's frame in two: first the pixels that this sweep over the display has not shown at their height yet.
+def unseen_first(sequence: FrameSequence, seen: BoolArray) -> FrameSequence:
+    """A stream's frame in two: first the pixels that this sweep over the display has not lit yet.
 
-    So every pixel has its turn however fast frames come. seen_m: [p], heights shown in this sweep, NaN where none.
+    So every pixel has its turn however fast frames come. seen: [p], lit in this sweep.
     """
     (frame,) = sequence.frames
-    unseen = (frame.target_m > 0) & (frame.target_m != seen_m)
-    parts = [np.where(part, frame.target_m, 0.0) for part in (unseen, ~unseen)]
+    parts = [np.where(part, frame.target_m, 0.0) for part in (~seen, seen)]
     return FrameSequence(
         tuple(TactileFrame(frame.frame_id, 0.0, frame.duration_s, part) for part in parts if part.any()) or (frame,)
     )
