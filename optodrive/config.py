@@ -13,10 +13,13 @@ from optodrive.errors import InputError, nearest
 from optodrive.flow import FloatArray, IntArray, freeze_arrays
 
 FORMAT = "optodrive-config"
-VERSION = 2
+VERSION = 3
 DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time one point of the wire protocol can carry (16 bit, microseconds)."""
+
+CODES_A_SIDE = 32_767
+"""Steps of the converter from the middle to the end of a mirror's range."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -61,19 +64,34 @@ class PixelModelSection(Section):
 
 
 class LaserSection(Section):
-    """The diode: incident power at the sample with the gate fully on, and its modulation."""
+    """The diode: incident power at the sample with the gate fully on, its modulation, its focus on the absorber."""
 
     max_power_w: Positive
     pwm_hz: Positive
+    focus_width_m: Positive
+    focus_height_m: Positive
 
 
 class ScannerSection(Section):
-    """Mirrors and lens: ideal f-theta x = f · 2 · angle; a move takes settle_s + distance / slew."""
+    """Mirrors and lens: ideal f-theta x = f · 2 · angle; either mirror follows its command as a servo.
+
+    delay_s after a command the servo's own target begins to move towards it at slew_rad_per_s; the angle follows that
+    with natural frequency bandwidth_hz and damping, always underdamped. aim_error_m: how far a settled beam may stand
+    from where it should.
+    """
 
     focal_length_m: Positive
     range_rad: Annotated[float, Field(gt=0, lt=0.8)]
-    settle_s: Annotated[float, Field(ge=0, le=0.01)]
-    slew_rad_per_s: Positive
+    bandwidth_hz: Annotated[float, Field(ge=100, le=100_000)]
+    damping: Annotated[float, Field(ge=0.3, le=0.9)]
+    delay_s: Annotated[float, Field(ge=0, le=0.01)]
+    slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000)]
+    aim_error_m: NonNegative
+
+    @property
+    def code_rad(self) -> float:
+        """Mirror angle of one step of the converter, rad: range_rad is the most it can say."""
+        return self.range_rad / CODES_A_SIDE
 
 
 class UncertaintySection(Section):
@@ -104,7 +122,7 @@ class LimitsSection(Section):
     wall_max_c: float
     touch_max_c: float
     galvo_acceleration_rms_max_rad_per_s2: Positive
-    galvo_mean_s: Positive
+    galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
     pulse_energy_max_j: Positive
     pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
     pulse_rest_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
@@ -144,7 +162,7 @@ class Config(Section):
     """The whole configuration of one display."""
 
     format: Literal["optodrive-config"]
-    version: Literal[2]
+    version: Literal[3]
     name: str
     ambient_c: Annotated[float, Field(ge=-20, le=60)]
     display: DisplaySection
@@ -191,6 +209,29 @@ class Config(Section):
                 f"scanner reaches ±{reach_m:.4f} m (range_rad, focal_length_m), a pixel lies at {farthest_m:.4f} m"
             )
         return self
+
+    @model_validator(mode="after")
+    def _focus_fits_on_the_absorber(self) -> Self:
+        display, laser = self.display, self.laser
+        least_rad = 2.0 * self.scanner.code_rad
+        for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
+            if tolerance_rad <= least_rad:
+                raise ValueError(
+                    f"laser.focus_{side}_m {getattr(laser, f'focus_{side}_m')} with scanner.aim_error_m "
+                    f"{self.scanner.aim_error_m} to either side does not fit on display.absorber_{side}_m "
+                    f"{getattr(display, f'absorber_{side}_m')} with two steps of the converter to spare"
+                )
+        return self
+
+    @property
+    def tolerance_rad(self) -> tuple[float, float]:
+        """How far mirrors x and y may stand from where they should with the whole focus on the absorber, rad."""
+        display, laser, scanner = self.display, self.laser, self.scanner
+        room_m = (
+            (display.absorber_width_m - laser.focus_width_m) / 2.0 - scanner.aim_error_m,
+            (display.absorber_height_m - laser.focus_height_m) / 2.0 - scanner.aim_error_m,
+        )
+        return room_m[0] / (2.0 * scanner.focal_length_m), room_m[1] / (2.0 * scanner.focal_length_m)
 
 
 @dataclass(frozen=True, eq=False)

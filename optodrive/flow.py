@@ -77,7 +77,7 @@ class PulsePlan:
     start_s: gate on, from the plan's start, whole microseconds; width_s: whole PWM periods
     x_rad, y_rad: mechanical mirror angles (the beam turns by twice that)
     power_w: mean incident power while on; pixel: index
-    settle_s: dark time kept before the pulse for the mirrors' move and settling
+    settle_s: dark time kept before the pulse for the mirrors' move
     target_m: peak displacement the pulse is meant to reach, NaN for pulses of a train
     nominal_s: when the request wanted the pulse (frame: shown by; train: gate on); source: index of frame, or of
     train counted on from the frames
@@ -142,7 +142,8 @@ class BudgetState:
     its wall, leaky bucket of energy, light without a rest; least_k: [p] that rise at least
     wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]; inflow_w: [p] what neighbours send a
     wall at most, as of exchanged_at_s
-    mirror_rad: [2] where the mirrors stand; acceleration2: [2] their mean-square acceleration, rad²/s⁴, at mirror_at_s
+    mirror_rad: [2] where the mirrors stand; acceleration2: [2] bound on their mean-square acceleration, rad²/s⁴, and
+    swing: [2] on the root of the integral of a² still to come, rad/s^1.5, at mirror_at_s, when their targets arrived
     recent_*: [r] pulses still inside a sliding window: start_s, width_s, power_w, pixel
     """
 
@@ -159,6 +160,7 @@ class BudgetState:
     exchanged_at_s: float
     mirror_rad: FloatArray
     acceleration2: FloatArray
+    swing: FloatArray
     mirror_at_s: float
     recent_start_s: FloatArray
     recent_width_s: FloatArray

@@ -12,17 +12,16 @@ from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_WARMING, Most, Values, Warming
 from optodrive.physics.terms import known_terms
+from optodrive.plan.galvo import MoveModel
 from optodrive.units import ZERO_CELSIUS_K
 
 BOUNDED = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
 """Terms that the bound on heat counts with."""
-ANGLE_CODES = 32_768
-"""Steps of the converter over a mirror's range to one side."""
 
 
 def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
     """Caps, bound and mirrors; raises InputError where a bound cannot be given."""
-    limits, scanner, ambient_c = config.limits, config.scanner, config.ambient_c
+    limits, ambient_c = config.limits, config.ambient_c
     warming = warming_of(parameters, pixels, config)
     base_c = ambient_c + warming.everywhere_k
     for name, cap_c in (
@@ -51,13 +50,21 @@ def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> B
     )
     model = declared(parameters, pixels, Neighbours.of(config.display), ambient_c + ZERO_CELSIUS_K, warming)
     uncertainty = Uncertainty(**limits.uncertainty.model_dump())
-    mirrors = Mirrors(
-        settle_s=scanner.settle_s,
+    return Budget(caps, heat_bound(model, uncertainty, caps, config.laser.max_power_w), mirrors_of(config))
+
+
+def mirrors_of(config: Config) -> Mirrors:
+    """The mirrors' servo, and the lead that every plan keeps."""
+    scanner = config.scanner
+    return Mirrors(
+        omega_per_s=2.0 * np.pi * scanner.bandwidth_hz,
+        damping=scanner.damping,
+        delay_s=scanner.delay_s,
         slew_rad_per_s=scanner.slew_rad_per_s,
-        mean_s=limits.galvo_mean_s,
-        code_rad=scanner.range_rad / ANGLE_CODES,
+        lead_s=MoveModel.of(config).lead_us * 1e-6,
+        mean_s=config.limits.galvo_mean_s,
+        code_rad=scanner.code_rad,
     )
-    return Budget(caps, heat_bound(model, uncertainty, caps, config.laser.max_power_w), mirrors)
 
 
 def warming_of(parameters: ParameterSet, pixels: PixelArray, config: Config) -> Warming:

@@ -46,11 +46,11 @@ class Display:
         layout = pixel_layout(config.display)
         parameters = load_parameters(config.pixel_model.parameters)
         pixels = display_pixels(config, parameters)
-        limits, laser, scanner = config.limits, config.laser, config.scanner
+        limits, laser = config.limits, config.laser
         machine = Machine(
             layout=layout,
-            field=IdealField(scanner.focal_length_m),
-            moves=MoveModel(scanner.settle_s, scanner.slew_rad_per_s),
+            field=IdealField(config.scanner.focal_length_m),
+            moves=MoveModel.of(config),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
         )
         return cls(config, layout, parameters, pixels, machine, budget_of(config, parameters, pixels))

@@ -3,8 +3,11 @@
 from dataclasses import dataclass
 from math import ceil
 
+import numpy as np
+
 from optodrive.config import Config, pixel_layout
 from optodrive.errors import InputError
+from optodrive.plan.galvo import MoveModel
 from optodrive.wire import messages as m
 from optodrive.wire.connection import RTO_S
 from optodrive.wire.quantise import CENTRE_CODE, CODE_MAX, WireScale
@@ -55,6 +58,7 @@ class Requirements:
     def limits(self) -> m.Limits:
         """The limits this host asks the board to tighten to."""
         limits, scanner, layout = self.config.limits, self.config.scanner, pixel_layout(self.config.display)
+        settle_us, settle_ns_per_code = self._settling()
         angle = 1.0 / (2.0 * scanner.focal_length_m)
         x_codes, y_codes = (self.scale.codes(position * angle) for position in (layout.x_m, layout.y_m))
         return m.Limits(
@@ -68,11 +72,25 @@ class Requirements:
             x_max=min(CODE_MAX, int(x_codes.max()) + FIELD_MARGIN_CODES),
             y_min=max(0, int(y_codes.min()) - FIELD_MARGIN_CODES),
             y_max=min(CODE_MAX, int(y_codes.max()) + FIELD_MARGIN_CODES),
-            settle_us=round(scanner.settle_s * 1e6),
-            settle_ns_per_code=int(self.scale.rad_per_code / scanner.slew_rad_per_s * 1e9),
+            settle_us=settle_us,
+            settle_ns_per_code=settle_ns_per_code,
             rest_us=round(limits.pulse_rest_min_s * 1e6),
             lease_ms=round(self.lease_s * 1e3),
         )
+
+    def _settling(self) -> tuple[int, int]:
+        """settle_us and settle_ns_per_code: the slew, and as much as never comes above the plan's own time of a move.
+
+        Times jump where a longer move begins to overshoot; a steeper line would have to lie lower for the short ones.
+        """
+        display = self.config.display
+        moves = MoveModel.of(self.config)
+        ns_per_code = int(self.scale.rad_per_code / self.config.scanner.slew_rad_per_s * 1e9)
+        pitches = np.arange(1, max(display.rows, display.columns, 2))
+        # A move may come out a code longer than planned.
+        codes = np.floor(pitches * moves.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
+        times_us = np.minimum(*(np.array(table)[pitches] for table in moves.calm))
+        return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code
 
     def check(self, peer: m.HelloReply) -> None:
         """Refuse a board that cannot do what the configuration plans with; InputError names key and value."""
@@ -84,14 +102,13 @@ class Requirements:
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, asked = peer.limits, self.limits()
-        slower = "a value the board's own settling allows: "
+        slower = "a slower servo: the board itself keeps the gate closed"
         if limits.settle_us > asked.settle_us:
-            raise InputError(
-                "scanner.settle_s", config.scanner.settle_s, f"{slower}{limits.settle_us * 1e-6:g}", "board"
-            )
+            expected = f"{slower} for {limits.settle_us} µs a move, the plan for {asked.settle_us} µs"
+            raise InputError("scanner.bandwidth_hz", config.scanner.bandwidth_hz, expected, "board")
         if limits.settle_ns_per_code > asked.settle_ns_per_code:
-            most = self.scale.rad_per_code / (limits.settle_ns_per_code * 1e-9)
-            raise InputError("scanner.slew_rad_per_s", config.scanner.slew_rad_per_s, f"{slower}{most:.1f}", "board")
+            expected = f"{slower} for {limits.settle_ns_per_code} ns a code, the plan for {asked.settle_ns_per_code} ns"
+            raise InputError("scanner.slew_rad_per_s", config.scanner.slew_rad_per_s, expected, "board")
         if limits.max_on_us < asked.max_on_us:
             most_s = limits.max_on_us * 1e-6
             raise InputError(

@@ -6,13 +6,15 @@ from optodrive.pipeline import Display
 
 
 def resolved_config(display: Display) -> dict[str, Any]:
-    """`optodrive config show --json`: sections as configured; pixels with positions; the pixel model's numbers."""
+    """`optodrive config show --json`: sections as configured, pixels' places, a move's time, the model's numbers."""
     config, layout = display.config, display.layout
     resolved = config.model_dump(mode="json")
     resolved["display"]["pixels"] = [
         {"index": index, "x_m": x_m, "y_m": y_m, "bridge_width_m": config.display.bridge_width_m}
         for index, (x_m, y_m) in enumerate(zip(layout.x_m.tolist(), layout.y_m.tolist(), strict=True))
     ]
+    moves = display.machine.moves
+    resolved["scanner"]["move_pitch_s"] = moves.time_us(moves.pitch_rad, moves.pitch_rad, moves.calm_us) * 1e-6
     pixel = display.pixels.each[0]
     resolved["pixel_model"].update(
         {

@@ -8,6 +8,7 @@ from optodrive.config import Config
 from optodrive.flow import FloatArray, FrameSequence, TactileFrame
 from optodrive.frames.lattice import Lattice
 from optodrive.physics.drive import DriveRange
+from optodrive.physics.gate import servo_of, settled_s
 from optodrive.physics.heat import heat_at_rest
 from optodrive.physics.parameters import load_parameters
 
@@ -23,7 +24,8 @@ class Beam:
 
     def __init__(self, config: Config) -> None:
         self.lattice = Lattice.of(config)
-        self._scanner = config.scanner
+        self._scanner, self._servo = config.scanner, servo_of(config.scanner)
+        self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
         self._period_s = 1.0 / config.laser.pwm_hz
         laser = config.laser
         self._drive = DriveRange.of(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
@@ -33,6 +35,10 @@ class Beam:
         """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
         pulse = self._at_rest.pulse_for_peak(0, 0.0, target_m, self._drive)
         return self._drive.period_s * (1 if pulse is None else pulse[0])
+
+    def _move_s(self, step_m: float) -> float:
+        """From a move's command until the focus lies on the next absorber, s."""
+        return settled_s(self._servo, step_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
 
     def picture_s(self, target_m: FloatArray) -> float:
         """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
@@ -47,8 +53,9 @@ class Beam:
         steps_m = np.maximum(
             *(np.abs(np.diff(at_m[order], append=at_m[order[0]])) for at_m in (layout.x_m, layout.y_m))
         )
-        turns_s = steps_m / (2.0 * self._scanner.focal_length_m * self._scanner.slew_rad_per_s)
-        moves_s = float(np.sum(turns_s)) + len(driven) * self._scanner.settle_s
+        # A single pixel is still come to from somewhere: a pitch at least.
+        lengths_m, counts = np.unique(np.maximum(steps_m, self._pitch_m).round(9), return_counts=True)
+        moves_s = sum(self._move_s(float(step_m)) * int(n) for step_m, n in zip(lengths_m, counts, strict=True))
         return ceil(RESERVE * (pulses_s + moves_s) * 1e3) / 1e3
 
 

@@ -73,13 +73,17 @@ class HeatBound(NamedTuple):
 
 
 class Mirrors(NamedTuple):
-    """A move of d takes settle_s + d / slew and is reckoned as full acceleration, then full braking.
+    """Servos of the second order, natural frequency omega_per_s; delay_s after a command their targets run at the slew.
 
-    mean_s: time constant of the mean; code_rad: one step of the converter, by which a move may come out longer
+    lead_s: from a plan's begin to its first pulse at least; mean_s: time constant of the mean
+    code_rad: one step of the converter, by which a move may come out longer
     """
 
-    settle_s: float
+    omega_per_s: float
+    damping: float
+    delay_s: float
     slew_rad_per_s: float
+    lead_s: float
     mean_s: float
     code_rad: float
 

@@ -36,6 +36,7 @@ def open_ledger(state: BudgetState, room: int) -> Ledger:
         peak_k=np.zeros(pixels),
         mirror_rad=state.mirror_rad.copy(),
         acceleration2=state.acceleration2.copy(),
+        swing=state.swing.copy(),
         mirror_at_s=np.array([state.mirror_at_s]),
     )
     pulses = Pulses(
@@ -84,6 +85,7 @@ def close_ledger(ledger: Ledger, budget: Budget) -> BudgetState:
         exchanged_at_s=float(nodes.exchanged_at_s[0]),
         mirror_rad=spots.mirror_rad,
         acceleration2=spots.acceleration2,
+        swing=spots.swing,
         mirror_at_s=float(spots.mirror_at_s[0]),
         recent_start_s=pulses.start_s[kept],
         recent_width_s=pulses.width_s[kept],

@@ -96,6 +96,7 @@ def fresh_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
         exchanged_at_s=-inf,
         mirror_rad=np.zeros(2),
         acceleration2=np.zeros(2),
+        swing=np.zeros(2),
         mirror_at_s=at_s,
         recent_start_s=np.zeros(0),
         recent_width_s=np.zeros(0),

@@ -1,11 +1,11 @@
 """A plan, pulse by pulse, through the bound: what each cap allows, and what a fired pulse leaves. Kernels."""
 
-from math import exp
 from typing import NamedTuple
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray, IntArray
-from optodrive.limit.budget import Budget, Mirrors
+from optodrive.limit.budget import Budget
+from optodrive.limit.mirrors import Motion, acceleration2_after, moved
 from optodrive.limit.nodes import Nodes, absorber_after_k, exchange, least_after_k, settle, touch_after_k, wall_after_k
 from optodrive.limit.slow import Ask, slow_nodes_allow, wall_during_k, wall_over_k
 from optodrive.limit.windows import Chains, Pulses, allowed_w, append
@@ -25,7 +25,7 @@ class Spots(NamedTuple):
 
     bucket_j, on_s: [p] at the end of the pixel's last pulse; end_s: [1] end of the display's last pulse
     peak_k: [p] largest bound on the absorber so far
-    mirror_rad: [2] where the mirrors stand; acceleration2: [2] their mean-square acceleration at mirror_at_s [1]
+    mirror_rad: [2] where the mirrors stand; acceleration2, swing: [2], mirror_at_s: [1], see `mirrors.Motion`
     """
 
     bucket_j: FloatArray
@@ -34,6 +34,7 @@ class Spots(NamedTuple):
     peak_k: FloatArray
     mirror_rad: FloatArray
     acceleration2: FloatArray
+    swing: FloatArray
     mirror_at_s: FloatArray
 
 
@@ -112,8 +113,11 @@ def _allowed(budget: Budget, ledger: Ledger, ask: Ask) -> tuple[float, int]:
     rise_k, least_k, bucket_j, on_s = _before(budget, ledger, ask)
     if on_s + width_s > caps.pulse_width_s + ROUNDING:
         return 0.0, WIDTH
-    if max(_accelerated(budget.mirrors, ledger.spots, ask)) > caps.galvo_rad2_per_s4 * (1 + ROUNDING):
-        return 0.0, GALVO
+    if _moves(ledger.spots, ask):
+        motion = _motion(budget, ledger.spots, ask)
+        after = acceleration2_after(budget.mirrors, motion, ask.start_s + width_s)
+        if after > caps.galvo_rad2_per_s4 * (1 + ROUNDING):
+            return 0.0, GALVO
     most_w, binding = caps.pulse_energy_j / width_s, ENERGY
     spot_w = (caps.pulse_energy_j - bucket_j) / width_s
     if spot_w < most_w:
@@ -163,18 +167,17 @@ def _absorber_allows(budget: Budget, ledger: Ledger, ask: Ask, rise_k: float, wa
 
 
 @kernel
-def _accelerated(mirrors: Mirrors, spots: Spots, ask: Ask) -> tuple[float, float]:
-    """Mean-square acceleration of x and y after the move to a pulse, rad²/s⁴; zero where there is no move."""
-    dx_rad, dy_rad = abs(ask.x_rad - spots.mirror_rad[0]), abs(ask.y_rad - spots.mirror_rad[1])
-    if dx_rad == 0.0 and dy_rad == 0.0:
-        return 0.0, 0.0
-    dx_rad, dy_rad = dx_rad + mirrors.code_rad, dy_rad + mirrors.code_rad
-    move_s = mirrors.settle_s + max(dx_rad, dy_rad) / mirrors.slew_rad_per_s
-    kept = exp(-max(0.0, ask.start_s - move_s - spots.mirror_at_s[0]) / mirrors.mean_s)
-    # Full acceleration over half the time, full braking over the other: a = 4 d / t², on for t.
-    x2 = spots.acceleration2[0] * kept + 16.0 * dx_rad**2 / move_s**3 / mirrors.mean_s
-    y2 = spots.acceleration2[1] * kept + 16.0 * dy_rad**2 / move_s**3 / mirrors.mean_s
-    return x2, y2
+def _moves(spots: Spots, ask: Ask) -> bool:
+    return bool(ask.x_rad != spots.mirror_rad[0] or ask.y_rad != spots.mirror_rad[1])
+
+
+@kernel
+def _motion(budget: Budget, spots: Spots, ask: Ask) -> Motion:
+    """The mirrors after the move to a pulse."""
+    x2, y2 = spots.acceleration2[0], spots.acceleration2[1]
+    before = Motion(x2, y2, spots.swing[0], spots.swing[1], spots.mirror_at_s[0])
+    dx_rad, dy_rad = ask.x_rad - spots.mirror_rad[0], ask.y_rad - spots.mirror_rad[1]
+    return moved(budget.mirrors, before, dx_rad, dy_rad, spots.end_s[0], ask.start_s)
 
 
 @kernel
@@ -187,6 +190,12 @@ def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float) -> None:
     nodes.absorber_k[pixel] = absorber_after_k(heat, pixel, rise_k, power_w, ask.width_s)
     drive_k = heat.touch_per_wall_k * wall_during_k(budget, ledger.nodes, ask, least_k, power_w)
     nodes.least_k[pixel] = least_after_k(heat, pixel, least_k, power_w, ask.width_s)
+    if _moves(spots, ask):
+        motion = _motion(budget, spots, ask)
+        spots.acceleration2[0], spots.acceleration2[1] = motion.x2, motion.y2
+        spots.swing[0], spots.swing[1] = motion.x_swing, motion.y_swing
+        spots.mirror_rad[0], spots.mirror_rad[1] = ask.x_rad, ask.y_rad
+        spots.mirror_at_s[0] = motion.at_s
     nodes.dark_since_s[pixel] = spots.end_s[0] = end_s
 
     for lag in range(2):
@@ -199,11 +208,6 @@ def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float) -> None:
 
     spots.bucket_j[pixel] = max(0.0, bucket_j + (power_w - budget.caps.pixel_mean_w) * ask.width_s)
     spots.on_s[pixel] = on_s + ask.width_s
-    if ask.x_rad != spots.mirror_rad[0] or ask.y_rad != spots.mirror_rad[1]:
-        spots.acceleration2[0], spots.acceleration2[1] = _accelerated(budget.mirrors, spots, ask)
-        spots.mirror_rad[0], spots.mirror_rad[1] = ask.x_rad, ask.y_rad
-        spots.mirror_at_s[0] = ask.start_s
-
     pulses = ledger.pulses
     row = pulses.fired[0]
     pulses.start_s[row], pulses.width_s[row] = ask.start_s, ask.width_s

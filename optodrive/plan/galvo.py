@@ -1,19 +1,138 @@
-"""How long the mirrors need: both axes move at once, the farther one decides."""
+"""How long a move of the mirrors keeps the gate closed: until the whole focus lies on the absorber, and stays there.
 
+Both axes start at once and the later one decides. What is left of the moves before is counted by shares of the
+tolerance, see docs/decisions/0013-gate-by-trajectory.md.
+"""
+
+from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil
+from itertools import accumulate
+from math import ceil, exp, log
+from typing import Self
+
+from optodrive.config import Config
+from optodrive.physics.gate import outlasting, pole_per_s, servo_of, settled_s
+from optodrive.physics.mirror import Servo
+
+CALM_SHARE = 0.01
+"""Share of the tolerance that is kept for what is left of the moves before, once they have had time to die out."""
+HALVINGS = 40
+UPWARDS = 1.0 - 1e-6
+"""Added to a number of pitches it gives the next whole one upwards, but for what is only rounding."""
+
+Table = tuple[int, ...]
 
 
 @dataclass(frozen=True)
 class MoveModel:
-    """A move of distance d takes settle_s + d / slew_rad_per_s; no move takes no time."""
+    """Times of moves between pixels, by pitches: no move takes no time.
 
-    settle_s: float
-    slew_rad_per_s: float
+    calm, hasty: times of x and of y, µs, rising, and never more than those of two moves that lead to the same place
+    calm_us: after stays on a pixel at least as long as this a move is calm
+    lead_us: for the farthest move, from the middle too, whatever was before
+    """
 
-    def time_us(self, dx_rad: float, dy_rad: float) -> int:
-        """Dark time to keep for a move, µs, rounded up, with one for the rounding of codes on the wire."""
-        distance_rad = max(abs(dx_rad), abs(dy_rad))
-        if distance_rad == 0.0:
-            return 0
-        return ceil(1e6 * (self.settle_s + distance_rad / self.slew_rad_per_s)) + 1
+    pitch_rad: float
+    calm_us: int
+    calm: tuple[Table, Table]
+    hasty: tuple[Table, Table]
+    lead_us: int
+
+    @classmethod
+    def of(cls, config: Config) -> Self:
+        """Tables for a configuration's lattice, servo, absorber and focus."""
+        moves, display = _Moves.of(config), config.display
+        share = moves.hasty_share()
+        farthest = max(1, display.rows - 1, display.columns - 1)
+        calm, hasty = ((moves.table(0, farthest, left), moves.table(1, farthest, left)) for left in (CALM_SHARE, share))
+        # Only a first move, from the middle of an even lattice, goes half pitches.
+        halves = [
+            1e6 * moves.time_s(axis, 0.5 * odd, share)
+            for axis, count in enumerate((display.columns, display.rows))
+            for odd in range(1, count if count % 2 == 0 else 0, 2)
+        ]
+        lead_us = max(hasty[0][display.columns - 1], hasty[1][display.rows - 1], *(ceil(each) for each in halves))
+        return cls(moves.pitch_rad, moves.calm_us(share), calm, hasty, lead_us)
+
+    def time_us(self, dx_rad: float, dy_rad: float, lit_us: int = 0) -> int:
+        """Dark time to keep for a move over whole pitches, µs, after a stay of lit_us since the gate opened."""
+        tables = self.calm if lit_us >= self.calm_us else self.hasty
+        x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + UPWARDS)]
+        y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + UPWARDS)]
+        return x_us if x_us > y_us else y_us
+
+
+@dataclass(frozen=True)
+class _Moves:
+    """The servo's moves on one lattice. room_rad: tolerance of x and y, less half a code by which the aim is off."""
+
+    servo: Servo
+    pitch_rad: float
+    code_rad: float
+    room_rad: tuple[float, float]
+    shortest_s: float
+
+    @classmethod
+    def of(cls, config: Config) -> Self:
+        scanner = config.scanner
+        x_rad, y_rad = (tolerance_rad - 0.5 * scanner.code_rad for tolerance_rad in config.tolerance_rad)
+        pitch_rad = config.display.pitch_m / (2.0 * scanner.focal_length_m)
+        shortest_s = int(1e6 / config.laser.pwm_hz) * 1e-6
+        return cls(servo_of(scanner), pitch_rad, scanner.code_rad, (x_rad, y_rad), shortest_s)
+
+    def time_s(self, axis: int, pitches: float, share: float) -> float:
+        """Time of a move with a share of the tolerance kept for what is left of others. A code more may be moved."""
+        tolerance_rad = (1.0 - share) * self.room_rad[axis] - self.code_rad
+        return settled_s(self.servo, pitches * self.pitch_rad, tolerance_rad)
+
+    def table(self, axis: int, farthest: int, share: float) -> Table:
+        return _by_way([0, *(ceil(1e6 * self.time_s(axis, pitches, share)) for pitches in range(1, farthest + 1))])
+
+    def _one_pitch_s(self, share: float) -> float:
+        return min(self.time_s(axis, 1, share) for axis in range(2))
+
+    def _kept(self, share: float) -> float:
+        """How far a swing dies out from one gate to the next: over the shortest pulse and the shortest move."""
+        return exp(pole_per_s(self.servo).real * (self.shortest_s + self._one_pitch_s(share)))
+
+    def hasty_share(self) -> float:
+        """Share of the tolerance that all former moves together may still have when pulses are as short as can be.
+
+        A larger share makes moves longer and thereby leaves less: the share is where both meet.
+        """
+
+        def left(share: float) -> float:
+            kept = self._kept(share)
+            return outlasting(self.servo) * kept / (1.0 - kept)
+
+        return max(CALM_SHARE, _meeting(left, 1.0 - 1.01 * self.code_rad / min(self.room_rad)))
+
+    def calm_us(self, hasty_share: float) -> int:
+        """The stay after which all former moves together have no more than CALM_SHARE left when the next gate opens."""
+        rate_per_s = -pole_per_s(self.servo).real
+        needed = outlasting(self.servo) / (CALM_SHARE * (1.0 - self._kept(hasty_share)))
+        return max(0, ceil(1e6 * (log(needed) / rate_per_s - self._one_pitch_s(CALM_SHARE))))
+
+
+def _meeting(falling: Callable[[float], float], most: float) -> float:
+    """Where a falling function of a share meets the share, or just above."""
+    low, high = 0.0, most
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        if falling(middle) > middle:
+            low = middle
+        else:
+            high = middle
+    return high
+
+
+def _by_way(times_us: list[int]) -> Table:
+    """Rising times at or above those given with none above the sum of two that lead as far.
+
+    A pulse between them may be trimmed to nothing: then the mirrors go all the way in the time of both moves.
+    """
+    times_us = list(accumulate(times_us, max))
+    for far in range(len(times_us) - 1, 1, -1):
+        for rest in range(1, far // 2 + 1):
+            times_us[far - rest] = max(times_us[far - rest], times_us[far] - times_us[rest])
+    return tuple(accumulate(times_us, max))

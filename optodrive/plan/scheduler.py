@@ -68,10 +68,15 @@ class _Row(NamedTuple):
 
 @dataclass
 class _Cursor:
-    """How far a plan has come. place: in the frame's order; waited_us: pauses put in so far."""
+    """How far a plan has come. place: in the frame's order; waited_us: pauses put in so far.
+
+    since_us, stay_us: when the gate first opened on the pixel `lit`, and how long the mirrors stayed there after that
+    """
 
     free_us: int = 0
     lit: int | None = None
+    since_us: int = 0
+    stay_us: int = 0
     next_train: int = 0
     place: int = 0
     waited_us: int = 0
@@ -104,11 +109,7 @@ class Scheduler:
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = _train_pulses(sequence.trains, len(sequence.frames))
         self._now = _Cursor(lit=standing_on)
-        self.lead_us = (
-            0
-            if standing_on is not None
-            else machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
-        )
+        self.lead_us = machine.moves.lead_us if standing_on is None else 0
         self.skipped: list[Skipped] = []
 
     def pieces(self, heat: Heat) -> Pieces:
@@ -140,11 +141,11 @@ class Scheduler:
     def _wanted_us(self, time_s: float) -> int:
         return self.lead_us + round(time_s * 1e6)
 
-    def _move_us(self, origin: int | None, pixel: int) -> int:
+    def _move_us(self, origin: int | None, pixel: int, lit_us: int) -> int:
         if origin is None:
             return self.lead_us
         return self._machine.moves.time_us(
-            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin]
+            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin], lit_us
         )
 
     def _order(self, frame: TactileFrame) -> list[int]:
@@ -155,9 +156,12 @@ class Scheduler:
 
     def _place(self, pixel: int, width_us: int, power_w: float, wanted_us: int, target_m: float, source: int) -> _Row:
         now = self._now
-        settle_us = self._move_us(now.lit, pixel)
+        settle_us = self._move_us(now.lit, pixel, now.stay_us)
         start_us = max(wanted_us + now.waited_us, now.free_us + settle_us)
+        if pixel != now.lit:
+            now.since_us = start_us
         now.free_us, now.lit = start_us + width_us, pixel
+        now.stay_us = now.free_us - now.since_us
         return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
 
     def _train_row(self) -> _Row:
@@ -178,14 +182,14 @@ class Scheduler:
         while (yield from self._offer(build)):
             pass
 
-    def _train_is_due(self, end_us: int, pixel: int) -> bool:
-        """Whether the next train pulse would come late if the beam stayed on `pixel` until end_us."""
+    def _train_is_due(self, end_us: int, pixel: int, lit_us: int) -> bool:
+        """Whether the next train pulse would come late if the beam lit `pixel` for lit_us until end_us."""
         now = self._now
         if now.next_train >= len(self._trains):
             return False
         pulse = self._trains[now.next_train]
         due_us = self.lead_us + pulse.nominal_us + now.waited_us
-        return due_us < end_us + self._move_us(pixel, pulse.pixel)
+        return due_us < end_us + self._move_us(pixel, pulse.pixel, lit_us)
 
     def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
         """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
@@ -201,7 +205,7 @@ class Scheduler:
         while now.place < len(order):
             pixel = order[now.place]
             target_m = float(frame.target_m[pixel])
-            start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel))
+            start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel, now.stay_us))
             if now.place % TICK == 0:
                 self._tick()
             pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
@@ -211,7 +215,7 @@ class Scheduler:
                 now.place += 1
                 continue
             width_us = round(pulse[0] * drive.period_s * 1e6)
-            if self._train_is_due(start_us + width_us, pixel):
+            if self._train_is_due(start_us + width_us, pixel, width_us):
                 return [*rows, self._train_row()]
             rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, wanted_us, target_m, source))
             now.place += 1

@@ -116,7 +116,7 @@ def wrong_constant(guard):
         elif guard == "diode":
             caps = caps._replace(display_window_s=2.0 * caps.display_window_s)
         else:
-            mirrors = mirrors._replace(settle_s=1.25 * mirrors.settle_s)
+            mirrors = mirrors._replace(omega_per_s=0.8 * mirrors.omega_per_s)
         return Budget(caps, heat, mirrors)
 
     return dict(mutate=mutate)

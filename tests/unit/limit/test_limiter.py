@@ -28,12 +28,13 @@ MODEL = Declared(
     walls=Walls(20.0, 0.06, 430.0, 430.0),
     touch=Touch(0.3, 0.4, 1.2),
 )
+SERVO = Mirrors(omega_per_s=1e4, damping=0.7, delay_s=3e-5, slew_rad_per_s=100.0, lead_s=1e-3, mean_s=1.0, code_rad=0.0)
 
 
 def roomy(**caps):
     """No cap binds but those given."""
     caps = NO_CAPS._replace(**caps)
-    return Budget(caps, heat_bound(MODEL, CERTAIN, caps, 2.45), Mirrors(4e-4, 100.0, 1.0, 0.0))
+    return Budget(caps, heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
 
 
 ROOMY = roomy()
@@ -149,7 +150,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
 def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
     caps = NO_CAPS._replace(absorber_k=150.0)
     bare = replace(MODEL, walls=None, touch=None)
-    budget = Budget(caps, heat_bound(bare, CERTAIN, caps, 2.45), Mirrors(4e-4, 100.0, 1.0, 0.0))
+    budget = Budget(caps, heat_bound(bare, CERTAIN, caps, 2.45), SERVO)
     gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
     assert gentle.trimmed_j.sum() == 0
     limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))

@@ -4,7 +4,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optodrive.plan.field import IdealField
-from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import serpentine
 
 
@@ -13,13 +12,6 @@ def test_field_there_and_back():
     position = np.linspace(-0.076, 0.076, 9)
     assert np.allclose(field.position_m(field.mirror_rad(position)), position, atol=1e-15)
     assert field.mirror_rad(np.array([0.044]))[0] == pytest.approx(0.1)
-
-
-def test_move_time_is_decided_by_the_farther_axis():
-    moves = MoveModel(4e-4, 100.0)
-    assert moves.time_us(0.0, 0.0) == 0
-    assert moves.time_us(0.01, 0.0) == 501
-    assert moves.time_us(0.01, -0.02) == 601
 
 
 @given(st.lists(st.integers(0, 99), min_size=1, unique=True))

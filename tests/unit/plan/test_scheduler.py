@@ -24,7 +24,9 @@ def test_one_beam_with_time_for_every_move(any_display):
     result = prepared(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
     plan = result.plan
     moves = any_display.machine.moves
-    needed = [moves.time_us(dx, dy) * 1e-6 for dx, dy in zip(np.diff(plan.x_rad), np.diff(plan.y_rad), strict=True)]
+    lit_us = np.rint(plan.width_s[:-1] * 1e6)
+    steps = zip(np.diff(plan.x_rad), np.diff(plan.y_rad), lit_us, strict=True)
+    needed = [moves.time_us(*step) * 1e-6 for step in steps]
     assert np.all(gaps(plan) >= np.array(needed) - 1e-9)
     assert len(plan) == len(any_display.layout)
 

@@ -1,0 +1,204 @@
+"""While the gate is on the whole focus lies on the absorber: plans as the wire has them, by an exact servo."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+from hypothesis import given, reject, settings
+from hypothesis import strategies as st
+
+from displays import DISPLAYS
+from optodrive.board.requirements import Requirements
+from optodrive.config import Config
+from optodrive.errors import InputError
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.frames.patterns import build_pattern
+from optodrive.pipeline import Display, prepare
+from optodrive.wire.quantise import quantise
+
+GRID_S = 1e-6
+ROUNDING_M = 1e-9
+
+
+@dataclass(frozen=True)
+class Exact:
+    """A servo by the exponential of its matrix: [angle, speed] about where it stands, or runs, in the long run."""
+
+    scanner: object
+
+    def angles(self, at_s, goal_rad, t_s):
+        """Angle at t_s of one that rests at 0 and is sent to goal_rad at at_s."""
+        omega, damping = 2 * np.pi * self.scanner.bandwidth_hz, self.scanner.damping
+        rates, vectors = np.linalg.eig(np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]]))
+        inverse = np.linalg.inv(vectors)
+
+        def later(state, after_s):
+            return ((vectors * (inverse @ state)) @ np.exp(np.outer(rates, after_s))).real
+
+        out, target, state = np.zeros(len(t_s)), 0.0, np.zeros(2)
+        begins_s = at_s + self.scanner.delay_s
+        ends_s = np.append(begins_s[1:], np.inf)
+        for begin_s, end_s, goal in zip(begins_s, ends_s, goal_rad, strict=True):
+            run_s = min(abs(goal - target) / self.scanner.slew_rad_per_s, end_s - begin_s)
+            pace = self.scanner.slew_rad_per_s * np.sign(goal - target)
+            for from_s, to_s, rate in ((begin_s, begin_s + run_s, pace), (begin_s + run_s, end_s, 0.0)):
+                lasting = np.array([target - 2 * damping / omega * rate, rate])
+                rows = slice(*np.searchsorted(t_s, [from_s, to_s]))
+                after_s = t_s[rows] - from_s
+                out[rows] = later(state - lasting, after_s)[0] + lasting[0] + rate * after_s
+                if np.isfinite(to_s):
+                    moved = later(state - lasting, np.array([to_s - from_s]))[:, 0]
+                    state = moved + lasting + np.array([rate * (to_s - from_s), 0.0])
+                    target += rate * (to_s - from_s)
+        return out
+
+
+def outside_m(display, plan):
+    """How far the focus, with its aim error, reaches over an absorber's edge while lit, m; negative: it never does."""
+    scale, config = Requirements.of(display.config).scale, display.config
+    points = quantise(plan, scale)
+    x, y, dark, on, _ = points.table.astype(np.int64).T
+    begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s
+    if not on.any():
+        return -np.inf
+    # Edges of the gate and a grid between them, fine for as long as anything may still swing.
+    samples, row_of = [], []
+    for row in np.flatnonzero(on):
+        lit_s = on[row] * scale.tick_s
+        inside_s = np.append(np.arange(0.0, min(lit_s, 3e-3), GRID_S), np.linspace(0.0, lit_s, 50))
+        samples.append(begin_s[row] + dark[row] * scale.tick_s + np.sort(inside_s))
+        row_of.append(np.full(len(inside_s), row))
+    t_s, row_of = np.concatenate(samples), np.concatenate(row_of)
+    pixel = plan.pixel[points.row[row_of]]
+    display_section, laser, servo = config.display, config.laser, Exact(config.scanner)
+    worst = []
+    for codes, place_m, absorber_m, focus_m in (
+        (x, display.layout.x_m, display_section.absorber_width_m, laser.focus_width_m),
+        (y, display.layout.y_m, display_section.absorber_height_m, laser.focus_height_m),
+    ):
+        angle_rad = servo.angles(begin_s, scale.angles(codes), t_s)
+        off_m = np.abs(2.0 * config.scanner.focal_length_m * angle_rad - place_m[pixel])
+        worst.append((off_m + config.scanner.aim_error_m + focus_m / 2 - absorber_m / 2).max())
+    return max(worst)
+
+
+def planned(display, sequence):
+    return prepare(display, sequence, *display.at_rest()).plan
+
+
+def changed(name, **sections):
+    table = DISPLAYS[name].config.model_dump()
+    for section, values in sections.items():
+        table[section] |= values
+    return Display.of(Config.model_validate(table))
+
+
+@st.composite
+def displays(draw):
+    """Small lattices with any servo, focus and PWM there may be."""
+    name = "display-16"
+    try:
+        return changed(
+            name,
+            display={
+                "rows": draw(st.integers(1, 4)),
+                "columns": draw(st.integers(1, 5)),
+                "pitch_m": draw(st.floats(2.05e-3, 6e-3)),
+            },
+            laser={
+                "pwm_hz": draw(st.sampled_from([5e3, 2e4, 5e4])),
+                "focus_width_m": draw(st.floats(0.2e-3, 1.4e-3)),
+                "focus_height_m": draw(st.floats(0.2e-3, 1.1e-3)),
+            },
+            scanner={
+                "bandwidth_hz": draw(st.floats(300, 4000)),
+                "damping": draw(st.floats(0.3, 0.9)),
+                "delay_s": draw(st.floats(0.0, 2e-4)),
+                "slew_rad_per_s": draw(st.floats(30, 500)),
+                "aim_error_m": draw(st.sampled_from([0.0, 1e-4, 1.5e-4])),
+            },
+            limits={"galvo_acceleration_rms_max_rad_per_s2": draw(st.sampled_from([2e4, 1e5, 1e9]))},
+        )
+    except InputError:
+        reject()
+
+
+def hops(draw, display):
+    """Pulses of all widths on random pixels, one after the other, as trains of one pulse each."""
+    period_s = 1.0 / display.config.laser.pwm_hz
+    trains, at_s = [], 0.0
+    for _ in range(draw(st.integers(2, 40))):
+        pixel = draw(st.integers(0, len(display.layout) - 1))
+        width_s = period_s * draw(st.sampled_from([1, 1, 1, 2, 3, 10, 60]))
+        trains.append(PulseTrain(pixel, at_s, width_s, width_s, 0.0, draw(st.sampled_from([0.3, 2.45]))))
+        at_s += width_s + draw(st.sampled_from([0.0, 0.0, 0.0, 1e-3, 0.2]))
+    return trains
+
+
+@settings(max_examples=200)
+@given(data=st.data())
+def test_the_focus_lies_on_the_absorber_while_the_gate_is_on(data):
+    display = data.draw(displays())
+    sequence = FrameSequence(trains=tuple(hops(data.draw, display)))
+    assert outside_m(display, planned(display, sequence)) <= ROUNDING_M
+
+
+def frame(display, height_m):
+    return FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(len(display.layout), height_m)),))
+
+
+@pytest.mark.parametrize(("name", "height_m"), [("display-1511", 50e-6), ("display-437", 10e-6), ("display-1", 50e-6)])
+def test_in_a_full_frame(name, height_m):
+    display = DISPLAYS[name]
+    assert outside_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
+
+
+@pytest.mark.parametrize("number", range(1, 7))
+def test_in_the_experiments_of_the_paper(number):
+    display = DISPLAYS["display-437"]
+    assert outside_m(display, planned(display, build_pattern(f"experiment-{number}", {}, display.config))) <= ROUNDING_M
+
+
+def with_moves(display, moves):
+    return replace(display, machine=replace(display.machine, moves=moves))
+
+
+class Early:
+    """The gate opens 15 % earlier."""
+
+    def __init__(self, moves):
+        self._moves, self.lead_us = moves, moves.lead_us
+
+    def time_us(self, *move):
+        return int(0.85 * self._moves.time_us(*move))
+
+
+@pytest.mark.parametrize("name", ["display-16", "display-437"])
+def test_a_gate_that_opens_earlier_is_caught(name):
+    display = DISPLAYS[name]
+    early = with_moves(display, Early(display.machine.moves))
+    assert outside_m(early, planned(early, frame(early, 50e-6))) > 2e-5
+
+
+def there_and_back(display):
+    """The shortest pulses there are on pixels of the first row, as quickly as the mirrors go."""
+    width_s = 1.0 / display.config.laser.pwm_hz
+    pixels = [k % display.config.display.columns for k in range(60)] + [k % 2 for k in range(60)]
+    return FrameSequence(
+        trains=tuple(PulseTrain(p, 1e-6 * k, width_s, width_s, 0.0, 2.45) for k, p in enumerate(pixels))
+    )
+
+
+def test_hasty_moves_taken_for_calm_ones_are_caught():
+    """A servo that rings, and pulses of 20 µs."""
+    ringing = {"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0}
+    display = changed(
+        "display-16",
+        scanner=ringing,
+        display={"pitch_m": 2.1e-3},
+        laser={"pwm_hz": 5e4},
+        limits={"galvo_acceleration_rms_max_rad_per_s2": 1e9},
+    )
+    assert outside_m(display, planned(display, there_and_back(display))) <= 0
+    always_calm = with_moves(display, replace(display.machine.moves, calm_us=0))
+    assert outside_m(always_calm, planned(always_calm, there_and_back(always_calm))) > 2e-5
