@@ -11,7 +11,16 @@ import numpy as np
 
 from optodrive.config import Config, PixelLayout, pixel_layout
 from optodrive.errors import InputError, OverBudgetError, RefusedError
-from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain, TactileFrame
+from optodrive.flow import (
+    BudgetState,
+    FloatArray,
+    FrameSequence,
+    HeightTrain,
+    LimitedPlan,
+    PulsePlan,
+    PulseTrain,
+    TactileFrame,
+)
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
@@ -23,6 +32,9 @@ from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import warm as warm_order
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
+
+JOINED = 256
+"""Pieces joined at a time: each carries the headroom of every pixel, and a piece may be a single pulse."""
 
 Progress = Callable[[float], None]
 """Told the share done, 0 to 1."""
@@ -51,6 +63,7 @@ class Display:
             field=IdealField(scanner.focal_length_m),
             moves=MoveModel(scanner.settle_s, scanner.slew_rad_per_s),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
+            rest_s=limits.pulse_rest_min_s,
         )
         return cls(config, layout, parameters, pixels, machine, budget_of(config, parameters, pixels))
 
@@ -149,8 +162,11 @@ def warm_up(display: Display) -> None:
     warm_order()
     laser, target_m = display.config.laser, np.zeros(len(display.pixels))
     target_m[0] = 1e-6
-    pulse = PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
-    prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), (pulse,)), *display.at_rest())
+    trains = (
+        PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
+        HeightTrain(0, 2.0, 1e-3, 0.1, 1e-6),
+    )
+    prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), trains), *display.at_rest())
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
@@ -183,8 +199,8 @@ def prepare(
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
 
     Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
-    frame as a whole. Raises InputError for a target out of reach, RefusedError for what no policy lets pass: under
-    "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
+    frame as a whole. Raises InputError for a height or a swing out of reach, RefusedError for what no policy lets
+    pass: under "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
     """
     check_reach(display, sequence)
     done = 0.0
@@ -193,9 +209,11 @@ def prepare(
         if progress is not None:
             progress(done)
 
-    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick)
+    train_piece = 1 if policy == "delay" else TRAIN_PIECE
+    scheduler = Scheduler(display.machine, sequence, display.heat_at_rest(), train_piece, tick)
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
+    waiting: list[LimitedPlan] = []
     delays: list[Delay] = []
     shortfall: Shortfall | None = None
     pieces = scheduler.pieces(working)
@@ -213,11 +231,13 @@ def prepare(
             shortfall = _shortfall(piece, passed, state, display.budget)
         state = after
         working.pulses(passed.pixel, passed.start_s, passed.width_s, passed.power_w, tick)
-        limited.append(passed)
+        waiting.append(passed)
+        if len(waiting) == JOINED:
+            limited, waiting = [*limited, joined(waiting, state, display.budget)], []
         done = _share_done(sequence, passed)
         tick()
         piece = next(pieces, None)
-    plan = joined(limited, state, display.budget)
+    plan = joined([*limited, *waiting], state, display.budget)
     after_heat = heat.copy()
     predicted_m = after_heat.pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, tick).displacement_m
     lead_s = scheduler.lead_us * 1e-6

@@ -45,7 +45,7 @@ def summary(prepared: Prepared) -> dict[str, Any]:
         ],
         "skipped": [
             {
-                "frame": prepared.sequence.frames[item.source].frame_id,
+                "frame": _source(prepared, item.source),
                 "pixel": item.pixel,
                 "target_um": m_to_um(item.target_m),
                 "reason": "the heat left in the pixel reaches the target by itself",

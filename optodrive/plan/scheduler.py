@@ -1,6 +1,7 @@
 """Frames and trains onto one beam: when each pulse starts, and how strong it must be.
 
-Trains keep their times; a frame's pulses fill the beam time between them. Times are whole microseconds inside.
+Trains keep their times; a frame's pulses fill the beam time between them. What is asked by height is planned from the
+heat that is there. Times are whole microseconds inside.
 """
 
 from collections.abc import Callable, Generator
@@ -10,13 +11,16 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.config import PixelLayout
-from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
+from optodrive.errors import InputError
+from optodrive.flow import FrameSequence, HeightTrain, PulsePlan, TactileFrame
 from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
+from optodrive.plan.cycles import Cycle, cycle_of, with_room
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import visiting_order
+from optodrive.plan.trains import free_us, train_pulses, usual_free_us
 
 TRAIN_PIECE = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
@@ -30,29 +34,22 @@ Pieces = Generator[PulsePlan, int | None, None]
 
 @dataclass(frozen=True)
 class Machine:
-    """What the scheduler knows of optics and laser."""
+    """What the scheduler knows of optics and laser. rest_s: dark time after which a pixel's next pulse counts anew."""
 
     layout: PixelLayout
     field: IdealField
     moves: MoveModel
     drive: DriveRange
+    rest_s: float
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A pixel that got no pulse: the heat left there reaches its target by itself."""
+    """A pixel that got no pulse from a frame or in a train's cycle: the heat left reaches its target by itself."""
 
     source: int
     pixel: int
     target_m: float
-
-
-class _TrainPulse(NamedTuple):
-    nominal_us: int
-    source: int
-    pixel: int
-    width_us: int
-    power_w: float
 
 
 class _Row(NamedTuple):
@@ -82,14 +79,17 @@ class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
     tick: called again and again while a frame is planned.
+    at_rest: the display's heat before anybody lit it, for the cycles of trains that ask for heights.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
     skipped: pixels that needed no pulse, so far.
+    Raises InputError for a train whose height or swing its cycles cannot have, or that leaves the beam no time.
     """
 
     def __init__(
         self,
         machine: Machine,
         sequence: FrameSequence,
+        at_rest: Heat,
         train_piece: int = TRAIN_PIECE,
         tick: Callable[[], None] = nothing,
     ) -> None:
@@ -99,10 +99,12 @@ class Scheduler:
         self._tick = tick
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
-        self._trains = _train_pulses(sequence.trains, len(sequence.frames))
+        self._trains = train_pulses(sequence.trains, len(sequence.frames))
+        self._rest_us = round(machine.rest_s * 1e6)
         self._now = _Cursor()
         self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
         self.skipped: list[Skipped] = []
+        self._cycles = self._planned_cycles(at_rest)
 
     def pieces(self, heat: Heat) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
@@ -111,9 +113,9 @@ class Scheduler:
         piece that must come later is planned again for then, and all that follows comes as much later.
         """
         for source, frame in enumerate(self._sequence.frames):
-            yield from self._trains_before(frame.show_at_s)
+            yield from self._trains_before(frame.show_at_s, heat)
             yield from self._frame(source, frame, heat)
-        yield from self._trains_before(float("inf"))
+        yield from self._trains_before(float("inf"), heat)
 
     def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, int | None, bool]:
         """Yield what build makes, later and later as the answers ask; False where it makes nothing."""
@@ -153,19 +155,70 @@ class Scheduler:
         now.free_us, now.lit = start_us + width_us, pixel
         return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
 
-    def _train_row(self) -> _Row:
-        pulse = self._trains[self._now.next_train]
-        self._now.next_train += 1
-        wanted_us = self.lead_us + pulse.nominal_us
-        return self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)
+    def _planned_cycles(self, at_rest: Heat) -> dict[int, tuple[HeightTrain, Cycle]]:
+        """Each height train by its source, with how its pulses are planned."""
+        first_source = len(self._sequence.frames)
+        trains = {k: t for k, t in enumerate(self._sequence.trains, first_source) if isinstance(t, HeightTrain)}
+        free = usual_free_us(self._trains, set(trains), self._rest_us, self._move_us)
+        return {
+            source: (train, self._cycle(train, at_rest, *free[source], f"trains[{source - first_source}]"))
+            for source, train in trains.items()
+        }
 
-    def _trains_before(self, until_s: float) -> Pieces:
+    def _cycle(self, train: HeightTrain, at_rest: Heat, least_us: int, usual_us: int, where: str) -> Cycle:
+        drive, room_us = self._machine.drive, min(usual_us, self._own_room_us(train))
+        if min(least_us, room_us) < drive.period_s * 1e6:
+            expected = (
+                f"room for a PWM period of {drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of any "
+                f"train, with the mirrors' move or a rest of {self._machine.rest_s * 1e3:g} ms"
+            )
+            raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")
+        self._tick()
+        return cycle_of(train, at_rest, with_room(drive, room_us), where)
+
+    def _own_room_us(self, train: HeightTrain) -> int:
+        return round(train.period_s * 1e6) - self._rest_us
+
+    def _train_rows(self, heat: Heat) -> list[_Row]:
+        """The next train pulse as a row, or none where it asks for a height that the heat there reaches by itself."""
+        now = self._now
+        pulse = self._trains[now.next_train]
+        wanted_us = self.lead_us + pulse.nominal_us
+        if pulse.source not in self._cycles:
+            now.next_train += 1
+            return [self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)]
+        train, cycle = self._cycles[pulse.source]
+        start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pulse.pixel))
+        late_us = start_us - wanted_us - now.waited_us
+        room_us = min(
+            free_us(self._trains, now.next_train, self._rest_us, self._move_us) - late_us, self._own_room_us(train)
+        )
+        drive = with_room(self._machine.drive, room_us)
+        shape = (cycle.goal_m, drive, cycle.least_periods, cycle.from_s)
+        planned = heat.pulse_for_peak(pulse.pixel, start_us * 1e-6, *shape)
+        now.next_train += 1
+        if planned is None:
+            self.skipped.append(Skipped(pulse.source, pulse.pixel, train.target_m))
+            now.skipped += 1
+            return []
+        width_us = round(planned[0] * drive.period_s * 1e6)
+        power_w = planned[1] * drive.max_power_w
+        return [self._place(pulse.pixel, width_us, power_w, wanted_us, train.target_m, pulse.source)]
+
+    def _heat_is_known(self, rows: list[_Row]) -> bool:
+        """Whether the next train pulse can be planned after rows that the limiter has not seen."""
+        pulse = self._trains[self._now.next_train]
+        return pulse.source not in self._cycles or all(row.pixel != pulse.pixel for row in rows)
+
+    def _trains_before(self, until_s: float, heat: Heat) -> Pieces:
         def build() -> list[_Row]:
             rows: list[_Row] = []
             while self._now.next_train < len(self._trains) and len(rows) < self._train_piece:
                 if self._trains[self._now.next_train].nominal_us >= until_s * 1e6:
                     break
-                rows.append(self._train_row())
+                if not self._heat_is_known(rows):
+                    break
+                rows += self._train_rows(heat)
             return rows
 
         while (yield from self._offer(build)):
@@ -205,7 +258,12 @@ class Scheduler:
                 continue
             width_us = round(pulse[0] * drive.period_s * 1e6)
             if self._train_is_due(start_us + width_us, pixel):
-                return [*rows, self._train_row()]
+                if not self._heat_is_known(rows):
+                    return rows
+                rows += self._train_rows(heat)
+                if rows:
+                    return rows
+                continue
             rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, wanted_us, target_m, source))
             now.place += 1
         return rows
@@ -225,14 +283,3 @@ class Scheduler:
             nominal_s=np.array(nominal_us) * 1e-6,
             source=np.array(source, dtype=np.int64),
         )
-
-
-def _train_pulses(trains: tuple[PulseTrain, ...], first_source: int) -> list[_TrainPulse]:
-    pulses = [
-        _TrainPulse(
-            round(start_s * 1e6), first_source + k, train.pixel, round(train.pulse_width_s * 1e6), train.power_w
-        )
-        for k, train in enumerate(trains)
-        for start_s in train.pulse_starts_s()
-    ]
-    return sorted(pulses)
