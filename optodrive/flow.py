@@ -29,12 +29,14 @@ class TactileFrame:
     """One tactile picture: the peak displacement asked of each pixel while the frame is shown.
 
     target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
+    together: the pixels shall stand up at one time rather than one after the other
     """
 
     frame_id: str
     show_at_s: float
     duration_s: float
     target_m: FloatArray
+    together: bool = False
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -104,6 +106,7 @@ class PulsePlan:
     power_w: mean incident power while on; pixel: index
     settle_s: dark time kept before the pulse for the mirrors' move and settling
     target_m: peak displacement the pulse is meant to reach, NaN for pulses of a `PulseTrain`
+    and for slices of a frame's pulse before the last, which are to reach nothing by themselves
     nominal_s: when the request wanted the pulse (frame: shown by; train: gate on); source: index of frame, or of
     train counted on from the frames
     """

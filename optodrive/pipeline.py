@@ -31,6 +31,7 @@ from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import warm as warm_order
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
+from optodrive.plan.slices import Together
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
 
 JOINED = 256
@@ -85,6 +86,7 @@ class Display:
 class FrameTiming:
     """How a frame fared: when its last pulse ends against when it should, and how many pulses came in time."""
 
+    source: int
     frame_id: str
     show_at_s: float
     due_s: float
@@ -124,6 +126,7 @@ class Prepared:
     """A limited plan and what is known about it before it runs. heat, budget: after the plan, on its time line.
 
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
+    together: how the frames were split whose pixels shall stand up at one time
     shortfall: under "trim", None where nothing was; delays: under "delay"
     """
 
@@ -133,6 +136,7 @@ class Prepared:
     lead_s: float
     skipped: tuple[Skipped, ...]
     frames: tuple[FrameTiming, ...]
+    together: tuple[Together, ...]
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
     heat: Heat
@@ -248,6 +252,7 @@ def prepare(
         lead_s=lead_s,
         skipped=tuple(scheduler.skipped),
         frames=_frame_timings(sequence, plan, lead_s),
+        together=tuple(scheduler.together),
         shortfall=shortfall,
         delays=_merged(delays),
         heat=after_heat,
@@ -293,6 +298,7 @@ def _frame_timings(sequence: FrameSequence, plan: LimitedPlan, lead_s: float) ->
         due_s = lead_s + frame.show_at_s + frame.duration_s
         timings.append(
             FrameTiming(
+                source=source,
                 frame_id=frame.frame_id,
                 show_at_s=lead_s + frame.show_at_s,
                 due_s=due_s,

@@ -76,7 +76,8 @@ def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
 
 def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
     driven = np.flatnonzero(frame.target_m)
-    return {
+    together = {"together": True} if frame.together else {}
+    return together | {
         "id": frame.frame_id,
         "show_at_s": frame.show_at_s,
         "duration_s": frame.duration_s,

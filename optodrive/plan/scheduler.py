@@ -20,6 +20,7 @@ from optodrive.plan.cycles import Cycle, cycle_of, with_room
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import visiting_order
+from optodrive.plan.slices import ROUNDS, Periods, Rehearsal, Together, best, joined, rested, simultaneity, slices
 from optodrive.plan.trains import free_us, train_pulses, usual_free_us
 
 TRAIN_PIECE = 1000
@@ -81,7 +82,7 @@ class Scheduler:
     tick: called again and again while a frame is planned.
     at_rest: the display's heat before anybody lit it, for the cycles of trains that ask for heights.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
-    skipped: pixels that needed no pulse, so far.
+    skipped: pixels that needed no pulse, together: how frames were split that ask for it; both so far.
     Raises InputError for a train whose height or swing its cycles cannot have, or that leaves the beam no time.
     """
 
@@ -104,6 +105,7 @@ class Scheduler:
         self._now = _Cursor()
         self.lead_us = machine.moves.time_us(max(self._x_rad) - min(self._x_rad), max(self._y_rad) - min(self._y_rad))
         self.skipped: list[Skipped] = []
+        self.together: list[Together] = []
         self._cycles = self._planned_cycles(at_rest)
 
     def pieces(self, heat: Heat) -> Pieces:
@@ -234,14 +236,71 @@ class Scheduler:
         return due_us < end_us + self._move_us(pixel, pulse.pixel)
 
     def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
-        """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
+        """A frame's pulses, one a pixel, or several where its pixels shall stand up together."""
         order = self._order(frame)
+        if frame.together and len(order) > 1:
+            yield from self._together(source, frame, order, heat)
+        else:
+            yield from self._round(source, frame, order, heat)
+
+    def _together(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> Pieces:
+        """A frame in as many rounds as bring its pixels up together best, in the time it has."""
+        drive, waited_us = self._machine.drive, self._now.waited_us
+        begin_us = max(self._wanted_us(frame.show_at_s) + waited_us, self._now.free_us)
+        single = {}
+        for pixel in order:
+            pulse = heat.pulse_for_peak(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
+            if pulse is not None:
+                single[pixel] = pulse
+        if not single:
+            yield from self._round(source, frame, order, heat)
+            return
+        split = {rounds: shares for rounds in ROUNDS if (shares := slices(single, rounds)) is not None}
+        rehearsals = [self._rehearsal(source, frame, order, heat, *item) for item in split.items()]
+        due_us = self._wanted_us(frame.show_at_s + frame.duration_s) + waited_us
+        chosen, unsplit = best(rehearsals, due_us * 1e-6), rehearsals[0]
+        extra_s = chosen.end_s - unsplit.end_s
+        self.together.append(Together(source, chosen.rounds, chosen.simultaneity, unsplit.simultaneity, extra_s))
+        yield from self._rounds(source, frame, order, heat, chosen.rounds, split[chosen.rounds])
+
+    def _rehearsal(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
+    ) -> Rehearsal:
+        """What a number of rounds would come to, on a copy of the heat; the plan stays where it is."""
+        before, trial, pieces, last_round_s = replace(self._now), heat.copy(), [], 0.0
+        for piece in self._rounds(source, frame, order, trial, rounds, shares):
+            trial.pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self._tick)
+            pieces.append(piece)
+            if np.isfinite(piece.target_m[piece.source == source]).any() and last_round_s == 0.0:
+                last_round_s = float(piece.start_s[0])
+        self._now = before
+        del self.skipped[before.skipped :]
+        plan = joined(pieces)
+        target_m = {pixel: float(frame.target_m[pixel]) for pixel in order}
+        share = simultaneity(heat, plan, target_m, last_round_s, self._tick)
+        end_s = float(plan.start_s[-1] + plan.width_s[-1])
+        return Rehearsal(rounds, share, end_s, rounds == 1 or rested(plan, self._machine.rest_s))
+
+    def _rounds(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
+    ) -> Pieces:
+        """Slices of so many PWM periods in every round but the last, in which each pixel gets what it still needs."""
+        for _ in range(rounds - 1):
+            yield from self._round(source, frame, [pixel for pixel in order if pixel in shares], heat, shares)
+        yield from self._round(source, frame, order, heat)
+
+    def _round(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None = None
+    ) -> Pieces:
+        """One pulse a pixel, cut where a train's pulse comes between; to its height, or as wide as its share."""
         self._now.place = 0
-        while (yield from self._offer(lambda: self._frame_rows(source, frame, order, heat))):
+        while (yield from self._offer(lambda: self._round_rows(source, frame, order, heat, shares))):
             pass
 
-    def _frame_rows(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> list[_Row]:
-        """The frame's rows from where it stands, up to the next train pulse or its own end."""
+    def _round_rows(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None
+    ) -> list[_Row]:
+        """The round's rows from where it stands, up to the next train pulse or its own end."""
         now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
         rows: list[_Row] = []
         while now.place < len(order):
@@ -250,7 +309,10 @@ class Scheduler:
             start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel))
             if now.place % TICK == 0:
                 self._tick()
-            pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
+            if shares is None:
+                pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
+            else:
+                pulse, target_m = (shares[pixel], 1.0), float("nan")
             if pulse is None:
                 self.skipped.append(Skipped(source, pixel, target_m))
                 now.skipped += 1
