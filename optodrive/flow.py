@@ -30,12 +30,14 @@ class TactileFrame:
     """One tactile picture: the peak displacement asked of each pixel while the frame is shown.
 
     target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
+    together: the pixels shall stand up at one time rather than one after the other
     """
 
     frame_id: str
     show_at_s: float
     duration_s: float
     target_m: FloatArray
+    together: bool = False
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -57,17 +59,43 @@ class PulseTrain:
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""
-        period_s = self.pulse_width_s + self.gap_s
-        count = max(1, int(np.ceil(self.duration_s / period_s - 1e-9)))
-        return np.asarray(self.start_s + period_s * np.arange(count), dtype=np.float64)
+        return _cycle_starts_s(self.start_s, self.duration_s, self.pulse_width_s + self.gap_s)
+
+
+@dataclass(frozen=True)
+class HeightTrain:
+    """Cyclic stimulation of one pixel by what is felt: a peak of target_m every period_s, for `duration_s`.
+
+    peak_to_peak_m: fall of the membrane between two peaks, m; None for as little energy as possible. Cycles as for a
+    `PulseTrain`; each pulse is planned from the heat that is there.
+    """
+
+    pixel: int
+    start_s: float
+    duration_s: float
+    period_s: float
+    target_m: float
+    peak_to_peak_m: float | None = None
+
+    def pulse_starts_s(self) -> FloatArray:
+        """Nominal start of each pulse, s: [n]."""
+        return _cycle_starts_s(self.start_s, self.duration_s, self.period_s)
+
+
+Train = PulseTrain | HeightTrain
+
+
+def _cycle_starts_s(start_s: float, duration_s: float, period_s: float) -> FloatArray:
+    count = max(1, int(np.ceil(duration_s / period_s - 1e-9)))
+    return np.asarray(start_s + period_s * np.arange(count), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """What a caller asks to be felt: frames by height, trains by pulse; times from the plan's start."""
+    """What a caller asks to be felt: frames by height, trains by pulse or by height; times from the plan's start."""
 
     frames: tuple[TactileFrame, ...] = ()
-    trains: tuple[PulseTrain, ...] = ()
+    trains: tuple[Train, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +106,8 @@ class PulsePlan:
     x_rad, y_rad: mechanical mirror angles (the beam turns by twice that)
     power_w: mean incident power while on; pixel: index
     settle_s: dark time kept before the pulse for the mirrors' move
-    target_m: peak displacement the pulse is meant to reach, NaN for pulses of a train
+    target_m: peak displacement the pulse is meant to reach, NaN for pulses of a `PulseTrain`
+    and for slices of a frame's pulse before the last, which are to reach nothing by themselves
     nominal_s: when the request wanted the pulse (frame: shown by; train: gate on); source: index of frame, or of
     train counted on from the frames
     """

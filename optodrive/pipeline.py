@@ -12,7 +12,16 @@ import numpy as np
 
 from optodrive.config import Config, PixelLayout, pixel_layout
 from optodrive.errors import InputError, OverBudgetError, RefusedError
-from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain, TactileFrame
+from optodrive.flow import (
+    BudgetState,
+    FloatArray,
+    FrameSequence,
+    HeightTrain,
+    LimitedPlan,
+    PulsePlan,
+    PulseTrain,
+    TactileFrame,
+)
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
@@ -23,7 +32,11 @@ from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import warm as warm_order
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
+from optodrive.plan.slices import Together
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
+
+JOINED = 256
+"""Pieces joined at a time: each carries the headroom of every pixel, and a piece may be a single pulse."""
 
 Progress = Callable[[float], None]
 """Told the share done, 0 to 1."""
@@ -52,6 +65,7 @@ class Display:
             field=IdealField(config.scanner.focal_length_m),
             moves=MoveModel.of(config),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
+            rest_s=limits.pulse_rest_min_s,
         )
         return cls(config, layout, parameters, pixels, machine, budget_of(config, parameters, pixels))
 
@@ -78,6 +92,7 @@ class Display:
 class FrameTiming:
     """How a frame fared: when its last pulse ends against when it should, and how many pulses came in time."""
 
+    source: int
     frame_id: str
     show_at_s: float
     due_s: float
@@ -117,6 +132,7 @@ class Prepared:
     """A limited plan and what is known about it before it runs. heat, budget: after the plan, on its time line.
 
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
+    together: how the frames were split whose pixels shall stand up at one time
     shortfall: under "trim", None where nothing was; delays: under "delay"
     """
 
@@ -126,6 +142,7 @@ class Prepared:
     lead_s: float
     skipped: tuple[Skipped, ...]
     frames: tuple[FrameTiming, ...]
+    together: tuple[Together, ...]
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
     heat: Heat
@@ -155,8 +172,11 @@ def warm_up(display: Display) -> None:
     warm_order()
     laser, target_m = display.config.laser, np.zeros(len(display.pixels))
     target_m[0] = 1e-6
-    pulse = PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
-    prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), (pulse,)), *display.at_rest())
+    trains = (
+        PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
+        HeightTrain(0, 2.0, 1e-3, 0.1, 1e-6),
+    )
+    prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), trains), *display.at_rest())
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
@@ -190,8 +210,8 @@ def prepare(
     standing_on: the pixel the mirrors stand on as the plan begins; None where that is not known.
 
     Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
-    frame as a whole. Raises InputError for a target out of reach, RefusedError for what no policy lets pass: under
-    "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
+    frame as a whole. Raises InputError for a height or a swing out of reach, RefusedError for what no policy lets
+    pass: under "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
     """
     check_reach(display, sequence)
     done = 0.0
@@ -200,9 +220,17 @@ def prepare(
         if progress is not None:
             progress(done)
 
-    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick, standing_on)
+    scheduler = Scheduler(
+        display.machine,
+        sequence,
+        display.heat_at_rest,
+        train_piece=1 if policy == "delay" else TRAIN_PIECE,
+        tick=tick,
+        standing_on=standing_on,
+    )
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
+    waiting: list[LimitedPlan] = []
     delays: list[Delay] = []
     shortfall: Shortfall | None = None
     pieces = scheduler.pieces(working)
@@ -220,11 +248,13 @@ def prepare(
             shortfall = _shortfall(piece, passed, state, display.budget)
         state = after
         working.pulses(passed.pixel, passed.start_s, passed.width_s, passed.power_w, tick)
-        limited.append(passed)
+        waiting.append(passed)
+        if len(waiting) == JOINED:
+            limited, waiting = [*limited, joined(waiting, state, display.budget)], []
         done = _share_done(sequence, passed)
         tick()
         piece = next(pieces, None)
-    plan = joined(limited, state, display.budget)
+    plan = joined([*limited, *waiting], state, display.budget)
     after_heat = heat.copy()
     predicted_m = after_heat.pulses(plan.pixel, plan.start_s, plan.width_s, plan.power_w, tick).displacement_m
     lead_s = scheduler.lead_us * 1e-6
@@ -235,6 +265,7 @@ def prepare(
         lead_s=lead_s,
         skipped=tuple(scheduler.skipped),
         frames=_frame_timings(sequence, plan, lead_s),
+        together=tuple(scheduler.together),
         shortfall=shortfall,
         delays=_merged(delays),
         heat=after_heat,
@@ -280,6 +311,7 @@ def _frame_timings(sequence: FrameSequence, plan: LimitedPlan, lead_s: float) ->
         due_s = lead_s + frame.show_at_s + frame.duration_s
         timings.append(
             FrameTiming(
+                source=source,
                 frame_id=frame.frame_id,
                 show_at_s=lead_s + frame.show_at_s,
                 due_s=due_s,

@@ -8,6 +8,7 @@ import numpy as np
 
 from optodrive.files import written_whole
 from optodrive.pipeline import Display, Prepared, Shortfall, lateness
+from optodrive.plan.slices import Together
 from optodrive.units import m_to_um
 
 PULSES_LISTED_MAX = 20_000
@@ -19,6 +20,7 @@ def summary(prepared: Prepared) -> dict[str, Any]:
     plan = prepared.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
     asked_m = np.nan_to_num(plan.target_m)
+    together = {item.source: _together(item) for item in prepared.together}
     tallest = int(np.argmax(prepared.predicted_m)) if len(plan) else None
     return {
         "pulses": len(plan),
@@ -45,7 +47,7 @@ def summary(prepared: Prepared) -> dict[str, Any]:
         ],
         "skipped": [
             {
-                "frame": prepared.sequence.frames[item.source].frame_id,
+                "frame": _source(prepared, item.source),
                 "pixel": item.pixel,
                 "target_um": m_to_um(item.target_m),
                 "reason": "the heat left in the pixel reaches the target by itself",
@@ -62,6 +64,7 @@ def summary(prepared: Prepared) -> dict[str, Any]:
                 "late_s": timing.late_s,
                 "pulses": timing.pulses,
                 "in_time": timing.in_time,
+                "together": together.get(timing.source),
             }
             for timing in prepared.frames
         ],
@@ -75,6 +78,10 @@ def _shortfall(shortfall: Shortfall | None) -> dict[str, Any] | None:
     if shortfall is None:
         return None
     return vars(shortfall) | {"fits_later_s": _finite(shortfall.fits_later_s)}
+
+
+def _together(item: Together) -> dict[str, Any]:
+    return {key: value for key, value in vars(item).items() if key != "source"}
 
 
 def _source(prepared: Prepared, source: int) -> str:

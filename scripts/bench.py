@@ -63,9 +63,9 @@ def plan_rows(height_um):
     display, sequence = full_frame(height_m=height_um * 1e-6)
     heat, budget = display.at_rest()
     prepared = prepare(display, sequence, heat, budget)
-    piece = next(iter(Scheduler(display.machine, sequence).pieces(heat.copy())))
+    piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat.copy())))
     count = len(prepared.plan)
-    schedule_s = median_s(lambda: list(Scheduler(display.machine, sequence).pieces(heat.copy())))
+    schedule_s = median_s(lambda: list(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat.copy())))
     limit_s = median_s(lambda: limit(piece, budget, display.budget))
     whole_s = median_s(lambda: prepare(display, sequence, heat, budget))
     return [
@@ -243,12 +243,12 @@ def bench_limit():
     for height_um in (50, 400):
         display, sequence = full_frame(height_m=height_um * 1e-6)
         heat, state = display.at_rest()
-        piece = next(iter(Scheduler(display.machine, sequence).pieces(heat)))
+        piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat)))
         limit_s = median_s(lambda piece=piece, state=state, budget=display.budget: limit(piece, state, budget))
         rows.append((f"{height_um} µm: a full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
     display, sequence = full_frame()
     heat, state = display.at_rest()
-    piece = next(iter(Scheduler(display.machine, sequence).pieces(heat)))
+    piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat)))
     period_s = float(piece.start_s[-1] + piece.width_s[-1]) + 1e-3
     held_mib, count, begin_s = [], 0, time.process_time()
     while count < 1_000_000:

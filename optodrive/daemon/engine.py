@@ -24,7 +24,7 @@ from optodrive.daemon.programme import Programme
 from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, FrameSequence, TactileFrame
-from optodrive.frames.live import unseen_first
+from optodrive.frames.live import may_be_split, unseen_first
 from optodrive.limit.limiter import Policy, verify
 from optodrive.pipeline import Display, prepare, warm_up
 from optodrive.transport.base import Transport
@@ -268,7 +268,7 @@ class Engine:
         began_s = self._clock.now_s()
         basis = self._programme.basis(order.streamed, allowance_s)
         heat, budget = basis.heat, basis.budget
-        if basis.seen is not None and len(sequence.frames) == 1 and not sequence.trains:
+        if basis.seen is not None and may_be_split(sequence):
             sequence = unseen_first(sequence, basis.seen)
         prepared = prepare(self.display, sequence, heat, budget, order.policy, self._note_progress, basis.standing_on)
         points = quantise(prepared.plan, self._session.scale)

@@ -6,10 +6,10 @@ import numpy as np
 
 from optodrive.config import Config, pixel_layout
 from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.flow import FrameSequence, TactileFrame, Train
 from optodrive.frames.fields import decode_json, list_at, table_at
 from optodrive.frames.heights import parse_frames
-from optodrive.frames.trains import TRAIN_KEYS, check_trains, checked_train, parse_train
+from optodrive.frames.trains import check_trains, checked_train, parse_train, train_to_json
 from optodrive.units import m_to_um
 
 FRAMES_MAX = 10_000
@@ -58,7 +58,7 @@ def checked_sequence(sequence: FrameSequence, where: str, config: Config) -> Fra
     if len(sequence.frames) > most:
         raise InputError(f"{where}: frames", len(sequence.frames), f"at most {most}", code="too_many")
     trains = [checked_train(train, f"{where}: trains[{k}]", config) for k, train in enumerate(sequence.trains)]
-    check_trains(trains, f"{where}: trains")
+    check_trains(trains, f"{where}: trains", config)
     return FrameSequence(sequence.frames, tuple(trains))
 
 
@@ -70,13 +70,14 @@ def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
     """A sequence as FRAMES.json has it; heights to 1e-9 µm, so that parsing gives the same numbers back."""
     return {
         "frames": [_frame_to_json(frame) for frame in sequence.frames],
-        "trains": [{key: getattr(train, key) for key in TRAIN_KEYS} for train in sequence.trains],
+        "trains": [train_to_json(train) for train in sequence.trains],
     }
 
 
 def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
     driven = np.flatnonzero(frame.target_m)
-    return {
+    together = {"together": True} if frame.together else {}
+    return together | {
         "id": frame.frame_id,
         "show_at_s": frame.show_at_s,
         "duration_s": frame.duration_s,
@@ -97,7 +98,7 @@ def _sequence(decoded: object, config: Config, where: str) -> FrameSequence:
     )
 
 
-def _trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[PulseTrain, ...]:
+def _trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:
     trains = tuple(parse_train(entry, f"{where}[{k}]", config, pixel_count) for k, entry in enumerate(entries))
-    check_trains(trains, where)
+    check_trains(trains, where, config)
     return trains

@@ -1,5 +1,7 @@
 """Tactile frames from JSON: times in order, a height in µm for some pixels or for all."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from optodrive.errors import InputError
@@ -26,12 +28,20 @@ def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[T
 
 def _frame(entry: object, where: str, position: int, names: dict[str, int]) -> TactileFrame:
     required = ("show_at_s", "duration_s", "target_um")
-    table = table_at(entry, where, ("id", *required), required)
+    table = table_at(entry, where, ("id", *required, "together"), required)
     expected = "a time ≥ 0 in s (a frame in the past cannot be shown)"
     show_at_s = time_at(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = time_at(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
-    return TactileFrame(frame_id, show_at_s, duration_s, targets_m(table["target_um"], f"{where}.target_um", names))
+    target_m = targets_m(table["target_um"], f"{where}.target_um", names)
+    return TactileFrame(frame_id, show_at_s, duration_s, target_m, _together(table, f"{where}.together"))
+
+
+def _together(table: Mapping[str, object], where: str) -> bool:
+    value = table.get("together", False)
+    if not isinstance(value, bool):
+        raise InputError(where, value, "true or false", code="bad_json")
+    return value
 
 
 def _frame_id(value: object, where: str) -> str:

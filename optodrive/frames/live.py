@@ -54,6 +54,11 @@ def _from_text(message: str, expected_number: int, pixel_count: int) -> tuple[in
     return number, targets_m(table["target_um"], "frame.target_um", names)
 
 
+def may_be_split(sequence: FrameSequence) -> bool:
+    """Whether a sequence is one frame whose pixels may stand up one after the other."""
+    return len(sequence.frames) == 1 and not sequence.trains and not sequence.frames[0].together
+
+
 def unseen_first(sequence: FrameSequence, seen: BoolArray) -> FrameSequence:
     """A stream's frame in two: first the pixels that this sweep over the display has not lit yet.
 

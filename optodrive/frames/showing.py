@@ -5,7 +5,7 @@ from math import ceil
 import numpy as np
 
 from optodrive.config import Config
-from optodrive.flow import FloatArray, FrameSequence, TactileFrame
+from optodrive.flow import FloatArray, FrameSequence, HeightTrain, TactileFrame
 from optodrive.frames.lattice import Lattice
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.gate import servo_of, settled_s
@@ -81,7 +81,10 @@ def steps(beam: Beam, pictures: list[FloatArray], step_s: float, name: str) -> l
 
 
 def end_s(sequence: FrameSequence) -> float:
-    """When the last frame or the last pulse of a sequence ends, s; 0 for an empty one."""
+    """When the last frame, pulse, or cycle of a train by height ends, s; 0 for an empty sequence."""
     frame_ends = [frame.show_at_s + frame.duration_s for frame in sequence.frames]
-    train_ends = [float(train.pulse_starts_s()[-1]) + train.pulse_width_s for train in sequence.trains]
+    train_ends = [
+        float(train.pulse_starts_s()[-1]) + (train.period_s if isinstance(train, HeightTrain) else train.pulse_width_s)
+        for train in sequence.trains
+    ]
     return max(frame_ends + train_ends, default=0.0)

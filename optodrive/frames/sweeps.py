@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from optodrive.config import Config
 from optodrive.errors import InputError
-from optodrive.flow import FloatArray, FrameSequence
+from optodrive.flow import FloatArray, FrameSequence, HeightTrain
 from optodrive.frames.lattice import Lattice
 from optodrive.frames.showing import Beam, hold, steps
 
@@ -18,6 +18,20 @@ def single(config: Config, where: str, pixel: int | None, height_m: float, secon
     lattice = Lattice.of(config)
     chosen = lattice.middle() if pixel is None else pixel
     return _held(config, np.arange(len(lattice.layout)) == chosen, height_m, seconds, f"pixel-{chosen}")
+
+
+def vibration(
+    config: Config,
+    where: str,
+    pixel: int | None,
+    height_m: float,
+    peak_to_peak_m: float | None,
+    rate_hz: float,
+    seconds: float,
+) -> FrameSequence:
+    """One pixel (None: the middle) that swings below a height; peak_to_peak_m None: with as little energy as may be."""
+    chosen = Lattice.of(config).middle() if pixel is None else pixel
+    return FrameSequence(trains=(HeightTrain(chosen, 0.0, seconds, 1.0 / rate_hz, height_m, peak_to_peak_m),))
 
 
 def everything(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:

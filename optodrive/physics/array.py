@@ -100,12 +100,17 @@ class DisplayHeat:
             raise self._too_early(int(pixel[done]), float(start_s[done]))
         return peaks
 
-    def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
+    def pulse_for_peak(
+        self, pixel: int, at_s: float, target_m: float, drive: DriveRange, least_periods: int = 1, from_s: float = 0.0
+    ) -> tuple[int, float] | None:
         """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
 
-        A target beyond the longest pulse gets the longest pulse. ValueError for a time before the pixel's last event.
+        It has least_periods at least, as far as the drive allows; a target beyond the longest pulse gets that one.
+        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
+        ValueError for a time before the pixel's last event.
         """
-        return pulse_for_peak(self.pixels.each[pixel], *self.rises(pixel, at_s), target_m, drive)
+        rises_k = self.rises(pixel, at_s)
+        return pulse_for_peak(self.pixels.each[pixel], *rises_k, target_m, drive, least_periods, from_s)
 
     def reaches_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
@@ -132,6 +137,14 @@ class DisplayHeat:
         start = self._at_s[pixel], self._theta_k[pixel], self._gamma_k[pixel]
         _sample(self.pixels.each[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
         return absorber_k, gas_k
+
+    def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
+        """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
+
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
+        """
+        gas_k = self.trace(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
+        return self.pixels.each[pixel].kappa_m_per_k * gas_k
 
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """Exact values of some pixels at times t_s [m], increasing.

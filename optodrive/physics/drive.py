@@ -29,20 +29,41 @@ def pulse_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, wid
     return (lit_k, lit_s) if lit_k > dark_k else (dark_k, width_s + dark_s)
 
 
+@kernel
+def _peak_from(
+    pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, width_s: float, from_s: float
+) -> tuple[float, float]:
+    """As pulse_peak, counted only from from_s after the pulse's start on: all of it, or what follows its end."""
+    if from_s <= 0.0:
+        return pulse_peak(pixel, theta_k, gamma_k, power_w, width_s)
+    lit = advance(pixel, theta_k, gamma_k, power_w, width_s)
+    dark_k, dark_s = cooling_peak(pixel, *advance(pixel, lit[0], lit[1], 0.0, max(0.0, from_s - width_s)))
+    return dark_k, max(width_s, from_s) + dark_s
+
+
 def reach_m(pixel: Pixel, drive: DriveRange) -> float:
     """The largest displacement one pulse can reach from rest, m."""
     return pixel.kappa_m_per_k * pulse_peak(pixel, 0.0, 0.0, drive.max_power_w, drive.max_periods * drive.period_s)[0]
 
 
 def pulse_for_peak(
-    pixel: Pixel, theta_k: float, gamma_k: float, target_m: float, drive: DriveRange
+    pixel: Pixel,
+    theta_k: float,
+    gamma_k: float,
+    target_m: float,
+    drive: DriveRange,
+    least_periods: int = 1,
+    from_s: float = 0.0,
 ) -> tuple[int, float] | None:
     """PWM periods and duty of the shortest pulse whose peak is target_m, given the heat still there.
 
-    None when the heat there reaches the target by itself. A target beyond the longest pulse gets the longest pulse.
+    The pulse has least_periods at least, but never more than the drive allows. from_s: the peak counts only from so
+    long after the pulse's start on, beyond its end. None when the heat there reaches the target by itself. A target
+    beyond the longest pulse gets the longest pulse.
     """
     goal_k = target_m / pixel.kappa_m_per_k
-    periods, duty = _shortest(pixel, theta_k, gamma_k, goal_k, drive.max_power_w, drive.period_s, drive.max_periods)
+    span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+    periods, duty = _shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
     return (periods, duty) if periods else None
 
 
@@ -54,31 +75,33 @@ def _shortest(
     goal_k: float,
     max_power_w: float,
     period_s: float,
+    least_periods: int,
     max_periods: int,
+    from_s: float,
 ) -> tuple[int, float]:
     """As pulse_for_peak; no periods where no pulse is needed. In one kernel: each call from Python costs."""
-    if cooling_peak(pixel, theta_k, gamma_k)[0] >= goal_k:
+    if _peak_from(pixel, theta_k, gamma_k, 0.0, 0.0, from_s)[0] >= goal_k:
         return 0, 0.0
-    low, high = 0, max_periods
+    low, high = least_periods - 1, max_periods
     while high - low > 1:
         middle = (low + high) // 2
-        if pulse_peak(pixel, theta_k, gamma_k, max_power_w, middle * period_s)[0] >= goal_k:
+        if _peak_from(pixel, theta_k, gamma_k, max_power_w, middle * period_s, from_s)[0] >= goal_k:
             high = middle
         else:
             low = middle
-    return high, _duty_for_peak(pixel, theta_k, gamma_k, goal_k, high * period_s, max_power_w)
+    return high, _duty_for_peak(pixel, theta_k, gamma_k, goal_k, high * period_s, max_power_w, from_s)
 
 
 @kernel
 def _duty_for_peak(
-    pixel: Pixel, theta_k: float, gamma_k: float, goal_k: float, width_s: float, max_power_w: float
+    pixel: Pixel, theta_k: float, gamma_k: float, goal_k: float, width_s: float, max_power_w: float, from_s: float
 ) -> float:
     # The peak is a maximum over time of functions linear in duty, hence convex in duty: Newton from duty 1 falls
     # monotonically onto the root, and its slope is the gas response to full power at the time of the peak.
     full_theta_k, full_gamma_k = advance(pixel, 0.0, 0.0, max_power_w, width_s)
     duty = 1.0
     for _ in range(20):
-        peak_k, at_s = pulse_peak(pixel, theta_k, gamma_k, duty * max_power_w, width_s)
+        peak_k, at_s = _peak_from(pixel, theta_k, gamma_k, duty * max_power_w, width_s, from_s)
         if at_s <= width_s:
             slope_k = advance(pixel, 0.0, 0.0, max_power_w, at_s)[1]
         else:

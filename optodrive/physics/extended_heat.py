@@ -15,7 +15,7 @@ from optodrive.physics.drive import DriveRange
 from optodrive.physics.forward import Active, Scene, observe
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pulses import carry, glow, shortest, walk
+from optodrive.physics.pulses import carry, glow, heights, shortest, walk
 from optodrive.physics.term import (
     AMBIENT_K,
     CONTEXT,
@@ -99,10 +99,14 @@ class ExtendedHeat:
             tick()
         return peaks
 
-    def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
+    def pulse_for_peak(
+        self, pixel: int, at_s: float, target_m: float, drive: DriveRange, least_periods: int = 1, from_s: float = 0.0
+    ) -> tuple[int, float] | None:
         """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
 
-        A target beyond the longest pulse gets the longest pulse. ValueError for a time before the pixel's last event.
+        It has least_periods at least, as far as the drive allows; a target beyond the longest pulse gets that one.
+        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
+        ValueError for a time before the pixel's last event.
         """
         if at_s < self._at_s[pixel] - TIME_ROUNDING_S:
             raise self._too_early(pixel, at_s)
@@ -112,8 +116,8 @@ class ExtendedHeat:
         room[0] = self._states[pixel]
         dark_s, wait_s = float(self._dark_s[pixel]), max(0.0, float(at_s - self._at_s[pixel]))
         carry(one, self._active, context, True, room, 0.0, dark_s, wait_s)
-        span = (drive.max_power_w, drive.period_s, drive.max_periods)
-        periods, duty = shortest(one, self._active, context, room, lit, dark_s + wait_s, target_m, *span)
+        span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+        periods, duty = shortest(one, self._active, context, room, lit, dark_s + wait_s, target_m, *span, from_s)
         return (periods, duty) if periods else None
 
     def reaches_m(self, drive: DriveRange) -> FloatArray:
@@ -129,6 +133,21 @@ class ExtendedHeat:
                 one = (np.array([index]), np.zeros(1), np.array([width_s]), np.array([drive.max_power_w]))
                 reach[kind] = float(fresh.pulses(*one).displacement_m[0])
         return np.array([reach[kind] for kind in kinds])
+
+    def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
+        """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
+
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
+        """
+        felt = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._beside[pixel].tolist()])])
+        first_s = min(float(t_s[0]), float(felt[0, 0]) if len(felt) else np.inf)
+        if first_s < self._at_s[pixel] - TIME_ROUNDING_S:
+            raise self._too_early(pixel, first_s)
+        last = (float(self._at_s[pixel]), float(self._dark_s[pixel]), self._states[pixel].copy())
+        height_m = np.zeros(len(t_s))
+        one = self.pixels.each[pixel]
+        heights(one, self._active, self._context.copy(), pixel, *last, felt, np.array(t_s), height_m)
+        return height_m
 
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """What instruments show of some pixels from rest at times t_s [m], increasing.

@@ -33,11 +33,19 @@ class Heat(Protocol):
     ) -> Peaks:
         """Light pixels one after the other, all [n]; what each pulse brings its pixel to. tick: called meanwhile."""
 
-    def pulse_for_peak(self, pixel: int, at_s: float, target_m: float, drive: DriveRange) -> tuple[int, float] | None:
-        """PWM periods and duty of the shortest pulse whose peak is target_m; None where none is needed."""
+    def pulse_for_peak(
+        self, pixel: int, at_s: float, target_m: float, drive: DriveRange, least_periods: int = 1, from_s: float = 0.0
+    ) -> tuple[int, float] | None:
+        """PWM periods, at least so many, and duty of the shortest pulse whose peak is target_m; None: none is needed.
+
+        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
+        """
 
     def reaches_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
+
+    def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
+        """Displacement of a pixel at times t_s [m] under pulses [n, 4], from the heat there is, which stays."""
 
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """What some pixels do at times t_s [m] under pulses [n, 4]: start_s, width_s, power_w, pixel."""

@@ -65,18 +65,18 @@ def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
 
 
 @kernel
-def _afterglow_m(
-    pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, since_s: float, within_s: float
-) -> float:
-    """The most the membrane does in the dark from states room[0] on, within_s at most; the states move."""
+def _afterglow_m(pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, since_s: float, from_s: float) -> float:
+    """The most the membrane does in the dark, from_s after the states room[0] or later; the states move."""
     c[POWER_W] = 0.0
+    if from_s > 0.0:
+        carry(pixel, active, c, True, room, 0.0, since_s, from_s)
+        since_s += from_s
     peak_m, done_s = outputs(pixel, active, room[0], c, DISPLACEMENT), 0.0
     piece_s = pixel.tau_g_s
-    while done_s < within_s:
-        for_s = min(piece_s, within_s - done_s)
-        here_m = carry(pixel, active, c, True, room, done_s, since_s + done_s, for_s)[0]
+    while True:
+        here_m = carry(pixel, active, c, True, room, done_s, since_s + done_s, piece_s)[0]
         peak_m = max(peak_m, here_m)
-        done_s += for_s
+        done_s += piece_s
         settled = done_s > SETTLED * pixel.tau_g_s
         if settled and outputs(pixel, active, room[0], c, DISPLACEMENT) <= SETTLED_SHARE * peak_m:
             break
@@ -155,16 +155,57 @@ def glow(
         if last[i] >= 0:
             room[0] = states[i]
             c[PIXEL], c[MINE] = i, 1.0
-            glow_m = _afterglow_m(one_pixel(columns, i), active, c, room, 0.0, np.inf)
+            glow_m = _afterglow_m(one_pixel(columns, i), active, c, room, 0.0, 0.0)
             peak_m[last[i]] = max(peak_m[last[i]], glow_m)
 
 
 @kernel
+def heights(
+    pixel: Pixel,
+    active: Active,
+    c: FloatArray,
+    index: int,
+    at_s: float,
+    dark_s: float,
+    state: FloatArray,
+    pulses: FloatArray,
+    t_s: FloatArray,
+    height_m: FloatArray,
+) -> None:
+    """Fill in the displacement of pixel `index` at t_s [m], under pulses [n, 4] on it and beside it.
+
+    at_s, dark_s, state: its last event, how long it had been dark before it, and the states then; state is written.
+    """
+    room = np.zeros((8, len(state)))
+    room[0] = state
+    now_s, since_s, row = at_s, dark_s, 0
+    for edge in range(2 * len(pulses) + 1):
+        pulse, lit, own = edge // 2, edge % 2 == 1, True
+        c[POWER_W], c[PIXEL], c[MINE] = 0.0, index, 1.0
+        until_s = np.inf
+        if pulse < len(pulses):
+            own = pulses[pulse, 3] == index
+            c[PIXEL], c[MINE] = pulses[pulse, 3], 1.0 if own else 0.0
+            until_s = pulses[pulse, 0] + (pulses[pulse, 1] if lit else 0.0)
+            c[POWER_W] = pulses[pulse, 2] if lit else 0.0
+        while row < len(t_s) and t_s[row] <= until_s:
+            for_s = max(0.0, t_s[row] - now_s)
+            carry(pixel, active, c, own, room, 0.0, since_s, for_s)
+            now_s, since_s = now_s + for_s, since_s + for_s
+            height_m[row] = outputs(pixel, active, room[0], c, DISPLACEMENT)
+            row += 1
+        if row == len(t_s):
+            break
+        carry(pixel, active, c, own, room, 0.0, since_s, max(0.0, until_s - now_s))
+        now_s, since_s = max(now_s, until_s), 0.0
+
+
+@kernel
 def _peak_after_m(
-    pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, state: FloatArray, since_s: float
+    pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, state: FloatArray, since_s: float, from_s: float
 ) -> float:
     room[0] = state
-    return _afterglow_m(pixel, active, c, room, since_s, np.inf)
+    return _afterglow_m(pixel, active, c, room, since_s, from_s)
 
 
 @kernel
@@ -178,14 +219,16 @@ def shortest(
     goal_m: float,
     max_power_w: float,
     period_s: float,
+    least_periods: int,
     max_periods: int,
+    from_s: float,
 ) -> tuple[int, float]:
     """As pulse_for_peak, from the states room[0]; no periods where no pulse is needed.
 
     lit: [max_periods + 1, STATES] room for the states after each period at full power: one path holds all widths.
     """
     lit[0] = room[0]
-    if _peak_after_m(pixel, active, c, room, lit[0], dark_s) >= goal_m:
+    if _peak_after_m(pixel, active, c, room, lit[0], dark_s, from_s) >= goal_m:
         return 0, 0.0
     high, highest_m = max_periods, 0.0
     room[0] = lit[0]
@@ -193,17 +236,18 @@ def shortest(
         c[POWER_W] = max_power_w
         highest_m = carry(pixel, active, c, True, room, 0.0, period * period_s, period_s)[0]
         lit[period + 1] = room[0]
-        if highest_m >= goal_m:
-            high = period + 1
+        if highest_m >= goal_m and from_s <= 0.0:
+            high = max(period + 1, least_periods)
             break
-    low = 0
+    low = least_periods - 1
     while high - low > 1:
         middle = (low + high) // 2
-        if _peak_after_m(pixel, active, c, room, lit[middle], 0.0) >= goal_m:
+        dark_from_s = max(0.0, from_s - middle * period_s)
+        if _peak_after_m(pixel, active, c, room, lit[middle], 0.0, dark_from_s) >= goal_m:
             high = middle
         else:
             low = middle
-    return high, _duty(pixel, active, c, room, lit[0], goal_m, max_power_w, high * period_s)
+    return high, _duty(pixel, active, c, room, lit[0], goal_m, max_power_w, high * period_s, from_s)
 
 
 @kernel
@@ -216,17 +260,18 @@ def _duty(
     goal_m: float,
     max_power_w: float,
     width_s: float,
+    from_s: float,
 ) -> float:
     """The duty at which a pulse's peak is goal_m, by the Illinois form of false position; 1 where none is."""
     low, high = 0.0, 1.0
-    short_m = _peak_after_m(pixel, active, c, room, state, 0.0) - goal_m
-    over_m = _pulse_peak_m(pixel, active, c, room, state, max_power_w, width_s) - goal_m
+    short_m = _peak_after_m(pixel, active, c, room, state, 0.0, from_s) - goal_m
+    over_m = _pulse_peak_m(pixel, active, c, room, state, max_power_w, width_s, from_s) - goal_m
     if over_m <= 0.0:
         return 1.0
     kept = 0
     for _ in range(30):
         duty = (low * over_m - high * short_m) / (over_m - short_m)
-        miss_m = _pulse_peak_m(pixel, active, c, room, state, duty * max_power_w, width_s) - goal_m
+        miss_m = _pulse_peak_m(pixel, active, c, room, state, duty * max_power_w, width_s, from_s) - goal_m
         if abs(miss_m) <= CLOSE * goal_m:
             return duty
         if miss_m > 0.0:
@@ -249,8 +294,10 @@ def _pulse_peak_m(
     state: FloatArray,
     power_w: float,
     width_s: float,
+    from_s: float,
 ) -> float:
     room[0] = state
     c[POWER_W] = power_w
     lit_m = carry(pixel, active, c, True, room, 0.0, 0.0, width_s)[0]
-    return max(lit_m, _afterglow_m(pixel, active, c, room, 0.0, np.inf))
+    dark_m = _afterglow_m(pixel, active, c, room, 0.0, max(0.0, from_s - width_s))
+    return max(lit_m, dark_m) if from_s <= 0.0 else dark_m

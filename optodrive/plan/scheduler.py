@@ -1,6 +1,7 @@
 """Frames and trains onto one beam: when each pulse starts, and how strong it must be.
 
-Trains keep their times; a frame's pulses fill the beam time between them. Times are whole microseconds inside.
+Trains keep their times; a frame's pulses fill the beam time between them. What is asked by height is planned from the
+heat that is there. Times are whole microseconds inside.
 """
 
 from collections.abc import Callable, Generator
@@ -10,13 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.config import PixelLayout
-from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
+from optodrive.errors import InputError
+from optodrive.flow import FrameSequence, HeightTrain, PulsePlan, TactileFrame
 from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
+from optodrive.plan.cycles import Cycle, cycle_of, with_room
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import visiting_order
+from optodrive.plan.slices import ROUNDS, Periods, Rehearsal, Together, best, joined, rested, simultaneity, slices
+from optodrive.plan.trains import free_us, train_pulses, usual_free_us
 
 TRAIN_PIECE = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
@@ -30,29 +35,22 @@ Pieces = Generator[PulsePlan, int | None, None]
 
 @dataclass(frozen=True)
 class Machine:
-    """What the scheduler knows of optics and laser."""
+    """What the scheduler knows of optics and laser. rest_s: dark time after which a pixel's next pulse counts anew."""
 
     layout: PixelLayout
     field: IdealField
     moves: MoveModel
     drive: DriveRange
+    rest_s: float
 
 
 @dataclass(frozen=True)
 class Skipped:
-    """A pixel that got no pulse: the heat left there reaches its target by itself."""
+    """A pixel that got no pulse from a frame or in a train's cycle: the heat left reaches its target by itself."""
 
     source: int
     pixel: int
     target_m: float
-
-
-class _TrainPulse(NamedTuple):
-    nominal_us: int
-    source: int
-    pixel: int
-    width_us: int
-    power_w: float
 
 
 class _Row(NamedTuple):
@@ -87,16 +85,19 @@ class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
     tick: called again and again while a frame is planned.
+    at_rest: makes the display's heat before anybody lit it, for the cycles of trains that ask for heights.
     standing_on: the pixel the mirrors stand on as the plan begins.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are;
     none where it is known on which pixel they stand.
-    skipped: pixels that needed no pulse, so far.
+    skipped: pixels that needed no pulse, together: how frames were split that ask for it; both so far.
+    Raises InputError for a train whose height or swing its cycles cannot have, or that leaves the beam no time.
     """
 
     def __init__(
         self,
         machine: Machine,
         sequence: FrameSequence,
+        at_rest: Callable[[], Heat],
         train_piece: int = TRAIN_PIECE,
         tick: Callable[[], None] = nothing,
         standing_on: int | None = None,
@@ -107,10 +108,13 @@ class Scheduler:
         self._tick = tick
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
-        self._trains = _train_pulses(sequence.trains, len(sequence.frames))
+        self._trains = train_pulses(sequence.trains, len(sequence.frames))
+        self._rest_us = round(machine.rest_s * 1e6)
         self._now = _Cursor(lit=standing_on)
         self.lead_us = machine.moves.lead_us if standing_on is None else 0
         self.skipped: list[Skipped] = []
+        self.together: list[Together] = []
+        self._cycles = self._planned_cycles(at_rest)
 
     def pieces(self, heat: Heat) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
@@ -119,9 +123,9 @@ class Scheduler:
         piece that must come later is planned again for then, and all that follows comes as much later.
         """
         for source, frame in enumerate(self._sequence.frames):
-            yield from self._trains_before(frame.show_at_s)
+            yield from self._trains_before(frame.show_at_s, heat)
             yield from self._frame(source, frame, heat)
-        yield from self._trains_before(float("inf"))
+        yield from self._trains_before(float("inf"), heat)
 
     def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, int | None, bool]:
         """Yield what build makes, later and later as the answers ask; False where it makes nothing."""
@@ -141,7 +145,7 @@ class Scheduler:
     def _wanted_us(self, time_s: float) -> int:
         return self.lead_us + round(time_s * 1e6)
 
-    def _move_us(self, origin: int | None, pixel: int, lit_us: int) -> int:
+    def _move_us(self, origin: int | None, pixel: int, lit_us: int = 0) -> int:
         if origin is None:
             return self.lead_us
         return self._machine.moves.time_us(
@@ -164,19 +168,73 @@ class Scheduler:
         now.stay_us = now.free_us - now.since_us
         return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
 
-    def _train_row(self) -> _Row:
-        pulse = self._trains[self._now.next_train]
-        self._now.next_train += 1
-        wanted_us = self.lead_us + pulse.nominal_us
-        return self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)
+    def _planned_cycles(self, at_rest: Callable[[], Heat]) -> dict[int, tuple[HeightTrain, Cycle]]:
+        """Each height train by its source, with how its pulses are planned."""
+        first_source = len(self._sequence.frames)
+        trains = {k: t for k, t in enumerate(self._sequence.trains, first_source) if isinstance(t, HeightTrain)}
+        if not trains:
+            return {}
+        rest = at_rest()
+        free = usual_free_us(self._trains, set(trains), self._rest_us, self._move_us)
+        return {
+            source: (train, self._cycle(train, rest, *free[source], f"trains[{source - first_source}]"))
+            for source, train in trains.items()
+        }
 
-    def _trains_before(self, until_s: float) -> Pieces:
+    def _cycle(self, train: HeightTrain, rest: Heat, least_us: int, usual_us: int, where: str) -> Cycle:
+        drive, room_us = self._machine.drive, min(usual_us, self._own_room_us(train))
+        if min(least_us, room_us) < drive.period_s * 1e6:
+            expected = (
+                f"room for a PWM period of {drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of any "
+                f"train, with the mirrors' move or a rest of {self._machine.rest_s * 1e3:g} ms"
+            )
+            raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")
+        self._tick()
+        return cycle_of(train, rest, with_room(drive, room_us), where)
+
+    def _own_room_us(self, train: HeightTrain) -> int:
+        return round(train.period_s * 1e6) - self._rest_us
+
+    def _train_rows(self, heat: Heat) -> list[_Row]:
+        """The next train pulse as a row, or none where it asks for a height that the heat there reaches by itself."""
+        now = self._now
+        pulse = self._trains[now.next_train]
+        wanted_us = self.lead_us + pulse.nominal_us
+        if pulse.source not in self._cycles:
+            now.next_train += 1
+            return [self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)]
+        train, cycle = self._cycles[pulse.source]
+        start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pulse.pixel, now.stay_us))
+        late_us = start_us - wanted_us - now.waited_us
+        room_us = min(
+            free_us(self._trains, now.next_train, self._rest_us, self._move_us) - late_us, self._own_room_us(train)
+        )
+        drive = with_room(self._machine.drive, room_us)
+        shape = (cycle.goal_m, drive, cycle.least_periods, cycle.from_s)
+        planned = heat.pulse_for_peak(pulse.pixel, start_us * 1e-6, *shape)
+        now.next_train += 1
+        if planned is None:
+            self.skipped.append(Skipped(pulse.source, pulse.pixel, train.target_m))
+            now.skipped += 1
+            return []
+        width_us = round(planned[0] * drive.period_s * 1e6)
+        power_w = planned[1] * drive.max_power_w
+        return [self._place(pulse.pixel, width_us, power_w, wanted_us, train.target_m, pulse.source)]
+
+    def _heat_is_known(self, rows: list[_Row]) -> bool:
+        """Whether the next train pulse can be planned after rows that the limiter has not seen."""
+        pulse = self._trains[self._now.next_train]
+        return pulse.source not in self._cycles or all(row.pixel != pulse.pixel for row in rows)
+
+    def _trains_before(self, until_s: float, heat: Heat) -> Pieces:
         def build() -> list[_Row]:
             rows: list[_Row] = []
             while self._now.next_train < len(self._trains) and len(rows) < self._train_piece:
                 if self._trains[self._now.next_train].nominal_us >= until_s * 1e6:
                     break
-                rows.append(self._train_row())
+                if not self._heat_is_known(rows):
+                    break
+                rows += self._train_rows(heat)
             return rows
 
         while (yield from self._offer(build)):
@@ -192,14 +250,71 @@ class Scheduler:
         return due_us < end_us + self._move_us(pixel, pulse.pixel, lit_us)
 
     def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
-        """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
+        """A frame's pulses, one a pixel, or several where its pixels shall stand up together."""
         order = self._order(frame)
+        if frame.together and len(order) > 1:
+            yield from self._together(source, frame, order, heat)
+        else:
+            yield from self._round(source, frame, order, heat)
+
+    def _together(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> Pieces:
+        """A frame in as many rounds as bring its pixels up together best, in the time it has."""
+        drive, waited_us = self._machine.drive, self._now.waited_us
+        begin_us = max(self._wanted_us(frame.show_at_s) + waited_us, self._now.free_us)
+        single = {}
+        for pixel in order:
+            pulse = heat.pulse_for_peak(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
+            if pulse is not None:
+                single[pixel] = pulse
+        if not single:
+            yield from self._round(source, frame, order, heat)
+            return
+        split = {rounds: shares for rounds in ROUNDS if (shares := slices(single, rounds)) is not None}
+        rehearsals = [self._rehearsal(source, frame, order, heat, *item) for item in split.items()]
+        due_us = self._wanted_us(frame.show_at_s + frame.duration_s) + waited_us
+        chosen, unsplit = best(rehearsals, due_us * 1e-6), rehearsals[0]
+        extra_s = chosen.end_s - unsplit.end_s
+        self.together.append(Together(source, chosen.rounds, chosen.simultaneity, unsplit.simultaneity, extra_s))
+        yield from self._rounds(source, frame, order, heat, chosen.rounds, split[chosen.rounds])
+
+    def _rehearsal(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
+    ) -> Rehearsal:
+        """What a number of rounds would come to, on a copy of the heat; the plan stays where it is."""
+        before, trial, pieces, last_round_s = replace(self._now), heat.copy(), [], 0.0
+        for piece in self._rounds(source, frame, order, trial, rounds, shares):
+            trial.pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self._tick)
+            pieces.append(piece)
+            if np.isfinite(piece.target_m[piece.source == source]).any() and last_round_s == 0.0:
+                last_round_s = float(piece.start_s[0])
+        self._now = before
+        del self.skipped[before.skipped :]
+        plan = joined(pieces)
+        target_m = {pixel: float(frame.target_m[pixel]) for pixel in order}
+        share = simultaneity(heat, plan, target_m, last_round_s, self._tick)
+        end_s = float(plan.start_s[-1] + plan.width_s[-1])
+        return Rehearsal(rounds, share, end_s, rounds == 1 or rested(plan, self._machine.rest_s))
+
+    def _rounds(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
+    ) -> Pieces:
+        """Slices of so many PWM periods in every round but the last, in which each pixel gets what it still needs."""
+        for _ in range(rounds - 1):
+            yield from self._round(source, frame, [pixel for pixel in order if pixel in shares], heat, shares)
+        yield from self._round(source, frame, order, heat)
+
+    def _round(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None = None
+    ) -> Pieces:
+        """One pulse a pixel, cut where a train's pulse comes between; to its height, or as wide as its share."""
         self._now.place = 0
-        while (yield from self._offer(lambda: self._frame_rows(source, frame, order, heat))):
+        while (yield from self._offer(lambda: self._round_rows(source, frame, order, heat, shares))):
             pass
 
-    def _frame_rows(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> list[_Row]:
-        """The frame's rows from where it stands, up to the next train pulse or its own end."""
+    def _round_rows(
+        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None
+    ) -> list[_Row]:
+        """The round's rows from where it stands, up to the next train pulse or its own end."""
         now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
         rows: list[_Row] = []
         while now.place < len(order):
@@ -208,7 +323,10 @@ class Scheduler:
             start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel, now.stay_us))
             if now.place % TICK == 0:
                 self._tick()
-            pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
+            if shares is None:
+                pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
+            else:
+                pulse, target_m = (shares[pixel], 1.0), float("nan")
             if pulse is None:
                 self.skipped.append(Skipped(source, pixel, target_m))
                 now.skipped += 1
@@ -216,7 +334,12 @@ class Scheduler:
                 continue
             width_us = round(pulse[0] * drive.period_s * 1e6)
             if self._train_is_due(start_us + width_us, pixel, width_us):
-                return [*rows, self._train_row()]
+                if not self._heat_is_known(rows):
+                    return rows
+                rows += self._train_rows(heat)
+                if rows:
+                    return rows
+                continue
             rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, wanted_us, target_m, source))
             now.place += 1
         return rows
@@ -236,14 +359,3 @@ class Scheduler:
             nominal_s=np.array(nominal_us) * 1e-6,
             source=np.array(source, dtype=np.int64),
         )
-
-
-def _train_pulses(trains: tuple[PulseTrain, ...], first_source: int) -> list[_TrainPulse]:
-    pulses = [
-        _TrainPulse(
-            round(start_s * 1e6), first_source + k, train.pixel, round(train.pulse_width_s * 1e6), train.power_w
-        )
-        for k, train in enumerate(trains)
-        for start_s in train.pulse_starts_s()
-    ]
-    return sorted(pulses)

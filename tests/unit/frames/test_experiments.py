@@ -15,7 +15,7 @@ MIDDLE = 218
 
 def pulses(sequence):
     """Start, width, power and pixel of every pulse, in order of time."""
-    check_trains(sequence.trains, "trains")
+    check_trains(sequence.trains, "trains", CONFIG)
     rows = [(at, t.pulse_width_s, t.power_w, t.pixel) for t in sequence.trains for at in t.pulse_starts_s()]
     return np.array(sorted(rows)).T
 

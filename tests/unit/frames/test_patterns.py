@@ -190,7 +190,7 @@ DOC = (Path(__file__).parents[3] / "docs" / "patterns.md").read_text(encoding="u
 def test_the_documented_example_is_read():
     example = DOC.partition("```json")[2].partition("```")[0]
     sequence = parse_sequence(example, CONFIG, "docs")
-    assert (len(sequence.frames), len(sequence.trains)) == (2, 1)
+    assert (len(sequence.frames), len(sequence.trains)) == (2, 2)
 
 
 def test_the_document_names_every_pattern_and_its_parameters():

@@ -6,8 +6,8 @@ import pytest
 
 from optodrive.config import load_config
 from optodrive.errors import InputError
-from optodrive.flow import PulseTrain
-from optodrive.frames.files import parse_sequence
+from optodrive.flow import HeightTrain, PulseTrain
+from optodrive.frames.files import parse_sequence, sequence_to_json
 from optodrive.frames.trains import check_trains, checked_train, pulse_count
 
 CONFIG = load_config("display-437")
@@ -60,6 +60,55 @@ def test_a_wrong_train_is_refused(change, code, says):
     found, message = refusal(change)
     assert found == code
     assert says in message
+
+
+HEIGHTS = {"pixel": 17, "start_s": 0.0, "duration_s": 1.0, "period_s": 0.04, "target_um": 300, "peak_to_peak_um": 120}
+
+
+def test_a_train_by_height_is_told_by_its_keys():
+    (train,) = parse_sequence({"trains": [HEIGHTS]}, CONFIG, "f").trains
+    assert train == HeightTrain(17, 0.0, 1.0, 0.04, pytest.approx(300e-6), pytest.approx(120e-6))
+    assert len(train.pulse_starts_s()) == pulse_count(train) == 25
+    (free,) = parse_sequence({"trains": [{**HEIGHTS, "peak_to_peak_um": None}]}, CONFIG, "f").trains
+    assert free.peak_to_peak_m is None
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "says"),
+    [
+        ({"pixel": 437}, "unknown_pixel", "frames.json: trains[0].pixel: got 437"),
+        ({"period_s": 0.0006}, "bad_train", "trains[0].period_s: got 0.0006, expected at least 0.0007 s"),
+        ({"period_s": 0}, "bad_train", "period_s: got 0"),
+        ({"target_um": 0}, "bad_target", "target_um: got 0.0, expected a height > 0 in µm"),
+        ({"target_um": "300"}, "bad_target", "target_um: got '300'"),
+        ({"peak_to_peak_um": 301}, "bad_train", "peak_to_peak_um: got 301.0, expected a height above 0, at most"),
+        ({"peak_to_peak_um": -1}, "bad_train", "peak_to_peak_um: got -1.0"),
+        ({"power_w": 2}, "unknown_key", "got 'power_w', expected a known key"),
+        ({"duration_s": 1001, "period_s": 0.01}, "too_many", "got 100100, expected at most 100000 pulses in all"),
+    ],
+)
+def test_a_wrong_train_by_height_is_refused(change, code, says):
+    with pytest.raises(InputError) as caught:
+        parse_sequence({"trains": [{**HEIGHTS, **change}]}, CONFIG, "frames.json")
+    assert caught.value.code == code
+    assert says in str(caught.value)
+
+
+def test_a_train_by_height_needs_its_keys_and_its_share_of_the_beam():
+    for key in ("target_um", "period_s", "pixel"):
+        with pytest.raises(InputError) as caught:
+            parse_sequence({"trains": [{k: v for k, v in HEIGHTS.items() if k != key}]}, CONFIG, "f")
+        assert caught.value.code == "missing_key"
+    for other in ({**HEIGHTS, "start_s": 0.0001}, {**TRAIN, "start_s": 0.03}, TRAIN):
+        with pytest.raises(InputError) as caught:
+            parse_sequence({"trains": [HEIGHTS, other]}, CONFIG, "f")
+        assert caught.value.code == "overlapping_trains"
+    assert parse_sequence({"trains": [{**HEIGHTS, "start_s": 0.025}, {**TRAIN, "gap_s": 0.02}]}, CONFIG, "f").trains
+
+
+def test_a_train_by_height_is_written_as_it_was_read():
+    once = parse_sequence({"trains": [HEIGHTS, {**HEIGHTS, "start_s": 0.01, "peak_to_peak_um": None}]}, CONFIG, "f")
+    assert parse_sequence(sequence_to_json(once), CONFIG, "f").trains == once.trains
 
 
 def test_the_limits_themselves_are_allowed():
@@ -124,12 +173,12 @@ def test_a_hundred_thousand_pulses_are_checked_quickly():
     train = PulseTrain(0, 0.0, 1000.0, 0.0002, 0.0018, 1.0)
     many = [replace(train, pixel=k, start_s=0.0005 * k, duration_s=50.0) for k in range(4)]
     start_s = time.process_time()
-    check_trains(many, "trains")
+    check_trains(many, "trains", CONFIG)
     assert time.process_time() - start_s < 0.5
     assert sum(map(pulse_count, many)) == 100_000
     late = replace(train, pixel=9, start_s=49.9996, duration_s=0.001)
     with pytest.raises(InputError, match="one beam"):
-        check_trains([*many, late], "trains")
+        check_trains([*many, late], "trains", CONFIG)
 
 
 def test_another_laser_has_other_periods():

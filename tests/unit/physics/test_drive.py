@@ -55,3 +55,28 @@ def test_no_pulse_where_the_heat_is_enough():
 
 def test_a_target_out_of_reach_gets_the_longest_pulse():
     assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * reach_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
+
+
+@given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), least=st.integers(1, 300))
+def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, least):
+    target = share * reach_m(PIXEL, DRIVE)
+    shortest, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
+    if shortest is None:
+        assert wide is None
+        return
+    assert wide[0] == max(shortest[0], min(least, DRIVE.max_periods))
+    peak = pulse_peak(PIXEL, theta, 0.0, wide[1] * 2.45, wide[0] * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
+    assert peak == pytest.approx(target, rel=1e-6)
+
+
+@given(share=st.floats(0.01, 0.5), least=st.integers(1, 40), from_s=st.floats(0.01, 0.04))
+def test_a_peak_may_count_only_from_a_time_on(share, least, from_s):
+    target = share * reach_m(PIXEL, DRIVE)
+    periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, target, DRIVE, least, from_s)
+    width = periods * DRIVE.period_s
+    lit = advance(PIXEL, 0.0, 0.0, duty * 2.45, width)
+    gas = [advance(PIXEL, *lit, 0.0, s)[1] for s in max(0.0, from_s - width) + np.linspace(0, 0.05, 2001)]
+    assert periods >= least
+    assert (duty == 1.0 and periods == DRIVE.max_periods) or max(gas) * PIXEL.kappa_m_per_k == pytest.approx(
+        target, rel=1e-4
+    )

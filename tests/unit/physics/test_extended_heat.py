@@ -104,6 +104,48 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
             assert shorter.pulses(*columns).displacement_m[0] < target_m
 
 
+@pytest.mark.parametrize("key", ["", "laser_turn_on+membrane_creep", "gas_leak"])
+def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
+    keys = key.split("+")
+    heat, before = extended(*keys), some_pulses(4, 10, pixels=(5,))
+    heat.pulses(*before)
+    at_s = before[1][-1] + 0.06
+    for least, from_s in ((60, 0.0), (20, 0.02), (1, 0.015)):
+        periods, duty = heat.pulse_for_peak(5, at_s, 1e-4, DRIVE, least, from_s)
+        assert periods >= least
+        pulse = np.array([[at_s, periods * DRIVE.period_s, duty * FULL_W, 5.0]])
+        t_s = at_s + max(from_s, 0.0) + np.linspace(0.0, 0.08, 1601)
+        assert heat.heights_m(pulse, 5, t_s).max() == pytest.approx(1e-4, rel=1e-3)
+        if not key:
+            nominal = DisplayHeat(ARRAY)
+            nominal.pulses(*before)
+            theirs = nominal.pulse_for_peak(5, at_s, 1e-4, DRIVE, least, from_s)
+            assert periods == theirs[0]
+            assert duty == pytest.approx(theirs[1], rel=1e-2)
+
+
+@pytest.mark.parametrize("key", ["", *SINGLE])
+def test_heights_from_the_heat_there_are_those_of_the_whole_run(key):
+    keys = key.split("+")
+    near = "neighbour_crosstalk" in keys
+    index, *columns = some_pulses(9)
+    for pixel in (0, 5):
+        felt = np.isin(index, [pixel, *SMALL.beside[pixel]]) if near else index == pixel
+        own = (index[felt], *(column[felt] for column in columns))
+        half = len(own[0]) // 2
+        heat = extended(*keys)
+        heat.pulses(*(column[:half] for column in own))
+        pulses = np.column_stack([*own[1:], own[0]])
+        t_s, _, displacement_m = seen(keys, pixel, own, pulses[-1, 0] + 0.1)
+        after = t_s > pulses[half - 1, :2].sum() + 1e-6
+        untouched = heat.copy()
+        ours_m = heat.heights_m(pulses[half:], pixel, t_s[after])
+        assert ours_m == pytest.approx(displacement_m[after], rel=1e-3, abs=5e-8)
+        assert heat.pulse_for_peak(pixel, t_s[-1], 4e-4, DRIVE) == untouched.pulse_for_peak(pixel, t_s[-1], 4e-4, DRIVE)
+    with pytest.raises(ValueError, match="lies before it"):
+        heat.heights_m(pulses[half:], pixel, np.array([pulses[half - 1, 0]]))
+
+
 def test_no_pulse_where_the_heat_left_reaches_the_height_and_the_longest_where_none_does():
     heat = extended("radiation")
     heat.pulses(np.array([2]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))

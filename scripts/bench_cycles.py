@@ -1,0 +1,197 @@
+"""Trains by height and frames together: what is asked, what an independent integrator sees, what it costs.
+
+Every figure is a calculation on the shipped display-437, nothing is measured on hardware.
+"""
+
+import sys
+from contextlib import contextmanager
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from scipy.integrate import solve_ivp
+
+from optodrive.config import load_config
+from optodrive.errors import InputError
+from optodrive.flow import FrameSequence, HeightTrain, PulseTrain, TactileFrame
+from optodrive.pipeline import Display, prepare
+from optodrive.plan import scheduler
+from optodrive.plan.cycles import at_target, with_room
+
+PIXELS = (200, 201, 222, 221)
+SECONDS, CYCLES = 0.6, 12
+"""A train lasts so long, and so many cycles at least."""
+STEADY = 5
+"""Cycles at the end that are looked at."""
+FRAMES = 300
+SWING = 0.5
+"""Swing asked for, between the least (0) and the most (1) that a height and a rate allow."""
+
+
+def height_um(pixel, pulses, t_s):
+    """Displacement at t_s [m] under pulses [n, 3] in order, from rest, by solve_ivp from edge to edge."""
+    edges_s = [0.0, *(pulses[:, :1] + np.column_stack([np.zeros(len(pulses)), pulses[:, 1]])).ravel(), t_s[-1] + 1e-3]
+    power_w = [0.0, *np.column_stack([pulses[:, 2], np.zeros(len(pulses))]).ravel()]
+    state, height = np.zeros(2), np.zeros(len(t_s))
+    for begin_s, end_s, light_w in zip(edges_s[:-1], edges_s[1:], power_w, strict=True):
+        if end_s <= begin_s:
+            continue
+
+        def slope(_, y, light_w=light_w):
+            heating = (pixel.epsilon * light_w - y[0] / pixel.r_k_per_w) / pixel.c_j_per_k
+            return [heating, (y[0] / 2 - y[1]) / pixel.tau_g_s]
+
+        inside = (t_s >= begin_s) & (t_s < end_s)
+        run = solve_ivp(slope, (begin_s, end_s), state, t_eval=[*t_s[inside], end_s], rtol=1e-7, atol=1e-7)
+        height[inside], state = run.y[1][:-1], run.y[:, -1]
+    return 1e6 * pixel.kappa_m_per_k * height
+
+
+def last_cycles(display, result, train, period_s):
+    """Peak and swing, µm, mean of the last cycles of a train, and its energy a cycle there, J."""
+    plan = result.plan
+    rows = np.flatnonzero(plan.pixel == train.pixel)
+    starts_s = train.pulse_starts_s()[-STEADY - 1 : -1] + result.lead_s
+    t_s = np.linspace(starts_s[0], starts_s[0] + STEADY * period_s, 200 * STEADY + 1)
+    pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w])[rows]
+    each = height_um(display.pixels.each[train.pixel], pulses, t_s)[:-1].reshape(STEADY, 200)
+    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[rows][-STEADY - 1 : -1].mean()
+
+
+def room_us(display, count, period_s):
+    """Beam time of a pulse of one of so many trains that share a period."""
+    machine = display.machine
+    own_us = round((period_s - machine.rest_s) * 1e6)
+    if count == 1:
+        return own_us
+    x_rad = machine.field.mirror_rad(display.layout.x_m)
+    return min(own_us, int(1e6 * period_s / count) - machine.moves.time_us(x_rad[201] - x_rad[200], 0.0))
+
+
+def train_rows(display, count, rate_hz, target_um):
+    """One row of the table of cycles."""
+    period_s = 1.0 / rate_hz
+    at_rest, drive = display.heat_at_rest(), with_room(display.machine.drive, room_us(display, count, period_s))
+    lasts_s = max(SECONDS, CYCLES * period_s)
+    first = HeightTrain(PIXELS[0], 0.0, lasts_s, period_s, target_um * 1e-6)
+    head = (str(count), f"{rate_hz:g}", f"{target_um:g}")
+    fewest = next(
+        (
+            n
+            for n in range(1, drive.max_periods + 1)
+            if at_target(first, at_rest, drive, n).peak_m > 0.9999e-6 * target_um
+        ),
+        None,
+    )
+    if fewest is None:
+        return (*head, f"out of reach: {1e6 * at_target(first, at_rest, drive, drive.max_periods).peak_m:.0f} at most")
+    most_m, least_m = (at_target(first, at_rest, drive, n).peak_to_peak_m for n in (fewest, drive.max_periods))
+    swing_m = least_m + SWING * (most_m - least_m)
+    trains = tuple(
+        replace(first, pixel=PIXELS[k], start_s=round(k * period_s / count, 6), peak_to_peak_m=swing_m)
+        for k in range(count)
+    )
+    result = prepare(display, FrameSequence(trains=trains), *display.at_rest())
+    peak_um, felt_um, warm_j = last_cycles(display, result, trains[0], period_s)
+    width_s = result.plan.width_s[result.plan.pixel == PIXELS[0]][-1]
+    periods, duty = at_rest.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
+    cold = tuple(
+        PulseTrain(
+            item.pixel, item.start_s, lasts_s, periods * drive.period_s,
+            period_s - periods * drive.period_s, duty * drive.max_power_w,
+        )
+        for item in trains
+    )  # fmt: skip
+    from_rest = prepare(display, FrameSequence(trains=cold), *display.at_rest())
+    cold_um, _, cold_j = last_cycles(display, from_rest, trains[0], period_s)
+    trimmed = "" if not from_rest.plan.trimmed_j.any() else ", trimmed"
+    return (
+        *head,
+        f"{peak_um:.1f} ({100 * (peak_um / target_um - 1):+.2f} %)",
+        f"{1e6 * swing_m:.1f}",
+        f"{felt_um:.1f} ({100 * (felt_um / swing_m / 1e6 - 1):+.1f} %)",
+        f"{1e3 * warm_j:.2f}",
+        f"{1e3 * cold_j:.2f}",
+        f"{100 * (1 - warm_j / cold_j):.0f} %",
+        f"{cold_um:.0f}{trimmed}",
+    )
+
+
+def cycles_table(display):
+    """Trains by height against pulses planned as if from rest."""
+    table = Table("pixels", "Hz", "peak µm", "simulated", "swing µm", "simulated", "mJ a cycle", "from rest", "less",
+                  "peak from rest", title="trains by height")  # fmt: skip
+    for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
+        try:
+            table.add_row(*train_rows(display, count, rate_hz, target_um))
+        except InputError as error:
+            table.add_row(str(count), f"{rate_hz:g}", f"{target_um:g}", str(error))
+    return table
+
+
+@contextmanager
+def overheard():
+    """Every list of rehearsals that the scheduler chooses from meanwhile."""
+    choose, heard = scheduler.best, []
+    scheduler.best = lambda items, due_s: (heard.append(items), choose(items, due_s))[1]
+    try:
+        yield heard
+    finally:
+        scheduler.best = choose
+
+
+def shown(display, heights_um):
+    """A frame of heights by pixel, as prepared, with time enough for any number of rounds."""
+    target_m = np.zeros(len(display.layout))
+    target_m[list(heights_um)] = np.array(list(heights_um.values())) * 1e-6
+    frame = TactileFrame("f", 0.0, 20.0, target_m, together=True)
+    return prepare(display, FrameSequence((frame,)), *display.at_rest())
+
+
+def together_table(display):
+    """Squares of pixels in rounds: simultaneity, and how long the whole takes."""
+    table = Table("pixels", "µm", "rounds", "simultaneity", "ends ms", "longer by ms", "", title="frames together")
+    for side, target_um in ((2, 100), (2, 300), (3, 50), (3, 100), (3, 200), (6, 50)):
+        square = [200 + 21 * row + column for row in range(side) for column in range(side)]
+        with overheard() as heard:
+            (told,) = shown(display, dict.fromkeys(square, target_um)).together
+        for item in heard[0]:
+            longer_ms = 1e3 * (item.end_s - heard[0][0].end_s)
+            table.add_row(
+                f"{side * side}",
+                f"{target_um}",
+                f"{item.rounds}",
+                f"{item.simultaneity:.3f}",
+                f"{1e3 * item.end_s:.1f}",
+                f"{longer_ms:+.1f}",
+                "chosen" if item.rounds == told.rounds else "",
+            )
+    return table
+
+
+def shortening(display):
+    """Whether more rounds ever shorten a frame: random pixels and heights, one line."""
+    generator = np.random.default_rng(1)
+    with overheard() as heard:
+        for _ in range(FRAMES):
+            chosen = generator.choice(len(display.layout), generator.integers(2, 30), replace=False)
+            shown(display, dict(zip(chosen.tolist(), generator.uniform(5.0, 400.0, len(chosen)), strict=True)))
+    longer_s = np.array([item.end_s - items[0].end_s for items in heard for item in items[1:]])
+    return (
+        f"{FRAMES} random frames, split in {len(longer_s)} ways: {np.count_nonzero(longer_s < 0)} end earlier than "
+        f"unsplit, the least later by {1e3 * longer_s.min():.1f} ms"
+    )
+
+
+def main() -> int:
+    display, console = Display.of(load_config("display-437")), Console(width=150)
+    console.print(cycles_table(display))
+    console.print(together_table(display))
+    console.print(shortening(display))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
