@@ -3,7 +3,7 @@
 The engine, `optodrive plan` and `optodrive simulate` all come through here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import ceil, inf
 
@@ -11,7 +11,16 @@ import numpy as np
 
 from optodrive.config import Config, PixelLayout, pixel_layout
 from optodrive.errors import InputError, OverBudgetError, RefusedError
-from optodrive.flow import BudgetState, FloatArray, FrameSequence, LimitedPlan, PulsePlan, PulseTrain, TactileFrame
+from optodrive.flow import (
+    BudgetState,
+    FloatArray,
+    FrameSequence,
+    IntArray,
+    LimitedPlan,
+    PulsePlan,
+    PulseTrain,
+    TactileFrame,
+)
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
@@ -26,6 +35,8 @@ from optodrive.units import ZERO_CELSIUS_K, m_to_um
 
 Progress = Callable[[float], None]
 """Told the share done, 0 to 1."""
+ROUNDING_S = 1e-9
+"""Times are whole microseconds; sums of them may be off by this much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +83,7 @@ class Display:
 class FrameTiming:
     """How a frame fared: when its last pulse ends against when it should, and how many pulses came in time."""
 
+    source: int
     frame_id: str
     show_at_s: float
     due_s: float
@@ -83,7 +95,8 @@ class FrameTiming:
     @property
     def late_s(self) -> float:
         """By how much the frame overruns its time, s."""
-        return max(0.0, self.finished_s - self.due_s)
+        late_s = self.finished_s - self.due_s
+        return late_s if late_s > ROUNDING_S else 0.0
 
 
 @dataclass(frozen=True)
@@ -151,25 +164,40 @@ def warm_up(display: Display) -> None:
     target_m[0] = 1e-6
     pulse = PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w)
     prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), (pulse,)), *display.at_rest())
+    if not display.parameters.planner_terms:
+        # Admission looks whether heat falls.
+        display.heat_at_rest().traces(np.zeros((0, 4)), [0], np.zeros(2))
+
+
+def beyond_reach(display: Display, sequence: FrameSequence) -> tuple[int, int, float] | None:
+    """The first target that the longest pulse at full power does not reach from rest: frame, pixel, what it reaches, m.
+
+    None where all are within reach.
+    """
+    if not sequence.frames:
+        return None
+    most_m = display.heat_at_rest().reaches_m(display.machine.drive)
+    for source, frame in enumerate(sequence.frames):
+        beyond = np.flatnonzero(frame.target_m > most_m)
+        if len(beyond):
+            return source, int(beyond[0]), float(most_m[beyond[0]])
+    return None
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
     """Refuse a target that the longest pulse at full power does not reach from rest."""
-    if not sequence.frames:
+    beyond = beyond_reach(display, sequence)
+    if beyond is None:
         return
-    most_m = display.heat_at_rest().reaches_m(display.machine.drive)
-    laser, limits = display.config.laser, display.config.limits
-    for frame in sequence.frames:
-        beyond = np.flatnonzero(frame.target_m > most_m)
-        if len(beyond):
-            index = int(beyond[0])
-            raise InputError(
-                f"frame {frame.frame_id}: target_um of pixel {index}",
-                round(m_to_um(float(frame.target_m[index])), 3),
-                f"at most {m_to_um(float(most_m[index])):.0f} µm, what the longest pulse "
-                f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W) reaches",
-                code="target_out_of_reach",
-            )
+    source, pixel, most_m = beyond
+    frame, laser, limits = sequence.frames[source], display.config.laser, display.config.limits
+    raise InputError(
+        f"frame {frame.frame_id}: target_um of pixel {pixel}",
+        round(m_to_um(float(frame.target_m[pixel])), 3),
+        f"at most {m_to_um(most_m):.0f} µm, what the longest pulse "
+        f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W) reaches",
+        code="target_out_of_reach",
+    )
 
 
 def prepare(
@@ -179,8 +207,11 @@ def prepare(
     budget: BudgetState,
     policy: Policy = "trim",
     progress: Progress | None = None,
+    orders: Mapping[int, IntArray] | None = None,
 ) -> Prepared:
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
+
+    orders: as the scheduler takes them, in place of its own.
 
     Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
     frame as a whole. Raises InputError for a target out of reach, RefusedError for what no policy lets pass: under
@@ -193,7 +224,7 @@ def prepare(
         if progress is not None:
             progress(done)
 
-    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick)
+    scheduler = Scheduler(display.machine, sequence, 1 if policy == "delay" else TRAIN_PIECE, tick, orders)
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
     delays: list[Delay] = []
@@ -273,13 +304,14 @@ def _frame_timings(sequence: FrameSequence, plan: LimitedPlan, lead_s: float) ->
         due_s = lead_s + frame.show_at_s + frame.duration_s
         timings.append(
             FrameTiming(
+                source=source,
                 frame_id=frame.frame_id,
                 show_at_s=lead_s + frame.show_at_s,
                 due_s=due_s,
                 first_s=float(plan.start_s[rows[0]]),
                 finished_s=float(end_s[rows[-1]]),
                 pulses=len(rows),
-                in_time=int(np.count_nonzero(end_s[rows] <= due_s + 1e-9)),
+                in_time=int(np.count_nonzero(end_s[rows] <= due_s + ROUNDING_S)),
             )
         )
     return tuple(timings)
@@ -294,7 +326,7 @@ def _refuse_late(prepared: Prepared) -> None:
 def lateness(timing: FrameTiming) -> str:
     """One sentence with the numbers of a frame that does not fit its time."""
     return (
-        f"frame {timing.frame_id} needs {timing.finished_s - timing.show_at_s:.3f} s of beam time and has "
-        f"{timing.due_s - timing.show_at_s:.3f} s: {timing.in_time} of {timing.pulses} pulses come in time, "
-        f"the last ends {timing.late_s:.3f} s late"
+        f"frame {timing.frame_id} needs {timing.finished_s - timing.show_at_s:.4f} s of beam time and has "
+        f"{timing.due_s - timing.show_at_s:.4f} s: {timing.in_time} of {timing.pulses} pulses come in time, "
+        f"the last ends {timing.late_s:.4f} s late"
     )

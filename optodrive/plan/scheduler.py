@@ -3,14 +3,14 @@
 Trains keep their times; a frame's pulses fill the beam time between them. Times are whole microseconds inside.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from optodrive.config import PixelLayout
-from optodrive.flow import FrameSequence, PulsePlan, PulseTrain, TactileFrame
+from optodrive.flow import FrameSequence, IntArray, PulsePlan, PulseTrain, TactileFrame
 from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
@@ -82,6 +82,7 @@ class Scheduler:
     """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
 
     tick: called again and again while a frame is planned.
+    orders: by source, the order [k] in which a frame's driven pixels are visited; the others by a short path.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are.
     skipped: pixels that needed no pulse, so far.
     """
@@ -92,11 +93,13 @@ class Scheduler:
         sequence: FrameSequence,
         train_piece: int = TRAIN_PIECE,
         tick: Callable[[], None] = nothing,
+        orders: Mapping[int, IntArray] | None = None,
     ) -> None:
         self._machine = machine
         self._sequence = sequence
         self._train_piece = train_piece
         self._tick = tick
+        self._orders = orders or {}
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = _train_pulses(sequence.trains, len(sequence.frames))
@@ -182,7 +185,7 @@ class Scheduler:
 
     def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
         """A frame's pulses, one a pixel, cut where a train's pulse comes between."""
-        order = self._order(frame)
+        order = self._orders[source].tolist() if source in self._orders else self._order(frame)
         self._now.place = 0
         while (yield from self._offer(lambda: self._frame_rows(source, frame, order, heat))):
             pass
