@@ -29,12 +29,14 @@ class TactileFrame:
     """One tactile picture: the peak displacement asked of each pixel while the frame is shown.
 
     target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
+    priority: the larger, the later it is left out where not everything fits.
     """
 
     frame_id: str
     show_at_s: float
     duration_s: float
     target_m: FloatArray
+    priority: int = 0
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -45,6 +47,7 @@ class PulseTrain:
     """Cyclic stimulation of one pixel: pulses of `pulse_width_s` with `gap_s` between, for `duration_s`.
 
     power_w: incident power while on, W. The train holds every pulse that starts before its end; the last may end later.
+    priority: as a frame's.
     """
 
     pixel: int
@@ -53,6 +56,7 @@ class PulseTrain:
     pulse_width_s: float
     gap_s: float
     power_w: float
+    priority: int = 0
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""

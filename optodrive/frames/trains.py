@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.config import Config
 from optodrive.errors import InputError
 from optodrive.flow import PulseTrain
-from optodrive.frames.fields import number_at, table_at, time_at
+from optodrive.frames.fields import number_at, priority_at, table_at, time_at
 
 TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
 PULSES_MAX = 2_000_000
@@ -21,8 +21,8 @@ PWM_TOLERANCE = 0.01
 
 
 def parse_train(value: object, where: str, config: Config, pixel_count: int) -> PulseTrain:
-    """One entry of `trains`; raises InputError (bad_train, bad_time, unknown_pixel, unknown_key)."""
-    table = table_at(value, where, TRAIN_KEYS, TRAIN_KEYS)
+    """One entry of `trains`; raises InputError (bad_train, bad_time, bad_priority, unknown_pixel, …)."""
+    table = table_at(value, where, (*TRAIN_KEYS, "priority"), TRAIN_KEYS)
     pixel = table["pixel"]
     if type(pixel) is not int or not 0 <= pixel < pixel_count:
         raise InputError(f"{where}.pixel", pixel, f"a pixel, 0…{pixel_count - 1}", code="unknown_pixel")
@@ -31,7 +31,8 @@ def parse_train(value: object, where: str, config: Config, pixel_count: int) -> 
     gap_s = time_at(table["gap_s"], f"{where}.gap_s", "a gap ≥ 0 in s", "bad_train", positive=False)
     width_s = number_at(table["pulse_width_s"], f"{where}.pulse_width_s", "a width > 0 in s", "bad_train")
     power_w = number_at(table["power_w"], f"{where}.power_w", "a power > 0 in W", "bad_train")
-    return checked_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w), where, config)
+    priority = priority_at(table.get("priority", 0), f"{where}.priority")
+    return checked_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w, priority), where, config)
 
 
 def checked_train(train: PulseTrain, where: str, config: Config) -> PulseTrain:
