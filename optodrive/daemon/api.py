@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 
 from optodrive import __version__
+from optodrive.admission import Fit
 from optodrive.daemon.auth import BodyTooLargeError, Guard, problem
 from optodrive.daemon.engine import Engine
 from optodrive.daemon.resolved import resolved_config
@@ -57,6 +58,8 @@ DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")
 Strict = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="what becomes of a frame that a cap does not allow as it is")]
 
+FitQuery = Annotated[Fit, Query(description="what becomes of a sequence that does not fit on the beam as it is")]
+
 
 def make_app(engine: Engine, token: str) -> FastAPI:
     """The daemon's web application over a running engine."""
@@ -100,12 +103,17 @@ def make_app(engine: Engine, token: str) -> FastAPI:
 
     @app.post("/v1/plans", status_code=201, openapi_extra=_json_body("FRAMES.json: frames and trains"))
     async def push(
-        request: Request, dry_run: DryRun = False, strict: Strict = False, policy: PolicyQuery = "trim"
+        request: Request,
+        dry_run: DryRun = False,
+        strict: Strict = False,
+        policy: PolicyQuery = "trim",
+        fit: FitQuery = "as_is",
     ) -> Answer:
         """Plan frames and trains, and show them."""
         body = await request.body()
+        policy = chosen(policy, strict)
         return await _result(
-            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, chosen(policy, strict))
+            engine.submit(lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit)
         )
 
     @app.get("/v1/plans/{plan_id}")
@@ -130,6 +138,7 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         dry_run: DryRun = False,
         strict: Strict = False,
         policy: PolicyQuery = "trim",
+        fit: FitQuery = "as_is",
     ) -> Answer:
         """Build a named pattern, plan it, show it."""
         body = await request.body()
@@ -137,7 +146,9 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         if not isinstance(given, dict):
             raise InputError("body", given, "an object of the pattern's parameters")
         policy = chosen(policy, strict)
-        return await _result(engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy))
+        return await _result(
+            engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy, fit)
+        )
 
     return app
 
@@ -171,6 +182,8 @@ def _add_error_answers(app: FastAPI) -> None:
         if isinstance(error, OverBudgetError):
             later_s = error.earliest_s if error.earliest_s < inf else None
             more = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": later_s}
+        if isinstance(error, RefusedError) and error.admission is not None:
+            more["admission"] = error.admission
         return answer(problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more))
 
     @on(RequestValidationError)

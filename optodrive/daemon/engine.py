@@ -13,6 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count
 from queue import Empty, SimpleQueue
 
+from optodrive.admission import Fit, admit
 from optodrive.board.faults import hint
 from optodrive.board.job import Job
 from optodrive.board.requirements import Requirements
@@ -24,7 +25,7 @@ from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, ExecutedPulses, FrameSequence
 from optodrive.limit.limiter import Policy, fired, verify
-from optodrive.pipeline import Display, prepare, warm_up
+from optodrive.pipeline import Display, warm_up
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
 
@@ -202,23 +203,28 @@ class Engine:
     # --- plans --------------------------------------------------------------------------------------------------
 
     def submit(
-        self, build: Callable[[], FrameSequence], name: str, dry_run: bool = False, policy: Policy = "trim"
+        self,
+        build: Callable[[], FrameSequence],
+        name: str,
+        dry_run: bool = False,
+        policy: Policy = "trim",
+        fit: Fit = "as_is",
     ) -> "Future[Answer]":
         """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when."""
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
             self._plans_pending += 1
-        return self._planner.submit(self._plan, build, name, dry_run, policy)
+        return self._planner.submit(self._plan, build, name, dry_run, policy, fit)
 
-    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, policy: Policy) -> Answer:
+    def _plan(self, build: Callable[[], FrameSequence], name: str, dry_run: bool, policy: Policy, fit: Fit) -> Answer:
         try:
             self._note_progress(0.0)
             sequence = build()
             while True:
                 if not dry_run:
                     self._require_armed()
-                answer = self._planned(sequence, name, dry_run, policy)
+                answer = self._planned(sequence, name, dry_run, policy, fit)
                 if answer is not None:
                     return answer
         finally:
@@ -238,14 +244,14 @@ class Engine:
         if len(self._waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
 
-    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, policy: Policy) -> Answer | None:
+    def _planned(self, sequence: FrameSequence, name: str, dry_run: bool, policy: Policy, fit: Fit) -> Answer | None:
         """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
         with self._lock:
             thermal, start_s = self._thermal, self._earliest_start_s()
         heat, budget = thermal.seen_from(start_s)
-        prepared = prepare(self.display, sequence, heat, budget, policy, self._note_progress)
+        prepared, admission = admit(self.display, sequence, heat, budget, policy, self._note_progress, fit)
         points = quantise(prepared.plan, self._session.scale)
-        record = PlanRecord(f"p{next(self._ids)}", name, prepared, points, heat, budget, start_s)
+        record = PlanRecord(f"p{next(self._ids)}", name, prepared, admission, points, heat, budget, start_s)
         self._prove(record, budget)
         if dry_run:
             return record.answer(self._session.board_s())

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from optodrive.admission import Admission
 from optodrive.errors import InputError
 from optodrive.flow import BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.heat import Heat
@@ -33,6 +34,7 @@ class PlanRecord:
     plan_id: str
     name: str
     prepared: Prepared
+    admission: Admission
     points: WirePoints
     heat_before: Heat
     budget_before: BudgetState
@@ -66,7 +68,7 @@ class PlanRecord:
             "planned": len(self.prepared.plan),
             "sent": self.sent,
             "executed": self.executed_count,
-            "summary": summary(self.prepared),
+            "summary": summary(self.prepared, self.admission),
             "pulses": pulse_columns(self.prepared) if pulses else None,
             "simulated_max_um": None,
             "tallest_asked": self._tallest_asked(),
