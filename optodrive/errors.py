@@ -1,5 +1,6 @@
 """Errors, by whose fault they are: the caller's input, the plan, the board, the link."""
 
+from collections.abc import Mapping
 from difflib import get_close_matches
 
 
@@ -28,6 +29,8 @@ class RefusedError(OptodriveError):
     """The input is well formed, but what it asks for is refused (limits, deadlines, reach)."""
 
     code = "refused"
+    admission: Mapping[str, object] | None = None
+    """What was found of a sequence that does not fit, as `Admission.answer` gives it."""
 
 
 class OverBudgetError(RefusedError):

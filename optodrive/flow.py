@@ -31,6 +31,7 @@ class TactileFrame:
 
     target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
     together: the pixels shall stand up at one time rather than one after the other
+    priority: the larger, the later it is left out where not everything fits.
     """
 
     frame_id: str
@@ -38,6 +39,7 @@ class TactileFrame:
     duration_s: float
     target_m: FloatArray
     together: bool = False
+    priority: int = 0
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -48,6 +50,7 @@ class PulseTrain:
     """Cyclic stimulation of one pixel: pulses of `pulse_width_s` with `gap_s` between, for `duration_s`.
 
     power_w: incident power while on, W. The train holds every pulse that starts before its end; the last may end later.
+    priority: as a frame's.
     """
 
     pixel: int
@@ -56,6 +59,7 @@ class PulseTrain:
     pulse_width_s: float
     gap_s: float
     power_w: float
+    priority: int = 0
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""
@@ -67,7 +71,7 @@ class HeightTrain:
     """Cyclic stimulation of one pixel by what is felt: a peak of target_m every period_s, for `duration_s`.
 
     peak_to_peak_m: fall of the membrane between two peaks, m; None for as little energy as possible. Cycles as for a
-    `PulseTrain`; each pulse is planned from the heat that is there.
+    `PulseTrain`; each pulse is planned from the heat that is there. priority: as a frame's.
     """
 
     pixel: int
@@ -76,6 +80,7 @@ class HeightTrain:
     period_s: float
     target_m: float
     peak_to_peak_m: float | None = None
+    priority: int = 0
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""

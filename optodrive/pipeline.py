@@ -3,7 +3,7 @@
 The engine, `optodrive plan` and `optodrive simulate` all come through here.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import ceil, inf
@@ -17,6 +17,7 @@ from optodrive.flow import (
     FloatArray,
     FrameSequence,
     HeightTrain,
+    IntArray,
     LimitedPlan,
     PulsePlan,
     PulseTrain,
@@ -40,6 +41,8 @@ JOINED = 256
 
 Progress = Callable[[float], None]
 """Told the share done, 0 to 1."""
+ROUNDING_S = 1e-9
+"""Times are whole microseconds; sums of them may be off by this much."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +107,8 @@ class FrameTiming:
     @property
     def late_s(self) -> float:
         """By how much the frame overruns its time, s."""
-        return max(0.0, self.finished_s - self.due_s)
+        late_s = self.finished_s - self.due_s
+        return late_s if late_s > ROUNDING_S else 0.0
 
 
 @dataclass(frozen=True)
@@ -177,23 +181,37 @@ def warm_up(display: Display) -> None:
         HeightTrain(0, 2.0, 1e-3, 0.1, 1e-6),
     )
     prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), trains), *display.at_rest())
+    if not display.parameters.planner_terms:
+        # Admission looks whether heat falls.
+        display.heat_at_rest().traces(np.zeros((0, 4)), [0], np.zeros(2))
+
+
+def beyond_reach(display: Display, sequence: FrameSequence) -> tuple[int, int, float] | None:
+    """The first target that the longest pulse at full power does not reach from rest: frame, pixel, what it reaches, m.
+
+    None where all are within reach.
+    """
+    for source, frame in enumerate(sequence.frames):
+        beyond = np.flatnonzero(frame.target_m > display.reach_m)
+        if len(beyond):
+            return source, int(beyond[0]), float(display.reach_m[beyond[0]])
+    return None
 
 
 def check_reach(display: Display, sequence: FrameSequence) -> None:
     """Refuse a target that the longest pulse at full power does not reach from rest."""
-    most_m = display.reach_m
-    laser, limits = display.config.laser, display.config.limits
-    for frame in sequence.frames:
-        beyond = np.flatnonzero(frame.target_m > most_m)
-        if len(beyond):
-            index = int(beyond[0])
-            raise InputError(
-                f"frame {frame.frame_id}: target_um of pixel {index}",
-                round(m_to_um(float(frame.target_m[index])), 3),
-                f"at most {m_to_um(float(most_m[index])):.0f} µm, what the longest pulse "
-                f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W) reaches",
-                code="target_out_of_reach",
-            )
+    beyond = beyond_reach(display, sequence)
+    if beyond is None:
+        return
+    source, pixel, most_m = beyond
+    frame, laser, limits = sequence.frames[source], display.config.laser, display.config.limits
+    raise InputError(
+        f"frame {frame.frame_id}: target_um of pixel {pixel}",
+        round(m_to_um(float(frame.target_m[pixel])), 3),
+        f"at most {m_to_um(most_m):.0f} µm, what the longest pulse "
+        f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W) reaches",
+        code="target_out_of_reach",
+    )
 
 
 def prepare(
@@ -204,10 +222,12 @@ def prepare(
     policy: Policy = "trim",
     progress: Progress | None = None,
     standing_on: int | None = None,
+    orders: Mapping[int, IntArray] | None = None,
 ) -> Prepared:
     """Plan and limit a sequence from the heat and budget there are, both on the plan's time line; neither is changed.
 
     standing_on: the pixel the mirrors stand on as the plan begins; None where that is not known.
+    orders: as the scheduler takes them, in place of its own.
 
     Under "delay" whatever does not fit waits, with all that follows, until it does; a pulse of a train by itself, a
     frame as a whole. Raises InputError for a height or a swing out of reach, RefusedError for what no policy lets
@@ -227,6 +247,7 @@ def prepare(
         train_piece=1 if policy == "delay" else TRAIN_PIECE,
         tick=tick,
         standing_on=standing_on,
+        orders=orders,
     )
     working, state = heat.copy(), budget
     limited: list[LimitedPlan] = []
@@ -318,7 +339,7 @@ def _frame_timings(sequence: FrameSequence, plan: LimitedPlan, lead_s: float) ->
                 first_s=float(plan.start_s[rows[0]]),
                 finished_s=float(end_s[rows[-1]]),
                 pulses=len(rows),
-                in_time=int(np.count_nonzero(end_s[rows] <= due_s + 1e-9)),
+                in_time=int(np.count_nonzero(end_s[rows] <= due_s + ROUNDING_S)),
             )
         )
     return tuple(timings)
@@ -333,7 +354,7 @@ def _refuse_late(prepared: Prepared) -> None:
 def lateness(timing: FrameTiming) -> str:
     """One sentence with the numbers of a frame that does not fit its time."""
     return (
-        f"frame {timing.frame_id} needs {timing.finished_s - timing.show_at_s:.3f} s of beam time and has "
-        f"{timing.due_s - timing.show_at_s:.3f} s: {timing.in_time} of {timing.pulses} pulses come in time, "
-        f"the last ends {timing.late_s:.3f} s late"
+        f"frame {timing.frame_id} needs {timing.finished_s - timing.show_at_s:.4f} s of beam time and has "
+        f"{timing.due_s - timing.show_at_s:.4f} s: {timing.in_time} of {timing.pulses} pulses come in time, "
+        f"the last ends {timing.late_s:.4f} s late"
     )

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from optodrive.admission import Admission
 from optodrive.files import written_whole
 from optodrive.pipeline import Display, Prepared, Shortfall, lateness
 from optodrive.plan.slices import Together
@@ -15,14 +16,15 @@ PULSES_LISTED_MAX = 20_000
 """An answer lists pulses one by one up to this many."""
 
 
-def summary(prepared: Prepared) -> dict[str, Any]:
-    """What will be shown, when, how high, and what was taken away and why; JSON-able."""
+def summary(prepared: Prepared, admission: Admission | None = None) -> dict[str, Any]:
+    """Whether all of it fits, what will be shown, when, how high, what was taken away and why; JSON-able."""
     plan = prepared.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
     asked_m = np.nan_to_num(plan.target_m)
     together = {item.source: _together(item) for item in prepared.together}
     tallest = int(np.argmax(prepared.predicted_m)) if len(plan) else None
     return {
+        "admission": None if admission is None else admission.answer(),
         "pulses": len(plan),
         "duration_s": prepared.duration_s,
         "beam_on_s": beam_on_s,

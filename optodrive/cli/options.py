@@ -28,6 +28,13 @@ PolicyOption = Annotated[
     Literal["trim", "delay", "refuse"],
     typer.Option("--policy", help="What becomes of a frame that a cap does not allow as it is."),
 ]
+FitOption = Annotated[
+    Literal["as_is", "even", "priority"],
+    typer.Option(
+        "--fit", help="What does not fit on the beam: even lowers all of it, priority leaves out the less important."
+    ),
+]
+LEFT_OUT_LISTED_MAX = 5
 DEFAULT_URL = "http://127.0.0.1:8450"
 
 
@@ -81,6 +88,7 @@ def progress(label: str) -> Iterator[Callable[[float], None]]:
 def report_lines(summary: dict[str, Any]) -> list[str]:
     """A plan's summary as a few lines of plain words."""
     lines = [
+        *_admission(summary["admission"]),
         f"pulses           {summary['pulses']}",
         f"duration         {summary['duration_s']:.4f} s",
         f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
@@ -110,6 +118,27 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     if summary["skipped"]:
         lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
     return lines
+
+
+def _admission(admission: dict[str, Any]) -> list[str]:
+    if admission["fits"]:
+        return ["fits: yes" if admission["proof"] == "planned" else f"fits: yes, {admission['sentence']}"]
+    lines = [f"fits: no, {admission['sentence']}"]
+    if admission["fit"] == "even":
+        lines.append(f"shown            all heights and powers × {admission['height']:g}")
+    for left in admission["left_out"][:LEFT_OUT_LISTED_MAX]:
+        lines.append(f"left out         {left['name']}: {_pixels(left['pixels'])}")
+    more = len(admission["left_out"]) - LEFT_OUT_LISTED_MAX
+    if more > 0:
+        lines.append(f"left out         and less of {more} more")
+    return lines
+
+
+def _pixels(pixels: list[int]) -> str:
+    listed = ", ".join(map(str, pixels[:20]))
+    return (
+        f"pixel{'s' if len(pixels) > 1 else ''} {listed}{f' and {len(pixels) - 20} more' if len(pixels) > 20 else ''}"
+    )
 
 
 def _shortfall(shortfall: dict[str, Any]) -> str:

@@ -7,6 +7,7 @@ import typer
 
 from optodrive.cli.options import (
     ConfigOption,
+    FitOption,
     JsonOption,
     ModelOption,
     PolicyOption,
@@ -33,21 +34,23 @@ def plan(
     model: ModelOption = None,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
+    fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
-    """Plan and limit frames: pulses, beam-on share, duration, what was trimmed and why, predicted displacement."""
+    """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
+    from optodrive.admission import admit
     from optodrive.frames.files import load_sequence
-    from optodrive.pipeline import Display, chosen, prepare
+    from optodrive.pipeline import Display, chosen
     from optodrive.summary import summary, write_plan_csv
 
     display = Display.of(configured(config, model))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
     with progress("planning") as done:
-        prepared = prepare(display, sequence, *display.at_rest(), chosen(policy, strict), done)
+        prepared, admission = admit(display, sequence, *display.at_rest(), chosen(policy, strict), done, fit)
     if out is not None:
         write_plan_csv(out, prepared, display)
-    figures = summary(prepared)
+    figures = summary(prepared, admission)
     if json:
         print_json(figures)
         return

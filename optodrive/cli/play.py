@@ -9,6 +9,7 @@ import typer
 
 from optodrive.cli.options import (
     DEFAULT_URL,
+    FitOption,
     JsonOption,
     PolicyOption,
     StrictOption,
@@ -40,6 +41,7 @@ def push(
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
+    fit: FitOption = "as_is",
     wait: WaitOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -51,7 +53,7 @@ def push(
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
     remote = Remote(url)
-    query = {"dry_run": dry_run, "strict": strict, "policy": policy}
+    query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
     answer = remote.call("POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"})
     _follow(remote, answer, wait, json)
 
@@ -63,6 +65,7 @@ def play(
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
+    fit: FitOption = "as_is",
     wait: WaitOption = True,
     json: JsonOption = False,
 ) -> None:
@@ -71,9 +74,8 @@ def play(
 
     given = _parameters(pattern, values or [])
     remote = Remote(url)
-    answer = remote.call(
-        "POST", f"/v1/patterns/{pattern}", json=given, params={"dry_run": dry_run, "strict": strict, "policy": policy}
-    )
+    query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
+    answer = remote.call("POST", f"/v1/patterns/{pattern}", json=given, params=query)
     _follow(remote, answer, wait, json)
 
 

@@ -21,6 +21,7 @@ from optodrive.errors import InputError
 if TYPE_CHECKING:
     import numpy as np
 
+    from optodrive.admission import Admission
     from optodrive.config import Config
     from optodrive.flow import ExecutedPulses, PixelTrace
     from optodrive.physics.heat import Heat
@@ -51,8 +52,9 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and measure what the pixels do."""
+    from optodrive.admission import admit
     from optodrive.frames.files import load_sequence
-    from optodrive.pipeline import Display, prepare
+    from optodrive.pipeline import Display
     from optodrive.simulator.run import execute
     from optodrive.simulator.truth import trace
 
@@ -66,14 +68,14 @@ def simulate(
     sequence = load_sequence(frames, display.config)
     announce_compilation()
     with progress("planning") as done:
-        prepared = prepare(display, sequence, *display.at_rest(), progress=done)
+        prepared, admission = admit(display, sequence, *display.at_rest(), progress=done)
     with progress("simulating") as done:
         executed = execute(display, prepared, done)
     looked_at = _tallest(prepared) if wanted is None else wanted
     traced = trace(real, executed, looked_at, dt)
     if out is not None:
         _write(out, display, executed, traced, noise, seed)
-    report = _report(display, prepared, executed, traced, real)
+    report = _report(display, prepared, admission, executed, traced, real)
     if json:
         print_json(report)
         return
@@ -126,7 +128,12 @@ def _write(
 
 
 def _report(
-    display: "Display", prepared: "Prepared", executed: "ExecutedPulses", traced: "PixelTrace", real: "Heat"
+    display: "Display",
+    prepared: "Prepared",
+    admission: "Admission",
+    executed: "ExecutedPulses",
+    traced: "PixelTrace",
+    real: "Heat",
 ) -> dict[str, Any]:
     from optodrive.summary import pulse_columns, summary
     from optodrive.units import m_to_um
@@ -134,7 +141,7 @@ def _report(
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     simulated_m = real.copy().pulses(*columns).displacement_m
     return {
-        "summary": summary(prepared),
+        "summary": summary(prepared, admission),
         "planned": len(prepared.plan),
         "executed": len(executed),
         "complete": executed.complete,

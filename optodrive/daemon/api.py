@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 
 from optodrive import __version__
+from optodrive.admission import Fit
 from optodrive.daemon.auth import BodyTooLargeError, Guard, problem
 from optodrive.daemon.engine import Engine
 from optodrive.daemon.live import LiveStream
@@ -58,6 +59,8 @@ DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")
 Newest = Annotated[bool, Query(description="take the place of everything that has not left for the board yet")]
 Strict = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="what becomes of a frame that a cap does not allow as it is")]
+
+FitQuery = Annotated[Fit, Query(description="what becomes of a sequence that does not fit on the beam as it is")]
 
 
 def make_app(engine: Engine, token: str) -> FastAPI:
@@ -107,12 +110,14 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         strict: Strict = False,
         policy: PolicyQuery = "trim",
         newest: Newest = False,
+        fit: FitQuery = "as_is",
     ) -> Answer:
         """Plan frames and trains, and show them."""
         body = await request.body()
+        policy = chosen(policy, strict)
         return await _result(
             engine.submit(
-                lambda: parse_sequence(body, display.config, "body"), "push", dry_run, chosen(policy, strict), newest
+                lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
             )
         )
 
@@ -143,6 +148,7 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         dry_run: DryRun = False,
         strict: Strict = False,
         policy: PolicyQuery = "trim",
+        fit: FitQuery = "as_is",
     ) -> Answer:
         """Build a named pattern, plan it, show it."""
         body = await request.body()
@@ -150,7 +156,9 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         if not isinstance(given, dict):
             raise InputError("body", given, "an object of the pattern's parameters")
         policy = chosen(policy, strict)
-        return await _result(engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy))
+        return await _result(
+            engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy, fit)
+        )
 
     return app
 
@@ -176,6 +184,8 @@ def problem_of(error: OptodriveError) -> Answer:
     if isinstance(error, OverBudgetError):
         later_s = error.earliest_s if error.earliest_s < inf else None
         more = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": later_s}
+    if isinstance(error, RefusedError) and error.admission is not None:
+        more["admission"] = error.admission
     return problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **more)
 
 

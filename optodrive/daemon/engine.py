@@ -15,18 +15,19 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
+from optodrive.admission import Admission, Fit, admit
 from optodrive.board.faults import hint
 from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
 from optodrive.clock import Clock
 from optodrive.daemon.plans import PlanBook, PlanRecord
-from optodrive.daemon.programme import Programme
+from optodrive.daemon.programme import Basis, Programme
 from optodrive.daemon.waits import Answer, Waits
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, FrameSequence, TactileFrame
 from optodrive.frames.live import may_be_split, unseen_first
 from optodrive.limit.limiter import Policy, verify
-from optodrive.pipeline import Display, prepare, warm_up
+from optodrive.pipeline import Display, Prepared, prepare, warm_up
 from optodrive.transport.base import Transport
 from optodrive.wire.quantise import decode, quantise
 
@@ -51,6 +52,7 @@ class _Order(NamedTuple):
     name: str
     dry_run: bool
     policy: Policy
+    fit: Fit
     streamed: bool
     arrived_s: float
 
@@ -216,6 +218,7 @@ class Engine:
         name: str,
         dry_run: bool = False,
         policy: Policy = "trim",
+        fit: Fit = "as_is",
         streamed: bool = False,
         arrived_s: float | None = None,
     ) -> "Future[Answer]":
@@ -224,8 +227,10 @@ class Engine:
         streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
         arrived_s: board time at which it was asked for, if not now
         """
+        if streamed and fit != "as_is":
+            raise InputError("fit", fit, "as_is where the newest wins: a stream has no time to ask what else would fit")
         arrived_s = self.board_s() if arrived_s is None else arrived_s
-        order = _Order(build, name, dry_run, policy, streamed and not dry_run, arrived_s)
+        order = _Order(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s)
         with self._lock:
             if self._plans_pending == 0:
                 self._progress_at_s = self._clock.now_s()
@@ -268,14 +273,13 @@ class Engine:
         began_s = self._clock.now_s()
         basis = self._programme.basis(order.streamed, allowance_s)
         heat, budget = basis.heat, basis.budget
-        if basis.seen is not None and may_be_split(sequence):
-            sequence = unseen_first(sequence, basis.seen)
-        prepared = prepare(self.display, sequence, heat, budget, order.policy, self._note_progress, basis.standing_on)
+        prepared, admission = self._prepared(sequence, order, basis)
         points = quantise(prepared.plan, self._session.scale)
         record = PlanRecord(
             plan_id=f"p{next(self._ids)}",
             name=order.name,
             prepared=prepared,
+            admission=admission,
             points=points,
             heat_before=heat,
             budget_before=budget,
@@ -290,6 +294,23 @@ class Engine:
             return record
         taken = self._in_loop(lambda: self._programme.take(record, basis)).result(LOOP_TIMEOUT_S)
         return record if taken else None
+
+    def _prepared(self, sequence: FrameSequence, order: "_Order", basis: Basis) -> tuple[Prepared, Admission | None]:
+        """The plan; a stream has no time to ask what else would fit."""
+        if not order.streamed:
+            told, from_where = self._note_progress, (basis.heat, basis.budget)
+            return admit(self.display, sequence, *from_where, order.policy, told, order.fit)
+        if basis.seen is not None and may_be_split(sequence):
+            sequence = unseen_first(sequence, basis.seen)
+        return prepare(
+            self.display,
+            sequence,
+            basis.heat,
+            basis.budget,
+            order.policy,
+            self._note_progress,
+            standing_on=basis.standing_on,
+        ), None
 
     def _in_loop(self, action: Callable[[], T]) -> "Future[T]":
         """Do something in the loop's thread, which owns the session."""

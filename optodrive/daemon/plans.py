@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from optodrive.admission import Admission
 from optodrive.errors import InputError
 from optodrive.flow import BoolArray, BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.heat import Heat
@@ -38,6 +39,7 @@ class PlanRecord:
     plan_id: str
     name: str
     prepared: Prepared
+    admission: Admission | None
     points: WirePoints
     heat_before: Heat
     budget_before: BudgetState
@@ -86,7 +88,7 @@ class PlanRecord:
                 "first_byte_s": self.first_byte_after_s,
                 "first_light_s": self.first_light_after_s,
             },
-            "summary": summary(self.prepared),
+            "summary": summary(self.prepared, self.admission),
             "pulses": pulse_columns(self.prepared) if pulses else None,
             "simulated_max_um": None,
             "tallest_asked": self._tallest_asked(),

@@ -6,6 +6,8 @@ from math import isfinite
 
 from optodrive.errors import InputError, nearest
 
+PRIORITY_MAX = 1_000_000
+
 TIME_MAX_S = 86_400.0
 """No sequence reaches beyond a day; whole microseconds stay exact in a float."""
 
@@ -66,6 +68,13 @@ def number_at(value: object, where: str, expected: str, code: str) -> float:
     if type(value) is int and abs(value) < 2**1000:
         return float(value)
     raise InputError(where, value, expected, code=code)
+
+
+def priority_at(value: object, where: str) -> int:
+    """How important a frame or train is, a whole number; raises InputError (bad_priority)."""
+    if type(value) is int and abs(value) <= PRIORITY_MAX:
+        return value
+    raise InputError(where, value, f"a whole number, -{PRIORITY_MAX}…{PRIORITY_MAX}", code="bad_priority")
 
 
 def time_at(value: object, where: str, expected: str, code: str, *, positive: bool) -> float:

@@ -44,7 +44,7 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
     """A sequence from JSON text, or from JSON already decoded, for a display; `where` names the source in errors.
 
     Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
-    bad_time, bad_train, overlapping_trains, too_many.
+    bad_time, bad_train, bad_priority, overlapping_trains, too_many.
     """
     try:
         return _sequence(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
@@ -70,19 +70,27 @@ def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
     """A sequence as FRAMES.json has it; heights to 1e-9 µm, so that parsing gives the same numbers back."""
     return {
         "frames": [_frame_to_json(frame) for frame in sequence.frames],
-        "trains": [train_to_json(train) for train in sequence.trains],
+        "trains": [train_to_json(train) | _priority(train) for train in sequence.trains],
     }
 
 
 def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
     driven = np.flatnonzero(frame.target_m)
     together = {"together": True} if frame.together else {}
-    return together | {
-        "id": frame.frame_id,
-        "show_at_s": frame.show_at_s,
-        "duration_s": frame.duration_s,
-        "target_um": {str(pixel): round(m_to_um(float(frame.target_m[pixel])), 9) for pixel in driven},
-    }
+    return (
+        together
+        | {
+            "id": frame.frame_id,
+            "show_at_s": frame.show_at_s,
+            "duration_s": frame.duration_s,
+            "target_um": {str(pixel): round(m_to_um(float(frame.target_m[pixel])), 9) for pixel in driven},
+        }
+        | _priority(frame)
+    )
+
+
+def _priority(item: TactileFrame | Train) -> dict[str, object]:
+    return {"priority": item.priority} if item.priority else {}
 
 
 def _sequence(decoded: object, config: Config, where: str) -> FrameSequence:

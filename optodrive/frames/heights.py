@@ -6,7 +6,7 @@ import numpy as np
 
 from optodrive.errors import InputError
 from optodrive.flow import FloatArray, TactileFrame
-from optodrive.frames.fields import number_at, table_at, time_at
+from optodrive.frames.fields import number_at, priority_at, table_at, time_at
 from optodrive.units import um_to_m
 
 ID_MAX = 100
@@ -15,7 +15,7 @@ OVERLAP_S = 1e-9
 
 
 def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[TactileFrame, ...]:
-    """The entries of `frames`; raises InputError (bad_time, bad_target, unknown_pixel, unknown_key, missing_key)."""
+    """The entries of `frames`; raises InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
     names = {str(pixel): pixel for pixel in range(pixel_count)}
     frames: list[TactileFrame] = []
     for k, entry in enumerate(entries):
@@ -28,13 +28,15 @@ def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[T
 
 def _frame(entry: object, where: str, position: int, names: dict[str, int]) -> TactileFrame:
     required = ("show_at_s", "duration_s", "target_um")
-    table = table_at(entry, where, ("id", *required, "together"), required)
+    table = table_at(entry, where, ("id", *required, "together", "priority"), required)
     expected = "a time ≥ 0 in s (a frame in the past cannot be shown)"
     show_at_s = time_at(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = time_at(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
     target_m = targets_m(table["target_um"], f"{where}.target_um", names)
-    return TactileFrame(frame_id, show_at_s, duration_s, target_m, _together(table, f"{where}.together"))
+    together = _together(table, f"{where}.together")
+    priority = priority_at(table.get("priority", 0), f"{where}.priority")
+    return TactileFrame(frame_id, show_at_s, duration_s, target_m, together, priority)
 
 
 def _together(table: Mapping[str, object], where: str) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from optodrive.config import Config
 from optodrive.errors import InputError
 from optodrive.flow import HeightTrain, PulseTrain, Train
-from optodrive.frames.fields import number_at, table_at, time_at
+from optodrive.frames.fields import number_at, priority_at, table_at, time_at
 from optodrive.units import m_to_um, um_to_m
 
 TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
@@ -29,16 +29,17 @@ PWM_TOLERANCE = 0.01
 def parse_train(value: object, where: str, config: Config, pixel_count: int) -> Train:
     """One entry of `trains`, by pulse or by height as its keys say.
 
-    Raises InputError (bad_train, bad_time, unknown_pixel, unknown_key, missing_key).
+    Raises InputError (bad_train, bad_time, bad_priority, unknown_pixel, unknown_key, missing_key).
     """
     if isinstance(value, dict) and not OWN_HEIGHT_KEYS.isdisjoint(value):
         return _height_train(value, where, config, pixel_count)
-    table = table_at(value, where, TRAIN_KEYS, TRAIN_KEYS)
+    table = table_at(value, where, (*TRAIN_KEYS, "priority"), TRAIN_KEYS)
     pixel, start_s, duration_s = _place_and_time(table, where, pixel_count)
     gap_s = time_at(table["gap_s"], f"{where}.gap_s", "a gap ≥ 0 in s", "bad_train", positive=False)
     width_s = number_at(table["pulse_width_s"], f"{where}.pulse_width_s", "a width > 0 in s", "bad_train")
     power_w = number_at(table["power_w"], f"{where}.power_w", "a power > 0 in W", "bad_train")
-    return checked_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w), where, config)
+    priority = priority_at(table.get("priority", 0), f"{where}.priority")
+    return checked_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w, priority), where, config)
 
 
 def _place_and_time(table: Mapping[str, object], where: str, pixel_count: int) -> tuple[int, float, float]:
@@ -51,7 +52,7 @@ def _place_and_time(table: Mapping[str, object], where: str, pixel_count: int) -
 
 
 def _height_train(value: object, where: str, config: Config, pixel_count: int) -> HeightTrain:
-    table = table_at(value, where, HEIGHT_KEYS, HEIGHT_KEYS[:-1])
+    table = table_at(value, where, (*HEIGHT_KEYS, "priority"), HEIGHT_KEYS[:-1])
     pixel, start_s, duration_s = _place_and_time(table, where, pixel_count)
     period_s = time_at(table["period_s"], f"{where}.period_s", "a period > 0 in s", "bad_train", positive=True)
     target_um = number_at(table["target_um"], f"{where}.target_um", "a height > 0 in µm", "bad_target")
@@ -59,9 +60,9 @@ def _height_train(value: object, where: str, config: Config, pixel_count: int) -
     swing_m = None
     if swing_um is not None:
         swing_m = um_to_m(number_at(swing_um, f"{where}.peak_to_peak_um", "a height > 0 in µm", "bad_train"))
-    return _checked_height_train(
-        HeightTrain(pixel, start_s, duration_s, period_s, um_to_m(target_um), swing_m), where, config
-    )
+    priority = priority_at(table.get("priority", 0), f"{where}.priority")
+    train = HeightTrain(pixel, start_s, duration_s, period_s, um_to_m(target_um), swing_m, priority)
+    return _checked_height_train(train, where, config)
 
 
 def _checked_height_train(train: HeightTrain, where: str, config: Config) -> HeightTrain:

@@ -10,7 +10,10 @@ from itertools import accumulate
 from math import ceil, exp, log
 from typing import Self
 
+import numpy as np
+
 from optodrive.config import Config
+from optodrive.flow import FloatArray
 from optodrive.physics.gate import outlasting, pole_per_s, servo_of, settled_s
 from optodrive.physics.mirror import Servo
 
@@ -60,6 +63,14 @@ class MoveModel:
         x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + UPWARDS)]
         y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + UPWARDS)]
         return x_us if x_us > y_us else y_us
+
+    def least_us(self, dx_rad: FloatArray, dy_rad: FloatArray) -> int:
+        """The least dark time that any of several moves can take, µs; both [k]."""
+        x_us, y_us = (
+            np.array(table)[(np.abs(way_rad) / self.pitch_rad + UPWARDS).astype(np.int64)]
+            for table, way_rad in zip(self.calm, (dx_rad, dy_rad), strict=True)
+        )
+        return int(np.maximum(x_us, y_us).min())
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ Trains keep their times; a frame's pulses fill the beam time between them. What 
 heat that is there. Times are whole microseconds inside.
 """
 
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from optodrive.config import PixelLayout
 from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, HeightTrain, PulsePlan, TactileFrame
+from optodrive.flow import FrameSequence, HeightTrain, IntArray, PulsePlan, TactileFrame
 from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
@@ -86,6 +86,7 @@ class Scheduler:
 
     tick: called again and again while a frame is planned.
     at_rest: makes the display's heat before anybody lit it, for the cycles of trains that ask for heights.
+    orders: by source, the order [k] in which a frame's driven pixels are visited; the others by a short path.
     standing_on: the pixel the mirrors stand on as the plan begins.
     lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are;
     none where it is known on which pixel they stand.
@@ -101,11 +102,13 @@ class Scheduler:
         train_piece: int = TRAIN_PIECE,
         tick: Callable[[], None] = nothing,
         standing_on: int | None = None,
+        orders: Mapping[int, IntArray] | None = None,
     ) -> None:
         self._machine = machine
         self._sequence = sequence
         self._train_piece = train_piece
         self._tick = tick
+        self._orders = orders or {}
         self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
         self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
         self._trains = train_pulses(sequence.trains, len(sequence.frames))
@@ -251,7 +254,7 @@ class Scheduler:
 
     def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
         """A frame's pulses, one a pixel, or several where its pixels shall stand up together."""
-        order = self._order(frame)
+        order = self._orders[source].tolist() if source in self._orders else self._order(frame)
         if frame.together and len(order) > 1:
             yield from self._together(source, frame, order, heat)
         else:

@@ -54,10 +54,15 @@ def slices(single: Mapping[int, tuple[int, float]], rounds: int) -> Periods | No
     return share if rounds == 1 or all(share.values()) else None
 
 
+WORTH = 0.01
+"""More rounds take longer: they must bring up so much more of every target at one time."""
+
+
 def best(rehearsals: list[Rehearsal], due_s: float) -> Rehearsal:
-    """The rehearsal with the largest simultaneity that ends in time; the first, of one round, where none does."""
+    """Of those that end in time the one of fewest rounds within WORTH of the most simultaneous; else the first."""
     able = [item for item in rehearsals if item.end_s <= due_s + 1e-9 and item.rested]
-    return max(able, key=lambda item: item.simultaneity) if able else rehearsals[0]
+    most = max((item.simultaneity for item in able), default=0.0)
+    return next((item for item in able if item.simultaneity >= most - WORTH), rehearsals[0])
 
 
 def simultaneity(

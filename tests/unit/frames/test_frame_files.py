@@ -271,3 +271,17 @@ def _seconds(call):
     start_s = time.process_time()
     call()
     return time.process_time() - start_s
+
+
+def test_a_priority_is_read_written_and_refused_by_name():
+    sequence = parse_sequence(body([{"priority": 2}], [{"priority": -1}]), CONFIG, "f")
+    assert (sequence.frames[0].priority, sequence.trains[0].priority) == (2, -1)
+    written = sequence_to_json(sequence)
+    assert written["frames"][0]["priority"] == 2
+    assert parse_sequence(written, CONFIG, "f").trains == sequence.trains
+    for value in ("high", 1.5, True, None, 10**9):
+        for wrong in (body([{"priority": value}]), body([], [{"priority": value}])):
+            code, message = refusal(wrong)
+            assert code == "bad_priority"
+            assert "priority: got" in message
+            assert "expected a whole number" in message

@@ -87,3 +87,9 @@ def test_a_plan_leaves_time_to_come_from_any_pixel_to_its_first(any_display):
     longest = max(moves.time_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
     assert result.plan.start_s[0] >= longest * 1e-6 - 1e-12
     assert result.lead_s == pytest.approx(result.plan.start_s[0])
+
+
+def test_an_order_that_is_given_is_kept(display):
+    sequence = FrameSequence((frame(display, dict.fromkeys((3, 4, 5), 50)),))
+    result = prepare(display, sequence, *display.at_rest(), orders={0: np.array([4, 3, 5])})
+    assert result.plan.pixel.tolist() == [4, 3, 5]

@@ -1,0 +1,318 @@
+"""Admission against a search of this file's own: its own loop over all orders, its own clock in whole microseconds.
+
+Both look at the same class of schedules: every order of every frame's pixels, each pulse as early as it may come, a
+train's pulse before any pulse that would make it late.
+"""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from displays import DISPLAYS
+from optodrive.admission import admit, admitting, breach, scaled, stretched, trials, without
+from optodrive.errors import InputError, RefusedError
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.frames.trains import check_trains
+from optodrive.limit.limiter import limit
+from optodrive.physics.array import DisplayHeat
+
+DISPLAY = DISPLAYS["display-16"]
+MACHINE = DISPLAY.machine
+X_RAD = MACHINE.field.mirror_rad(DISPLAY.layout.x_m)
+Y_RAD = MACHINE.field.mirror_rad(DISPLAY.layout.y_m)
+LEAD_US = MACHINE.moves.lead_us
+SLACK_US = 1e-3
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def move_us(stand, free, pixel):
+    """The move to a pixel from where the beam stands: a pixel, and since when the gate was first open there, µs."""
+    if stand is None:
+        return LEAD_US
+    origin, since = stand
+    return MACHINE.moves.time_us(X_RAD[origin] - X_RAD[pixel], Y_RAD[origin] - Y_RAD[pixel], free - since)
+
+
+def standing(stand, pixel, start):
+    """Where the beam stands after it was lit from `start` on."""
+    return stand if stand is not None and stand[0] == pixel else (pixel, start)
+
+
+def train_pulses(sequence):
+    pulses = []
+    for k, train in enumerate(sequence.trains):
+        for start_s in train.pulse_starts_s():
+            width_us = round(train.pulse_width_s * 1e6)
+            pulses.append((LEAD_US + round(start_s * 1e6), k, train.pixel, width_us, train.power_w))
+    return sorted(pulses)
+
+
+class Search:
+    """Depth first over everything the beam can do, cut off at the first miss."""
+
+    def __init__(self, sequence, heat=None):
+        self.frames = sequence.frames
+        self.heat = heat or DISPLAY.heat_at_rest()
+        self.pulses = train_pulses(sequence)
+
+    def fits(self):
+        return self.frame(0, 0, None, 0, self.heat)
+
+    def train(self, free, stand, done, heat):
+        """Place the next train pulse; None where it comes late by more than the move to it."""
+        due, _, pixel, width, power_w = self.pulses[done]
+        move = move_us(stand, free, pixel)
+        start = max(due, free + move)
+        if start > due + move:
+            return None
+        heat.pulse(pixel, start * 1e-6, width * 1e-6, power_w)
+        return start + width, standing(stand, pixel, start), done + 1
+
+    def frame(self, index, free, stand, done, heat):
+        until_us = LEAD_US + (self.frames[index].show_at_s * 1e6 if index < len(self.frames) else np.inf)
+        heat = heat.copy()
+        while done < len(self.pulses) and self.pulses[done][0] < until_us:
+            placed = self.train(free, stand, done, heat)
+            if placed is None:
+                return False
+            free, stand, done = placed
+        if index == len(self.frames):
+            return True
+        left = frozenset(np.flatnonzero(self.frames[index].target_m > 0).tolist())
+        return self.pixels(index, left, free, stand, done, heat)
+
+    def pixels(self, index, left, free, stand, done, heat):
+        if not left:
+            return self.frame(index + 1, free, stand, done, heat)
+        return any(self.pixel(index, pixel, left, free, stand, done, heat.copy()) for pixel in sorted(left))
+
+    def pixel(self, index, pixel, left, free, stand, done, heat):
+        frame = self.frames[index]
+        while True:
+            start = max(LEAD_US + round(frame.show_at_s * 1e6), free + move_us(stand, free, pixel))
+            pulse = heat.pulse_for_peak(pixel, start * 1e-6, float(frame.target_m[pixel]), MACHINE.drive)
+            if pulse is None:
+                return self.pixels(index, left - {pixel}, free, stand, done, heat)
+            end = start + round(pulse[0] * MACHINE.drive.period_s * 1e6)
+            if done == len(self.pulses):
+                break
+            due, _, following, _, _ = self.pulses[done]
+            if end + move_us(standing(stand, pixel, start), end, following) <= due:
+                break
+            placed = self.train(free, stand, done, heat)
+            if placed is None:
+                return False
+            free, stand, done = placed
+        if end > LEAD_US + (frame.show_at_s + frame.duration_s) * 1e6 + SLACK_US:
+            return False
+        heat.pulse(pixel, start * 1e-6, (end - start) * 1e-6, pulse[1] * MACHINE.drive.max_power_w)
+        return self.pixels(index, left - {pixel}, end, standing(stand, pixel, start), done, heat)
+
+
+def small(seed, trains_most=2):
+    """One to three frames of one to four pixels, up to two trains, in about the time they need."""
+    rng = np.random.default_rng(seed)
+    pool = rng.choice(16, size=6, replace=False)
+    trains = _trains(rng, pool, int(rng.integers(0, trains_most + 1)))
+    share = min(0.5, sum(t.pulse_width_s / (t.pulse_width_s + t.gap_s) for t in trains))
+    frames, at_s = [], 0.0
+    for k in range(int(rng.integers(1, 4))):
+        target_m, need_s = np.zeros(16), 0.0
+        for pixel in rng.choice(pool, size=int(rng.integers(1, 5)), replace=False):
+            target_m[pixel] = rng.uniform(20e-6, 160e-6)
+            at_rest = DISPLAY.heat_at_rest().pulse_for_peak(int(pixel), 0.0, target_m[pixel], MACHINE.drive)
+            need_s += at_rest[0] * MACHINE.drive.period_s + 0.0006
+        duration_s = (need_s - 0.0006) * rng.uniform(0.96, 1.12) / (1.0 - share) + (0.002 if trains else 0.0)
+        frames.append(TactileFrame(f"f{k}", at_s, duration_s, target_m, priority=int(rng.integers(0, 3))))
+        at_s += duration_s + rng.choice([0.0, 0.0, 0.01])
+    return FrameSequence(tuple(frames), trains)
+
+
+def _trains(rng, pool, count):
+    if count == 2 and rng.random() < 0.2:  # abutting, so that the moves between them add up
+        width_s, pair = 2e-4 * int(rng.integers(2, 8)), rng.choice(pool, size=2, replace=False)
+        last_s = width_s * int(rng.integers(1, 5))
+        return tuple(PulseTrain(int(p), k * width_s, last_s, width_s, width_s, 0.5) for k, p in enumerate(pair))
+    trains = ()
+    for _ in range(count):
+        width_s, gap_s = 2e-4 * int(rng.integers(1, 12)), rng.uniform(0.006, 0.03)
+        power_w, priority = rng.uniform(0.2, 1.0), int(rng.integers(0, 3))
+        train = PulseTrain(
+            int(rng.choice(pool)), rng.uniform(0, 0.01), rng.uniform(0.005, 0.06), width_s, gap_s, power_w, priority
+        )
+        try:
+            check_trains([*trains, train], "trains", DISPLAY.config)
+        except InputError:
+            continue
+        trains += (train,)
+    return trains
+
+
+def left_warm(seed):
+    """Every other time a display at rest; else pixels were lit until shortly before, so that the gas still rises."""
+    heat = DisplayHeat(DISPLAY.pixels, -0.1)
+    rng = np.random.default_rng([seed, 1])
+    for pixel in range(16) if seed % 2 else ():
+        width_s = rng.uniform(1e-3, 1e-2)
+        heat.pulse(pixel, -width_s - rng.choice([0.0, 0.002, 0.02]), width_s, rng.uniform(0.0, 2.45))
+    return heat
+
+
+def misses(sequence, prepared):
+    """What a plan misses of a sequence, reckoned here from the plan's columns, and through the limiter once more."""
+    plan, wrong = prepared.plan, []
+    end_us = (plan.start_s + plan.width_s) * 1e6
+    for source, frame in enumerate(sequence.frames):
+        own = plan.source == source
+        due_us = LEAD_US + (frame.show_at_s + frame.duration_s) * 1e6
+        wrong += [f"frame {source} late"] if (end_us[own] > due_us + SLACK_US).any() else []
+        skipped = {item.pixel for item in prepared.skipped if item.source == source}
+        shown = set(plan.pixel[own].tolist()) | skipped
+        wrong += [f"frame {source} lacks pixels"] if shown != set(np.flatnonzero(frame.target_m).tolist()) else []
+    nominal_us = [pulse[0] for pulse in train_pulses(sequence)]
+    stand, free, done = None, 0, 0
+    for source, pixel, start, end in zip(plan.source, plan.pixel, plan.start_s * 1e6, end_us, strict=True):
+        if source >= len(sequence.frames):
+            late_us = start - nominal_us[done]
+            wrong += ["a train's pulse late"] if late_us > move_us(stand, free, int(pixel)) + SLACK_US else []
+            done += 1
+        stand, free = standing(stand, int(pixel), round(start)), round(end)
+    wrong += ["trains lack pulses"] if done != len(nominal_us) else []
+    limit(plan, DISPLAY.at_rest()[1], DISPLAY.budget, "refuse")
+    return wrong
+
+
+def agrees(seed):
+    """Whether admission and the search here say the same; the answer."""
+    sequence = small(seed)
+    heat, budget = left_warm(seed), DISPLAY.at_rest()[1]
+    prepared, admission = admit(DISPLAY, sequence, heat, budget)
+    assert admission.reason in (None, "deadline")
+    assert admission.fits == Search(sequence, heat).fits(), (seed, admission.sentence)
+    if admission.fits:
+        assert misses(sequence, prepared) == []
+        for source, frame in enumerate(sequence.frames):
+            bound_s = trials.least_s(DISPLAY, sequence, heat, source, LEAD_US * 1e-6)
+            assert bound_s <= frame.duration_s + 1e-6, (seed, source)
+    else:
+        assert admission.proof in ("searched", "bound")
+    return admission
+
+
+def test_yes_and_no_agree_with_an_exhaustive_search():
+    seen = {}
+
+    @settings(max_examples=300)
+    @given(SEEDS)
+    def property_(seed):
+        admission = agrees(seed)
+        key = admission.fits, admission.proof
+        seen[key] = seen.get(key, 0) + 1
+
+    property_()
+    yes, no = (sum(count for key, count in seen.items() if key[0] is fits) for fits in (True, False))
+    assert min(yes, no) > 0.25 * (yes + no)
+
+
+@settings(max_examples=60)
+@given(SEEDS)
+def test_what_is_suggested_fits_when_it_is_asked_for(seed):
+    sequence = small(seed)
+    nearest = admit(DISPLAY, sequence, *DISPLAY.at_rest())[1].nearest
+    if nearest is None:
+        return
+    offered = []
+    if nearest.height is not None:
+        offered.append(scaled(sequence, nearest.height))
+        if nearest.complete and nearest.height < 0.99:
+            assert not Search(scaled(sequence, round(nearest.height * 100 + 1) / 100)).fits()
+    if nearest.rate is not None:
+        offered.append(stretched(sequence, nearest.rate))
+    if nearest.pixels is not None:
+        left_out = {item.source: item.pixels for item in nearest.pixels.left_out}
+        offered.append(without(sequence, left_out))
+        if nearest.complete and len(sequence.frames) == 1 and not sequence.trains:
+            pixels = np.flatnonzero(sequence.frames[0].target_m).tolist()
+            fewer = combinations(pixels, len(left_out[0]) - 1)
+            assert not any(Search(without(sequence, {0: left})).fits() for left in fewer)
+    for other in offered:
+        prepared, admission = admit(DISPLAY, other, *DISPLAY.at_rest())
+        assert admission.fits
+        assert misses(other, prepared) == []
+
+
+@pytest.mark.parametrize("fit", ["even", "priority"])
+@settings(max_examples=40)
+@given(seed=SEEDS)
+def test_best_effort_fits_or_says_that_nothing_does(fit, seed):
+    sequence = small(seed)
+    nearest = admit(DISPLAY, sequence, *DISPLAY.at_rest())[1].nearest
+    if nearest is not None and (nearest.height if fit == "even" else nearest.pixels) is None:
+        with pytest.raises(RefusedError, match="fits"):
+            admit(DISPLAY, sequence, *DISPLAY.at_rest(), fit=fit)
+        return
+    prepared, admission = admit(DISPLAY, sequence, *DISPLAY.at_rest(), fit=fit)
+    shown = without(scaled(sequence, admission.height), {item.source: item.pixels for item in admission.left_out})
+    assert misses(shown, prepared) == []
+    assert admission.fits == (admission.height == 1.0 and not admission.left_out)
+
+
+def _last_deadline_ignored(monkeypatch):
+    true = breach.deadlines_s
+
+    def ignoring(sequence, lead_s):
+        due_s = true(sequence, lead_s)
+        due_s[-1:] = np.inf
+        return due_s
+
+    for module in (trials, admitting):
+        monkeypatch.setattr(module, "deadlines_s", ignoring)
+
+
+def _only_the_planners_order(monkeypatch):
+    monkeypatch.setattr(trials.Trials, "_search", lambda self, sequence: None)
+
+
+def _bound_too_high(monkeypatch):
+    true = trials.least_s
+    monkeypatch.setattr(trials, "least_s", lambda *given: 1.05 * true(*given))
+
+
+def _orders_passed_over(monkeypatch):
+    true = trials._broken_at
+
+    def too_early(*given):
+        source, place = true(*given)
+        return source, max(0, place - 2)
+
+    monkeypatch.setattr(trials, "_broken_at", too_early)
+
+
+def _trains_may_be_late(monkeypatch):
+    true = breach.first_breach
+
+    def lenient(plan, due_s):
+        found = true(plan, due_s)
+        return None if found is not None and found.source >= len(due_s) else found
+
+    for module in (trials, admitting):
+        monkeypatch.setattr(module, "first_breach", lenient)
+
+
+MUTANTS = (
+    _last_deadline_ignored,
+    _only_the_planners_order,
+    _bound_too_high,
+    _orders_passed_over,
+    _trains_may_be_late,
+)
+
+
+@pytest.mark.parametrize("mutant", MUTANTS)
+def test_an_admission_that_is_wrong_is_caught(mutant, monkeypatch):
+    mutant(monkeypatch)
+    with pytest.raises(AssertionError):
+        all(agrees(seed) for seed in range(400))

@@ -1,0 +1,108 @@
+"""Whether it fits, said by every face on the real board process, and what is shown in its place on request."""
+
+import json
+import os
+import subprocess
+
+import pytest
+
+from rig import OPTODRIVE, TOKEN, running
+
+PIXELS = [str(pixel) for pixel in range(40)]
+LATE = {"frames": [{"id": "late", "show_at_s": 0.0, "duration_s": 0.1, "target_um": dict.fromkeys(PIXELS, 100)}]}
+EASY = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}}]}
+
+
+@pytest.fixture(scope="module")
+def armed(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("admission")) as (_, daemon):
+        daemon.arm()
+        yield daemon
+
+
+def run(*arguments):
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
+    return subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=60, env=environment)
+
+
+def test_what_fits_says_so(armed):
+    answer = armed.call("POST", "/v1/plans", json=EASY, params={"dry_run": True})
+    admission = answer["summary"]["admission"]
+    assert (admission["fits"], admission["proof"], admission["plans"]) == (True, "planned", 0)
+
+
+def test_what_does_not_fit_names_who_breaks_it_before_anything_moves(armed):
+    before = armed.state()["totals"]
+    admission = armed.call("POST", "/v1/plans", json=LATE, params={"dry_run": True})["summary"]["admission"]
+    assert (admission["fits"], admission["proof"], admission["name"]) == (False, "bound", "late")
+    assert admission["beam_needed_s"] > admission["beam_there_s"]
+    assert admission["nearest"]["pixels"]["kept"] < 40
+    refused = armed.call("POST", "/v1/plans", status=409, json=LATE, params={"policy": "refuse"})
+    assert refused["code"] == "refused"
+    assert refused["admission"] == admission
+    assert refused["detail"] == admission["sentence"]
+    assert armed.state()["totals"] == before
+
+
+@pytest.mark.parametrize("fit", ["even", "priority"])
+def test_best_effort_is_executed_in_time(armed, fit):
+    plan = armed.call("POST", "/v1/plans", json=LATE, params={"fit": fit})["plan"]
+    answer = armed.finished(plan)
+    assert answer["status"] == "done", answer["error"]
+    figures = answer["summary"]
+    assert figures["late"] == []
+    assert (figures["admission"]["height"] < 1.0) == (fit == "even")
+    left_out = [pixel for item in figures["admission"]["left_out"] for pixel in item["pixels"]]
+    assert answer["executed"] == 40 - len(left_out)
+    executed = answer["executed_pulses"]
+    assert executed["start_s"][-1] + executed["width_s"][-1] <= figures["lead_s"] + 0.1 + 1e-4
+
+
+def test_a_pattern_takes_it_too(armed):
+    params = {"fit": "even", "dry_run": True}
+    answer = armed.call("POST", "/v1/patterns/dot", json={"step_s": 0.02}, params=params)
+    assert answer["summary"]["admission"]["fit"] == "even"
+    armed.call("POST", "/v1/patterns/dot", status=422, json={}, params={"fit": "evenly"})
+
+
+def test_wrong_input(armed, tmp_path):
+    wrong = armed.call("POST", "/v1/plans", status=422, json=LATE, params={"fit": "evenly"})
+    assert wrong["where"] == "query.fit"
+    high = {"frames": [LATE["frames"][0] | {"priority": "high"}]}
+    answer = armed.call("POST", "/v1/plans", status=422, json=high)
+    assert answer["code"] == "bad_priority"
+    assert answer["where"] == "body: frames[0].priority"
+    path = tmp_path / "frames.json"
+    path.write_text(json.dumps(high))
+    for arguments, naming in (
+        (("plan", path), "priority: got 'high', expected a whole number"),
+        (("plan", path, "--fit", "evenly"), "evenly"),
+        (("push", path, "--fit", "evenly", "--url", armed.url), "evenly"),
+        (("play", "dot", "--fit", "evenly", "--url", armed.url), "evenly"),
+        (("push", path, "--url", armed.url), "priority"),
+    ):
+        done = run(*arguments)
+        assert done.returncode == 2, done.stderr
+        assert done.stdout == ""
+        assert done.stderr.count("\n") == 1
+        assert naming in done.stderr
+
+
+def test_the_command_line_says_it_in_one_line(armed, tmp_path):
+    path = tmp_path / "frames.json"
+    path.write_text(json.dumps(EASY))
+    assert run("plan", path).stdout.startswith("fits: yes\n")
+    path.write_text(json.dumps(LATE))
+    late = run("plan", path).stdout.splitlines()[0]
+    assert late.startswith("fits: no, frame late needs 0.2")
+    assert "nearest that fits: " in late
+    figures = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
+    assert figures["late"] == []
+    assert figures["admission"]["height"] < 1.0
+    refused = run("plan", path, "--strict")
+    assert refused.returncode == 1
+    assert "nearest that fits: " in refused.stderr
+    pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url).stdout
+    assert "left out         late: pixels " in pushed
+    simulated = run("simulate", path, "--pixels", "0").stdout
+    assert simulated.splitlines()[0] == late
