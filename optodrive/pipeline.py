@@ -25,19 +25,23 @@ from optodrive.flow import (
 )
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
-from optodrive.limit.limiter import Policy, fresh_state, joined, limit, wait_s
+from optodrive.limit.limiter import Policy, fresh_state, joined, limit, moves_borne, wait_s
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat, heat_at_rest
 from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels, load_parameters
 from optodrive.plan.field import IdealField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import warm as warm_order
-from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Scheduler, Skipped
+from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Rest, Scheduler, Skipped
 from optodrive.plan.slices import Together
 from optodrive.units import ZERO_CELSIUS_K, m_to_um
 
 JOINED = 256
 """Pieces joined at a time: each carries the headroom of every pixel, and a piece may be a single pulse."""
+
+REST = 0.1
+"""Mirrors rest for this share of the time over which their coils' heat is averaged."""
+MEANS_COOLED = 50.0
 
 Progress = Callable[[float], None]
 """Told the share done, 0 to 1."""
@@ -138,6 +142,7 @@ class Prepared:
     predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
     together: how the frames were split whose pixels shall stand up at one time
     shortfall: under "trim", None where nothing was; delays: under "delay"
+    rested_s: how long mirrors rest in all, for the sake of their coils
     """
 
     sequence: FrameSequence
@@ -149,6 +154,7 @@ class Prepared:
     together: tuple[Together, ...]
     shortfall: Shortfall | None
     delays: tuple[Delay, ...]
+    rested_s: float
     heat: Heat
     budget: BudgetState
 
@@ -255,8 +261,14 @@ def prepare(
     delays: list[Delay] = []
     shortfall: Shortfall | None = None
     pieces = scheduler.pieces(working)
+    rested_s = 0.0
     piece = next(pieces, None)
     while piece is not None:
+        rest = mirrors_rest(display, piece, state, len(sequence.frames))
+        if rest is not None:
+            rested_s += rest.us * 1e-6
+            piece = pieces.send(rest)
+            continue
         try:
             passed, after = limit(piece, state, display.budget, policy)
         except OverBudgetError as error:
@@ -289,12 +301,28 @@ def prepare(
         together=tuple(scheduler.together),
         shortfall=shortfall,
         delays=_merged(delays),
+        rested_s=rested_s,
         heat=after_heat,
         budget=state,
     )
     if policy == "refuse":
         _refuse_late(prepared)
     return prepared
+
+
+def mirrors_rest(display: Display, piece: PulsePlan, state: BudgetState, frames: int) -> Rest | None:
+    """The rest that mirrors need within a frame's piece; None where they need none, or where none helps.
+
+    No power makes a move right that the mirrors do not bear: a frame is drawn slower rather than with holes. A train
+    keeps its times, and leaves such a pulse to the limiter.
+    """
+    row = moves_borne(piece, state, display.budget)
+    mean_s = display.budget.mirrors.mean_s
+    if row == len(piece) or piece.source[row] >= frames:
+        return None
+    if row == 0 and moves_borne(piece, state, display.budget, MEANS_COOLED * mean_s) == 0:
+        return None
+    return Rest(row, ceil(1e6 * REST * mean_s))
 
 
 def _shortfall(piece: PulsePlan, passed: LimitedPlan, state: BudgetState, budget: Budget) -> Shortfall:

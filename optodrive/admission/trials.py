@@ -15,7 +15,7 @@ from optodrive.errors import InputError
 from optodrive.flow import BudgetState, FrameSequence, HeightTrain, IntArray, PulsePlan
 from optodrive.limit.limiter import limit
 from optodrive.physics.heat import Heat
-from optodrive.pipeline import ROUNDING_S, Display, Prepared, beyond_reach, prepare
+from optodrive.pipeline import ROUNDING_S, Display, Prepared, beyond_reach, mirrors_rest, prepare
 from optodrive.plan.scheduler import Scheduler
 
 ORDERS_MAX = 14_000
@@ -123,15 +123,22 @@ class Trials:
         scheduler = Scheduler(machine, sequence, at_rest, tick=self.tick, orders=orders)
         due_s = deadlines_s(sequence, scheduler.lead_us * 1e-6)
         heat, state = self._heat.copy(), self._budget
-        for asked in scheduler.pieces(heat):
+        pieces = scheduler.pieces(heat)
+        asked = next(pieces, None)
+        while asked is not None:
+            self.tick()
             piece: PulsePlan = asked
             if limited:
+                rest = mirrors_rest(self._display, asked, state, len(sequence.frames))
+                if rest is not None:
+                    asked = pieces.send(rest)
+                    continue
                 piece, state = limit(asked, state, self._display.budget)
             breach = first_breach(piece, due_s)
             if breach is not None:
                 return breach
             heat.pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self.tick)
-            self.tick()
+            asked = next(pieces, None)
         return None
 
     def _search(self, sequence: FrameSequence) -> Orders | None:

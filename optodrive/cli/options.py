@@ -92,7 +92,8 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
         f"pulses           {summary['pulses']}",
         f"duration         {summary['duration_s']:.4f} s",
         f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
-        f"moves            {summary['moves_s']:.4f} s",
+        f"moves            {summary['moves_s']:.4f} s"
+        + (f", and {summary['mirrors_rest_s']:.1f} s of rest for the mirrors" if summary["mirrors_rest_s"] else ""),
         f"energy           {summary['energy_j']:.4f} J incident",
         f"tallest          {summary['predicted_max_um']:.1f} µm predicted"
         + (f", {summary['asked_max_um']:.1f} µm asked for" if summary["asked_max_um"] else "")

@@ -15,7 +15,7 @@ from optodrive.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.flow import EMPTY_PLAN, BudgetState, FloatArray, IntArray, LimitedPlan, PulsePlan
 from optodrive.limit.budget import Budget
 from optodrive.limit.ledger import close_ledger, open_ledger
-from optodrive.limit.walk import FIRE, ORDER, STOP, TRIM, WIDTH, Ledger, walk
+from optodrive.limit.walk import FIRE, ORDER, STOP, TRIM, WIDTH, Ledger, Spots, borne, walk
 
 Policy = Literal["trim", "delay", "refuse"]
 
@@ -160,6 +160,23 @@ def wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float:
         else:
             low_s = middle_s
     return high_s
+
+
+def moves_borne(plan: PulsePlan, state: BudgetState, budget: Budget, later_s: float = 0.0) -> int:
+    """How many of a plan's first pulses have moves that the mirrors bear, if the plan comes later_s later."""
+    none = np.zeros(0)
+    spots = Spots(
+        bucket_j=none,
+        on_s=none,
+        end_s=np.array([state.at_s]),
+        peak_k=none,
+        mirror_rad=state.mirror_rad.copy(),
+        acceleration2=state.acceleration2.copy(),
+        swing=state.swing.copy(),
+        mirror_at_s=np.array([state.mirror_at_s]),
+    )
+    columns = (plan.start_s + later_s, plan.width_s.copy(), plan.x_rad.copy(), plan.y_rad.copy())
+    return borne(budget, spots, *columns)
 
 
 def joined(pieces: list[LimitedPlan], state: BudgetState, budget: Budget) -> LimitedPlan:

@@ -181,6 +181,31 @@ def _motion(budget: Budget, spots: Spots, ask: Ask) -> Motion:
 
 
 @kernel
+def _move(spots: Spots, ask: Ask, motion: Motion) -> None:
+    spots.acceleration2[0], spots.acceleration2[1] = motion.x2, motion.y2
+    spots.swing[0], spots.swing[1] = motion.x_swing, motion.y_swing
+    spots.mirror_rad[0], spots.mirror_rad[1] = ask.x_rad, ask.y_rad
+    spots.mirror_at_s[0] = motion.at_s
+
+
+@kernel
+def borne(
+    budget: Budget, spots: Spots, start_s: FloatArray, width_s: FloatArray, x_rad: FloatArray, y_rad: FloatArray
+) -> int:
+    """How many of a plan's first pulses [n] have moves that the mirrors bear; the mirrors' part of spots is written."""
+    for row in range(len(start_s)):
+        ask = Ask(0, start_s[row], width_s[row], x_rad[row], y_rad[row], 0.0)
+        if _moves(spots, ask):
+            motion = _motion(budget, spots, ask)
+            after = acceleration2_after(budget.mirrors, motion, ask.start_s + ask.width_s)
+            if after > budget.caps.galvo_rad2_per_s4 * (1 + ROUNDING):
+                return row
+            _move(spots, ask, motion)
+        spots.end_s[0] = ask.start_s + ask.width_s
+    return len(start_s)
+
+
+@kernel
 def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float) -> None:
     """Count a pulse as fired."""
     heat, nodes, spots, pixel = budget.heat, ledger.nodes, ledger.spots, ask.pixel
@@ -191,11 +216,7 @@ def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float) -> None:
     drive_k = heat.touch_per_wall_k * wall_during_k(budget, ledger.nodes, ask, least_k, power_w)
     nodes.least_k[pixel] = least_after_k(heat, pixel, least_k, power_w, ask.width_s)
     if _moves(spots, ask):
-        motion = _motion(budget, spots, ask)
-        spots.acceleration2[0], spots.acceleration2[1] = motion.x2, motion.y2
-        spots.swing[0], spots.swing[1] = motion.x_swing, motion.y_swing
-        spots.mirror_rad[0], spots.mirror_rad[1] = ask.x_rad, ask.y_rad
-        spots.mirror_at_s[0] = motion.at_s
+        _move(spots, ask, _motion(budget, spots, ask))
     nodes.dark_since_s[pixel] = spots.end_s[0] = end_s
 
     for lag in range(2):

@@ -29,8 +29,19 @@ TRAIN_PIECE = 1000
 TICK = 16
 """Pulses of a frame between two ticks."""
 
-Pieces = Generator[PulsePlan, int | None, None]
-"""Yields pieces of a plan; takes how much later, µs, the last one must come, or None where it may stay."""
+ALL = 2**60
+
+
+class Rest(NamedTuple):
+    """Of a piece only the first rows may stay as they are; then the mirrors rest for so long, µs."""
+
+    rows: int
+    us: int
+
+
+Answer = int | Rest | None
+Pieces = Generator[PulsePlan, Answer, None]
+"""Yields pieces of a plan; takes how much later, µs, the last one must come, a rest, or None where it may stay."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +125,7 @@ class Scheduler:
         self._trains = train_pulses(sequence.trains, len(sequence.frames))
         self._rest_us = round(machine.rest_s * 1e6)
         self._now = _Cursor(lit=standing_on)
+        self._most = ALL
         self.lead_us = machine.moves.lead_us if standing_on is None else 0
         self.skipped: list[Skipped] = []
         self.together: list[Together] = []
@@ -130,20 +142,28 @@ class Scheduler:
             yield from self._frame(source, frame, heat)
         yield from self._trains_before(float("inf"), heat)
 
-    def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, int | None, bool]:
-        """Yield what build makes, later and later as the answers ask; False where it makes nothing."""
+    def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, Answer, bool]:
+        """Yield what build makes, later or less of it as the answers ask; False where it makes nothing."""
+        rest_us = 0
         while True:
             before = replace(self._now)
             rows = build()
             if not rows:
                 return False
-            wait_us = yield self._plan(rows)
-            if not wait_us:
+            answer = yield self._plan(rows)
+            if not answer:
+                self._now.free_us += rest_us
+                self._most = ALL
                 return True
             self._now = before
-            self._now.free_us += wait_us
-            self._now.waited_us += wait_us
             del self.skipped[before.skipped :]
+            if isinstance(answer, int):
+                self._now.free_us += answer
+                self._now.waited_us += answer
+            elif answer.rows:
+                self._most, rest_us = answer.rows, answer.us
+            else:
+                self._now.free_us += answer.us
 
     def _wanted_us(self, time_s: float) -> int:
         return self.lead_us + round(time_s * 1e6)
@@ -320,7 +340,7 @@ class Scheduler:
         """The round's rows from where it stands, up to the next train pulse or its own end."""
         now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
         rows: list[_Row] = []
-        while now.place < len(order):
+        while now.place < len(order) and len(rows) < self._most:
             pixel = order[now.place]
             target_m = float(frame.target_m[pixel])
             start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel, now.stay_us))
