@@ -38,6 +38,15 @@ class Spots(NamedTuple):
     mirror_at_s: FloatArray
 
 
+class Before(NamedTuple):
+    """A pixel as a pulse begins: absorber over wall, and that at least, K; bucket, J; light without a rest, s."""
+
+    rise_k: float
+    least_k: float
+    bucket_j: float
+    on_s: float
+
+
 class Ledger(NamedTuple):
     """Everything that changes while a plan is walked through."""
 
@@ -77,20 +86,21 @@ def walk(
     for row in range(len(pixel)):
         ask = Ask(pixel[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row])
         given_w[row], cause[row] = ask.power_w, NOTHING
+        before = _before(budget, ledger, ask)
         if policy != FIRE:
-            most_w, binding = _allowed(budget, ledger, ask)
+            most_w, binding = _allowed(budget, ledger, ask, before)
             if ask.power_w > most_w * (1 + ROUNDING):
                 given_w[row], cause[row] = max(0.0, most_w), binding
                 if policy == STOP or most_w < 0.0:
                     return row
         if given_w[row] > 0.0:
-            _fire(budget, ledger, ask, given_w[row])
+            _fire(budget, ledger, ask, given_w[row], before)
     return len(pixel)
 
 
 @kernel
-def _before(budget: Budget, ledger: Ledger, ask: Ask) -> tuple[float, float, float, float]:
-    """The pixel as a pulse begins: absorber over wall, and that at least (K), bucket (J), light without a rest (s)."""
+def _before(budget: Budget, ledger: Ledger, ask: Ask) -> Before:
+    """The pixel as a pulse begins."""
     exchange(budget.heat, ledger.nodes, ask.start_s, budget.caps.pulse_width_s)
     settle(budget.heat, ledger.nodes, ask.pixel, ask.start_s)
     spots, pixel = ledger.spots, ask.pixel
@@ -99,18 +109,18 @@ def _before(budget: Budget, ledger: Ledger, ask: Ask) -> tuple[float, float, flo
     least_k = least_after_k(budget.heat, pixel, ledger.nodes.least_k[pixel], 0.0, dark_s)
     bucket_j = max(0.0, spots.bucket_j[pixel] - dark_s * budget.caps.pixel_mean_w)
     rested = dark_s >= budget.caps.pulse_rest_s - ROUNDING
-    return rise_k, least_k, bucket_j, 0.0 if rested else spots.on_s[pixel]
+    return Before(rise_k, least_k, bucket_j, 0.0 if rested else spots.on_s[pixel])
 
 
 @kernel
-def _allowed(budget: Budget, ledger: Ledger, ask: Ask) -> tuple[float, int]:
+def _allowed(budget: Budget, ledger: Ledger, ask: Ask, before: Before) -> tuple[float, int]:
     """Largest power the caps allow a pulse, W, and the cap that binds; below zero for a pulse no power makes right."""
     caps, width_s = budget.caps, ask.width_s
     if ask.start_s < ledger.spots.end_s[0] - ROUNDING:
         return -1.0, ORDER
     if width_s > caps.pulse_width_s * (1 + ROUNDING):
         return -1.0, WIDTH
-    rise_k, least_k, bucket_j, on_s = _before(budget, ledger, ask)
+    rise_k, least_k, bucket_j, on_s = before
     if on_s + width_s > caps.pulse_width_s + ROUNDING:
         return 0.0, WIDTH
     if _moves(ledger.spots, ask):
@@ -206,10 +216,10 @@ def borne(
 
 
 @kernel
-def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float) -> None:
+def _fire(budget: Budget, ledger: Ledger, ask: Ask, power_w: float, before: Before) -> None:
     """Count a pulse as fired."""
     heat, nodes, spots, pixel = budget.heat, ledger.nodes, ledger.spots, ask.pixel
-    rise_k, least_k, bucket_j, on_s = _before(budget, ledger, ask)
+    rise_k, least_k, bucket_j, on_s = before
     end_s = ask.start_s + ask.width_s
     spots.peak_k[pixel] = max(spots.peak_k[pixel], _absorber_over_k(budget, ledger, ask, rise_k, power_w))
     nodes.absorber_k[pixel] = absorber_after_k(heat, pixel, rise_k, power_w, ask.width_s)

@@ -7,7 +7,7 @@ import numpy as np
 
 from optodrive.compiled import kernel
 from optodrive.flow import FloatArray, IntArray, PixelTrace
-from optodrive.physics.drive import DriveRange, pulse_for_peak, reach_m
+from optodrive.physics.drive import DriveRange, reach_m, shortest
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
@@ -109,8 +109,14 @@ class DisplayHeat:
         from_s: the peak counts only from so long after the pulse's start on, beyond its end.
         ValueError for a time before the pixel's last event.
         """
-        rises_k = self.rises(pixel, at_s)
-        return pulse_for_peak(self.pixels.each[pixel], *rises_k, target_m, drive, least_periods, from_s)
+        if not 0 <= pixel < len(self._at_s):
+            raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
+        span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+        state = (self._columns, self._at_s, self._theta_k, self._gamma_k)
+        periods, duty = _shortest_at(*state, pixel, float(at_s), float(target_m), *span, float(from_s))
+        if periods < 0:
+            raise self._too_early(pixel, at_s)
+        return (periods, duty) if periods else None
 
     def reaches_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
@@ -206,6 +212,33 @@ def _walk(
             glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
             peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
     return len(pixel)
+
+
+@kernel
+def _shortest_at(
+    columns: FloatArray,
+    last_s: FloatArray,
+    theta_k: FloatArray,
+    gamma_k: FloatArray,
+    i: int,
+    at_s: float,
+    target_m: float,
+    max_power_w: float,
+    period_s: float,
+    least_periods: int,
+    max_periods: int,
+    from_s: float,
+) -> tuple[int, float]:
+    """As pulse_for_peak; no periods where no pulse is needed, fewer where at_s is too early.
+
+    In one kernel, because each call from Python costs as much as what it does.
+    """
+    one, dark_s = one_pixel(columns, i), at_s - last_s[i]
+    if dark_s < -TIME_ROUNDING_S:
+        return -1, 0.0
+    absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, dark_s))
+    goal_k = target_m / one.kappa_m_per_k
+    return shortest(one, absorber_k, gas_k, goal_k, max_power_w, period_s, least_periods, max_periods, from_s)
 
 
 @kernel

@@ -63,12 +63,12 @@ def pulse_for_peak(
     """
     goal_k = target_m / pixel.kappa_m_per_k
     span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
-    periods, duty = _shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
+    periods, duty = shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
     return (periods, duty) if periods else None
 
 
 @kernel
-def _shortest(
+def shortest(
     pixel: Pixel,
     theta_k: float,
     gamma_k: float,
@@ -79,7 +79,7 @@ def _shortest(
     max_periods: int,
     from_s: float,
 ) -> tuple[int, float]:
-    """As pulse_for_peak; no periods where no pulse is needed. In one kernel: each call from Python costs."""
+    """As pulse_for_peak, goal_k the gas rise; no periods where no pulse is needed."""
     if _peak_from(pixel, theta_k, gamma_k, 0.0, 0.0, from_s)[0] >= goal_k:
         return 0, 0.0
     low, high = least_periods - 1, max_periods
