@@ -96,7 +96,7 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
         + (f", and {summary['mirrors_rest_s']:.1f} s of rest for the mirrors" if summary["mirrors_rest_s"] else ""),
         f"energy           {summary['energy_j']:.4f} J incident",
         f"tallest          {summary['predicted_max_um']:.1f} µm predicted"
-        + (f", {summary['asked_max_um']:.1f} µm asked for" if summary["asked_max_um"] else "")
+        + (f", {summary['tallest_asked_um']:.1f} µm asked for" if summary["tallest_asked_um"] else "")
         + (f", at pixel {summary['tallest_pixel']}" if summary["tallest_pixel"] is not None else ""),
         f"least headroom   {summary['headroom_min_k']:.1f} K below the absorber cap",
     ]
