@@ -22,7 +22,7 @@ from optodrive.board.session import Session
 from optodrive.clock import Clock
 from optodrive.daemon.plans import PlanBook, PlanRecord
 from optodrive.daemon.programme import Basis, Programme
-from optodrive.daemon.waits import Answer, Waits
+from optodrive.daemon.waits import Answer, Waits, promise
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.flow import BudgetState, FrameSequence, TactileFrame
 from optodrive.frames.live import may_be_split, unseen_first
@@ -187,7 +187,7 @@ class Engine:
         return self._command(self._session.abort, ("DISARMED", "FAULT"), "stop")
 
     def _command(self, action: Callable[[], None], states: tuple[str, ...], what: str) -> "Future[Answer]":
-        future: Future[Answer] = Future()
+        future: Future[Answer] = promise()
 
         def obey() -> None:
             try:
@@ -246,7 +246,7 @@ class Engine:
                 if not order.dry_run:
                     self._require_armed()
                 if order.streamed and self._programme.in_the_way:
-                    self._in_loop(self._programme.make_way).result(LOOP_TIMEOUT_S)
+                    self._by_loop(self._programme.make_way)
                 record = self._planned(sequence, order, allowance_s)
                 if record is not None:
                     return record.answer(self._session.board_s())
@@ -292,8 +292,7 @@ class Engine:
         self._planning_s = self._clock.now_s() - began_s
         if order.dry_run:
             return record
-        taken = self._in_loop(lambda: self._programme.take(record, basis)).result(LOOP_TIMEOUT_S)
-        return record if taken else None
+        return record if self._by_loop(lambda: self._programme.take(record, basis)) else None
 
     def _prepared(self, sequence: FrameSequence, order: "_Order", basis: Basis) -> tuple[Prepared, Admission | None]:
         """The plan; a stream has no time to ask what else would fit."""
@@ -314,7 +313,7 @@ class Engine:
 
     def _in_loop(self, action: Callable[[], T]) -> "Future[T]":
         """Do something in the loop's thread, which owns the session."""
-        future: Future[T] = Future()
+        future: Future[T] = promise()
 
         def obey() -> None:
             try:
@@ -324,6 +323,13 @@ class Engine:
 
         self._commands.put(obey)
         return future
+
+    def _by_loop(self, action: Callable[[], T]) -> T:
+        """What comes of an action in the loop's thread; LinkError where the loop has ended."""
+        try:
+            return self._in_loop(action).result(LOOP_TIMEOUT_S)
+        except TimeoutError:
+            raise LinkError(f"the engine did not answer within {LOOP_TIMEOUT_S:g} s: {self.failure!r}") from None
 
     def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
@@ -339,11 +345,10 @@ class Engine:
         """Done when nothing more will happen to a plan; InputError (no_plan) where there is none."""
         return self._book.find(plan_id).ending
 
-    def drop(self, plan_id: str | None) -> None:
-        """Let what has not left of a stream's last plan go, if it is still being shown; whoever sent it is gone."""
+    def end_stream(self) -> "Future[Answer]":
+        """Let go what has not left of a stream's last plan: whoever sent it is gone."""
         nothing = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
-        if plan_id is not None and not self.ending(plan_id).done():
-            self.submit(lambda: FrameSequence((nothing,)), "end of stream", streamed=True)
+        return self.submit(lambda: FrameSequence((nothing,)), "end of stream", streamed=True)
 
     def plan(self, plan_id: str, pulses: bool = True) -> Answer:
         """A plan by its id; InputError (no_plan) where there is none."""

@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from concurrent.futures import Future
 from functools import partial
 from typing import Any
 
@@ -34,7 +35,7 @@ class LiveStream:
         self._arrived = asyncio.Event()
         self._outbox: asyncio.Queue[Answer] = asyncio.Queue(OUTBOX_MAX)
         self._watchers: set[asyncio.Task[None]] = set()
-        self._last_plan: str | None = None
+        self._last: Future[None] | None = None
 
     async def run(self) -> None:
         """Serve until the caller leaves; what has not left of the last frame is then dropped."""
@@ -43,7 +44,8 @@ class LiveStream:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            self._engine.drop(self._last_plan)  # first: this coroutine may be cancelled while it waits for others
+            if self._last is not None and not self._last.done():
+                self._engine.end_stream()  # first: this coroutine may be cancelled while it waits for others
             for task in (*tasks, *self._watchers):
                 task.cancel()
             await asyncio.gather(*tasks, *self._watchers, return_exceptions=True)
@@ -79,14 +81,14 @@ class LiveStream:
             except OptodriveError as error:
                 self._tell({"frame": number, "status": "refused", "error": self._problem_of(error)})
                 continue
-            self._last_plan = answer["plan"]
+            self._last = self._engine.ending(answer["plan"])
             self._tell({"frame": number, "status": "planned", **_planned(answer)})
-            watcher = asyncio.create_task(self._watch(number, answer["plan"]))
+            watcher = asyncio.create_task(self._watch(number, answer["plan"], self._last))
             self._watchers.add(watcher)
             watcher.add_done_callback(self._watchers.discard)
 
-    async def _watch(self, number: int, plan_id: str) -> None:
-        await asyncio.wrap_future(self._engine.ending(plan_id))
+    async def _watch(self, number: int, plan_id: str, ending: "Future[None]") -> None:
+        await asyncio.wrap_future(ending)
         self._tell({"frame": number, **_ended(self._engine.plan(plan_id, pulses=False))})
 
     def _tell(self, answer: Answer) -> None:

@@ -8,6 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from optodrive.admission import Admission
+from optodrive.daemon.waits import promise
 from optodrive.errors import InputError
 from optodrive.flow import BoolArray, BudgetState, ExecutedPulses, FloatArray, IntArray
 from optodrive.physics.heat import Heat
@@ -59,7 +60,7 @@ class PlanRecord:
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
     seen: BoolArray | None = None
-    ending: "Future[None]" = field(default_factory=Future)
+    ending: "Future[None]" = field(default_factory=promise)
 
     @property
     def ended(self) -> bool:

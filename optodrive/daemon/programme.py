@@ -175,7 +175,8 @@ class Programme:
     def cancel(self, record: PlanRecord) -> None:
         """Take a plan out of the queue, or end it dark when it runs, with those that follow it at once."""
         if record in self.waiting:
-            self.waiting.remove(record)
+            with self.lock:
+                self.waiting.remove(record)
             record.end("cancelled", "taken out of the queue")
         elif any(run.record is record for run in self.running):
             self._session.flush()
@@ -187,13 +188,14 @@ class Programme:
         """Begin the next plan where the board is ready for it."""
         if self.running or not self.waiting or not self._session.ready:
             return
-        record = self.waiting.popleft()
-        if not len(record.prepared.plan):
-            record.end("done", None)
-            return
-        record.status = "running"
-        ahead_s = STREAM_AHEAD_S if record.streamed else inf
-        self.running.append(Run(record, self._session.begin(record.points, record.start_s, ahead_s)))
+        with self.lock:
+            record = self.waiting.popleft()
+            if not len(record.prepared.plan):
+                record.end("done", None)
+                return
+            record.status = "running"
+            ahead_s = STREAM_AHEAD_S if record.streamed else inf
+            self.running.append(Run(record, self._session.begin(record.points, record.start_s, ahead_s)))
 
     def follow_jobs(self, refusal: str | None) -> None:
         """Take over what the board did; refusal: what it refused since the last look."""
@@ -213,10 +215,11 @@ class Programme:
 
     def _end_first(self) -> None:
         """The first running plan is through: a delay moves everything after it."""
-        record, job = self.running.popleft()
-        self._conclude(record, job, "superseded" if record.dropped else "done", None)
-        if record.delay_s > DELAY_NOTICED_S:
-            self._move_later(record.delay_s)
+        with self.lock:
+            record, job = self.running.popleft()
+            self._conclude(record, job, "superseded" if record.dropped else "done", None)
+            if record.delay_s > DELAY_NOTICED_S:
+                self._move_later(record.delay_s)
 
     def _conclude(self, record: PlanRecord, job: Job, status: Status, error: str | None) -> None:
         scale = self._session.scale

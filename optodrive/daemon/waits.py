@@ -13,6 +13,13 @@ Answer = dict[str, Any]
 TIMEOUT_S = 5.0
 
 
+def promise() -> "Future[Any]":
+    """A future that whoever waits for it cannot cancel: a caller that gives up must not stop whoever keeps the word."""
+    future: Future[Any] = Future()
+    future.set_running_or_notify_cancel()
+    return future
+
+
 @dataclass
 class _Wait:
     states: tuple[str, ...]

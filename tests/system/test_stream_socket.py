@@ -92,6 +92,7 @@ def test_a_caller_that_leaves_takes_the_light_with_it(daemon):
         wait_for(lambda: daemon.state()["totals"]["executed"], "the first light")
     wait_for(lambda: daemon.board_state() == "ARMED", "the board to rest", patience_s=1.5)
     assert daemon.state()["totals"]["executed"] < 200
+    assert daemon.finished("p1")["status"] == "superseded"
 
 
 def test_sigterm_ends_it_dark_at_once_though_a_caller_stays(make_board, make_daemon):
