@@ -1,8 +1,11 @@
 """The simulated board as a process: a pty, a real serial port, real time, its log and its exits."""
 
+import os
+import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import pytest
 import serial
@@ -181,6 +184,23 @@ def test_what_a_host_wrote_before_it_closed_does_not_reach_the_next(board, open_
     (status,) = again.of(m.Status)
     assert m.STATES[status.state] == "DISARMED"
     assert status.fault == 0
+
+
+def test_a_process_that_is_kept_from_the_processor_is_not_a_board_that_is_late(board, open_host):
+    """What a host said in time counts as heard in time; points that fell due meanwhile ran when they were due."""
+    host = open_host(board).hello().arm()
+    host.play(points(200, on_us=2000))
+    host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
+    os.kill(board.process.pid, signal.SIGSTOP)
+    until = time.monotonic() + 0.3
+    while time.monotonic() < until:
+        host.say(m.Lease(60_000))
+        time.sleep(0.02)
+    os.kill(board.process.pid, signal.SIGCONT)
+    host.wait(lambda: sum(len(x.records) for x in host.of(m.Executed)) == 200, "every point")
+    assert board.of("fault") == []
+    gaps_us = {after["on_us"] - before["off_us"] for before, after in pairwise(board.of("pulse"))}
+    assert gaps_us == {3000, 6000}
 
 
 def test_the_session_works_over_the_real_port(board):
