@@ -1,6 +1,5 @@
 """Configuration: one TOML file a display, versioned, checked whole before anything uses it."""
 
-import tomllib
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -10,20 +9,34 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from optodrive.errors import InputError, nearest
+from optodrive.files import read_toml
 from optodrive.flow import FloatArray, IntArray, freeze_arrays
 
 FORMAT = "optodrive-config"
 VERSION = 3
+MIRRORS_FORMAT = "optodrive-mirrors"
+MIRRORS_VERSION = 1
 DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time one point of the wire protocol can carry (16 bit, microseconds)."""
 
 CODES_A_SIDE = 32_767
-"""Steps of the converter from the middle to the end of a mirror's range."""
+"""Steps of the board's converter from the middle to the end of a mirror's range."""
+HELIOS_CODES_A_SIDE = 2_047
+"""The same of a Helios, whose converter has 12 bits."""
+POWER_STEPS = 65_535
+"""Steps of the board's duty from none to the laser's full power."""
+HELIOS_POWER_STEPS = 255
+HELIOS_EARLY_POINTS = 5
+"""Light on a Helios begins up to two points late (rounding; the end of a frame) and ends up to three early (the same,
+and the dark point before a pulse that follows at once)."""
+HELIOS_POINT_LONGER_S = 1e-8
+"""A point lasts up to a tick of the board's clock longer than asked for."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 HalfWidth = Annotated[float, Field(ge=0, le=0.5)]
+UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 class Section(BaseModel):
@@ -33,7 +46,10 @@ class Section(BaseModel):
 
 
 class DisplaySection(Section):
-    """The lattice of pixels: rows × columns at one pitch, centred on the optical axis, less the missing places."""
+    """The lattice of pixels: rows × columns at one pitch, centred on the optical axis, less the missing places.
+
+    pixel_map: file of what was measured of each pixel, from the configuration's folder.
+    """
 
     rows: Annotated[int, Field(ge=1, le=200)]
     columns: Annotated[int, Field(ge=1, le=200)]
@@ -42,6 +58,7 @@ class DisplaySection(Section):
     bridge_width_m: Positive
     absorber_width_m: Positive = 2.0e-3
     absorber_height_m: Positive = 1.5e-3
+    pixel_map: Annotated[str, Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _missing_places_exist(self) -> Self:
@@ -72,26 +89,38 @@ class LaserSection(Section):
     focus_height_m: Positive
 
 
-class ScannerSection(Section):
-    """Mirrors and lens: ideal f-theta x = f · 2 · angle; either mirror follows its command as a servo.
+class ServoSection(Section):
+    """How either mirror follows its command.
 
     delay_s after a command the servo's own target begins to move towards it at slew_rad_per_s; the angle follows that
-    with natural frequency bandwidth_hz and damping, always underdamped. aim_error_m: how far a settled beam may stand
-    from where it should.
+    with natural frequency bandwidth_hz and damping, always underdamped.
     """
 
-    focal_length_m: Positive
-    range_rad: Annotated[float, Field(gt=0, lt=0.8)]
     bandwidth_hz: Annotated[float, Field(ge=100, le=100_000)]
     damping: Annotated[float, Field(ge=0.3, le=0.9)]
     delay_s: Annotated[float, Field(ge=0, le=0.01)]
     slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000)]
+
+
+class ScannerSection(ServoSection):
+    """Mirrors and lens: ideal f-theta x = f · 2 · angle; either mirror follows its command as a servo.
+
+    aim_error_m: how far a settled beam may stand from where it should. field: file of a calibrated field in place of
+    the ideal lens, from the configuration's folder; mirrors: the same of measured servos, which go before those stated.
+    codes_a_side: steps of the converter from the middle to the end of the range.
+    """
+
+    focal_length_m: Positive
+    range_rad: Annotated[float, Field(gt=0, lt=0.8)]
     aim_error_m: NonNegative
+    field: Annotated[str, Field(min_length=1)] | None = None
+    mirrors: Annotated[str, Field(min_length=1)] | None = None
+    codes_a_side: int = CODES_A_SIDE
 
     @property
     def code_rad(self) -> float:
         """Mirror angle of one step of the converter, rad: range_rad is the most it can say."""
-        return self.range_rad / CODES_A_SIDE
+        return self.range_rad / self.codes_a_side
 
 
 class UncertaintySection(Section):
@@ -134,28 +163,63 @@ class LimitsSection(Section):
 
 
 class BoardSection(Section):
-    """How the board is reached; uid: refuse any other board; port: serial device, or the simulated board's link."""
+    """How the board is reached; uid: refuse any other board; port: serial device, or the simulated board's link.
 
-    transport: Literal["simulated", "serial"]
+    vendor_id, product_id, serial_number: a board on USB; without a serial number it must be the only one of its kind.
+    points_per_s, interlock_watched: for a Helios, whose uid is its name; whether an external interlock cuts its light.
+    """
+
+    transport: Literal["simulated", "serial", "usb", "helios"]
     port: str = ""
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
     uid: str = ""
     lease_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
+    vendor_id: UsbId | None = None
+    product_id: UsbId | None = None
+    serial_number: str = ""
+    points_per_s: Annotated[int, Field(ge=20_000, le=50_000)] = 40_000
+    interlock_watched: bool = False
 
     @model_validator(mode="after")
-    def _serial_has_a_port(self) -> Self:
+    def _board_can_be_found(self) -> Self:
         if self.transport == "serial" and not self.port:
             raise ValueError("transport 'serial' needs port, for example \"/dev/ttyACM0\"")
+        if self.transport == "usb" and (self.vendor_id is None or self.product_id is None):
+            raise ValueError("transport 'usb' needs vendor_id and product_id, for example 0x1209 and 0x0001")
         return self
+
+    @property
+    def early_s(self) -> float:
+        """By how much two times of a plan may come nearer to each other on this board, s; a tick is none."""
+        point_s = 1.0 / self.points_per_s + HELIOS_POINT_LONGER_S
+        return HELIOS_EARLY_POINTS * point_s if self.transport == "helios" else 0.0
+
+
+class SensorSection(Section):
+    """A spot sensor on a serial port of its own, as SENSOR.md says; a simulated board brings one."""
+
+    port: Annotated[str, Field(min_length=1)]
+    baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 115_200
 
 
 class DaemonSection(Section):
-    """The daemon's address; hosts: names it answers to besides loopback; body_max_bytes: largest request body."""
+    """The daemon's address; hosts: names it answers to besides loopback; body_max_bytes: largest request body.
+
+    socket: a Unix socket it listens at too. tokens: file of its tokens, kept over restarts; without one they are made
+    anew at each start. audit: file to which it adds who armed, stopped, pushed. requests_per_s, requests_burst: what a
+    caller may ask for, for ever and at once; STOP is not counted. record: a folder in which each session is recorded.
+    """
 
     host: str = "127.0.0.1"
     port: Annotated[int, Field(ge=0, le=65_535)] = 8450
+    socket: str = ""
     hosts: tuple[str, ...] = ()
     body_max_bytes: Annotated[int, Field(ge=1024, le=64_000_000)] = 8_000_000
+    tokens: str = ""
+    audit: str = ""
+    requests_per_s: Annotated[float, Field(ge=1, le=100_000)] = 500.0
+    requests_burst: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    record: str = ""
 
 
 class Config(Section):
@@ -171,6 +235,7 @@ class Config(Section):
     scanner: ScannerSection
     limits: LimitsSection
     board: BoardSection
+    sensor: SensorSection | None = None
     daemon: DaemonSection = DaemonSection()
 
     @model_validator(mode="after")
@@ -222,6 +287,22 @@ class Config(Section):
                     f"{getattr(display, f'absorber_{side}_m')} with two steps of the converter to spare"
                 )
         return self
+
+    @model_validator(mode="after")
+    def _steps_are_the_converters(self) -> Self:
+        steps = HELIOS_CODES_A_SIDE if self.board.transport == "helios" else CODES_A_SIDE
+        if self.scanner.codes_a_side != steps:
+            raise ValueError(
+                f"scanner.codes_a_side {self.scanner.codes_a_side} must be {steps}, "
+                f"the converter's steps behind board.transport '{self.board.transport}'"
+            )
+        return self
+
+    @property
+    def least_power_w(self) -> float:
+        """The laser power that the board's smallest step stands for, W; it rounds down."""
+        steps = HELIOS_POWER_STEPS if self.board.transport == "helios" else POWER_STEPS
+        return self.laser.max_power_w / steps
 
     @property
     def tolerance_rad(self) -> tuple[float, float]:
@@ -280,8 +361,11 @@ def shipped_configs() -> list[str]:
     return sorted(path.stem for path in shipped_path().glob("display-*.toml"))
 
 
-def load_config(source: str | Path | None = None) -> Config:
-    """Read a configuration file, or a shipped one by its name; raises InputError with one line."""
+def load_config(source: str | Path | None = None, measured: bool = True) -> Config:
+    """Read a configuration file, or a shipped one by its name; raises InputError with one line.
+
+    measured: with the mirrors' file it names, else with the servo it states.
+    """
     source = DEFAULT_CONFIG if source is None else source
     path = Path(source)
     if not path.exists():
@@ -290,20 +374,52 @@ def load_config(source: str | Path | None = None) -> Config:
         path = shipped_path(f"{source}.toml")
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
+    _place_beside(path, table.get("scanner"), ("field", "mirrors"))
+    _place_beside(path, table.get("display"), ("pixel_map",))
     try:
-        return Config.model_validate(table)
+        config = Config.model_validate(table)
     except ValidationError as error:
         raise input_error(error, str(path), Config) from None
+    mirrors = config.scanner.mirrors
+    return with_mirrors(config, Path(mirrors)) if measured and mirrors is not None else config
 
 
-def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a table; raises InputError where it cannot be read or parsed."""
+def _place_beside(path: Path, section: object, keys: tuple[str, ...]) -> None:
+    """Files that a section names are looked for from the configuration's folder."""
+    for key in keys:
+        if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
+            section[key] = str(path.parent / section[key])
+
+
+class GalvoSection(Section):
+    """share: of the galvo cap that is left, where a mirror accelerates more than the one servo that is counted."""
+
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+
+class MirrorsFile(Section):
+    """mirrors.toml, as `optodrive calibrate --mirrors` writes it; about and axes are for people."""
+
+    format: Literal["optodrive-mirrors"]
+    version: Literal[1]
+    scanner: ServoSection
+    galvo: GalvoSection = GalvoSection()
+    about: dict[str, Any] = {}
+    axes: dict[str, Any] = {}
+
+
+def with_mirrors(config: Config, path: Path) -> Config:
+    """The configuration with measured servos, and the galvo cap that they leave; InputError with one line."""
+    table = read_toml(path)
+    check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(str(path), str(error), "valid TOML") from None
+        measured = MirrorsFile.model_validate(table)
+    except ValidationError as error:
+        raise input_error(error, str(path), MirrorsFile) from None
+    scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
+    stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
+    cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}
+    return config.model_copy(update={"scanner": scanner, "limits": config.limits.model_copy(update=cap)})
 
 
 def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:

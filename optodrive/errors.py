@@ -9,6 +9,8 @@ class OptodriveError(Exception):
 
     code = "error"
     exit_status = 1
+    problem: Mapping[str, object] | None = None
+    """The problem document, where a daemon answered with one."""
 
 
 class InputError(OptodriveError):

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from optodrive.aiming import moves_of
 from optodrive.config import Config
 from optodrive.errors import InputError
 from optodrive.limit.budget import Budget, Caps, Mirrors
@@ -12,7 +13,6 @@ from optodrive.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_WARMING, Most, Values, Warming
 from optodrive.physics.terms import known_terms
-from optodrive.plan.galvo import MoveModel
 from optodrive.units import ZERO_CELSIUS_K
 
 BOUNDED = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
@@ -47,6 +47,7 @@ def budget_of(config: Config, parameters: ParameterSet, pixels: PixelArray) -> B
         pixel_window_s=limits.pixel_mean_window_s,
         display_mean_w=limits.display_mean_power_max_w,
         display_window_s=limits.display_mean_window_s,
+        least_w=config.least_power_w,
     )
     model = declared(parameters, pixels, Neighbours.of(config.display), ambient_c + ZERO_CELSIUS_K, warming)
     uncertainty = Uncertainty(**limits.uncertainty.model_dump())
@@ -61,9 +62,10 @@ def mirrors_of(config: Config) -> Mirrors:
         damping=scanner.damping,
         delay_s=scanner.delay_s,
         slew_rad_per_s=scanner.slew_rad_per_s,
-        lead_s=MoveModel.of(config).lead_us * 1e-6,
+        lead_s=moves_of(config).lead_us * 1e-6,
         mean_s=config.limits.galvo_mean_s,
         code_rad=scanner.code_rad,
+        early_s=config.board.early_s,
     )
 
 

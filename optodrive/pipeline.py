@@ -10,9 +10,11 @@ from math import ceil, inf
 
 import numpy as np
 
+from optodrive.aiming import field_of, moves_of
 from optodrive.config import Config, PixelLayout, pixel_layout
 from optodrive.errors import InputError, OverBudgetError, RefusedError
 from optodrive.flow import (
+    BoolArray,
     BudgetState,
     FloatArray,
     FrameSequence,
@@ -26,11 +28,11 @@ from optodrive.flow import (
 from optodrive.guard import budget_of
 from optodrive.limit.budget import Budget
 from optodrive.limit.limiter import Policy, fresh_state, joined, limit, moves_borne, wait_s
+from optodrive.limit.usage import usage
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat, heat_at_rest
 from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels, load_parameters
-from optodrive.plan.field import IdealField
-from optodrive.plan.galvo import MoveModel
+from optodrive.pixel_map import aimed_layout, map_of
 from optodrive.plan.order import warm as warm_order
 from optodrive.plan.scheduler import TRAIN_PIECE, Machine, Rest, Scheduler, Skipped
 from optodrive.plan.slices import Together
@@ -51,30 +53,35 @@ ROUNDING_S = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Display:
-    """A configuration resolved into what the stages take."""
+    """A configuration resolved into what the stages take.
+
+    layout: where pixels lie; the machine's says where the beam is sent for them. dead: [p] which are known to be dead
+    """
 
     config: Config
     layout: PixelLayout
     parameters: ParameterSet
     pixels: PixelArray
+    dead: BoolArray
     machine: Machine
     budget: Budget
 
     @classmethod
     def of(cls, config: Config) -> "Display":
         """Resolve a configuration."""
-        layout = pixel_layout(config.display)
+        layout, known = pixel_layout(config.display), map_of(config)
         parameters = load_parameters(config.pixel_model.parameters)
         pixels = display_pixels(config, parameters)
         limits, laser = config.limits, config.laser
         machine = Machine(
-            layout=layout,
-            field=IdealField(config.scanner.focal_length_m),
-            moves=MoveModel.of(config),
+            layout=aimed_layout(config),
+            field=field_of(config),
+            moves=moves_of(config),
             drive=DriveRange.of(laser.max_power_w, laser.pwm_hz, limits.pulse_width_max_s),
             rest_s=limits.pulse_rest_min_s,
         )
-        return cls(config, layout, parameters, pixels, machine, budget_of(config, parameters, pixels))
+        dead = np.zeros(len(layout), dtype=np.bool_) if known is None else known.dead
+        return cls(config, layout, parameters, pixels, dead, machine, budget_of(config, parameters, pixels))
 
     @property
     def ambient_k(self) -> float:
@@ -83,7 +90,7 @@ class Display:
 
     def heat_at_rest(self) -> Heat:
         """Heat of a display that nobody has lit."""
-        return heat_at_rest(self.config, self.parameters)
+        return heat_at_rest(self.config, self.parameters, self.pixels)
 
     @cached_property
     def reach_m(self) -> FloatArray:
@@ -143,6 +150,7 @@ class Prepared:
     together: how the frames were split whose pixels shall stand up at one time
     shortfall: under "trim", None where nothing was; delays: under "delay"
     rested_s: how long mirrors rest in all, for the sake of their coils
+    dead: pixels that frames asked for and that are left out, for they are dead
     """
 
     sequence: FrameSequence
@@ -157,6 +165,7 @@ class Prepared:
     rested_s: float
     heat: Heat
     budget: BudgetState
+    dead: tuple[int, ...] = ()
 
     @property
     def duration_s(self) -> float:
@@ -181,15 +190,19 @@ def warm_up(display: Display) -> None:
     """Plan a frame and a pulse for nobody, so that every kernel is compiled and loaded."""
     warm_order()
     laser, target_m = display.config.laser, np.zeros(len(display.pixels))
-    target_m[0] = 1e-6
+    pixel = int(np.argmin(display.dead))
+    target_m[pixel] = 1e-6
     trains = (
-        PulseTrain(0, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
-        HeightTrain(0, 2.0, 1e-3, 0.1, 1e-6),
+        PulseTrain(pixel, 1.0, 1e-3, 1.0 / laser.pwm_hz, 1e-3, laser.max_power_w),
+        HeightTrain(pixel, 2.0, 1e-3, 0.1, 1e-6),
     )
     prepare(display, FrameSequence((TactileFrame("", 0.0, 1.0, target_m),), trains), *display.at_rest())
     if not display.parameters.planner_terms:
         # Admission looks whether heat falls.
         display.heat_at_rest().traces(np.zeros((0, 4)), [0], np.zeros(2))
+    # Telemetry looks at heat and budget while a plan runs.
+    display.heat_at_rest().at(0.0)
+    usage(fresh_state(len(display.pixels)), display.budget, 0.0)
 
 
 def beyond_reach(display: Display, sequence: FrameSequence) -> tuple[int, int, float] | None:
@@ -220,6 +233,28 @@ def check_reach(display: Display, sequence: FrameSequence) -> None:
     )
 
 
+def without_dead(display: Display, sequence: FrameSequence) -> tuple[FrameSequence, tuple[int, ...]]:
+    """The sequence with dead pixels left out of its frames, and which those are.
+
+    Raises InputError (dead_pixel) for a train on one: it asks for that pixel and no other.
+    """
+    if not display.dead.any():
+        return sequence, ()
+    for index, train in enumerate(sequence.trains):
+        if display.dead[train.pixel]:
+            raise InputError(
+                f"trains[{index}].pixel", train.pixel, "a pixel that lives: this one is dead", "dead_pixel"
+            )
+    asked = np.zeros(len(display.dead), dtype=np.bool_)
+    for frame in sequence.frames:
+        asked |= frame.target_m > 0
+    dead = np.flatnonzero(asked & display.dead)
+    if not len(dead):
+        return sequence, ()
+    frames = tuple(replace(frame, target_m=np.where(display.dead, 0.0, frame.target_m)) for frame in sequence.frames)
+    return replace(sequence, frames=frames), tuple(dead.tolist())
+
+
 def prepare(
     display: Display,
     sequence: FrameSequence,
@@ -239,6 +274,7 @@ def prepare(
     frame as a whole. Raises InputError for a height or a swing out of reach, RefusedError for what no policy lets
     pass: under "refuse" a cap or a deadline that is missed, under "delay" what would never fit.
     """
+    sequence, dead = without_dead(display, sequence)
     check_reach(display, sequence)
     done = 0.0
 
@@ -304,6 +340,7 @@ def prepare(
         rested_s=rested_s,
         heat=after_heat,
         budget=state,
+        dead=dead,
     )
     if policy == "refuse":
         _refuse_late(prepared)

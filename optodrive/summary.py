@@ -12,6 +12,7 @@ from optodrive.pipeline import Display, Prepared, Shortfall, lateness
 from optodrive.plan.slices import Together
 from optodrive.units import m_to_um
 
+DEAD_LISTED_MAX = 20
 PULSES_LISTED_MAX = 20_000
 """An answer lists pulses one by one up to this many."""
 
@@ -49,6 +50,7 @@ def summary(prepared: Prepared, admission: Admission | None = None) -> dict[str,
             }
             for item in prepared.delays
         ],
+        "dead": {"pixels": list(prepared.dead), "count": len(prepared.dead), "sentence": dead_sentence(prepared.dead)},
         "skipped": [
             {
                 "frame": _source(prepared, item.source),
@@ -76,6 +78,19 @@ def summary(prepared: Prepared, admission: Admission | None = None) -> dict[str,
         "late": [lateness(timing) for timing in prepared.frames if timing.late_s > 0 and not prepared.delays],
         "train_late_s": prepared.train_late_s,
     }
+
+
+def dead_sentence(dead: tuple[int, ...]) -> str | None:
+    """Which pixels were left out, in words; None where none were."""
+    if not dead:
+        return None
+    if len(dead) == 1:
+        return f"pixel {dead[0]} is dead: left out"
+    if len(dead) > DEAD_LISTED_MAX:
+        listed = f"{', '.join(map(str, dead[:DEAD_LISTED_MAX]))} and {len(dead) - DEAD_LISTED_MAX} more"
+    else:
+        listed = f"{', '.join(map(str, dead[:-1]))} and {dead[-1]}"
+    return f"pixels {listed} are dead: left out"
 
 
 def _shortfall(shortfall: Shortfall | None) -> dict[str, Any] | None:
@@ -162,8 +177,8 @@ def write_plan_csv(path: Path, prepared: Prepared, display: Display) -> None:
         plan.width_s.tolist(),
         plan.power_w.tolist(),
         plan.pixel.tolist(),
-        display.layout.x_m[plan.pixel].tolist(),
-        display.layout.y_m[plan.pixel].tolist(),
+        display.machine.layout.x_m[plan.pixel].tolist(),
+        display.machine.layout.y_m[plan.pixel].tolist(),
         plan.x_rad.tolist(),
         plan.y_rad.tolist(),
         plan.energy_j.tolist(),

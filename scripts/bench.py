@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from bench_field import bench_field
 from bench_stream import bench_stream
 from rich.console import Console
 from rich.table import Table
@@ -99,7 +100,7 @@ def bench_wire():
 
     def prove():
         decoded = decode(payload, scale)
-        verify(plan.pixel[points.row[decoded.index]], decoded, budget, display.budget)
+        verify(plan, points.row[decoded.index], decoded, budget, display.budget)
 
     return [
         ("pulses quantised a second", len(plan) / median_s(lambda: quantise(plan, scale)), "1/s"),
@@ -322,6 +323,13 @@ def bench_order():
     return run()
 
 
+def bench_page():
+    """The page in Chromium, which must be there."""
+    from bench_page import bench_page as run
+
+    return run()
+
+
 BENCHMARKS = {
     "plan": bench_plan,
     "limit": bench_limit,
@@ -329,8 +337,10 @@ BENCHMARKS = {
     "board": bench_board,
     "hour": bench_hour,
     "display": bench_display,
+    "field": bench_field,
     "stream": bench_stream,
     "order": bench_order,
+    "page": bench_page,
 }
 
 

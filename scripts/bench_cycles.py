@@ -7,11 +7,11 @@ import sys
 from contextlib import contextmanager
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
-from scipy.integrate import solve_ivp
 
 from optodrive.config import load_config
 from optodrive.errors import InputError
@@ -19,6 +19,9 @@ from optodrive.flow import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.pipeline import Display, prepare
 from optodrive.plan import scheduler
 from optodrive.plan.cycles import at_target, with_room
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from pixel_ode import height_um
 
 PIXELS = (200, 201, 222, 221)
 SECONDS, CYCLES = 0.6, 12
@@ -30,25 +33,6 @@ SWING = 0.5
 """Swing asked for, between the least (0) and the most (1) that a height and a rate allow."""
 
 
-def height_um(pixel, pulses, t_s):
-    """Displacement at t_s [m] under pulses [n, 3] in order, from rest, by solve_ivp from edge to edge."""
-    edges_s = [0.0, *(pulses[:, :1] + np.column_stack([np.zeros(len(pulses)), pulses[:, 1]])).ravel(), t_s[-1] + 1e-3]
-    power_w = [0.0, *np.column_stack([pulses[:, 2], np.zeros(len(pulses))]).ravel()]
-    state, height = np.zeros(2), np.zeros(len(t_s))
-    for begin_s, end_s, light_w in zip(edges_s[:-1], edges_s[1:], power_w, strict=True):
-        if end_s <= begin_s:
-            continue
-
-        def slope(_, y, light_w=light_w):
-            heating = (pixel.epsilon * light_w - y[0] / pixel.r_k_per_w) / pixel.c_j_per_k
-            return [heating, (y[0] / 2 - y[1]) / pixel.tau_g_s]
-
-        inside = (t_s >= begin_s) & (t_s < end_s)
-        run = solve_ivp(slope, (begin_s, end_s), state, t_eval=[*t_s[inside], end_s], rtol=1e-7, atol=1e-7)
-        height[inside], state = run.y[1][:-1], run.y[:, -1]
-    return 1e6 * pixel.kappa_m_per_k * height
-
-
 def last_cycles(display, result, train, period_s):
     """Peak and swing, µm, mean of the last cycles of a train, and its energy a cycle there, J."""
     plan = result.plan
@@ -57,7 +41,8 @@ def last_cycles(display, result, train, period_s):
     t_s = np.linspace(starts_s[0], starts_s[0] + STEADY * period_s, 200 * STEADY + 1)
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w])[rows]
     each = height_um(display.pixels.each[train.pixel], pulses, t_s)[:-1].reshape(STEADY, 200)
-    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[rows][-STEADY - 1 : -1].mean()
+    lit = rows[(plan.start_s[rows] > starts_s[0] - 1e-6) & (plan.start_s[rows] < t_s[-1] - 1e-6)]
+    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[lit].sum() / STEADY
 
 
 def room_us(display, count, period_s):
@@ -66,7 +51,7 @@ def room_us(display, count, period_s):
     own_us = round((period_s - machine.rest_s) * 1e6)
     if count == 1:
         return own_us
-    x_rad = machine.field.mirror_rad(display.layout.x_m)
+    x_rad, _ = machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
     return min(own_us, int(1e6 * period_s / count) - machine.moves.time_us(x_rad[201] - x_rad[200], 0.0))
 
 

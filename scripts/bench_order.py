@@ -31,7 +31,7 @@ class Bench:
         self.display = Display.of(load_config(name))
         machine = self.display.machine
         self.layout, self.moves, self.drive = machine.layout, machine.moves, machine.drive
-        self.x_rad, self.y_rad = (machine.field.mirror_rad(at_m) for at_m in (self.layout.x_m, self.layout.y_m))
+        self.x_rad, self.y_rad = machine.field.angles_rad(self.layout.x_m, self.layout.y_m)
 
     def move_us(self, origin, pixel, lit_us=CALM_US):
         if origin is None:

@@ -19,6 +19,7 @@ import httpx
 import numpy as np
 
 RUNS = 50
+MINUTE_S, FULL_HZ = 60.0, 16.0
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CALLERS = 1511, 200, 20.0, 15.0, 4
 TOKEN = "a-token-for-a-benchmark"
 
@@ -70,7 +71,7 @@ def planning_rows():
             prepared = prepare(display, sequence, heat, budget, standing_on=7)
             points = quantise(prepared.plan, scale)
             decoded = decode(points.payload(), scale)
-            verify(prepared.plan.pixel[points.row[decoded.index]], decoded, budget, display.budget)
+            verify(prepared.plan, points.row[decoded.index], decoded, budget, display.budget)
             times.append(time.process_time() - begin_s)
         rows.append(
             (f"a changed frame of {active} pixels: planned, limited, proven", 1e3 * statistics.median(times), "ms")
@@ -128,6 +129,62 @@ def pushed(url):
             if "plan" in answers[0]
             else [],
         )
+
+
+def a_minute():
+    """Full frames that ripple over the display, as fast as 16 a second, without other callers; from rest to the end."""
+    from optodrive.clock import MonotonicClock
+    from optodrive.config import load_config
+    from optodrive.daemon.engine import Engine
+    from optodrive.flow import FrameSequence, TactileFrame
+    from optodrive.pipeline import Display
+    from optodrive.transport.simulated import SimulatedBoard
+
+    display = Display.of(load_config("display-1511"))
+    board = SimulatedBoard("", 1_000_000)
+    engine = Engine(display, board, MonotonicClock())
+    engine.start()
+    engine.arm().result(10)
+    plans, misses, lights, open_plans = [], [], [], []
+
+    def take(plan):
+        engine.ending(plan).result(20)
+        record = engine.plan(plan)
+        if record["executed"]:
+            asked_um = dict(zip(record["pulses"]["pixel"], record["pulses"]["target_um"], strict=True))
+            done = record["executed_pulses"]
+            misses.extend(
+                um / asked_um[pixel] - 1 for pixel, um in zip(done["pixel"], done["simulated_um"], strict=True)
+            )
+            lights.append(record["latency"]["first_light_s"])
+            plans.append(set(done["pixel"]))
+
+    try:
+        begin_s = time.monotonic()
+        for k in range(int(MINUTE_S * FULL_HZ)):
+            target = 60e-6 * (1 + np.sin(0.3 * k + display.layout.column / 4))
+            target[target < 5e-6] = 0
+            sequence = FrameSequence((TactileFrame(str(k), 0.0, 3600.0, target),))
+            open_plans.append(engine.submit(lambda s=sequence: s, "frame", streamed=True).result(20)["plan"])
+            if len(open_plans) > 5:
+                take(open_plans.pop(0))
+            time.sleep(max(0.0, begin_s + (k + 1) / FULL_HZ - time.monotonic()))
+        engine.end_stream().result(10)
+        time.sleep(1.0)
+        for plan in open_plans:
+            take(plan)
+        underruns = engine.snapshot()["board"]["underruns"]
+    finally:
+        engine.close()
+        board.release()
+    name = f"full frames, {FULL_HZ:g} a second for {MINUTE_S:g} s, no other callers"
+    return [
+        (f"{name}: arrival to first light, median", 1e3 * statistics.median(lights), "ms"),
+        (f"{name}: the same, largest", 1e3 * max(lights), "ms"),
+        (f"{name}: pixels lit", len(set().union(*plans)), "1"),
+        (f"{name}: largest error of a height", float(np.abs(misses).max()), "1"),
+        (f"{name}: times the board ran out of points", underruns, "1"),
+    ]
 
 
 def in_a_process(arguments, environment, ready):
@@ -203,4 +260,4 @@ def bench_stream():
         ),
         ("times the board ran out of points", state["board"]["underruns"], "1"),
     ]
-    return rows
+    return rows + a_minute()

@@ -9,7 +9,7 @@ from optodrive.config import load_config
 from optodrive.frames.patterns import build_pattern
 from optodrive.pipeline import Display, prepare
 from optodrive.simulator.run import execute
-from optodrive.simulator.truth import trace
+from optodrive.simulator.traces import trace
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
 SCALE = 22

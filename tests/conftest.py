@@ -6,16 +6,26 @@ from hypothesis import HealthCheck, settings
 from displays import DISPLAYS
 
 settings.register_profile(
-    "project", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+    "thorough", deadline=None, print_blob=True, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
 )
-settings.load_profile("project")
+settings.register_profile("every run", settings.get_profile("thorough"), max_examples=40)
+
+
+def pytest_configure(config):
+    settings.load_profile("every run" if config.getoption("markexpr") == "not slow" else "thorough")
 
 
 def pytest_addoption(parser):
     parser.addoption("--board", default=None, metavar="PORT", help="run the hardware tests on the board at PORT")
 
 
+LONG_FIRST = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
+LONGEST = ("test_calibrate_loop.py", "test_home.py", "test_ends_dark.py")
+"""Folders and files that take long: begun last, one of them would keep one worker while the others have nothing."""
+
+
 def pytest_collection_modifyitems(config, items):
+    items.sort(key=lambda item: item.path.name not in LONGEST and item.path.parent.name not in LONG_FIRST)
     if config.getoption("--board") is None:
         skip = pytest.mark.skip(reason="needs a real board: --board PORT")
         for item in items:

@@ -24,6 +24,7 @@ NO_CAPS = Caps(
     pixel_window_s=1.0,
     display_mean_w=1e3,
     display_window_s=2.0,
+    least_w=0.0,
 )
 """Caps that do not bind."""
 

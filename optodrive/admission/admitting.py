@@ -16,7 +16,7 @@ from optodrive.errors import OverBudgetError, RefusedError
 from optodrive.flow import BudgetState, FrameSequence
 from optodrive.limit.limiter import Policy
 from optodrive.physics.heat import Heat
-from optodrive.pipeline import Display, Prepared, Progress, beyond_reach, prepare
+from optodrive.pipeline import Display, Prepared, Progress, beyond_reach, prepare, without_dead
 
 PLANS_MAX = 1_000
 """So many plans at most are tried for each of the nearest sets."""
@@ -73,16 +73,23 @@ def admit(
 
     Where the planner's order does not fit and there are few, all orders are tried, and one that fits is the plan.
     "as_is": what does not fit goes by the policy; "even": lower by one factor; "priority": less of the less important.
-    Raises as `prepare`; RefusedError, with the admission, under policy "refuse", and where nothing fits that is asked.
+    Dead pixels are left out of frames first. Raises as `prepare`; RefusedError, with the admission, under policy
+    "refuse", and where nothing fits that is asked.
     """
-    asked = _Asked(display, sequence, heat, budget, fit, progress or (lambda _share: None))
-    beyond = None if fit == "as_is" else beyond_reach(display, sequence)
+    living, dead = without_dead(display, sequence)
+    asked = _Asked(display, living, heat, budget, fit, progress or (lambda _share: None))
+    prepared, admission = _admitted(asked, policy)
+    return replace(prepared, dead=dead), admission
+
+
+def _admitted(asked: _Asked, policy: Policy) -> tuple[Prepared, Admission]:
+    beyond = None if asked.fit == "as_is" else beyond_reach(asked.display, asked.sequence)
     if beyond is not None:
         return _instead(asked, None, Breach("reach", beyond[0], beyond[1]), policy)
     plan = asked.planned()
-    breach = first_breach(plan.plan, deadlines_s(sequence, plan.lead_s))
+    breach = first_breach(plan.plan, deadlines_s(asked.sequence, plan.lead_s))
     if breach is None:
-        return plan, fitting(plan, "planned", fit)
+        return plan, fitting(plan, "planned", asked.fit)
     return _instead(asked, plan, breach, policy)
 
 

@@ -101,7 +101,7 @@ def _least_moves_s(machine: Machine, pixels: IntArray, origins: IntArray) -> flo
     """Moves to each pixel but one, each from where of the other `origins` it takes least; [k] and [m]."""
     if not len(pixels):
         return 0.0
-    x_rad, y_rad = (machine.field.mirror_rad(place_m) for place_m in (machine.layout.x_m, machine.layout.y_m))
+    x_rad, y_rad = machine.field.angles_rad(machine.layout.x_m, machine.layout.y_m)
     moves_s = []
     for pixel in pixels:
         # A train on the pixel itself would need no move; its pixels are not counted here.

@@ -1,12 +1,22 @@
 """One plan on its way through the board: what was sent, what came back as executed."""
 
 from math import inf
+from typing import NamedTuple
 
 import numpy as np
 
 from optodrive.flow import ExecutedPulses, IntArray, PulsePlan
 from optodrive.wire.messages import Executed
 from optodrive.wire.quantise import WirePoints
+
+
+class Reported(NamedTuple):
+    """Pulses as executed, all [n]: row of the plan, tick of gate on, ticks of gate on, duty in 1/65535."""
+
+    row: IntArray
+    on_tick: IntArray
+    on_ticks: IntArray
+    duty: IntArray
 
 
 class Job:
@@ -107,6 +117,17 @@ class Job:
     def rows_executed(self) -> IntArray:
         """Rows of the plan reported as executed, in order."""
         return self._row[self._lit[self._on_tick[self._lit] >= 0]]
+
+    @property
+    def pulses(self) -> int:
+        """Pulses of the plan among its points."""
+        return len(self._lit)
+
+    def reported(self, begin: int, end: int) -> Reported:
+        """What came back so far of the pulses begin to end, counted in order of its points; any thread may ask."""
+        lit = self._lit[begin:end]
+        done = lit[self._on_tick[lit] >= 0]
+        return Reported(self._row[done], self._on_tick[done], self._on_ticks[done], self._duty[done])
 
     @property
     def finished(self) -> bool:

@@ -5,9 +5,10 @@ from math import ceil
 
 import numpy as np
 
-from optodrive.config import Config, pixel_layout
+from optodrive.aiming import field_of, moves_of
+from optodrive.config import Config
 from optodrive.errors import InputError
-from optodrive.plan.galvo import MoveModel
+from optodrive.pixel_map import aimed_layout
 from optodrive.wire import messages as m
 from optodrive.wire.connection import RTO_S
 from optodrive.wire.quantise import CENTRE_CODE, CODE_MAX, WireScale
@@ -18,27 +19,29 @@ SLACK = 1.05
 """The board's caps lie this much above the limiter's: it is the second fence, not the first."""
 FIELD_MARGIN_CODES = 64
 FRAME_BYTES = 254
-FLIGHT_S = 0.02
-"""Bytes on their way to the board never take longer than this, so that an ABORT is soon heard."""
+FLIGHT_S = 0.01
+"""Bytes on their way to the board never take longer than this, so that an ABORT is soon heard, and a lost frame costs
+few others that must be sent again behind it; the protocol allows twice as much."""
 BITS_A_BYTE = 10
 
 
 @dataclass(frozen=True)
 class Requirements:
-    """Derived once from a configuration."""
+    """Derived once from a configuration. margin_codes: so far beyond the outermost pixels the board is let go."""
 
     config: Config
     scale: WireScale
+    margin_codes: int = FIELD_MARGIN_CODES
 
     @classmethod
-    def of(cls, config: Config) -> "Requirements":
+    def of(cls, config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> "Requirements":
         """Derive them; codes span the scanner's whole range."""
         scale = WireScale(
             rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
             full_power_w=config.laser.max_power_w,
             tick_s=1.0 / TICK_HZ,
         )
-        return cls(config, scale)
+        return cls(config, scale, margin_codes)
 
     @property
     def lease_s(self) -> float:
@@ -57,10 +60,10 @@ class Requirements:
 
     def limits(self) -> m.Limits:
         """The limits this host asks the board to tighten to."""
-        limits, scanner, layout = self.config.limits, self.config.scanner, pixel_layout(self.config.display)
+        limits, layout = self.config.limits, aimed_layout(self.config)
         settle_us, settle_ns_per_code = self._settling()
-        angle = 1.0 / (2.0 * scanner.focal_length_m)
-        x_codes, y_codes = (self.scale.codes(position * angle) for position in (layout.x_m, layout.y_m))
+        angles_rad = field_of(self.config).angles_rad(layout.x_m, layout.y_m)
+        x_codes, y_codes = (self.scale.codes(angle_rad) for angle_rad in angles_rad)
         return m.Limits(
             max_on_us=ceil(limits.pulse_width_max_s * 1e6),
             max_duty=65535,
@@ -68,10 +71,10 @@ class Requirements:
             spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * SLACK),
             spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * SLACK),
             full_power_uw=round(self.config.laser.max_power_w * 1e6),
-            x_min=max(0, int(x_codes.min()) - FIELD_MARGIN_CODES),
-            x_max=min(CODE_MAX, int(x_codes.max()) + FIELD_MARGIN_CODES),
-            y_min=max(0, int(y_codes.min()) - FIELD_MARGIN_CODES),
-            y_max=min(CODE_MAX, int(y_codes.max()) + FIELD_MARGIN_CODES),
+            x_min=max(0, int(x_codes.min()) - self.margin_codes),
+            x_max=min(CODE_MAX, int(x_codes.max()) + self.margin_codes),
+            y_min=max(0, int(y_codes.min()) - self.margin_codes),
+            y_max=min(CODE_MAX, int(y_codes.max()) + self.margin_codes),
             settle_us=settle_us,
             settle_ns_per_code=settle_ns_per_code,
             rest_us=round(limits.pulse_rest_min_s * 1e6),
@@ -83,10 +86,9 @@ class Requirements:
 
         Times jump where a longer move begins to overshoot; a steeper line would have to lie lower for the short ones.
         """
-        display = self.config.display
-        moves = MoveModel.of(self.config)
+        moves = moves_of(self.config)
         ns_per_code = int(self.scale.rad_per_code / self.config.scanner.slew_rad_per_s * 1e9)
-        pitches = np.arange(1, max(display.rows, display.columns, 2))
+        pitches = np.arange(1, len(moves.calm[0]))
         # A move may come out a code longer than planned.
         codes = np.floor(pitches * moves.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
         times_us = np.minimum(*(np.array(table)[pitches] for table in moves.calm))

@@ -5,19 +5,21 @@ repeated by itself: a reconnect ends in DISARMED.
 """
 
 import secrets
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from math import inf
 from typing import Any
 
 from optodrive.board.clocksync import ClockSync
-from optodrive.board.faults import hint
 from optodrive.board.job import Job
+from optodrive.board.link_watch import Cause, Counts, LinkWatch
 from optodrive.board.requirements import Requirements
 from optodrive.board.stream import PointStream
+from optodrive.board.view import BoardView
 from optodrive.clock import Clock
 from optodrive.errors import InputError, LinkError, NotReadyError
+from optodrive.histogram import Histogram
 from optodrive.transport.base import Transport
 from optodrive.wire import messages as m
 from optodrive.wire.connection import HostConnection
@@ -34,35 +36,16 @@ SILENCE_S = 2.0
 """A board that answers nothing for this long counts as lost."""
 FOLLOW_S = 0.01
 """Points that follow others must be on their way so long before those end."""
+LEASE_AGES_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
 LEASED = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
-@dataclass
-class BoardView:
-    """What the host last heard of the board."""
-
-    state: str = "UNKNOWN"
-    fault: str = ""
-    inputs: int = 0
-    done_index: int = 0
-    queued: int = 0
-    free_points: int = 0
-    underruns: int = 0
-    crc_errors: int = 0
-    format_errors: int = 0
-    seq_errors: int = 0
-    laser_on_s: float = 0.0
-    temperature_c: float | None = None
-    uid: str = ""
-    firmware: int = 0
-
-    def figures(self) -> dict[str, Any]:
-        """As REST answers it, with the fault's likely cause in plain words."""
-        return {**asdict(self), "fault": self.fault or None, "hint": hint(self.fault)}
-
-
 class Session:
-    """A session over a transport, with the requirements of a configuration."""
+    """A session over a transport, with the requirements of a configuration.
+
+    faults: how often the board was seen to go into each; lease_ages: seconds since the last renewal, at each;
+    lease_slack_s: the least of the lease that was left then, None before the second renewal
+    """
 
     def __init__(self, transport: Transport, clock: Clock, requirements: Requirements) -> None:
         self._transport = transport
@@ -76,10 +59,17 @@ class Session:
         self._refusal: str | None = None
         self._arm_nonce: int | None = None
         self._lease_sent_s = self._status_asked_s = self._clock_sent_s = self._heard_s = 0.0
-        self._queue_points = 0
+        self._queue_points = self._reset_code = 0
+        self._leasing = False
+        self.faults: Counter[str] = Counter()
+        self.lease_ages = Histogram(LEASE_AGES_S)
+        self.lease_slack_s: float | None = None
+        self._watch = LinkWatch(transport.name, requirements.lease_s)
         self.board = BoardView()
         self.connected = False
         self.last_reason = ""
+        self.aborted = False
+        """Whether the board has said that it took the last ABORT: dark, queue dropped, DISARMED."""
 
     @property
     def port(self) -> str:
@@ -108,13 +98,20 @@ class Session:
     # --- connecting ---------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the link and shake hands; LinkError without an answer, InputError for a board that does not fit."""
-        self._transport.open()
+        """Open the link and shake hands; LinkError without an answer, InputError for a board that does not fit.
+
+        Until it has succeeded the clock known before goes on: heat is kept in its time.
+        """
+        known = self._sync
         try:
+            self._transport.open()
             self._shake_hands()
         except (LinkError, InputError):
+            self._sync = known
             self._transport.close()
+            self._watch.not_back(self._clock.now_s())
             raise
+        self._watch.back(self._clock.now_s(), self._reset_code, self.board_s(), self._counts())
         self.connected = True
 
     def _shake_hands(self) -> None:
@@ -133,7 +130,7 @@ class Session:
             self._ask_status()
             self._exchange(0.02)
             if self._clock.now_s() > give_up_s:
-                raise LinkError(f"{self.port}: the board greets, but does not answer further; {self._counters()}")
+                raise LinkError(f"{self.port}: the board greets, but does not answer further; {self._damage()}")
         for _ in range(CLOCK_FIRST):
             self._ask_clock()
             self._exchange(0.005)
@@ -151,9 +148,9 @@ class Session:
     def _take_hello(self, peer: m.HelloReply, now_s: float) -> None:
         self._requirements.check(peer)
         self.board.uid, self.board.firmware = peer.uid.hex(), peer.firmware
-        self._queue_points = peer.queue_points
+        self._queue_points, self._reset_code = peer.queue_points, peer.reset_cause
         self._points.restart()
-        self._connection.send(self._requirements.limits())
+        self._connection.send(self._requirements.limits(), first=True)  # an order may wait for this session already
         self._ask_status()
 
     def _forget(self) -> None:
@@ -164,11 +161,22 @@ class Session:
         self._refusal = None
         self.board = BoardView()
         self._heard_s = self._clock.now_s()
+        self._watch.opened()
 
     def drop(self) -> None:
-        """Give the link up after an error."""
+        """Give the link up."""
         self.connected = False
         self._transport.close()
+
+    def lost(self, error: Exception) -> str:
+        """Give the link up after an error; the error, and why it likely came where the link itself failed."""
+        told = str(error)
+        if isinstance(error, LinkError):
+            now_s = self._clock.now_s()
+            cause = self._watch.lost(now_s, self._heard_s, silent=now_s - self._heard_s > SILENCE_S)
+            told = f"{told}; likely cause: {cause.sentence}"
+        self.drop()
+        return told
 
     def close(self) -> None:
         """Tell the board to abort, if it can still be told, and close the link for good."""
@@ -187,13 +195,11 @@ class Session:
     def step(self, wait_s: float, lease: bool) -> None:
         """Send what is due, wait at most wait_s for bytes, take them in. lease: whether the planner is alive."""
         now_s = self._clock.now_s()
-        if (
-            lease
-            and self.board.state in LEASED
-            and now_s - self._lease_sent_s >= LEASE_SHARE * self._requirements.lease_s
-        ):
-            self._connection.send(m.Lease(ms=round(self._requirements.lease_s * 1e3)))
-            self._lease_sent_s = now_s
+        self._watch.turn(now_s, lease, self._counts())
+        if self.board.state not in LEASED:
+            self._leasing = False
+        elif lease and now_s - self._lease_sent_s >= LEASE_SHARE * self._requirements.lease_s:
+            self._renew_lease(now_s)
         if now_s - self._status_asked_s >= STATUS_EVERY_S:
             self._ask_status()
         if now_s - self._clock_sent_s >= CLOCK_EVERY_S:
@@ -202,7 +208,16 @@ class Session:
         self._stream()
         self._exchange(wait_s)
         if now_s - self._heard_s > SILENCE_S:
-            raise LinkError(f"{self.port}: the board fell silent for {SILENCE_S:g} s; {self._counters()}")
+            raise LinkError(f"{self.port}: the board fell silent for {SILENCE_S:g} s; {self._damage()}")
+
+    def _renew_lease(self, now_s: float) -> None:
+        lease_s, age_s = self._requirements.lease_s, now_s - self._lease_sent_s
+        self._connection.send(m.Lease(ms=round(lease_s * 1e3)))
+        self._lease_sent_s = now_s
+        if self._leasing:
+            self.lease_ages.add(age_s)
+            self.lease_slack_s = min(lease_s if self.lease_slack_s is None else self.lease_slack_s, lease_s - age_s)
+        self._leasing = True
 
     def _exchange(self, wait_s: float) -> None:
         out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes)
@@ -258,13 +273,21 @@ class Session:
         board.format_errors, board.seq_errors = message.format_errors, message.seq_errors
         board.laser_on_s = message.laser_on_us * 1e-6
         board.temperature_c = message.temperature_dc / 10.0
-        board.fault = m.FAULTS[message.fault]
+        self._note_fault(m.FAULTS[message.fault])
+        self._watch.heard(board.fault, now_s, self._counts())
         self._set_state(m.STATES[message.state])
 
     def _take_event(self, message: m.Event, now_s: float) -> None:
-        self.board.fault = m.FAULTS[message.fault]
+        self.aborted |= self._connection.peer is None and m.REASONS[message.reason] == "abort"
+        self._note_fault(m.FAULTS[message.fault])
+        self._watch.heard(self.board.fault, now_s, self._counts())
         self.last_reason = m.REASONS[message.reason]
         self._set_state(m.STATES[message.state])
+
+    def _note_fault(self, fault: str) -> None:
+        if fault and fault != self.board.fault:
+            self.faults[fault] += 1
+        self.board.fault = fault
 
     def _set_state(self, state: str) -> None:
         self.board.state = state
@@ -307,6 +330,7 @@ class Session:
     def abort(self) -> None:
         """Gate off now, queue dropped, DISARMED; goes ahead of everything else that waits to be sent."""
         self._refusal = None
+        self.aborted = False
         self._connection.abort()
         self._greet()
 
@@ -331,6 +355,10 @@ class Session:
         tick_s = self.scale.tick_s
         return self._points.follow(points, keep, ahead_s / tick_s, (self.board_s() + FOLLOW_S) / tick_s)
 
+    def end_after(self, keep: int) -> bool:
+        """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
+        return self._points.end_after(keep)
+
     def _stream(self) -> None:
         if not self._points:
             return
@@ -342,21 +370,31 @@ class Session:
 
     # --- figures ------------------------------------------------------------------------------------------------
 
+    @property
+    def likely_cause(self) -> Cause | None:
+        """Why the link was lost last, or the lease lapsed, as far as can be told; None before that."""
+        return self._watch.cause
+
     def link_figures(self) -> dict[str, Any]:
         """Counters of the link, for people who wonder why it is slow or lost; any thread may ask."""
-        counters, round_trip_s = self._connection.counters, self._sync.round_trip_s
+        counts, round_trip_s, cause = self._counts(), self._sync.round_trip_s, self._watch.cause
         return {
             "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
-            "received_bad": counters.crc_errors + counters.format_errors,
-            "retransmitted": counters.retransmitted,
-            "naks": counters.naks,
-            "board_bad": self.board.crc_errors + self.board.format_errors,
+            "received_bad": counts.bad_here,
+            "retransmitted": counts.sent_again,
+            "naks": counts.naks,
+            "board_bad": counts.bad_at_board,
             "underruns": self.board.underruns,
+            "longest_stall_ms": self._watch.longest_gap_s * 1e3,
+            "likely_cause": None if cause is None else cause.sentence,
+            "likely_cause_ago_s": None if cause is None else self._clock.now_s() - cause.at_s,
         }
 
-    def _counters(self) -> str:
-        figures = self.link_figures()
-        return (
-            f"{figures['received_bad']} bad frames here, {figures['board_bad']} at the board, "
-            f"{figures['retransmitted']} sent again"
-        )
+    def _counts(self) -> Counts:
+        here, board = self._connection.counters, self.board
+        bad = here.crc_errors + here.format_errors, board.crc_errors + board.format_errors
+        return Counts(*bad, here.retransmitted, here.naks)
+
+    def _damage(self) -> str:
+        counts = self._counts()
+        return f"{counts.bad_here} bad frames here, {counts.bad_at_board} at the board, {counts.sent_again} sent again"

@@ -45,12 +45,16 @@ class PointStream:
         None where more has left already, or `keep` points end before soonest_tick and the board might run dry.
         """
         last = self._jobs[-1] if self._jobs else None
-        if last is None or self._end_sent or not self._started or last.end_tick_of(keep) < soonest_tick:
+        if last is None or not self._started or last.end_tick_of(keep) < soonest_tick or not self.end_after(keep):
             return None
-        if not last.cut(keep):
-            return None
-        self._next_index = last.end_index
         return self._append(points, last.end_tick_of(keep), ahead_ticks)
+
+    def end_after(self, keep: int) -> bool:
+        """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
+        if not self._jobs or self._end_sent or not self._jobs[-1].cut(keep):
+            return False
+        self._next_index = self._jobs[-1].end_index
+        return True
 
     def _append(self, points: WirePoints, start_tick: int, ahead_ticks: float) -> Job:
         job = Job(self._number, points, self._next_index, start_tick, ahead_ticks)

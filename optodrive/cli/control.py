@@ -34,7 +34,7 @@ def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def _call(url: str, method: str, path: str) -> dict[str, Any]:
-    from optodrive.cli.remote import Remote
+    from optodrive.remote import Remote
 
     return Remote(url).call(method, path)
 
@@ -49,5 +49,7 @@ def _print(state: dict[str, Any], as_json: bool) -> None:
     print(f"board     {board['state']}" + (f", fault {board['fault']}: {board['hint']}" if board["fault"] else ""))
     print(f"queue     {state['queue']['waiting']} waiting, running {state['queue']['running'] or 'nothing'}")
     print(f"executed  {state['totals']['executed']} pulses of {state['totals']['sent']} sent")
+    if state["link"]["likely_cause"]:
+        print(f"cause     {state['link']['likely_cause_ago_s']:.0f} s ago: {state['link']['likely_cause']}")
     if state["link"]["error"]:
         print(f"error     {state['link']['error']}")

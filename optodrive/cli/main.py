@@ -6,9 +6,27 @@ from typing import Any
 
 import typer
 
-from optodrive.cli import config_cmd, control, diagnose, plan, play, recording_cmd, serve, simulate, validate_cmd
+from optodrive.cli import (
+    calibrate,
+    config_cmd,
+    control,
+    diagnose,
+    doctor,
+    field_cmd,
+    helios,
+    home,
+    plan,
+    play,
+    recording_cmd,
+    serve,
+    service,
+    simulate,
+    validate_cmd,
+    wire_cmd,
+)
 from optodrive.errors import OptodriveError
 
+INTERRUPTED = 130
 UsageError: Any = typer.BadParameter.__bases__[0]
 """The base of every complaint about arguments; typer brings its own copy of click, or uses click's."""
 
@@ -19,7 +37,24 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for module in (serve, control, play, plan, simulate, recording_cmd, diagnose, validate_cmd, config_cmd):
+for module in (
+    serve,
+    home,
+    calibrate,
+    field_cmd,
+    service,
+    control,
+    play,
+    plan,
+    simulate,
+    helios,
+    recording_cmd,
+    diagnose,
+    validate_cmd,
+    config_cmd,
+    wire_cmd,
+    doctor,
+):
     module.register(app)
 
 
@@ -35,13 +70,15 @@ def run(arguments: list[str]) -> int:
     try:
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
         sys.stdout.flush()
+        if status == INTERRUPTED:  # some versions of typer turn a Ctrl-C into a status
+            raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
         print(f"optodrive: {error}", file=sys.stderr)
         return error.exit_status
     except (typer.Abort, KeyboardInterrupt):
         print("optodrive: interrupted", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except UsageError as error:
         message = " ".join(error.format_message().split())
         if message:  # without arguments there is none: help was shown instead

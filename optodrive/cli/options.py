@@ -22,7 +22,18 @@ ModelOption = Annotated[
     Path | None,
     typer.Option("--model", metavar="model.toml", help="Plan with this parameter set, as `diagnose` writes it."),
 ]
-UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens.")]
+FieldOption = Annotated[
+    Path | None, typer.Option("--field", metavar="field.toml", help="Aim by this field, as `calibrate` writes it.")
+]
+MirrorsOption = Annotated[
+    Path | None,
+    typer.Option("--mirrors", metavar="mirrors.toml", help="Time moves by these mirrors, as `calibrate` writes them."),
+]
+PixelMapOption = Annotated[
+    Path | None,
+    typer.Option("--pixels-map", metavar="pixels.toml", help="Plan with this map of pixels, as `calibrate` writes it."),
+]
+UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens; unix:PATH for its socket.")]
 StrictOption = Annotated[bool, typer.Option("--strict", help="The same as --policy refuse.")]
 PolicyOption = Annotated[
     Literal["trim", "delay", "refuse"],
@@ -45,11 +56,24 @@ def model_file(path: Path) -> Path:
     return path
 
 
-def configured(config: str | None, model: Path | None) -> "Config":
-    """The configuration, its pixels following the model where one is given; InputError with one line."""
-    from optodrive.config import load_config
+def configured(
+    config: str | None,
+    model: Path | None,
+    field: Path | None = None,
+    mirrors: Path | None = None,
+    pixels_map: Path | None = None,
+) -> "Config":
+    """The configuration, following a model and what was calibrated where given; InputError with one line."""
+    from optodrive.config import load_config, with_mirrors
+    from optodrive.pixel_map import with_map
 
-    loaded = load_config(config)
+    # A file of mirrors lowers a cap: the one asked for here stands in place of the configuration's, not on top of it.
+    loaded = load_config(config) if mirrors is None else with_mirrors(load_config(config, measured=False), mirrors)
+    if field is not None:
+        scanner = loaded.scanner.model_copy(update={"field": str(field)})
+        loaded = loaded.model_copy(update={"scanner": scanner})
+    if pixels_map is not None:
+        loaded = with_map(loaded, pixels_map)
     if model is None:
         return loaded
     section = loaded.pixel_model.model_copy(update={"parameters": str(model_file(model))})
@@ -116,6 +140,8 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
         lines.append(
             f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms"
         )
+    if summary["dead"]["sentence"]:
+        lines.append(f"dead             {summary['dead']['sentence']}")
     if summary["skipped"]:
         lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
     return lines

@@ -7,9 +7,12 @@ import typer
 
 from optodrive.cli.options import (
     ConfigOption,
+    FieldOption,
     FitOption,
     JsonOption,
+    MirrorsOption,
     ModelOption,
+    PixelMapOption,
     PolicyOption,
     StrictOption,
     announce_compilation,
@@ -32,6 +35,9 @@ def plan(
     out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row a pulse.")] = None,
     config: ConfigOption = None,
     model: ModelOption = None,
+    field: FieldOption = None,
+    mirrors: MirrorsOption = None,
+    pixels_map: PixelMapOption = None,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
     fit: FitOption = "as_is",
@@ -43,7 +49,7 @@ def plan(
     from optodrive.pipeline import Display, chosen
     from optodrive.summary import summary, write_plan_csv
 
-    display = Display.of(configured(config, model))
+    display = Display.of(configured(config, model, field, mirrors, pixels_map))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
     with progress("planning") as done:

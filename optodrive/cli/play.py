@@ -21,7 +21,7 @@ from optodrive.cli.options import (
 from optodrive.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
-    from optodrive.cli.remote import Remote
+    from optodrive.remote import Remote
 
 POLL_S = 0.1
 
@@ -46,7 +46,7 @@ def push(
     json: JsonOption = False,
 ) -> None:
     """Plan frames and trains, show them, and say what was executed."""
-    from optodrive.cli.remote import Remote
+    from optodrive.remote import Remote
 
     try:
         body = frames.read_bytes()
@@ -70,7 +70,7 @@ def play(
     json: JsonOption = False,
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
-    from optodrive.cli.remote import Remote
+    from optodrive.remote import Remote
 
     given = _parameters(pattern, values or [])
     remote = Remote(url)

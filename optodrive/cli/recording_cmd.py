@@ -1,4 +1,4 @@
-"""`optodrive recording convert | show`."""
+"""`optodrive recording convert | show | merge`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,6 +20,7 @@ def register(app: typer.Typer) -> None:
     group = typer.Typer(help="Look into measured data, or turn one form of it into the other.", no_args_is_help=True)
     group.command("convert")(convert)
     group.command("show")(show)
+    group.command("merge")(merge)
     app.add_typer(group, name="recording")
 
 
@@ -61,6 +62,28 @@ def show(
     if out is not None:
         part = "" if drawn == len(runs) else f", the first {drawn} of {len(runs)} runs"
         print(f"written          {out}{part}")
+
+
+def merge(
+    session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="As `serve --record-session` writes it.")],
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
+    out: Annotated[Path, typer.Option("--out", metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a folder.")],
+    shift: Annotated[float, typer.Option("--shift", metavar="SECONDS", help="Added to every time measured.")] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """Join a session's pulses, as executed, with what was measured meanwhile: a recording for `diagnose`."""
+    from optodrive.recording import write_recording
+    from optodrive.recording.merge import merge_session
+
+    measurement = merge_session(session, measured, shift)
+    write_recording(out, measurement)
+    pulses = sum(len(run.pulses) for run in measurement.runs)
+    if json:
+        print_json({"written": str(out), "runs": len(measurement.runs), "pulses": pulses})
+    else:
+        print(f"runs             {len(measurement.runs)}")
+        print(f"pulses           {pulses}")
+        print(f"written          {out}")
 
 
 def _draw(out: Path, measurement: "Measurement") -> int:

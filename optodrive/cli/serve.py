@@ -1,10 +1,22 @@
 """`optodrive serve`: the daemon."""
 
-from typing import Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, ModelOption, announce_compilation, configured
+from optodrive.cli.options import (
+    ConfigOption,
+    FieldOption,
+    MirrorsOption,
+    ModelOption,
+    PixelMapOption,
+    announce_compilation,
+    configured,
+)
+
+if TYPE_CHECKING:
+    from optodrive.config import Config
 
 
 def register(app: typer.Typer) -> None:
@@ -15,15 +27,30 @@ def register(app: typer.Typer) -> None:
 def serve(
     config: ConfigOption = None,
     model: ModelOption = None,
+    field: FieldOption = None,
+    mirrors: MirrorsOption = None,
+    pixels_map: PixelMapOption = None,
     port: Annotated[
         int | None, typer.Option("--port", min=0, max=65535, help="TCP port, instead of the configured.")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option("--record", metavar="FILE", help="Note every byte on the link to the board in a new file."),
+    ] = None,
+    record_session: Annotated[
+        Path | None,
+        typer.Option("--record-session", metavar="FILE.h5", help="Note what is asked, planned and executed."),
     ] = None,
 ) -> None:
     """Run the daemon: the engine that drives the board, and REST."""
     from optodrive.daemon.server import run
 
-    loaded = configured(config, model)
-    if port is not None:
-        loaded = loaded.model_copy(update={"daemon": loaded.daemon.model_copy(update={"port": port})})
+    def load() -> "Config":
+        loaded = configured(config, model, field, mirrors, pixels_map)
+        if port is None:
+            return loaded
+        return loaded.model_copy(update={"daemon": loaded.daemon.model_copy(update={"port": port})})
+
+    first = load()
     announce_compilation()
-    run(loaded)
+    run(first, record, load, record_session)

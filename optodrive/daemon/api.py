@@ -8,16 +8,23 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request, WebSocket
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import JSONResponse
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 
 from optodrive import __version__
 from optodrive.admission import Fit
-from optodrive.daemon.auth import BodyTooLargeError, Guard, problem
+from optodrive.daemon.auth import FACTS, Door, Guard, problem
+from optodrive.daemon.bodies import BodyTooLargeError
+from optodrive.daemon.described import ERRORS, EVENTS, describe
+from optodrive.daemon.described_bodies import PARAMETERS, PATTERN_NAMES, SEQUENCE, SHOWN, json_body
 from optodrive.daemon.engine import Engine
 from optodrive.daemon.live import LiveStream
+from optodrive.daemon.metrics import CONTENT_TYPE
+from optodrive.daemon.promptness import InTurn, written
 from optodrive.daemon.resolved import resolved_config
+from optodrive.daemon.site import add_page
+from optodrive.daemon.telemetry import RATE_HZ, EventStream, Telemetry
 from optodrive.errors import (
     BoardFaultError,
     InputError,
@@ -41,37 +48,34 @@ STATUS: tuple[tuple[type[OptodriveError], int], ...] = (
     (BoardFaultError, 409),
     (LinkError, 503),
 )
-ERRORS: dict[int | str, dict[str, Any]] = {
-    status: {"description": text, "content": {"application/problem+json": {}}}
-    for status, text in {
-        401: "no token, or a wrong one",
-        403: "a foreign Origin",
-        404: "no such thing",
-        409: "refused, or not possible in this state",
-        413: "body too large",
-        421: "a foreign Host",
-        422: "bad input",
-        503: "no link to the board",
-    }.items()
-}
 PlanId = Annotated[str, Path(max_length=40)]
 DryRun = Annotated[bool, Query(description="plan and limit only; nothing moves")]
 Newest = Annotated[bool, Query(description="take the place of everything that has not left for the board yet")]
 Strict = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="what becomes of a frame that a cap does not allow as it is")]
 
+RateQuery = Annotated[float, Query(ge=1, le=60, description="looks at the display a second, while it is warm")]
 FitQuery = Annotated[Fit, Query(description="what becomes of a sequence that does not fit on the beam as it is")]
 
 
-def make_app(engine: Engine, token: str) -> FastAPI:
+def make_app(engine: Engine, door: Door) -> FastAPI:
     """The daemon's web application over a running engine."""
     display = engine.display
-    daemon = display.config.daemon
-    guard = Middleware(Guard, token=token, hosts=daemon.hosts, body_max_bytes=daemon.body_max_bytes)
+    guard = Middleware(Guard, door=door)
+    telemetry = Telemetry(engine)
     app = FastAPI(
-        title="optodrive", version=__version__, middleware=[guard], responses=ERRORS, docs_url=None, redoc_url=None
+        generate_unique_id_function=lambda route: route.name,
+        title="optodrive",
+        version=__version__,
+        middleware=[Middleware(InTurn), guard],
+        responses=ERRORS,
+        docs_url=None,
+        redoc_url=None,
+        lifespan=telemetry.while_served,
     )
+    app.state.telemetry = telemetry
     _add_error_answers(app)
+    add_page(app)
 
     @app.get("/v1/health")
     async def health() -> Answer:
@@ -82,6 +86,11 @@ def make_app(engine: Engine, token: str) -> FastAPI:
     async def state() -> Answer:
         """The board, the link, the queue, the display's heat."""
         return engine.snapshot()
+
+    @app.get("/metrics", response_class=PlainTextResponse)
+    async def figures() -> PlainTextResponse:
+        """Figures for Prometheus."""
+        return PlainTextResponse(engine.metrics(), media_type=CONTENT_TYPE)
 
     @app.get("/v1/config")
     async def config() -> Answer:
@@ -103,7 +112,12 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         """Gate off now, everything queued dropped, board disarmed."""
         return await _result(engine.stop())
 
-    @app.post("/v1/plans", status_code=201, openapi_extra=_json_body("FRAMES.json: frames and trains"))
+    @app.post(
+        "/v1/plans",
+        status_code=201,
+        response_model=Answer,
+        openapi_extra=json_body("FRAMES.json: frames and trains", SEQUENCE, SHOWN, True),
+    )
     async def push(
         request: Request,
         dry_run: DryRun = False,
@@ -111,25 +125,30 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         policy: PolicyQuery = "trim",
         newest: Newest = False,
         fit: FitQuery = "as_is",
-    ) -> Answer:
+    ) -> Response:
         """Plan frames and trains, and show them."""
         body = await request.body()
         policy = chosen(policy, strict)
-        return await _result(
-            engine.submit(
-                lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
-            )
+        planned = engine.submit(
+            lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
         )
+        return await written(await _shown(request, planned), 201)
 
     @app.websocket("/v1/stream")
     async def stream(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
         """Frames in, the newest wins; what became of each out."""
         await LiveStream(engine, socket, policy, problem_of).run()
 
-    @app.get("/v1/plans/{plan_id}")
-    async def plan(plan_id: PlanId, pulses: Annotated[bool, Query(description="list every pulse")] = True) -> Answer:
+    @app.get("/v1/telemetry", status_code=200, response_class=EventStream, responses=EVENTS)
+    async def watch(rate_hz: RateQuery = RATE_HZ) -> EventStream:
+        """What happens now, as server-sent events until the caller leaves: state, display, pulses, budget, fault."""
+        telemetry.check_room()
+        return EventStream(telemetry.events(rate_hz))
+
+    @app.get("/v1/plans/{plan_id}", response_model=Answer)
+    async def plan(plan_id: PlanId, pulses: Annotated[bool, Query(description="list every pulse")] = True) -> Response:
         """One plan: what was planned, sent, executed."""
-        return engine.plan(plan_id, pulses)
+        return await written(engine.plan(plan_id, pulses))
 
     @app.delete("/v1/plans/{plan_id}")
     async def cancel(plan_id: PlanId) -> Answer:
@@ -141,32 +160,39 @@ def make_app(engine: Engine, token: str) -> FastAPI:
         """The named patterns and their parameters."""
         return {"patterns": describe_patterns()}
 
-    @app.post("/v1/patterns/{name}", status_code=201, openapi_extra=_json_body("the pattern's parameters"))
+    @app.post(
+        "/v1/patterns/{name}",
+        status_code=201,
+        response_model=Answer,
+        openapi_extra=json_body("the pattern's parameters", PARAMETERS, {}, False),
+    )
     async def play(
-        name: Annotated[str, Path(max_length=80)],
+        name: Annotated[str, Path(max_length=80, json_schema_extra=PATTERN_NAMES)],
         request: Request,
         dry_run: DryRun = False,
         strict: Strict = False,
         policy: PolicyQuery = "trim",
         fit: FitQuery = "as_is",
-    ) -> Answer:
+    ) -> Response:
         """Build a named pattern, plan it, show it."""
         body = await request.body()
         given = parse_json(body, "body") if body.strip() else {}
         if not isinstance(given, dict):
             raise InputError("body", given, "an object of the pattern's parameters")
         policy = chosen(policy, strict)
-        return await _result(
-            engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy, fit)
-        )
+        planned = engine.submit(lambda: build_pattern(name, given, display.config), name, dry_run, policy, fit)
+        return await written(await _shown(request, planned), 201)
 
+    describe(app)
     return app
 
 
-def _json_body(description: str) -> dict[str, Any]:
-    return {
-        "requestBody": {"description": description, "content": {"application/json": {"schema": {"type": "object"}}}}
-    }
+async def _shown(request: Request, future: "Future[Answer]") -> Answer:
+    """What was planned, told to the audit file too."""
+    answer = await _result(future)
+    keys = {"plan": "plan", "name": "pattern", "planned": "pulses", "status": "plan_status"}
+    request.scope[FACTS].update({named: answer[key] for key, named in keys.items() if key in answer})
+    return answer
 
 
 async def _result(future: "Future[Answer]") -> Answer:

@@ -9,80 +9,66 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from itertools import count
 from queue import Empty, SimpleQueue
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from optodrive.admission import Admission, Fit, admit
+from optodrive.admission import Fit
 from optodrive.board.faults import hint
+from optodrive.board.link_watch import Cause
 from optodrive.board.requirements import Requirements
 from optodrive.board.session import Session
-from optodrive.clock import Clock
+from optodrive.clock import Clock, claim_processor
+from optodrive.daemon.metrics import PlanTally, metrics
+from optodrive.daemon.planner import Order, Planner
 from optodrive.daemon.plans import PlanBook, PlanRecord
-from optodrive.daemon.programme import Basis, Programme
+from optodrive.daemon.programme import Programme
+from optodrive.daemon.runs import ClockMoved, Progress
 from optodrive.daemon.waits import Answer, Waits, promise
 from optodrive.errors import InputError, LinkError, NotReadyError, OptodriveError
-from optodrive.flow import BudgetState, FrameSequence, TactileFrame
-from optodrive.frames.live import may_be_split, unseen_first
-from optodrive.limit.limiter import Policy, verify
-from optodrive.pipeline import Display, Prepared, prepare, warm_up
+from optodrive.flow import FrameSequence, TactileFrame
+from optodrive.limit.limiter import Policy
+from optodrive.pipeline import Display, warm_up
 from optodrive.transport.base import Transport
-from optodrive.wire.quantise import decode, quantise
+from optodrive.wire.quantise import WireScale
 
 TURN_S = 0.002
 IDLE_TURN_S = 0.01
-PLANNER_STALL_S = 2.0
-"""A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
 SWITCH_INTERVAL_S = 2e-4
 RECONNECT_S = 1.0
 QUEUE_MAX = 50
-PLANNING_GUESS_S = 0.01
-ALLOWANCE = 1.5
-"""A streamed plan is given so many times as long to be made as the last one took."""
 LOOP_TIMEOUT_S = 5.0
 T = TypeVar("T")
-
-
-class _Order(NamedTuple):
-    """What a caller asks for; arrived_s: board time."""
-
-    build: Callable[[], FrameSequence]
-    name: str
-    dry_run: bool
-    policy: Policy
-    fit: Fit
-    streamed: bool
-    arrived_s: float
 
 
 class Engine:
     """Runs plans on a board. Methods that return futures may be called from any thread.
 
     failure: what ended the loop, None while it runs; on_failure is then called, after the board was told to abort.
+    say: gets a line whenever the link goes wrong, for the log. on_turn: called at every turn of the loop; must be quick
     """
 
     def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
         self.display = display
         self.failure: BaseException | None = None
         self.on_failure: Callable[[], None] = lambda: None
+        self.say: Callable[[str], None] = lambda line: None
+        self.on_turn: Callable[[], None] = lambda: None
         self._clock = clock
         self._session = Session(transport, clock, Requirements.of(display.config))
         self._book = PlanBook()
+        self._tally = PlanTally()
+        self._book.on_end.append(self._tally.note)
         self._bookkeeper = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
         self._programme = Programme(display, self._session, self._book, self._bookkeeper)
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
         self._waits = Waits()
-        self._ids = count(1)
-        self._lock = threading.RLock()
         self._closing = threading.Event()
-        self._planner = ThreadPoolExecutor(1, thread_name_prefix="planner")
-        self._plans_pending = 0
-        self._progress_at_s = clock.now_s()
+        self._planner = Planner(display, self._session, self._programme, clock, self._by_loop, self._require_armed)
         self._link_error: str | None = None
+        self._told: Cause | None = None
         self._retry_at_s = 0.0
-        self._planning_s = PLANNING_GUESS_S
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
     # --- life ---------------------------------------------------------------------------------------------------
@@ -106,16 +92,19 @@ class Engine:
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
         self._session.close()
-        self._planner.shutdown(wait=False, cancel_futures=True)
+        self._planner.close()
         self._bookkeeper.shutdown(wait=False, cancel_futures=True)
 
     def _run(self) -> None:
+        claim_processor()
         try:
             while not self._closing.is_set():
                 try:
                     self._turn()
                 except (LinkError, InputError) as error:
                     self._link_lost(error)
+                self._tell_cause()
+                self.on_turn()
         except BaseException as error:
             self.failure = error
             raise
@@ -130,7 +119,7 @@ class Engine:
             self._reconnect()
             return
         busy = self._programme.busy or self._waits
-        self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner_alive())
+        self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner.alive)
         refusal = self._session.take_refusal()
         self._settle_waits(refusal)
         self._programme.follow_jobs(refusal)
@@ -144,16 +133,11 @@ class Engine:
                 return
             command()
 
-    def _planner_alive(self) -> bool:
-        with self._lock:
-            return self._plans_pending == 0 or self._clock.now_s() - self._progress_at_s < PLANNER_STALL_S
-
     # --- the link -----------------------------------------------------------------------------------------------
 
     def _link_lost(self, error: OptodriveError) -> None:
-        self._link_error = str(error)
-        self._session.drop()
-        self._programme.fail_all(str(error))
+        self._link_error = self._session.lost(error)
+        self._programme.fail_all(self._link_error)
         self._retry_at_s = self._clock.now_s() + RECONNECT_S
 
     def _reconnect(self) -> None:
@@ -171,6 +155,13 @@ class Engine:
         # The board may have restarted its clock: what is known of heat moves onto the new one.
         self._programme.board_restarted(self._session.board_s() - before_s)
         self._link_error = None
+
+    def _tell_cause(self) -> None:
+        cause = self._session.likely_cause
+        if cause is not self._told:
+            self._told = cause
+            if cause is not None:
+                self.say(f"board at {self._session.port}: {cause.sentence}")
 
     # --- commands from any thread -------------------------------------------------------------------------------
 
@@ -230,34 +221,7 @@ class Engine:
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is where the newest wins: a stream has no time to ask what else would fit")
         arrived_s = self.board_s() if arrived_s is None else arrived_s
-        order = _Order(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s)
-        with self._lock:
-            if self._plans_pending == 0:
-                self._progress_at_s = self._clock.now_s()
-            self._plans_pending += 1
-        return self._planner.submit(self._plan, order)
-
-    def _plan(self, order: "_Order") -> Answer:
-        try:
-            self._note_progress(0.0)
-            sequence = order.build()
-            allowance_s = ALLOWANCE * self._planning_s
-            while True:
-                if not order.dry_run:
-                    self._require_armed()
-                if order.streamed and self._programme.in_the_way:
-                    self._by_loop(self._programme.make_way)
-                record = self._planned(sequence, order, allowance_s)
-                if record is not None:
-                    return record.answer(self._session.board_s())
-                allowance_s *= 2.0
-        finally:
-            with self._lock:
-                self._plans_pending -= 1
-            self._note_progress(1.0)
-
-    def _note_progress(self, _share: float) -> None:
-        self._progress_at_s = self._clock.now_s()
+        return self._planner.submit(Order(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s))
 
     def _require_armed(self) -> None:
         self._require_link()
@@ -267,49 +231,6 @@ class Engine:
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
         if len(self._programme.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
-
-    def _planned(self, sequence: FrameSequence, order: "_Order", allowance_s: float) -> PlanRecord | None:
-        """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
-        began_s = self._clock.now_s()
-        basis = self._programme.basis(order.streamed, allowance_s)
-        heat, budget = basis.heat, basis.budget
-        prepared, admission = self._prepared(sequence, order, basis)
-        points = quantise(prepared.plan, self._session.scale)
-        record = PlanRecord(
-            plan_id=f"p{next(self._ids)}",
-            name=order.name,
-            prepared=prepared,
-            admission=admission,
-            points=points,
-            heat_before=heat,
-            budget_before=budget,
-            start_s=basis.start_s,
-            arrived_s=order.arrived_s,
-            streamed=order.streamed,
-            seen=basis.seen,
-        )
-        self._prove(record, budget)
-        self._planning_s = self._clock.now_s() - began_s
-        if order.dry_run:
-            return record
-        return record if self._by_loop(lambda: self._programme.take(record, basis)) else None
-
-    def _prepared(self, sequence: FrameSequence, order: "_Order", basis: Basis) -> tuple[Prepared, Admission | None]:
-        """The plan; a stream has no time to ask what else would fit."""
-        if not order.streamed:
-            told, from_where = self._note_progress, (basis.heat, basis.budget)
-            return admit(self.display, sequence, *from_where, order.policy, told, order.fit)
-        if basis.seen is not None and may_be_split(sequence):
-            sequence = unseen_first(sequence, basis.seen)
-        return prepare(
-            self.display,
-            sequence,
-            basis.heat,
-            basis.budget,
-            order.policy,
-            self._note_progress,
-            standing_on=basis.standing_on,
-        ), None
 
     def _in_loop(self, action: Callable[[], T]) -> "Future[T]":
         """Do something in the loop's thread, which owns the session."""
@@ -330,12 +251,6 @@ class Engine:
             return self._in_loop(action).result(LOOP_TIMEOUT_S)
         except TimeoutError:
             raise LinkError(f"the engine did not answer within {LOOP_TIMEOUT_S:g} s: {self.failure!r}") from None
-
-    def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
-        """Decode the very bytes that will leave, and hold them against the budget."""
-        points, plan = record.points, record.prepared.plan
-        decoded = decode(points.payload(), self._session.scale)
-        verify(plan.pixel[points.row[decoded.index]], decoded, budget, self.display.budget)
 
     def board_s(self) -> float:
         """The board's time now, s."""
@@ -364,12 +279,44 @@ class Engine:
 
         return self._in_loop(end)
 
+    def on_plan_end(self, tell: Callable[[PlanRecord], None]) -> None:
+        """Have each plan told when it has ended, by whichever thread ended it; `tell` must not wait."""
+        self._book.on_end.append(tell)
+
+    @property
+    def tick_s(self) -> float:
+        """The board's tick, s."""
+        return self._session.scale.tick_s
+
     # --- what can be seen from outside --------------------------------------------------------------------------
 
     @property
     def link_name(self) -> str:
         """The board's port."""
         return self._session.port
+
+    @property
+    def linked(self) -> bool:
+        """Whether there is a link to the board, and its clock is known."""
+        return self._session.connected
+
+    @property
+    def scale(self) -> WireScale:
+        """How SI becomes codes on this board."""
+        return self._session.scale
+
+    def take_told(self) -> list[Progress | ClockMoved]:
+        """What was done since the last call, in order; for one reader."""
+        told, taken = self._programme.told, []
+        while told:
+            taken.append(told.popleft())
+        return taken
+
+    def coming(self) -> list[PlanRecord]:
+        """The plans that run, and the first that waits."""
+        programme = self._programme
+        waiting = programme.waiting.copy()
+        return [run.record for run in programme.running.copy()] + ([waiting[0]] if waiting else [])
 
     @property
     def board_state(self) -> str:
@@ -397,6 +344,10 @@ class Engine:
                     {"plan": item.plan_id, "name": item.name, "status": item.status} for item in self._book.recent()
                 ],
             },
-            "totals": dict(programme.totals),
-            "planner": {"busy": self._plans_pending > 0, "alive": self._planner_alive()},
+            "totals": {**programme.totals, "timing_error": programme.timing.figures()},
+            "planner": {"busy": self._planner.busy, "alive": self._planner.alive},
         }
+
+    def metrics(self) -> str:
+        """Everything GET /metrics answers."""
+        return metrics(self.snapshot(), self._tally, self._session, self.display.config.board.lease_s)

@@ -1,13 +1,15 @@
 """A submitted plan through its life: queued, running, then done, failed or cancelled."""
 
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 
 from optodrive.admission import Admission
+from optodrive.board.timing import TimingError
 from optodrive.daemon.waits import promise
 from optodrive.errors import InputError
 from optodrive.flow import BoolArray, BudgetState, ExecutedPulses, FloatArray, IntArray
@@ -34,7 +36,7 @@ class PlanRecord:
     streamed: a newer plan may take the place of what has not left, dropped pulses then
     arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
     seen: [p] pixels that a stream's sweep over the display had lit before it
-    ending: done when nothing more will happen to it
+    ending: done when nothing more will happen to it; told_end: is then called with it, and must neither wait nor raise
     """
 
     plan_id: str
@@ -55,12 +57,14 @@ class PlanRecord:
     simulated_m: FloatArray | None = None
     executed_count: int = 0
     delay_s: float = 0.0
+    timing_error: TimingError | None = None
     dropped: int = 0
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
     seen: BoolArray | None = None
     ending: "Future[None]" = field(default_factory=promise)
+    told_end: "Callable[[PlanRecord], None]" = field(default=lambda record: None)
 
     @property
     def ended(self) -> bool:
@@ -71,6 +75,7 @@ class PlanRecord:
         """Nothing more will happen to it."""
         self.status, self.error = status, error
         self.ending.set_result(None)
+        self.told_end(self)
 
     def answer(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
         """The plan as REST answers it; pulses: list them one by one."""
@@ -89,6 +94,7 @@ class PlanRecord:
                 "first_byte_s": self.first_byte_after_s,
                 "first_light_s": self.first_light_after_s,
             },
+            "timing_error": None if self.timing_error is None else asdict(self.timing_error),
             "summary": summary(self.prepared, self.admission),
             "pulses": pulse_columns(self.prepared) if pulses else None,
             "simulated_max_um": None,
@@ -134,14 +140,19 @@ class PlanRecord:
 
 
 class PlanBook:
-    """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread."""
+    """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread.
+
+    on_end: called with each plan when it has ended, by whichever thread ended it; must not wait
+    """
 
     def __init__(self) -> None:
+        self.on_end: list[Callable[[PlanRecord], None]] = []
         self._lock = threading.Lock()
         self._records: dict[str, PlanRecord] = {}
 
     def add(self, record: PlanRecord) -> None:
         """Keep a plan."""
+        record.told_end = self._tell_end
         with self._lock:
             self._records[record.plan_id] = record
             pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
@@ -150,6 +161,10 @@ class PlanBook:
                     break
                 del self._records[plan_id]
                 pulses -= len(oldest.prepared.plan)
+
+    def _tell_end(self, record: PlanRecord) -> None:
+        for told in self.on_end:
+            told(record)
 
     def find(self, plan_id: str) -> PlanRecord:
         """A plan by its id; InputError (no_plan) where there is none."""

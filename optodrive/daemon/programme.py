@@ -15,9 +15,11 @@ import numpy as np
 from optodrive.board.faults import hint
 from optodrive.board.job import Job
 from optodrive.board.session import Session
+from optodrive.board.timing import TimingTotals, timing_error
 from optodrive.daemon.plans import PlanBook, PlanRecord, Status
+from optodrive.daemon.runs import ClockMoved, Progress, Run
 from optodrive.daemon.thermal import Thermal, heated
-from optodrive.flow import BoolArray, BudgetState
+from optodrive.flow import BoolArray, BudgetState, FloatArray
 from optodrive.limit.limiter import fired, shifted
 from optodrive.physics.heat import Heat
 from optodrive.pipeline import Display
@@ -28,13 +30,8 @@ STREAM_LEAD_S = 0.02
 STREAM_AHEAD_S = 0.04
 """Points of a streamed plan leave so long before they begin; a host that stops for longer makes the board wait."""
 DELAY_NOTICED_S = 1e-5
-
-
-class Run(NamedTuple):
-    """A plan, and its points on their way."""
-
-    record: PlanRecord
-    job: Job
+TOLD_MAX = 20_000
+"""Where nobody takes away what was done: minutes of it. Notes are references, and cost the loop nothing."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,20 +53,33 @@ class Basis:
     seen: BoolArray | None = None
 
 
+class _Sweep(NamedTuple):
+    """How far a sweep over the display had come when a stream was cut: it goes on if nothing came between."""
+
+    thermal: Thermal
+    seen: BoolArray
+
+
 class Programme:
-    """Any thread may ask for `basis`, `busy`, `in_the_way`; all else belongs to the loop that owns the session."""
+    """Any thread may ask for `basis`, `busy`, `in_the_way`; all else belongs to the loop that owns the session.
+
+    told: what was done, the newest last, for one reader in another thread who takes it away.
+    """
 
     def __init__(self, display: Display, session: Session, book: PlanBook, bookkeeper: Executor) -> None:
         self.lock = threading.RLock()
         self.running: deque[Run] = deque()
         self.waiting: deque[PlanRecord] = deque()
         self.totals = {"planned": 0, "sent": 0, "executed": 0}
+        self.timing = TimingTotals()
+        self.told: deque[Progress | ClockMoved] = deque(maxlen=TOLD_MAX)
         self._display = display
         self._session = session
         self._book = book
         self._bookkeeper = bookkeeper
         self._thermal = Thermal(*display.at_rest())
         self._queue_end_s = 0.0
+        self._sweep: _Sweep | None = None
 
     @property
     def busy(self) -> bool:
@@ -81,16 +91,27 @@ class Programme:
     def basis(self, streamed: bool, allowance_s: float) -> Basis:
         """Where the next plan begins; a streamed one cuts the running one short, allowance_s for planning from now."""
         with self.lock:
-            thermal, start_s = self._thermal, self._earliest_start_s(streamed)
-            last = self.running[-1].record if streamed and self.running and not self.waiting else None
-        if last is not None and last.streamed:
+            thermal = self._thermal
+            start_s = self._earliest_start_s(streamed, allowance_s if streamed else 0.0)
+            last = self._last_streamed() if streamed else None
+        if last is not None:
             basis = self._within(last, thermal, self._session.board_s() + STREAM_AHEAD_S + allowance_s)
             if basis is not None:
                 return basis
-        return Basis(thermal, start_s, *thermal.seen_from(start_s))
+        sweep = self._sweep
+        seen = sweep.seen if streamed and sweep is not None and sweep.thermal is thermal else None
+        return Basis(thermal, start_s, *thermal.seen_from(start_s), seen=seen)
 
-    def _earliest_start_s(self, streamed: bool) -> float:
-        return max(self._queue_end_s, self._session.board_s()) + (STREAM_LEAD_S if streamed else START_LEAD_S)
+    def _last_streamed(self) -> PlanRecord | None:
+        """The running plan that a newer one may follow without a pause."""
+        if self.waiting or not self.running:
+            return None
+        record = self.running[-1].record
+        return record if record.streamed and not record.dropped else None
+
+    def _earliest_start_s(self, streamed: bool, allowance_s: float = 0.0) -> float:
+        lead_s = STREAM_LEAD_S if streamed else START_LEAD_S
+        return max(self._queue_end_s, self._session.board_s() + allowance_s) + lead_s
 
     def _within(self, record: PlanRecord, thermal: Thermal, from_s: float) -> Basis | None:
         """What is known where a running plan is cut before its first pulse after from_s; None where none is left."""
@@ -168,6 +189,20 @@ class Programme:
                 self._session.flush()
                 self.finish("superseded", "a newer plan took its place")
 
+    def end_soon(self) -> None:
+        """Cut the running streamed plan short by itself: what comes next begins anew after it, and need not hurry."""
+        with self.lock:
+            last = self._last_streamed()
+            if last is None:
+                return
+            basis = self._within(last, self._thermal, self._session.board_s() + STREAM_AHEAD_S)
+            if basis is None or not self._session.end_after(last.points.up_to(basis.cut)):
+                return
+            last.dropped = len(last.prepared.plan) - basis.cut
+            self._thermal = Thermal.after_plan(basis.heat, basis.budget, basis.start_s)
+            self._queue_end_s = basis.start_s
+            self._sweep = _Sweep(self._thermal, _seen(last, basis.cut))
+
     def _give_way(self, record: PlanRecord) -> None:
         record.dropped = len(record.prepared.plan)
         record.end("superseded", "a newer plan took its place")
@@ -201,12 +236,18 @@ class Programme:
         """Take over what the board did; refusal: what it refused since the last look."""
         board = self._session.board
         if board.state in ("FAULT", "DISARMED", "ARMING", "BOOT") and self.busy:
-            why = f"{board.fault}: {hint(board.fault)}" if board.fault else self._session.last_reason
+            cause = self._session.likely_cause if board.fault == "LINK" else None
+            likely = hint(board.fault) if cause is None else cause.sentence
+            why = f"{board.fault}: {likely}" if board.fault else self._session.last_reason
             self.fail_all(f"the board went to {board.state} ({why})")
-        for record, job in self.running:
+        for run in self.running:
+            record, job = run
+            executed = job.executed_rows
+            if executed > record.executed_count:
+                self.told.append(Progress(run, record.executed_count, executed))
             self.totals["sent"] += job.sent_rows - record.sent
-            self.totals["executed"] += job.executed_rows - record.executed_count
-            record.sent, record.executed_count = job.sent_rows, job.executed_rows
+            self.totals["executed"] += executed - record.executed_count
+            record.sent, record.executed_count = job.sent_rows, executed
         while self.running and self.running[0].job.finished:
             self._end_first()
         if self.running and refusal is not None:
@@ -225,6 +266,8 @@ class Programme:
         scale = self._session.scale
         executed = job.executed(record.prepared.plan, scale.full_power_w, scale.tick_s)
         record.executed = executed
+        if record.executed_count < job.pulses:
+            self.told.append(Progress(Run(record, job), record.executed_count, job.pulses))
         if job.left_tick is not None:
             record.first_byte_after_s = job.left_tick * scale.tick_s - record.arrived_s
         if len(executed):
@@ -232,6 +275,9 @@ class Programme:
             record.executed_rows = job.rows_executed()
             last = int(record.executed_rows[-1])
             record.delay_s = float(executed.start_s[-1] - record.prepared.plan.start_s[last])
+            record.timing_error = timing_error(record.prepared.plan.start_s[record.executed_rows], executed.start_s)
+            if record.timing_error is not None:
+                self.timing.add(record.timing_error)
         if status in ("failed", "cancelled"):
             record.end(status, error)
         self._bookkeeper.submit(simulate, record, status, error)
@@ -290,6 +336,7 @@ class Programme:
 
     def board_restarted(self, delay_s: float) -> None:
         """The board's clock was set anew: what is known of heat moves onto it."""
+        self.told.append(ClockMoved(delay_s))
         with self.lock:
             self._thermal = self._thermal.later(delay_s)
             self._queue_end_s = 0.0
@@ -305,11 +352,17 @@ def _seen(record: PlanRecord, cut: int) -> BoolArray:
 
 def simulate(record: PlanRecord, status: Status, error: str | None) -> None:
     """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
-    executed = record.executed
     try:
-        if executed is not None:
-            columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-            record.simulated_m = record.heat_before.copy().pulses(*columns).displacement_m
+        record.simulated_m = simulated_m(record)
     finally:
         if not record.ended:
             record.end(status, error)
+
+
+def simulated_m(record: PlanRecord) -> FloatArray | None:
+    """Heights of what was executed, [n]; None where nothing was reported."""
+    executed = record.executed
+    if executed is None:
+        return None
+    columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    return record.heat_before.copy().pulses(*columns).displacement_m

@@ -15,7 +15,7 @@ def resolved_config(display: Display) -> dict[str, Any]:
     ]
     moves = display.machine.moves
     resolved["scanner"]["move_pitch_s"] = moves.time_us(moves.pitch_rad, moves.pitch_rad, moves.calm_us) * 1e-6
-    pixel = display.pixels.each[0]
+    pixel = display.parameters.pixel(config.display.bridge_width_m)
     resolved["pixel_model"].update(
         {
             "R": pixel.r_k_per_w,

@@ -49,7 +49,7 @@ class Waits:
             error = self._error(wait, session, refusal, link_error, now_s)
             if error is not None:
                 wait.future.set_exception(error)
-            elif session.board.state in wait.states and session.quiet:
+            elif session.board.state in wait.states and (session.quiet or (wait.what == "stop" and session.aborted)):
                 wait.future.set_result(answer())
             if wait.future.done():
                 self._waits.remove(wait)

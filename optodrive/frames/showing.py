@@ -5,15 +5,19 @@ from math import ceil
 import numpy as np
 
 from optodrive.config import Config
-from optodrive.flow import FloatArray, FrameSequence, HeightTrain, TactileFrame
+from optodrive.flow import FloatArray, FrameSequence, HeightTrain, IntArray, TactileFrame
 from optodrive.frames.lattice import Lattice
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.gate import servo_of, settled_s
 from optodrive.physics.heat import heat_at_rest
 from optodrive.physics.parameters import load_parameters
+from optodrive.pixel_map import map_of, without_map
 
 REFRESH_HZ = 10.0
 """A picture that stays is drawn again at most this often."""
+
+STEP = 0.01
+"""Where each pixel is asked for a height of its own, heights are told apart by so much, relative."""
 
 RESERVE = 1.05
 """Beam time asked for over the estimate."""
@@ -29,7 +33,9 @@ class Beam:
         self._period_s = 1.0 / config.laser.pwm_hz
         laser = config.laser
         self._drive = DriveRange.of(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
-        self._at_rest = heat_at_rest(config, load_parameters(config.pixel_model.parameters))
+        known = map_of(config)
+        self._lift = None if known is None else known.lift
+        self._at_rest = heat_at_rest(without_map(config), load_parameters(config.pixel_model.parameters))
 
     def pulse_s(self, target_m: float) -> float:
         """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
@@ -42,10 +48,10 @@ class Beam:
 
     def picture_s(self, target_m: FloatArray) -> float:
         """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
-        driven = np.flatnonzero(target_m > 0)
+        driven = np.flatnonzero((target_m > 0) if self._lift is None else (target_m > 0) & (self._lift > 0))
         if not len(driven):
             return 0.0
-        heights_m, counts = np.unique(target_m[driven], return_counts=True)
+        heights_m, counts = np.unique(self._nominal_m(target_m, driven), return_counts=True)
         pulses_s = sum(self.pulse_s(float(h)) * int(n) for h, n in zip(heights_m, counts, strict=True))
         layout = self.lattice.layout
         backwards = layout.row[driven] % 2 == 1
@@ -57,6 +63,13 @@ class Beam:
         lengths_m, counts = np.unique(np.maximum(steps_m, self._pitch_m).round(9), return_counts=True)
         moves_s = sum(self._move_s(float(step_m)) * int(n) for step_m, n in zip(lengths_m, counts, strict=True))
         return ceil(RESERVE * (pulses_s + moves_s) * 1e3) / 1e3
+
+    def _nominal_m(self, target_m: FloatArray, driven: IntArray) -> FloatArray:
+        """What a nominal pixel would be asked for, so that one of the map stands as high, [driven]; in few steps."""
+        if self._lift is None:
+            return target_m[driven]
+        asked = np.log(target_m[driven] / self._lift[driven])
+        return np.asarray(np.exp(np.ceil(asked / STEP) * STEP), dtype=np.float64)
 
 
 def hold(beam: Beam, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0) -> list[TactileFrame]:

@@ -11,7 +11,8 @@ from optodrive.flow import FloatArray, IntArray
 class Caps(NamedTuple):
     """Caps that no accepted sequence passes; rises above ambient, infinite where nothing is declared.
 
-    galvo_rad2_per_s4: mean-square acceleration of either mirror; the rest as in the configuration's limits
+    galvo_rad2_per_s4: mean-square acceleration of either mirror; least_w: light that is weaker is none, as the board
+    knows no step so small; the rest as in the configuration's limits
     """
 
     absorber_k: float
@@ -25,6 +26,7 @@ class Caps(NamedTuple):
     pixel_window_s: float
     display_mean_w: float
     display_window_s: float
+    least_w: float
 
 
 class HeatBound(NamedTuple):
@@ -77,6 +79,7 @@ class Mirrors(NamedTuple):
 
     lead_s: from a plan's begin to its first pulse at least; mean_s: time constant of the mean
     code_rad: one step of the converter, by which a move may come out longer
+    early_s: by how much two times of a plan may come nearer to each other on their way to points
     """
 
     omega_per_s: float
@@ -86,6 +89,7 @@ class Mirrors(NamedTuple):
     lead_s: float
     mean_s: float
     code_rad: float
+    early_s: float
 
 
 class Budget(NamedTuple):

@@ -7,7 +7,7 @@ later moment too warm.
 
 from dataclasses import fields, replace
 from math import inf
-from typing import Literal, Protocol
+from typing import Literal, NamedTuple, Protocol
 
 import numpy as np
 
@@ -18,6 +18,16 @@ from optodrive.limit.ledger import close_ledger, open_ledger
 from optodrive.limit.walk import FIRE, ORDER, STOP, TRIM, WIDTH, Ledger, Spots, borne, walk
 
 Policy = Literal["trim", "delay", "refuse"]
+
+
+class _Reckoned(NamedTuple):
+    """Encoded pulses, and without power those that leave dark; all [n]."""
+
+    start_s: FloatArray
+    width_s: FloatArray
+    x_rad: FloatArray
+    y_rad: FloatArray
+    power_w: FloatArray
 
 
 class Beam(Protocol):
@@ -197,14 +207,29 @@ def fired(plan: LimitedPlan, until_s: float, state: BudgetState, budget: Budget)
     return close_ledger(_walk(plan.pixel[:count], PulsePlan(**columns), 0.0, state, budget, FIRE)[3], budget)
 
 
-def verify(pixel: IntArray, pulses: Beam, state: BudgetState, budget: Budget) -> None:
-    """Check pulses as decoded from the very bytes that are about to leave; LocalProtocolError if any passes a cap."""
-    exact = budget._replace(mirrors=budget.mirrors._replace(code_rad=0.0))
-    row, power_w, cause, _ = _walk(pixel, pulses, 0.0, state, exact, STOP)
-    if row < len(pixel):
+def counted(pixel: IntArray, pulses: Beam, state: BudgetState, budget: Budget) -> BudgetState:
+    """What pulses [n] leave that were fired, in order of time, whatever the caps say."""
+    return close_ledger(_walk(pixel, pulses, 0.0, state, budget, FIRE)[3], budget)
+
+
+def verify(plan: PulsePlan, row: IntArray, pulses: Beam, state: BudgetState, budget: Budget) -> None:
+    """Check pulses [n] as decoded from the very bytes that are about to leave; row: the plan's pulse each is part of.
+
+    Raises LocalProtocolError if any passes a cap. Every bound holds, but the heat between walls is bounded a little
+    otherwise the more often it is reckoned: so it is where the plan's own was, also where its pulses leave dark.
+    """
+    dark = np.setdiff1d(np.arange(len(plan)), row)
+    order = np.argsort(np.concatenate([pulses.start_s, plan.start_s[dark]]), kind="stable")
+    columns = [np.concatenate([getattr(pulses, name), getattr(plan, name)[dark]]) for name in _Reckoned._fields[:-1]]
+    power_w = np.concatenate([pulses.power_w, np.zeros(len(dark))])
+    encoded = _Reckoned(*(column[order] for column in (*columns, power_w)))
+    pixel = np.concatenate([plan.pixel[row], plan.pixel[dark]])[order]
+    exact = budget._replace(mirrors=budget.mirrors._replace(code_rad=0.0, early_s=0.0))
+    at, allowed_w, cause, _ = _walk(pixel, encoded, 0.0, state, exact, STOP)
+    if at < len(pixel):
         raise LocalProtocolError(
-            f"encoded pulse {row} on pixel {pixel[row]} passes a cap ({CAPS[cause[row]]}): "
-            f"{pulses.power_w[row]:.4f} W, allowed {power_w[row]:.4f} W"
+            f"encoded pulse {order[at]} on pixel {pixel[at]} passes a cap ({CAPS[cause[at]]}): "
+            f"{encoded.power_w[at]:.4f} W, allowed {allowed_w[at]:.4f} W"
         )
 
 

@@ -57,7 +57,7 @@ def moved(mirrors: Mirrors, motion: Motion, dx_rad: float, dy_rad: float, from_s
     dx_rad, dy_rad = abs(dx_rad) + mirrors.code_rad, abs(dy_rad) + mirrors.code_rad
     # Mirrors are sent on when a pulse ends; those of a plan's first pulse no later than the plan's lead before it.
     at_s = max(from_s, start_s - mirrors.lead_s) + max(dx_rad, dy_rad) / mirrors.slew_rad_per_s
-    left = left_of_swing(mirrors, from_s - motion.at_s)
+    left = left_of_swing(mirrors, from_s - mirrors.early_s - motion.at_s)
     x_swing = sqrt(move_energy(mirrors, dx_rad)) + left * motion.x_swing
     y_swing = sqrt(move_energy(mirrors, dy_rad)) + left * motion.y_swing
     # Either place may be a code off.
@@ -77,8 +77,10 @@ def acceleration2_after(mirrors: Mirrors, motion: Motion, end_s: float) -> float
 
     The next move begins when the pulse ends, though the next pulse may be far off: the greatest one is always counted.
     """
-    waned = exp(-(end_s - motion.at_s - late_s(mirrors)) / mirrors.mean_s)
-    left = left_of_swing(mirrors, end_s - motion.at_s)
+    # Times as planned telescope from move to move: that they may come nearer counts once, here.
+    since_s = end_s - mirrors.early_s - motion.at_s
+    waned = exp(-(since_s - late_s(mirrors)) / mirrors.mean_s)
+    left = left_of_swing(mirrors, since_s)
     greatest = sqrt(move_energy(mirrors, 1e9))
     x2 = motion.x2 * waned + (greatest + left * motion.x_swing) ** 2 / mirrors.mean_s
     y2 = motion.y2 * waned + (greatest + left * motion.y_swing) ** 2 / mirrors.mean_s

@@ -87,12 +87,16 @@ def walk(
         ask = Ask(pixel[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row])
         given_w[row], cause[row] = ask.power_w, NOTHING
         before = _before(budget, ledger, ask)
+        if ask.power_w < budget.caps.least_w or ask.power_w <= 0.0:
+            continue
         if policy != FIRE:
             most_w, binding = _allowed(budget, ledger, ask, before)
             if ask.power_w > most_w * (1 + ROUNDING):
                 given_w[row], cause[row] = max(0.0, most_w), binding
                 if policy == STOP or most_w < 0.0:
                     return row
+                if given_w[row] < budget.caps.least_w:
+                    given_w[row] = 0.0
         if given_w[row] > 0.0:
             _fire(budget, ledger, ask, given_w[row], before)
     return len(pixel)

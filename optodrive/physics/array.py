@@ -28,6 +28,13 @@ class Peaks(NamedTuple):
     absorber_k: FloatArray
 
 
+class Heights(NamedTuple):
+    """A display at one time. displacement_m: membrane; absorber_k: absorber over ambient; both [p]."""
+
+    displacement_m: FloatArray
+    absorber_k: FloatArray
+
+
 def kernel_columns(
     pixels: int, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
@@ -152,6 +159,12 @@ class DisplayHeat:
         gas_k = self.trace(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
         return self.pixels.each[pixel].kappa_m_per_k * gas_k
 
+    def at(self, at_s: float) -> Heights:
+        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's."""
+        seen = Heights(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        _glance(self._columns, self._at_s, self._theta_k, self._gamma_k, float(at_s), *seen)
+        return seen
+
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """Exact values of some pixels at times t_s [m], increasing.
 
@@ -212,6 +225,23 @@ def _walk(
             glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
             peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
     return len(pixel)
+
+
+@kernel
+def _glance(
+    columns: FloatArray,
+    at_s: FloatArray,
+    theta_k: FloatArray,
+    gamma_k: FloatArray,
+    now_s: float,
+    height_m: FloatArray,
+    absorber_k: FloatArray,
+) -> None:
+    """Fill in every pixel [p] at now_s, left dark since its last event."""
+    for i in range(len(at_s)):
+        one = one_pixel(columns, i)
+        absorber_k[i], gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, now_s - at_s[i]))
+        height_m[i] = one.kappa_m_per_k * gas_k
 
 
 @kernel

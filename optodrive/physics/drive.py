@@ -46,27 +46,6 @@ def reach_m(pixel: Pixel, drive: DriveRange) -> float:
     return pixel.kappa_m_per_k * pulse_peak(pixel, 0.0, 0.0, drive.max_power_w, drive.max_periods * drive.period_s)[0]
 
 
-def pulse_for_peak(
-    pixel: Pixel,
-    theta_k: float,
-    gamma_k: float,
-    target_m: float,
-    drive: DriveRange,
-    least_periods: int = 1,
-    from_s: float = 0.0,
-) -> tuple[int, float] | None:
-    """PWM periods and duty of the shortest pulse whose peak is target_m, given the heat still there.
-
-    The pulse has least_periods at least, but never more than the drive allows. from_s: the peak counts only from so
-    long after the pulse's start on, beyond its end. None when the heat there reaches the target by itself. A target
-    beyond the longest pulse gets the longest pulse.
-    """
-    goal_k = target_m / pixel.kappa_m_per_k
-    span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
-    periods, duty = shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
-    return (periods, duty) if periods else None
-
-
 @kernel
 def shortest(
     pixel: Pixel,
@@ -79,7 +58,12 @@ def shortest(
     max_periods: int,
     from_s: float,
 ) -> tuple[int, float]:
-    """As pulse_for_peak, goal_k the gas rise; no periods where no pulse is needed."""
+    """PWM periods and duty of the shortest pulse whose peak gas rise is goal_k, given the heat still there.
+
+    The pulse has least_periods at least, but never more than max_periods. from_s: the peak counts only from so long
+    after the pulse's start on, beyond its end. No periods where the heat there reaches the goal by itself. A goal
+    beyond the longest pulse gets the longest pulse.
+    """
     if _peak_from(pixel, theta_k, gamma_k, 0.0, 0.0, from_s)[0] >= goal_k:
         return 0, 0.0
     low, high = least_periods - 1, max_periods

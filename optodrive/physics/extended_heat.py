@@ -9,10 +9,11 @@ import numpy as np
 
 from optodrive.flow import FloatArray, IntArray, PixelTrace
 from optodrive.neighbours import Neighbours
-from optodrive.physics.array import TIME_ROUNDING_S, Peaks, kernel_columns, nothing
+from optodrive.physics.array import TIME_ROUNDING_S, Heights, Peaks, kernel_columns, nothing
 from optodrive.physics.chains import STATES
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.forward import Active, Scene, observe
+from optodrive.physics.glance import View, glance
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pulses import carry, glow, heights, shortest, walk
@@ -57,6 +58,7 @@ class ExtendedHeat:
         self._at_s = np.full(len(pixels), at_s)
         self._dark_s = np.full(len(pixels), 1.0)
         self._states = np.zeros((len(pixels), STATES))
+        self._view: View | None = None
 
     def copy(self) -> "ExtendedHeat":
         """An independent copy."""
@@ -68,6 +70,7 @@ class ExtendedHeat:
         vars(twin).update(vars(self))
         twin._at_s = self._at_s + offset_s
         twin._dark_s, twin._states = self._dark_s.copy(), self._states.copy()
+        twin._view = None
         return twin
 
     def pulses(
@@ -149,6 +152,18 @@ class ExtendedHeat:
         heights(one, self._active, self._context.copy(), pixel, *last, felt, np.array(t_s), height_m)
         return height_m
 
+    def at(self, at_s: float) -> Heights:
+        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's.
+
+        Asked again and again for later times it goes on from the last answer: a display is stepped through but once.
+        """
+        if self._view is None:
+            self._view = View.of(self._states)
+        seen = Heights(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        display = (self._columns, self._at_s, self._dark_s, self._states)
+        glance(*display, self._active, self._context, self._view, float(at_s), *seen)
+        return seen
+
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """What instruments show of some pixels from rest at times t_s [m], increasing.
 
@@ -165,7 +180,8 @@ class ExtendedHeat:
             scene = Scene(own, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
             one = self.pixels.each[index]
             absorber_k, displacement_m, force_n = observe(scene, one, self._active)
-            gas_k = observe(scene, one, Active.of(bare))[1] / one.kappa_m_per_k
+            # Of a dead membrane nothing could be read.
+            gas_k = observe(scene, one._replace(kappa_m_per_k=1.0), Active.of(bare))[1]
             columns.append((absorber_k, gas_k, displacement_m, force_n))
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)

@@ -6,7 +6,7 @@ from typing import Protocol, Self
 from optodrive.config import Config
 from optodrive.flow import FloatArray, IntArray, PixelTrace
 from optodrive.neighbours import Neighbours
-from optodrive.physics.array import DisplayHeat, Peaks, nothing
+from optodrive.physics.array import DisplayHeat, Heights, Peaks, nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.parameters import ParameterSet, PixelArray, display_pixels
 from optodrive.units import ZERO_CELSIUS_K
@@ -47,13 +47,20 @@ class Heat(Protocol):
     def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
         """Displacement of a pixel at times t_s [m] under pulses [n, 4], from the heat there is, which stays."""
 
+    def at(self, at_s: float) -> Heights:
+        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's."""
+
     def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """What some pixels do at times t_s [m] under pulses [n, 4]: start_s, width_s, power_w, pixel."""
 
 
-def heat_at_rest(config: Config, parameters: ParameterSet) -> Heat:
-    """A configured display that nobody has lit, with the terms that the parameter set plans with."""
-    pixels = display_pixels(config, parameters)
+def heat_at_rest(config: Config, parameters: ParameterSet, pixels: PixelArray | None = None) -> Heat:
+    """A configured display that nobody has lit, with the terms that the parameter set plans with.
+
+    pixels: in place of those that the configuration and the set say.
+    """
+    if pixels is None:
+        pixels = display_pixels(config, parameters)
     values = {key: parameters.term_values(key) for key in parameters.planner_terms}
     if not values:
         return DisplayHeat(pixels)

@@ -1,6 +1,6 @@
 """Parameter sets: one file a source, each value with its unit, uncertainty and source."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -8,11 +8,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from optodrive.config import Config, check_format, input_error, pixel_layout, read_toml, shipped_path
+from optodrive.config import Config, check_format, input_error, pixel_layout, shipped_path
 from optodrive.errors import InputError, nearest
+from optodrive.files import read_toml
 from optodrive.flow import FloatArray, freeze_arrays
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import check_needs, find_term, known_terms
+from optodrive.pixel_map import map_of
 
 FORMAT = "optodrive-parameters"
 VERSION = 1
@@ -188,6 +190,15 @@ def _with_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
 
 
 def display_pixels(config: Config, parameters: ParameterSet) -> PixelArray:
-    """The parameters of every pixel of a configured display."""
-    pixel = parameters.pixel(config.display.bridge_width_m)
-    return PixelArray.uniform(pixel, len(pixel_layout(config.display)))
+    """The parameters of every pixel of a configured display; its map's gains lift membranes, never the heat.
+
+    Raises InputError as `map_of`, or for gains that are against another parameter set.
+    """
+    pixel, known = parameters.pixel(config.display.bridge_width_m), map_of(config)
+    pixels = PixelArray.uniform(pixel, len(pixel_layout(config.display)))
+    if known is None:
+        return pixels
+    if known.model not in ("", parameters.name):
+        expected = f"'{parameters.name}', the one planned with: calibrate again from the recordings"
+        raise InputError(f"{config.display.pixel_map}: model.parameters", known.model, expected)
+    return replace(pixels, kappa_m_per_k=pixels.kappa_m_per_k * known.lift)

@@ -5,9 +5,9 @@ tolerance, see docs/decisions/0013-gate-by-trajectory.md.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
-from math import ceil, exp, log
+from math import ceil, exp, log, sqrt
 from typing import Self
 
 import numpy as np
@@ -16,10 +16,14 @@ from optodrive.config import Config
 from optodrive.flow import FloatArray
 from optodrive.physics.gate import outlasting, pole_per_s, servo_of, settled_s
 from optodrive.physics.mirror import Servo
+from optodrive.pixel_map import aimed_layout
+from optodrive.plan.field import AimedField, largest_step_rad, tolerance_share
 
 CALM_SHARE = 0.01
 """Share of the tolerance that is kept for what is left of the moves before, once they have had time to die out."""
 HALVINGS = 40
+NARROWER = 0.03
+"""Share of the tolerance given away, at the most, so that a few moves can stand for all those between them."""
 UPWARDS = 1.0 - 1e-6
 """Added to a number of pitches it gives the next whole one upwards, but for what is only rounding."""
 
@@ -30,6 +34,7 @@ Table = tuple[int, ...]
 class MoveModel:
     """Times of moves between pixels, by pitches: no move takes no time.
 
+    pitch_rad: the lattice's; in a calibrated field the largest step between neighbours
     calm, hasty: times of x and of y, µs, rising, and never more than those of two moves that lead to the same place
     calm_us: after stays on a pixel at least as long as this a move is calm
     lead_us: for the farthest move, from the middle too, whatever was before
@@ -42,8 +47,29 @@ class MoveModel:
     lead_us: int
 
     @classmethod
-    def of(cls, config: Config) -> Self:
-        """Tables for a configuration's lattice, servo, absorber and focus."""
+    def of(cls, config: Config, field: AimedField | None = None) -> Self:
+        """Tables for a configuration's lattice, servo, absorber and focus; field: a calibrated one, else ideal."""
+        return cls._whole_pitches(config) if field is None else cls._any_distance(config, field)
+
+    @classmethod
+    def _any_distance(cls, config: Config, field: AimedField) -> Self:
+        """Places of a calibrated field lie at any distance: a pitch's time is enough for all that is not longer."""
+        layout = aimed_layout(config)
+        angles_rad = field.angles_rad(layout.x_m, layout.y_m)
+        nominal = _Moves.of(config, tolerance_share(field, layout, config))
+        moves = replace(nominal, pitch_rad=largest_step_rad(layout, *angles_rad) or nominal.pitch_rad)
+        share = moves.hasty_share()
+        # The first move begins in the middle, or on any pixel.
+        spans_rad = [max(float(np.ptp(angle_rad)), float(np.abs(angle_rad).max())) for angle_rad in angles_rad]
+        far = [int(span_rad / moves.pitch_rad + UPWARDS) for span_rad in spans_rad]
+        calm, hasty = (
+            (moves.any_table(0, max(1, *far), left), moves.any_table(1, max(1, *far), left))
+            for left in (CALM_SHARE, share)
+        )
+        return cls(moves.pitch_rad, moves.calm_us(share), calm, hasty, max(hasty[0][far[0]], hasty[1][far[1]]))
+
+    @classmethod
+    def _whole_pitches(cls, config: Config) -> Self:
         moves, display = _Moves.of(config), config.display
         share = moves.hasty_share()
         farthest = max(1, display.rows - 1, display.columns - 1)
@@ -58,7 +84,7 @@ class MoveModel:
         return cls(moves.pitch_rad, moves.calm_us(share), calm, hasty, lead_us)
 
     def time_us(self, dx_rad: float, dy_rad: float, lit_us: int = 0) -> int:
-        """Dark time to keep for a move over whole pitches, µs, after a stay of lit_us since the gate opened."""
+        """Dark time for a move, rounded up to whole pitches, µs; after a stay of lit_us since the gate opened."""
         tables = self.calm if lit_us >= self.calm_us else self.hasty
         x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + UPWARDS)]
         y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + UPWARDS)]
@@ -84,9 +110,11 @@ class _Moves:
     shortest_s: float
 
     @classmethod
-    def of(cls, config: Config) -> Self:
+    def of(cls, config: Config, tolerance_share: float = 1.0) -> Self:
         scanner = config.scanner
-        x_rad, y_rad = (tolerance_rad - 0.5 * scanner.code_rad for tolerance_rad in config.tolerance_rad)
+        x_rad, y_rad = (
+            tolerance_share * tolerance_rad - 0.5 * scanner.code_rad for tolerance_rad in config.tolerance_rad
+        )
         pitch_rad = config.display.pitch_m / (2.0 * scanner.focal_length_m)
         shortest_s = int(1e6 / config.laser.pwm_hz) * 1e-6
         return cls(servo_of(scanner), pitch_rad, scanner.code_rad, (x_rad, y_rad), shortest_s)
@@ -95,6 +123,24 @@ class _Moves:
         """Time of a move with a share of the tolerance kept for what is left of others. A code more may be moved."""
         tolerance_rad = (1.0 - share) * self.room_rad[axis] - self.code_rad
         return settled_s(self.servo, pitches * self.pitch_rad, tolerance_rad)
+
+    def any_time_s(self, axis: int, pitches: int, share: float) -> float:
+        """Enough for every move of more than a pitch less than so many, up to so many.
+
+        What swings on after a move, as a complex amplitude, changes by no more than 1/√(1 − ζ²) of what the move does,
+        less after a long ramp. So a move whose swing keeps within a tolerance narrower by that has all moves up to a
+        step shorter keep within the whole of it, and none of them has a longer ramp.
+        """
+        before_rad = (pitches - 1) * self.pitch_rad
+        slope = exp(pole_per_s(self.servo).real * before_rad / self.servo.slew) / sqrt(1.0 - self.servo.damping**2)
+        tolerance_rad = (1.0 - share) * self.room_rad[axis] - self.code_rad
+        steps = ceil(self.pitch_rad * slope / (NARROWER * tolerance_rad))
+        narrower_rad = tolerance_rad - slope * self.pitch_rad / steps
+        ends_rad = (before_rad + self.pitch_rad * (1 + np.arange(steps)) / steps).tolist()
+        return max(settled_s(self.servo, end_rad, narrower_rad) for end_rad in ends_rad)
+
+    def any_table(self, axis: int, farthest: int, share: float) -> Table:
+        return _by_way([0, *(ceil(1e6 * self.any_time_s(axis, way, share)) for way in range(1, farthest + 1))])
 
     def table(self, axis: int, farthest: int, share: float) -> Table:
         return _by_way([0, *(ceil(1e6 * self.time_s(axis, pitches, share)) for pitches in range(1, farthest + 1))])

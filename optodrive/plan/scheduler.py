@@ -11,17 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.config import PixelLayout
-from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, HeightTrain, IntArray, PulsePlan, TactileFrame
+from optodrive.flow import FrameSequence, IntArray, PulsePlan, TactileFrame
 from optodrive.physics.array import nothing
 from optodrive.physics.drive import DriveRange
 from optodrive.physics.heat import Heat
-from optodrive.plan.cycles import Cycle, cycle_of, with_room
-from optodrive.plan.field import IdealField
+from optodrive.plan.field import AimedField
 from optodrive.plan.galvo import MoveModel
 from optodrive.plan.order import visiting_order
 from optodrive.plan.slices import ROUNDS, Periods, Rehearsal, Together, best, joined, rested, simultaneity, slices
-from optodrive.plan.trains import free_us, train_pulses, usual_free_us
+from optodrive.plan.trains import TrainPulses
 
 TRAIN_PIECE = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
@@ -49,7 +47,7 @@ class Machine:
     """What the scheduler knows of optics and laser. rest_s: dark time after which a pixel's next pulse counts anew."""
 
     layout: PixelLayout
-    field: IdealField
+    field: AimedField
     moves: MoveModel
     drive: DriveRange
     rest_s: float
@@ -120,16 +118,23 @@ class Scheduler:
         self._train_piece = train_piece
         self._tick = tick
         self._orders = orders or {}
-        self._x_rad: list[float] = machine.field.mirror_rad(machine.layout.x_m).tolist()
-        self._y_rad: list[float] = machine.field.mirror_rad(machine.layout.y_m).tolist()
-        self._trains = train_pulses(sequence.trains, len(sequence.frames))
-        self._rest_us = round(machine.rest_s * 1e6)
+        x_rad, y_rad = machine.field.angles_rad(machine.layout.x_m, machine.layout.y_m)
+        self._x_rad: list[float] = x_rad.tolist()
+        self._y_rad: list[float] = y_rad.tolist()
         self._now = _Cursor(lit=standing_on)
         self._most = ALL
         self.lead_us = machine.moves.lead_us if standing_on is None else 0
         self.skipped: list[Skipped] = []
         self.together: list[Together] = []
-        self._cycles = self._planned_cycles(at_rest)
+        self._trains = TrainPulses(
+            sequence.trains,
+            len(sequence.frames),
+            machine.drive,
+            round(machine.rest_s * 1e6),
+            self._move_us,
+            at_rest,
+            tick,
+        )
 
     def pieces(self, heat: Heat) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
@@ -191,63 +196,27 @@ class Scheduler:
         now.stay_us = now.free_us - now.since_us
         return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
 
-    def _planned_cycles(self, at_rest: Callable[[], Heat]) -> dict[int, tuple[HeightTrain, Cycle]]:
-        """Each height train by its source, with how its pulses are planned."""
-        first_source = len(self._sequence.frames)
-        trains = {k: t for k, t in enumerate(self._sequence.trains, first_source) if isinstance(t, HeightTrain)}
-        if not trains:
-            return {}
-        rest = at_rest()
-        free = usual_free_us(self._trains, set(trains), self._rest_us, self._move_us)
-        return {
-            source: (train, self._cycle(train, rest, *free[source], f"trains[{source - first_source}]"))
-            for source, train in trains.items()
-        }
-
-    def _cycle(self, train: HeightTrain, rest: Heat, least_us: int, usual_us: int, where: str) -> Cycle:
-        drive, room_us = self._machine.drive, min(usual_us, self._own_room_us(train))
-        if min(least_us, room_us) < drive.period_s * 1e6:
-            expected = (
-                f"room for a PWM period of {drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of any "
-                f"train, with the mirrors' move or a rest of {self._machine.rest_s * 1e3:g} ms"
-            )
-            raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")
-        self._tick()
-        return cycle_of(train, rest, with_room(drive, room_us), where)
-
-    def _own_room_us(self, train: HeightTrain) -> int:
-        return round(train.period_s * 1e6) - self._rest_us
-
     def _train_rows(self, heat: Heat) -> list[_Row]:
         """The next train pulse as a row, or none where it asks for a height that the heat there reaches by itself."""
-        now = self._now
-        pulse = self._trains[now.next_train]
+        now, index = self._now, self._now.next_train
+        pulse = self._trains[index]
         wanted_us = self.lead_us + pulse.nominal_us
-        if pulse.source not in self._cycles:
-            now.next_train += 1
-            return [self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)]
-        train, cycle = self._cycles[pulse.source]
-        start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pulse.pixel, now.stay_us))
-        late_us = start_us - wanted_us - now.waited_us
-        room_us = min(
-            free_us(self._trains, now.next_train, self._rest_us, self._move_us) - late_us, self._own_room_us(train)
-        )
-        drive = with_room(self._machine.drive, room_us)
-        shape = (cycle.goal_m, drive, cycle.least_periods, cycle.from_s)
-        planned = heat.pulse_for_peak(pulse.pixel, start_us * 1e-6, *shape)
         now.next_train += 1
+        if not pulse.by_height:
+            return [self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)]
+        start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pulse.pixel, now.stay_us))
+        planned = self._trains.planned(index, heat, start_us, start_us - wanted_us - now.waited_us)
+        target_m = self._trains.target_m(pulse.source)
         if planned is None:
-            self.skipped.append(Skipped(pulse.source, pulse.pixel, train.target_m))
+            self.skipped.append(Skipped(pulse.source, pulse.pixel, target_m))
             now.skipped += 1
             return []
-        width_us = round(planned[0] * drive.period_s * 1e6)
-        power_w = planned[1] * drive.max_power_w
-        return [self._place(pulse.pixel, width_us, power_w, wanted_us, train.target_m, pulse.source)]
+        return [self._place(pulse.pixel, *planned, wanted_us, target_m, pulse.source)]
 
     def _heat_is_known(self, rows: list[_Row]) -> bool:
         """Whether the next train pulse can be planned after rows that the limiter has not seen."""
         pulse = self._trains[self._now.next_train]
-        return pulse.source not in self._cycles or all(row.pixel != pulse.pixel for row in rows)
+        return not pulse.by_height or all(row.pixel != pulse.pixel for row in rows)
 
     def _trains_before(self, until_s: float, heat: Heat) -> Pieces:
         def build() -> list[_Row]:

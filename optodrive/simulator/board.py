@@ -1,6 +1,7 @@
 """The simulated board as a process of its own on a pseudo-terminal.
 
 python -m optodrive.simulator.board --pty LINK [--log FILE] [--limits FILE] [--script FILE] [--baud N]
+    [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--false-share N] [--no-readback]]
 """
 
 import argparse
@@ -10,16 +11,24 @@ import select
 import signal
 import sys
 import time
-import tty
+from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
+from optodrive.clock import claim_processor
 from optodrive.errors import InputError
 from optodrive.simulator.core import BoardCore
 from optodrive.simulator.limits import BoardSettings, load_settings
 from optodrive.simulator.link import FaultyLink
-from optodrive.simulator.script import Step, load_script
+from optodrive.simulator.pseudo_terminal import check_link, open_pty
+from optodrive.simulator.script import SENSOR_ACTIONS, Step, load_script
+from optodrive.simulator.sensor_options import add_sensor_options, bench_of
+
+if TYPE_CHECKING:
+    from optodrive.simulator.bench import Bench
 
 TURN_MAX_S = 0.005
 LATE_US = 2_000
@@ -54,8 +63,39 @@ class Pace:
         self._tokens = min(self._tokens, BURST_BYTES)
 
 
+class Core(Protocol):
+    """What stands behind the pty: the simulated board, or a real core elsewhere. Times in µs since the start."""
+
+    def advance(self, now_us: int) -> None:
+        """Do everything that falls due up to now."""
+
+    def receive(self, data: bytes, now_us: int) -> None:
+        """Take bytes that arrived at now_us."""
+
+    def bytes_to_send(self) -> bytes:
+        """Bytes for the host since the last call."""
+
+    def link_lost(self, now_us: int) -> None:
+        """The host's end closed."""
+
+    def set_input(self, name: str, value: bool, now_us: int) -> None:
+        """An input changes."""
+
+    def reset(self, now_us: int) -> None:
+        """Power lost and back."""
+
+    def next_event_us(self) -> int | None:
+        """When it must be looked at next, None for whenever."""
+
+
+MakeCore = Callable[[BoardSettings, Callable[[dict[str, Any]], None]], Core]
+Actions = Mapping[str, Callable[[Any], None]]
+"""What a script may do to this core and to no other, by name."""
+NO_ACTIONS: Actions = {}
+
+
 class PtyBoard:
-    """A `BoardCore` between a pty and the real clock; failure: why it ended by itself, '' where it did not."""
+    """A core between a pty and the real clock; failure: why it ended by itself, '' where it did not."""
 
     def __init__(
         self,
@@ -65,15 +105,21 @@ class PtyBoard:
         script: list[Step],
         baud: int,
         exit_closed_s: float | None,
+        make_core: MakeCore = BoardCore,
+        actions: Actions = NO_ACTIONS,
+        bench: "Bench | None" = None,
     ) -> None:
         self.failure = ""
+        self._actions = actions
+        self._bench = bench
         self._link_path = link
         self._log_file = log
-        self._script = script
+        self._script = [step for step in script if not step.from_light]
+        self._since_light = [step for step in script if step.from_light]
         self._exit_closed_s = exit_closed_s
         self._started_s = time.monotonic()
         self._running = True
-        self._core = BoardCore(settings, self._log)
+        self._core = make_core(settings, self._log)
         self._faults = FaultyLink()
         self._in_pace, self._out_pace = Pace(baud), Pace(baud)
         self._out = b""
@@ -85,16 +131,13 @@ class PtyBoard:
         self._make_pty()
 
     def _make_pty(self) -> None:
-        self._master, slave = os.openpty()
-        tty.setraw(slave)
-        os.set_blocking(self._master, False)
-        temporary = self._link_path.with_name(self._link_path.name + ".new")
-        temporary.unlink(missing_ok=True)
-        temporary.symlink_to(os.ttyname(slave))
-        temporary.replace(self._link_path)
-        os.close(slave)  # from here on a hang-up means that no host has the port open
+        self._master = open_pty(self._link_path)
 
     def _log(self, event: dict[str, Any]) -> None:
+        if self._bench is not None:
+            self._bench.note(event)
+        if self._since_light and event["event"] == "gate":
+            self._time_from_light(event["t_us"] * 1e-6)
         if self._log_file is None:
             return
         try:
@@ -119,6 +162,8 @@ class PtyBoard:
         finally:
             self._core.link_lost(self._now_us())
             self._link_path.unlink(missing_ok=True)
+            if self._bench is not None:
+                self._bench.close()
 
     def _now_us(self) -> int:
         return int(self._now_s() * 1e6)
@@ -137,6 +182,8 @@ class PtyBoard:
         else:
             self._core.bytes_to_send()
             self._out = b""
+        if self._bench is not None:
+            self._bench.serve(self._now_us())
         self._wait()
 
     def _wait(self) -> None:
@@ -212,6 +259,11 @@ class PtyBoard:
         self._out_pace.passed(written)
         self._out = self._out[written:]
 
+    def _time_from_light(self, light_s: float) -> None:
+        self._script += [replace(step, at_s=light_s + step.at_s) for step in self._since_light]
+        self._script.sort(key=lambda step: step.at_s)
+        self._since_light = []
+
     def _follow_script(self) -> None:
         while self._script and self._script[0].at_s <= self._now_s():
             self._do(self._script.pop(0))
@@ -228,21 +280,22 @@ class PtyBoard:
             self._port_closed(now_us)
             os.close(self._master)
             self._make_pty()
+        elif step.name in self._actions:
+            self._actions[step.name](self._core)
+        elif step.name in SENSOR_ACTIONS:
+            if self._bench is not None:
+                self._bench.break_down(step.name, now_us)
         else:
             self._faults.break_down(step.name, step.rate)
 
 
 def _check_options(options: argparse.Namespace) -> None:
-    link: Path = options.pty
-    if not link.parent.is_dir():
-        raise InputError("--pty", str(link), "a name in a folder that exists")
-    if link.exists() and not link.is_symlink():
-        raise InputError("--pty", str(link), "a name that is free, or a link")
+    check_link("--pty", options.pty)
     if options.baud < BAUD_MIN:
         raise InputError("--baud", options.baud, f"at least {BAUD_MIN}")
 
 
-def main(arguments: list[str] | None = None) -> int:
+def main(arguments: list[str] | None = None, make_core: MakeCore = BoardCore, actions: Actions = NO_ACTIONS) -> int:
     """Run a board until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(prog="optodrive.simulator.board", description="A simulated board on a pty.")
     parser.add_argument("--pty", type=Path, required=True, metavar="LINK", help="link this name to the pty")
@@ -251,19 +304,27 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--script", type=Path, help="TOML: what happens to it, and when")
     parser.add_argument("--baud", type=int, default=1_000_000, help="pace of the serial line")
     parser.add_argument("--exit-when-closed", type=float, metavar="SECONDS", help="end when no host has it open")
+    parser.add_argument("--seed", type=int, help="make the same nonces every time, so that a session can be replayed")
+    add_sensor_options(parser)
     options = parser.parse_args(arguments)
     try:
         _check_options(options)
         settings = load_settings(options.limits) if options.limits else BoardSettings()
-        script = load_script(options.script) if options.script else []
+        script = load_script(options.script, actions) if options.script else []
         log = options.log.open("ab", buffering=0) if options.log else None
+        bench = bench_of(options, settings)
     except InputError as error:
         print(f"optodrive.simulator.board: {error}", file=sys.stderr)
         return error.exit_status
     except OSError as error:
         print(f"optodrive.simulator.board: --log {options.log}: {error.strerror}", file=sys.stderr)
         return 2
-    board = PtyBoard(options.pty, log, settings, script, options.baud, options.exit_when_closed)
+    if make_core is BoardCore:
+        make_core = partial(BoardCore, seed=options.seed, steer=bench.mirrors.go if bench else None)
+    board = PtyBoard(
+        options.pty, log, settings, script, options.baud, options.exit_when_closed, make_core, actions, bench
+    )
+    claim_processor()  # a real board waits for none
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     board.run()

@@ -32,6 +32,8 @@ SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
 INPUT_FAULTS = {"interlock": "INTERLOCK", "key": "KEY", "estop": "ESTOP"}
 
 Sink = Callable[[dict[str, Any]], None]
+Steer = Callable[[int, int, int], None]
+"""Told where the mirrors are sent, x and y in codes, and when, µs."""
 Record = tuple[int, int, int, int]
 """Number of the point, tick of gate on, gate-on time, duty."""
 
@@ -58,13 +60,18 @@ class Job:
 
 
 class BoardCore:
-    """A board from power-up on. sink: gets every log event as a dict with t_us."""
+    """A board from power-up on. sink: gets every log event as a dict with t_us; steer: what stands for the mirrors."""
 
     def __init__(
-        self, settings: BoardSettings | None = None, sink: Sink | None = None, seed: int | None = None
+        self,
+        settings: BoardSettings | None = None,
+        sink: Sink | None = None,
+        seed: int | None = None,
+        steer: Steer | None = None,
     ) -> None:
         self._settings = settings or BoardSettings()
         self._sink: Sink = sink or (lambda event: None)
+        self._steer: Steer = steer or (lambda x, y, at_us: None)
         self._random = random.Random(seed)
         self._now_us = 0
         self.inputs = dict(SAFE_INPUTS)
@@ -81,6 +88,7 @@ class BoardCore:
         self._guards = Guards(self._settings.cell_codes)
         self._queue: deque[Point] = deque()
         self._position = (32768, 32768)
+        self._steer(*self._position, self._now_us)
         self._settled_us = self._now_us
         self._job: Job | None = None
         self._current: Point | None = None
@@ -184,6 +192,7 @@ class BoardCore:
             # A move that was broken off may have left the mirrors anywhere on its way: its own time counts too.
             self._settled_us = max(self._settled_us, self._now_us) + settle_us
         self._position = point.x, point.y
+        self._steer(point.x, point.y, self._now_us)
         self._current = point
         self._due_us = max(self._now_us + point.dark_us, self._settled_us)
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from re import fullmatch
 
-from optodrive.config import read_toml
 from optodrive.errors import InputError, nearest
+from optodrive.files import read_toml
 from optodrive.wire.messages import POINTS_MAX, Limits
 
 OWN = Limits(

@@ -9,9 +9,18 @@ INSTRUMENT_SIGMA = {"absorber_temperature_K": 1.0, "displacement_m": 0.25e-6, "f
 
 
 def measure(
-    trace: PixelTrace, pulses: FloatArray, ambient_k: float, bridge_width_m: float, noise: float, seed: int
+    trace: PixelTrace,
+    pulses: FloatArray,
+    ambient_k: float,
+    bridge_width_m: float,
+    noise: float,
+    seed: int | np.random.Generator,
+    aim_m: FloatArray | None = None,
 ) -> Measurement:
-    """One run a pixel of the trace, named after it. noise: how many times its stated noise each instrument adds."""
+    """One run a pixel of the trace, named after it. noise: how many times its stated noise each instrument adds.
+
+    aim_m: [2, display's pixels] where the beam was sent, from each pixel's middle; None for the middle itself
+    """
     rng = np.random.default_rng(seed)
     runs = []
     for column, pixel in enumerate(trace.pixel.tolist()):
@@ -30,5 +39,7 @@ def measure(
             for name, values in exact.items()
         }
         attributes: dict[str, str | float] = {"bridge_width_m": bridge_width_m, "sample": "simulated"}
+        if aim_m is not None:
+            attributes |= {"aim_x_m": float(aim_m[0, pixel]), "aim_y_m": float(aim_m[1, pixel])}
         runs.append(Run(f"pixel-{pixel}", ambient_k, pulses, signals, attributes))
     return Measurement(tuple(runs))

@@ -12,10 +12,11 @@ WRITE_TIMEOUT_S = 0.5
 
 
 class SerialPort:
-    """A serial device opened exclusively, 8N1."""
+    """A serial device opened exclusively, 8N1. key: where the configuration names it."""
 
-    def __init__(self, port: str, baud: int) -> None:
+    def __init__(self, port: str, baud: int, key: str = "board.port") -> None:
         self.name = port
+        self._key = key
         self._baud = baud
         self._serial: serial.Serial | None = None
 
@@ -23,14 +24,14 @@ class SerialPort:
         """Open the port; InputError where it does not exist or may not be opened, LinkError where it is in use."""
         if not Path(self.name).exists():
             present = ", ".join(port.device for port in list_ports.comports()) or "none found"
-            raise InputError("board.port", self.name, f"a serial port that exists ({present})", "no_port")
+            raise InputError(self._key, self.name, f"a serial port that exists ({present})", "no_port")
         try:
             self._serial = serial.Serial(
                 self.name, self._baud, timeout=0, write_timeout=WRITE_TIMEOUT_S, exclusive=True
             )
         except serial.SerialException as error:
             if error.errno == 13:
-                raise InputError("board.port", self.name, "permission to open it (group dialout?)", "no_port") from None
+                raise InputError(self._key, self.name, "permission to open it (group dialout?)", "no_port") from None
             raise LinkError(f"{self.name} cannot be opened: {error}; does another program hold it?") from None
         except OSError as error:
             raise LinkError(f"{self.name} cannot be opened: {error}") from None
@@ -58,7 +59,7 @@ class SerialPort:
             raise self._lost(error) from None
 
     def _lost(self, error: Exception) -> LinkError:
-        gone = "" if Path(self.name).exists() else f"; {self.name} is gone: unplugged, or the board lost power"
+        gone = "" if Path(self.name).exists() else f"; {self.name} is gone: unplugged, or its power is off"
         return LinkError(f"link to {self.name} lost: {error}{gone}")
 
     def close(self) -> None:

@@ -15,12 +15,17 @@ LINGER_S = 5.0
 
 
 class SimulatedBoard(SerialPort):
-    """Starts the board process when opened, and again when it has ended; `log` is the board's own."""
+    """Starts the board process when opened, and again when it has ended; `log` is the board's own.
 
-    def __init__(self, port: str, baud: int) -> None:
+    display: a configuration's file or shipped name; with it the board brings a spot sensor, at `sensor_port`.
+    """
+
+    def __init__(self, port: str, baud: int, display: str | None = None) -> None:
         self._folder = tempfile.TemporaryDirectory(prefix="optodrive-board-")
         super().__init__(port or str(Path(self._folder.name) / "tty"), baud)
         self.log = Path(self._folder.name) / "board.jsonl"
+        self.sensor_port = str(Path(self._folder.name) / "sensor")
+        self._display = display
         self._process: subprocess.Popen[bytes] | None = None
 
     def open(self) -> None:
@@ -40,6 +45,8 @@ class SimulatedBoard(SerialPort):
 
     def _start(self) -> None:
         arguments = ["--pty", self.name, "--log", str(self.log), "--baud", str(self._baud)]
+        if self._display is not None:
+            arguments += ["--sensor", self.sensor_port, "--config", self._display]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "optodrive.simulator.board", *arguments, "--exit-when-closed", str(LINGER_S)],
             stdin=subprocess.DEVNULL,

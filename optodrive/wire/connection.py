@@ -12,6 +12,7 @@ from optodrive.wire.messages import (
     NAK_REASONS,
     Abort,
     Ack,
+    Event,
     Hello,
     HelloReply,
     Message,
@@ -53,6 +54,7 @@ class HostConnection:
         self._nonce: int | None = None
         self._naks = 0
         self._retransmitted = 0
+        self._aborted = 0
         self.peer: HelloReply | None = None
 
     @property
@@ -72,14 +74,19 @@ class HostConnection:
         return LinkCounters(counted.crc_errors, counted.format_errors, self._retransmitted, self._naks)
 
     def hello(self, nonce: int) -> None:
-        """Begin a new session; everything not yet acknowledged is forgotten."""
+        """Begin a new session; what was for the one before is forgotten, what was queued since waits for this one."""
+        if self.peer is not None:
+            self._forget()
         self.peer = None
         self._nonce = nonce
-        self._forget()
         self._control.append(encode_frame(Frame(Hello.TYPE, 0, 0, Hello(MAJOR, MINOR, nonce).body())))
 
     def abort(self) -> None:
-        """Put ABORT ahead of all and forget everything else; only a new hello goes on from here."""
+        """Put ABORT ahead of all and forget everything else; only a new hello goes on from here.
+
+        Until its answer the board's events of the session before are still given: they say what became of ABORT.
+        """
+        self._aborted = self.session or self._aborted
         self._control = [encode_frame(Frame(Abort.TYPE, 0, self.session, b""))]
         self.peer = self._nonce = None
         self._forget()
@@ -90,9 +97,11 @@ class HostConnection:
         self._next_seq = self._base_seq = 0
         self._resend = self._resent = False
 
-    def send(self, message: Message) -> None:
-        """Queue a message."""
-        if message.SEQUENCED:
+    def send(self, message: Message, first: bool = False) -> None:
+        """Queue a message. first: before all sequenced ones that wait."""
+        if message.SEQUENCED and first:
+            self._waiting.appendleft(message)
+        elif message.SEQUENCED:
             self._waiting.append(message)
         else:
             self._control.append(encode_frame(Frame(message.TYPE, 0, self.session, message.body())))
@@ -142,8 +151,11 @@ class HostConnection:
             if isinstance(message, HelloReply):
                 if message.host_nonce != self._nonce or self.peer is not None:
                     continue
-                self.peer = message
-            elif self.peer is None or frame.session != self.session:
+                self.peer, self._aborted = message, 0
+            elif self.peer is None:
+                if not self._aborted or frame.session != self._aborted or not isinstance(message, Event):
+                    continue
+            elif frame.session != self.session:
                 continue
             if isinstance(message, Ack):
                 self._acknowledged(message.next_seq, now_s)

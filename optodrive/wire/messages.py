@@ -357,8 +357,8 @@ class Executed(Message):
     def parse(cls, body: bytes) -> Self:
         """A message from its body."""
         head, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
-        if len(head) != cls.LAYOUT.size or not rest or len(rest) % RECORD.size:
-            raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes are no whole records")
+        if len(head) != cls.LAYOUT.size or len(rest) % RECORD.size or not 1 <= len(rest) // RECORD.size <= RECORDS_MAX:
+            raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes are not 1 to {RECORDS_MAX} whole records")
         first_index, base = cls.LAYOUT.unpack(head)
         records = tuple((base + offset, on, duty) for offset, on, duty in RECORD.iter_unpack(rest))
         return cls(first_index, records)

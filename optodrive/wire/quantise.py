@@ -6,9 +6,10 @@ import numpy as np
 
 from optodrive.errors import LocalProtocolError
 from optodrive.flow import FloatArray, IntArray, LimitedPlan, freeze_arrays
+from optodrive.wire.codes import Converter
 
-CENTRE_CODE = 32768
-CODE_MAX = 65535
+DAC = Converter(16)
+CENTRE_CODE, CODE_MAX = DAC.centre, DAC.code_max
 DUTY_MAX = 65535
 TICKS_MAX = 65535
 DARK_STEP_TICKS = 60_000
@@ -25,14 +26,11 @@ class WireScale:
 
     def codes(self, angle_rad: FloatArray) -> IntArray:
         """Mirror angle to DAC codes; LocalProtocolError beyond the DAC's range. Any shape."""
-        codes = np.rint(angle_rad / self.rad_per_code).astype(np.int64) + CENTRE_CODE
-        if codes.size and (codes.min() < 0 or codes.max() > CODE_MAX):
-            raise LocalProtocolError(f"codes {codes.min()} to {codes.max()} leave the DAC's range 0 to {CODE_MAX}")
-        return codes
+        return DAC.codes(angle_rad, self.rad_per_code)
 
     def angles(self, codes: IntArray) -> FloatArray:
         """DAC codes to mirror angle, rad. Any shape."""
-        return np.asarray((codes - CENTRE_CODE) * self.rad_per_code, dtype=np.float64)
+        return DAC.angles(codes, self.rad_per_code)
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from optodrive.recording import read_recording
 
 SEED = int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000)
 NULLS, SINGLES, PAIRS, UNKNOWNS = 2, 4, 1, 2
-pytestmark = pytest.mark.timeout(600)  # eleven cases are drawn and diagnosed before the first of them
+pytestmark = pytest.mark.timeout(600)  # nine cases are drawn and diagnosed before the first of them
 
 
 def found(case):

@@ -147,7 +147,7 @@ def test_the_same_seed_gives_the_same_file(tmp_path):
     assert contents(named[0].path) == contents(named[1].path)
 
 
-@pytest.mark.parametrize("seed", range(18))
+@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 18))])
 def test_singles_show(tmp_path, seed):
     case = draw("single", seed, tmp_path)
     assert case.causes == (list(CATALOGUE)[seed],)
@@ -163,6 +163,7 @@ def test_pairs_show_each_and_are_not_confusable(tmp_path):
     assert min(case.each_sigma[c] for c in case.causes) > ENOUGH_SIGMA
 
 
+@pytest.mark.slow
 def test_an_unknown_is_imitated_by_no_cause(tmp_path):
     case = draw("unknown", 8, tmp_path, mechanism="mode_hops")
     assert case.causes == ("unknown", "mode_hops")

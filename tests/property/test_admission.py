@@ -21,8 +21,7 @@ from optodrive.physics.array import DisplayHeat
 
 DISPLAY = DISPLAYS["display-16"]
 MACHINE = DISPLAY.machine
-X_RAD = MACHINE.field.mirror_rad(DISPLAY.layout.x_m)
-Y_RAD = MACHINE.field.mirror_rad(DISPLAY.layout.y_m)
+X_RAD, Y_RAD = MACHINE.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
 LEAD_US = MACHINE.moves.lead_us
 SLACK_US = 1e-3
 SEEDS = st.integers(0, 2**32 - 1)
@@ -202,19 +201,16 @@ def agrees(seed):
     return admission
 
 
-def test_yes_and_no_agree_with_an_exhaustive_search():
-    seen = {}
+@settings(max_examples=200)
+@given(SEEDS)
+def test_yes_and_no_agree_with_an_exhaustive_search(seed):
+    agrees(seed)
 
-    @settings(max_examples=300)
-    @given(SEEDS)
-    def property_(seed):
-        admission = agrees(seed)
-        key = admission.fits, admission.proof
-        seen[key] = seen.get(key, 0) + 1
 
-    property_()
-    yes, no = (sum(count for key, count in seen.items() if key[0] is fits) for fits in (True, False))
-    assert min(yes, no) > 0.25 * (yes + no)
+def test_both_answers_are_common_among_the_seeds():
+    """The same seeds in every run: what hypothesis draws, and how often, is its own."""
+    fits = [agrees(seed).fits for seed in range(100)]
+    assert 25 < sum(fits) < 75
 
 
 @settings(max_examples=60)

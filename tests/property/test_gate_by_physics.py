@@ -6,15 +6,20 @@ import numpy as np
 import pytest
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from displays import DISPLAYS
+from hidden_field import field_file
 from optodrive.board.requirements import Requirements
 from optodrive.config import Config
 from optodrive.errors import InputError
 from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
 from optodrive.frames.patterns import build_pattern
+from optodrive.helios.frames import points_of
+from optodrive.helios.points import PointScale, decode, encode
 from optodrive.pipeline import Display, prepare
-from optodrive.wire.quantise import quantise
+from optodrive.plan.galvo import MoveModel
+from optodrive.wire.quantise import CENTRE_CODE, quantise
 
 GRID_S = 1e-6
 ROUNDING_M = 1e-9
@@ -53,31 +58,58 @@ class Exact:
         return out
 
 
-def outside_m(display, plan):
+def ideal(display, x_rad, y_rad):
+    """Where the beam lands by an ideal lens."""
+    twice_f_m = 2.0 * display.config.scanner.focal_length_m
+    return twice_f_m * x_rad, twice_f_m * y_rad
+
+
+def outside_m(display, plan, lands=ideal):
     """How far the focus, with its aim error, reaches over an absorber's edge while lit, m; negative: it never does."""
-    scale, config = Requirements.of(display.config).scale, display.config
+    scale = Requirements.of(display.config).scale
     points = quantise(plan, scale)
     x, y, dark, on, _ = points.table.astype(np.int64).T
     begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s
-    if not on.any():
+    lit = np.flatnonzero(on)
+    from_s, lit_s = begin_s[lit] + dark[lit] * scale.tick_s, on[lit] * scale.tick_s
+    angles_rad = scale.angles(x), scale.angles(y)
+    return reaches_over_m(display, begin_s, angles_rad, from_s, lit_s, plan.pixel[points.row[lit]], lands)
+
+
+def outside_on_helios_m(display, plan):
+    """The same of a Helios' points, as decoded from the bytes of its frames."""
+    scale = PointScale.of(display.config)
+    frames = [frame.data for frame in encode(plan, scale)]
+    points = np.concatenate([points_of(data)[0] for data in frames]).astype(np.int64)
+    codes = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2]
+    begin = np.flatnonzero(np.append(True, (np.diff(codes[0]) != 0) | (np.diff(codes[1]) != 0)))
+    angles = tuple(scale.angles(code[begin]) for code in codes)
+    pulses = decode(frames, scale)
+    pixel = plan.pixel[np.searchsorted(plan.start_s, pulses.start_s + 1e-9, side="right") - 1]
+    return reaches_over_m(display, begin * scale.point_s, angles, pulses.start_s, pulses.width_s, pixel)
+
+
+def reaches_over_m(display, begin_s, angles_rad, from_s, width_s, pixel_of, lands=ideal):
+    """As `outside_m`: mirrors sent to angles_rad (x, y) at begin_s, light from from_s for width_s on pixel_of."""
+    config = display.config
+    if not len(from_s):
         return -np.inf
     # Edges of the gate and a grid between them, fine for as long as anything may still swing.
     samples, row_of = [], []
-    for row in np.flatnonzero(on):
-        lit_s = on[row] * scale.tick_s
+    for row, lit_s in enumerate(width_s):
         inside_s = np.append(np.arange(0.0, min(lit_s, 3e-3), GRID_S), np.linspace(0.0, lit_s, 50))
-        samples.append(begin_s[row] + dark[row] * scale.tick_s + np.sort(inside_s))
+        samples.append(from_s[row] + np.sort(inside_s))
         row_of.append(np.full(len(inside_s), row))
     t_s, row_of = np.concatenate(samples), np.concatenate(row_of)
-    pixel = plan.pixel[points.row[row_of]]
+    pixel = pixel_of[row_of]
     display_section, laser, servo = config.display, config.laser, Exact(config.scanner)
     worst = []
-    for codes, place_m, absorber_m, focus_m in (
-        (x, display.layout.x_m, display_section.absorber_width_m, laser.focus_width_m),
-        (y, display.layout.y_m, display_section.absorber_height_m, laser.focus_height_m),
+    landed_m = lands(display, *(servo.angles(begin_s, goal_rad, t_s) for goal_rad in angles_rad))
+    for at_m, place_m, absorber_m, focus_m in (
+        (landed_m[0], display.layout.x_m, display_section.absorber_width_m, laser.focus_width_m),
+        (landed_m[1], display.layout.y_m, display_section.absorber_height_m, laser.focus_height_m),
     ):
-        angle_rad = servo.angles(begin_s, scale.angles(codes), t_s)
-        off_m = np.abs(2.0 * config.scanner.focal_length_m * angle_rad - place_m[pixel])
+        off_m = np.abs(at_m - place_m[pixel])
         worst.append((off_m + config.scanner.aim_error_m + focus_m / 2 - absorber_m / 2).max())
     return max(worst)
 
@@ -153,6 +185,35 @@ def test_in_a_full_frame(name, height_m):
     assert outside_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
 
 
+def on_helios(display, points_per_s):
+    """The same display behind a Helios."""
+    table = display.config.model_dump()
+    table["board"] |= {"transport": "helios", "points_per_s": points_per_s}
+    table["scanner"]["codes_a_side"] = 2047
+    return Display.of(Config.model_validate(table))
+
+
+@settings(max_examples=60)
+@given(data=st.data())
+def test_on_a_helios_whose_steps_are_coarse(data):
+    try:
+        display = on_helios(data.draw(displays()), data.draw(st.sampled_from([20_000, 40_000, 50_000])))
+    except InputError:
+        reject()
+    except ValidationError:  # two coarse steps and the focus do not fit on the absorber
+        reject()
+    sequence = FrameSequence(trains=tuple(hops(data.draw, display)))
+    assert outside_on_helios_m(display, planned(display, sequence)) <= ROUNDING_M
+
+
+@pytest.mark.parametrize(("name", "height_m"), [("display-437", 10e-6), ("display-16", 50e-6)])
+def test_on_a_helios_in_a_full_frame(name, height_m):
+    display = on_helios(DISPLAYS[name], 40_000)
+    assert outside_on_helios_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
+    early = with_moves(display, Early(display.machine.moves))
+    assert outside_on_helios_m(early, planned(early, frame(early, 50e-6))) > 2e-5
+
+
 @pytest.mark.parametrize("number", range(1, 7))
 def test_in_the_experiments_of_the_paper(number):
     display = DISPLAYS["display-437"]
@@ -202,3 +263,34 @@ def test_hasty_moves_taken_for_calm_ones_are_caught():
     assert outside_m(display, planned(display, there_and_back(display))) <= 0
     always_calm = with_moves(display, replace(display.machine.moves, calm_us=0))
     assert outside_m(always_calm, planned(always_calm, there_and_back(always_calm))) > 2e-5
+
+
+def by_the_field(display, x_rad, y_rad):
+    """Where the beam lands by the calibrated field."""
+    step_rad = display.config.scanner.code_rad
+    return display.machine.field.position_m(CENTRE_CODE + x_rad / step_rad, CENTRE_CODE + y_rad / step_rad)
+
+
+@pytest.fixture(scope="module")
+def in_a_field(tmp_path_factory):
+    """Display-437 with a field calibrated on a hidden geometry."""
+    _, config = field_file(tmp_path_factory.mktemp("field") / "field.toml", seed=3)
+    return Display.of(config)
+
+
+def anywhere(display):
+    """Short pulses on pixels at random."""
+    pixels = np.random.default_rng(6).integers(0, len(display.layout), 300).tolist()
+    return FrameSequence(trains=tuple(PulseTrain(p, 1e-6 * k, 2e-4, 2e-4, 0.0, 2.45) for k, p in enumerate(pixels)))
+
+
+def test_in_a_calibrated_field(in_a_field):
+    for sequence in (frame(in_a_field, 10e-6), there_and_back(in_a_field), anywhere(in_a_field)):
+        assert outside_m(in_a_field, planned(in_a_field, sequence), by_the_field) <= ROUNDING_M
+
+
+def test_moves_of_the_ideal_lattice_in_a_calibrated_field_are_caught(in_a_field):
+    """What a nominal pitch needs, given to places a little farther apart."""
+    ideal_moves = MoveModel.of(in_a_field.config)
+    loose = with_moves(in_a_field, replace(ideal_moves, pitch_rad=1.1 * ideal_moves.pitch_rad))
+    assert outside_m(loose, planned(loose, anywhere(loose)), by_the_field) > ROUNDING_M

@@ -133,8 +133,16 @@ def unacknowledged_not_counted(guard):
 MUTANTS = (cap_five_percent_off, wrong_constant, forgotten_over_a_pause, unacknowledged_not_counted)
 
 
-@pytest.mark.parametrize("mutant", MUTANTS, ids=lambda mutant: mutant.__name__)
-@pytest.mark.parametrize("guard", SCENARIOS)
+LONGEST = {("absorber", wrong_constant), ("wall", wrong_constant), ("touch", wrong_constant)}
+"""By scripts/test --slow."""
+CASES = [
+    pytest.param(guard, mutant, marks=[pytest.mark.slow] if (guard, mutant) in LONGEST else [])
+    for guard in SCENARIOS
+    for mutant in MUTANTS
+]
+
+
+@pytest.mark.parametrize(("guard", "mutant"), CASES)
 def test_a_mutant_is_caught(guard, mutant):
     assert share(guard, worst(guard), **mutant(guard)) > 1.0005
 
@@ -148,7 +156,7 @@ def on_its_way_counted_double(heat):
     )
 
 
-@pytest.mark.parametrize("guard", ["wall", "touch"])
+@pytest.mark.parametrize("guard", [pytest.param("wall", marks=pytest.mark.slow), "touch"])
 def test_heat_on_its_way_taken_off_twice_is_caught(guard):
     """With nothing unsure, so that no other margin hides it."""
     name, binding, _, _ = SCENARIOS[guard]

@@ -38,6 +38,7 @@ def random_mirrors(rng):
         lead_s=rng.uniform(5e-4, 3e-3),
         mean_s=rng.choice([0.1, 1.0, 3.0]),
         code_rad=0.0,
+        early_s=0.0,
     )
 
 

@@ -56,7 +56,9 @@ def sequences(draw, name):
     return FrameSequence(tuple(frames), trains)
 
 
-@pytest.mark.parametrize("name", sorted(DISPLAYS))
+@pytest.mark.parametrize(
+    "name", [name if name != "display-16" else pytest.param(name, marks=pytest.mark.slow) for name in sorted(DISPLAYS)]
+)
 @settings(max_examples=12)
 @given(data=st.data())
 def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
@@ -74,8 +76,10 @@ def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
         assert result.plan.headroom_k[pixel] <= cap_k - absorber.max() + 1e-6
         until = np.append(plan.start_s[rows[1:]], np.inf)
         for row, limit_s in zip(rows, until, strict=True):
-            window = (time >= plan.start_s[row] - STEP_S) & (time <= limit_s + STEP_S)
-            measured = height[window].max()
+            window = (time >= plan.start_s[row]) & (time <= limit_s)
+            # Gas that falls steeply is a few per cent higher a step earlier: its edges are taken where they are.
+            edges = np.interp([plan.start_s[row], min(limit_s, time[-1])], time, height)
+            measured = max(height[window].max(initial=0.0), *edges)
             assert measured == pytest.approx(result.predicted_m[row], rel=0.02, abs=2e-8)
             crowded = limit_s - ends_s[row] < 0.008  # the gas lags: the next pulse came before this one's peak
             if plan.source[row] < len(sequence.frames) and not plan.reason[row] and not crowded:

@@ -110,7 +110,7 @@ def assert_in_order(run):
         assert not np.any(np.isinf(signal.value))
 
 
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(st.data())
 def test_bytes_changed_or_cut_off(valid, path, data):
     with pytest.MonkeyPatch.context() as patch:
@@ -178,7 +178,7 @@ def move(file, draw):
 CHANGES = [set_attribute, delete_attribute, delete, put_dataset, claim, set_entry, add, link, move]
 
 
-@settings(max_examples=300)
+@settings(max_examples=120)
 @given(st.data())
 def test_members_attributes_and_datasets_replaced(valid, path, data):
     shutil.copyfile(valid / "r.h5", path)

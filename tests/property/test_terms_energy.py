@@ -47,6 +47,7 @@ def test_energy_closes(keys, data, power, lit_s):
     assert traced.absorbed_j[-1] == pytest.approx(0.66 * power.sum() * lit_s, rel=1e-9)
 
 
+@pytest.mark.slow
 @settings(max_examples=20, deadline=None)
 @given(made=models(HEAT), power=POWERS, lit_s=st.floats(1e-3, 0.03))
 def test_half_the_step_changes_nothing(made, power, lit_s):

@@ -1,57 +1,20 @@
 import pytest
 
+from benches import at_rest, board, daemon, kept, make_board, make_daemon, start  # noqa: F401 - fixtures
 from optodrive.clock import MonotonicClock
 from optodrive.config import load_config
 from optodrive.daemon.engine import Engine
 from optodrive.pipeline import Display
-from optodrive.transport.simulated import SimulatedBoard
-from rig import Board, Daemon
+from optodrive.transport.serial_port import SerialPort
+from rig import config_text
 
 
 @pytest.fixture
-def make_board(tmp_path):
-    boards = []
-
-    def make(**options):
-        boards.append(Board(tmp_path, **options))
-        return boards[-1]
-
-    yield make
-    for board in boards:
-        board.stop()
-
-
-@pytest.fixture
-def make_daemon(tmp_path):
-    daemons = []
-
-    def make(board, **options):
-        daemons.append(Daemon(tmp_path, board.port, **options))
-        return daemons[-1]
-
-    yield make
-    for daemon in daemons:
-        daemon.stop()
-
-
-@pytest.fixture
-def board(make_board):
-    return make_board()
-
-
-@pytest.fixture
-def daemon(make_daemon, board):
-    return make_daemon(board)
-
-
-@pytest.fixture
-def transport():
-    return SimulatedBoard("", 1_000_000)
-
-
-@pytest.fixture
-def engine(transport):
-    engine = Engine(Display.of(load_config()), transport, MonotonicClock())
+def engine(board, tmp_path):  # noqa: F811
+    config = tmp_path / "engine.toml"
+    config.write_text(config_text(board.port))
+    display = Display.of(load_config(config))
+    engine = Engine(display, SerialPort(str(board.port), display.config.board.baud), MonotonicClock())
     engine.start()
     yield engine
     engine.close()

@@ -19,6 +19,8 @@ from optodrive.config import shipped_path
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
+PATIENT_LEASE_S = 1.0
+"""Of what is not about the lease: the longest there is, for a busy machine may keep a host waiting for 0.1 s."""
 ENDED = ("done", "superseded", "failed", "cancelled")
 
 
@@ -43,37 +45,45 @@ def ended(engine, answer):
     return wait_for(look, "the plan's end")
 
 
-def events(transport, kind):
-    """What a simulated board in this process wrote to its log."""
-    lines = transport.log.read_text().splitlines()
-    return [event for event in map(json.loads, lines) if event["event"] == kind]
+SIMULATED = (sys.executable, "-m", "optodrive.simulator.board")
 
 
 class Board:
-    """The board's process; its log is the witness."""
+    """The board's process; its log is the witness. program: how it is started, the simulated board if not said."""
 
-    def __init__(self, folder, script="", limits="", disk_bytes=None):
+    def __init__(self, folder, script="", limits="", disk_bytes=None, program=SIMULATED, seed=None, sensor=None):
         self.port = folder / "tty"
         self.log = folder / "board.jsonl"
         arguments = ["--pty", self.port, "--log", self.log]
+        arguments += [] if seed is None else ["--seed", str(seed)]
+        self.sensor = None
+        if sensor is not None:  # options of a spot sensor beside it
+            self.sensor = folder / "sensor"
+            arguments += ["--sensor", self.sensor, *sensor]
+        limits = limits or f"lease_ms = {PATIENT_LEASE_S * 1e3:.0f}\n"  # a host asks for less where it wants less
         for option, text in (("--script", script), ("--limits", limits)):
             if text:
                 path = folder / f"board{option}.toml"
                 path.write_text(text)
                 arguments += [option, path]
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "optodrive.simulator.board", *arguments],
+            [*program, *arguments],
             stderr=subprocess.PIPE if disk_bytes else None,
             text=True,
             preexec_fn=disk_bytes and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (disk_bytes, disk_bytes)),
         )
+        self._forgotten = 0
         wait_for(self.port.exists, "the board's port")
 
     def events(self):
         if not self.log.exists():
             return []
         lines = self.log.read_text().splitlines(keepends=True)
-        return [json.loads(line) for line in lines if line.endswith("\n")]
+        return [json.loads(line) for line in lines if line.endswith("\n")][self._forgotten :]
+
+    def forget(self):
+        """What was logged so far is another test's."""
+        self._forgotten += len(self.events())
 
     def of(self, kind):
         return [event for event in self.events() if event["event"] == kind]
@@ -85,12 +95,46 @@ class Board:
             self.process.stderr.close()
 
 
+def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
+    """A shipped configuration for a board at a port, and a sensor at another."""
+    text = shipped_path(f"{name}.toml").read_text()
+    text, count = re.subn(r"(?m)^lease_s = \S+", f"lease_s = {lease_s}", text)
+    assert count == 1
+    text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
+    return text if sensor is None else f'{text}\n[sensor]\nport = "{sensor}"\n'
+
+
+class Command:
+    """An `optodrive` command on a board's port and its sensor's, as a process."""
+
+    def __init__(self, folder, board, *arguments, lease_s=PATIENT_LEASE_S):
+        config = folder / "bench.toml"
+        config.write_text(config_text(board.port, sensor=board.sensor, lease_s=lease_s))
+        self.process = subprocess.Popen(
+            [OPTODRIVE, *map(str, arguments), "--config", config],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def ended(self, patience_s=90.0):
+        """Status, stdout, stderr."""
+        out, errors = self.process.communicate(timeout=patience_s)
+        assert "Traceback" not in errors, errors
+        return self.process.returncode, out, errors
+
+    def stop(self):
+        if self.process.poll() is None:
+            self.process.kill()
+        self.process.communicate()
+
+
 class Daemon:
     """`optodrive serve` on a board's port."""
 
-    def __init__(self, folder, port, name="display-437", replace=(), options=()):
-        text = shipped_path(f"{name}.toml").read_text()
-        text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)
+    def __init__(self, folder, port, name="display-437", replace=(), options=(), lease_s=PATIENT_LEASE_S):
+        text = config_text(port, name, lease_s=lease_s)
         for old, new in replace:
             assert old in text
             text = text.replace(old, new)
@@ -152,11 +196,11 @@ class Daemon:
 
 
 @contextmanager
-def running(folder):
-    """A board and a daemon on it, both ended whatever happens."""
-    board = Board(folder)
+def running(folder, replace=(), **options):
+    """A board and a daemon on it, both ended whatever happens; replace: in its configuration; options: the board's."""
+    board = Board(folder, **options)
     try:
-        daemon = Daemon(folder, board.port)
+        daemon = Daemon(folder, board.port, replace=replace)
         try:
             yield board, daemon
         finally:

@@ -5,6 +5,7 @@ import subprocess
 
 import pytest
 
+from optodrive.cli import main
 from rig import OPTODRIVE, Board, Daemon
 
 MODEL = """format = "optodrive-parameters"
@@ -101,18 +102,18 @@ WRONG = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_a_wrong_model_is_refused_in_one_line(what, files):
+def test_a_wrong_model_is_refused_in_one_line(what, files, capsys):
     model, frames = files
     text, expected = WRONG[what]
     if text is None:
         model.unlink()
     else:
         model.write_text(text)
-    finished = run("plan", frames, "--config", "display-16", "--model", model)
-    assert finished.returncode == 2
-    assert finished.stdout == ""
-    assert expected in finished.stderr
-    assert finished.stderr.count("\n") == 1
+    assert main.run(["plan", str(frames), "--config", "display-16", "--model", str(model)]) == 2
+    said, errors = capsys.readouterr()
+    assert said == ""
+    assert expected in errors
+    assert errors.count("\n") == 1
 
 
 def test_a_model_must_be_a_toml_file(files):

@@ -2,17 +2,19 @@
 
 import pytest
 
+from rig import running
+
 LOW = (("touch_max_c = 48.0", "touch_max_c = 23.0"),)
 FRAMES = {
     "frames": [{"show_at_s": 0.1 * k, "duration_s": 0.1, "target_um": {"200": 300, "201": 300}} for k in range(6)]
 }
 
 
-@pytest.fixture
-def armed(make_daemon, make_board):
-    daemon = make_daemon(make_board(), replace=LOW)
-    daemon.arm()
-    return daemon
+@pytest.fixture(scope="module")
+def armed(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("policies"), replace=LOW) as (_, daemon):
+        daemon.arm()
+        yield daemon
 
 
 def test_trim_names_pixel_cap_and_when_all_would_fit(armed):
@@ -29,7 +31,7 @@ def test_refuse_is_a_problem_document_and_nothing_moves(armed):
     assert answer["cap"] == "touch_temperature"
     assert answer["pixel"] in (200, 201)
     assert "the whole fits" in answer["detail"]
-    assert armed.state()["totals"] == {"planned": 0, "sent": 0, "executed": 0}
+    assert armed.state()["totals"] == {"planned": 0, "sent": 0, "executed": 0, "timing_error": None}
 
 
 def test_delayed_frames_are_executed_as_tall_as_asked(armed):

@@ -1,20 +1,33 @@
 """The paper's six experiments, played over REST, come back executed with its timings (Text S5, Fig. S17)."""
 
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import pytest
 
+from optodrive.board.requirements import Requirements
+from optodrive.config import load_config, pixel_layout
 from rig import running
 
 PWM_S = 2e-4
 
 
 @pytest.fixture(scope="module")
-def executed(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("experiments")) as (board, daemon):
+def options():
+    """How board and daemon are started."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def bench(tmp_path_factory, options):
+    with running(tmp_path_factory.mktemp("experiments"), **options) as (board, daemon):
         daemon.arm()
-        yield partial(play, board, daemon)
+        yield board, daemon
+
+
+@pytest.fixture(scope="module")
+def executed(bench):
+    return partial(play, *bench)
 
 
 def play(board, daemon, name, **parameters):
@@ -24,13 +37,39 @@ def play(board, daemon, name, **parameters):
     assert answer["planned"] == answer["sent"] == answer["executed"]
     assert answer["executed_complete"]
     assert answer["summary"]["trimmed"]["pulses"] == 0
-    logged = board.of("pulse")[-answer["executed"] :]
     columns = {key: np.array(value) for key, value in answer["executed_pulses"].items()}
-    assert np.allclose(np.diff([p["on_us"] for p in logged]) * 1e-6, np.diff(columns["start_s"]), atol=2e-6)
+    assert_logged(board, columns, daemon.state()["totals"]["executed"])
     columns["moves_s"] = answer["summary"]["moves_s"]
     columns["first_s"] = columns["start_s"] - columns["start_s"][0]
     columns["total_s"] = columns["first_s"][-1] + columns["width_s"][-1]
     return columns
+
+
+def assert_logged(board, columns, executed_in_all):
+    """The board's own log has all these pulses and no other, at their times, as wide, in their cells, then darkness."""
+    pulses = board.of("pulse")
+    assert len(pulses) == executed_in_all
+    pulses = pulses[-len(columns["pixel"]) :]
+    on_us, off_us, codes, index = (
+        np.array([[pulse[name] for name in names] for pulse in pulses])
+        for names in (("on_us",), ("off_us",), ("x", "y"), ("index",))
+    )
+    assert np.allclose(np.diff(on_us[:, 0]) * 1e-6, np.diff(columns["start_s"]), atol=2e-6)
+    assert (off_us - on_us)[:, 0].tolist() == np.rint(columns["width_s"] * 1e6).astype(int).tolist()
+    assert (np.diff(index[:, 0]) > 0).all()
+    assert codes.tolist() == cell_codes()[columns["pixel"]].tolist()
+    assert not board.of("fault")
+    edges = board.of("gate")[-2 * len(pulses) :]
+    assert [edge["on"] for edge in edges] == [True, False] * len(pulses)
+
+
+@cache
+def cell_codes():
+    """Codes of every pixel's centre, [p, 2]."""
+    config = load_config()
+    layout, angle = pixel_layout(config.display), 1.0 / (2.0 * config.scanner.focal_length_m)
+    scale = Requirements.of(config).scale
+    return np.column_stack([scale.codes(layout.x_m * angle), scale.codes(layout.y_m * angle)])
 
 
 def by_visit(pulses):

@@ -15,9 +15,10 @@ PIXELS = 437
 
 
 @pytest.fixture
-def daemon(make_board, make_daemon):
-    daemon = make_daemon(make_board())
-    daemon.arm()
+def daemon(kept):
+    _, daemon = kept
+    if daemon.board_state() == "DISARMED":
+        daemon.arm()
     return daemon
 
 
@@ -87,12 +88,14 @@ def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
 
 
 def test_a_caller_that_leaves_takes_the_light_with_it(daemon):
+    before = daemon.state()["totals"]["executed"]
     with socket(daemon) as stream:
         stream.send(binary(0, range(400), 100.0))  # three seconds of light
-        wait_for(lambda: daemon.state()["totals"]["executed"], "the first light")
+        (planned,) = until(stream, {"frame": 0, "status": "planned"})
+        wait_for(lambda: daemon.state()["totals"]["executed"] > before, "the first light")
     wait_for(lambda: daemon.board_state() == "ARMED", "the board to rest", patience_s=1.5)
-    assert daemon.state()["totals"]["executed"] < 200
-    assert daemon.finished("p1")["status"] == "superseded"
+    assert daemon.state()["totals"]["executed"] < before + 200
+    assert daemon.finished(planned["plan"])["status"] == "superseded"
 
 
 def test_sigterm_ends_it_dark_at_once_though_a_caller_stays(make_board, make_daemon):

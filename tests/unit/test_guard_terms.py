@@ -72,8 +72,8 @@ def hostile(power_w, seed):
     rest_s = generator.choice([5e-4, 5e-3, 0.03], count)
     start_s = 0.01 + np.cumsum(np.concatenate([[0.0], (width_s + rest_s)[:-1]]))
     pixel = generator.choice([5, 5, 5, 4, 6], count)
-    x_rad = DISPLAY.machine.field.mirror_rad(DISPLAY.layout.x_m)[pixel]
-    y_rad = DISPLAY.machine.field.mirror_rad(DISPLAY.layout.y_m)[pixel]
+    angles_rad = DISPLAY.machine.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
+    x_rad, y_rad = (angle_rad[pixel] for angle_rad in angles_rad)
     zero, nothing = np.zeros(count), np.full(count, np.nan)
     return PulsePlan(
         start_s, width_s, x_rad, y_rad, np.full(count, power_w), pixel, zero, nothing, start_s, pixel.astype(np.int64)

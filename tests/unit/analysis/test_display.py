@@ -78,6 +78,7 @@ def told(recording):
     return answers
 
 
+@pytest.mark.slow
 def test_every_pixel_has_its_answer_though_workers_were_killed(told):
     assert sorted(told) == [*HIDDEN, BAD, KILLER]
     for pixel, terms in HIDDEN.items():
@@ -137,6 +138,7 @@ def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(told):
     assert "; display-16 has no pixel 31." in small
 
 
+@pytest.mark.slow
 def test_the_command_writes_report_answer_and_model(tmp_path, capsys):
     path, out = tmp_path / "five.h5", tmp_path / "answer"
     out.mkdir()

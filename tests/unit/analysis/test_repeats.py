@@ -59,7 +59,7 @@ def hopping():
     return diagnose(hopping_lab(22))
 
 
-@pytest.mark.parametrize("scale", [1.0, 1.3])
+@pytest.mark.parametrize("scale", [1.0, pytest.param(1.3, marks=pytest.mark.slow)])
 def test_the_omnibus_keeps_its_level_whatever_the_noise_really_is(scale):
     rng = np.random.default_rng(1)
     draws = scale * rng.chisquare(150, 4000), scale * rng.chisquare(80, 4000)
@@ -124,6 +124,7 @@ def test_no_cause_has_no_other_form():
     assert bent(problem, base, (), ()).shape == (len(problem.data.value), 0)
 
 
+@pytest.mark.slow
 def test_what_only_the_runs_held_out_show_is_not_overlooked():
     limit_k = AMBIENT_K + 220.0
     runs = []

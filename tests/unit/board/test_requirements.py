@@ -17,7 +17,7 @@ def board_us(limits, codes):
 def moves_between(display, rng, count=400):
     """Codes and planned times of calm moves between pixels, straight and diagonal, and of the first from the middle."""
     scale, moves = Requirements.of(display.config).scale, display.machine.moves
-    x_rad, y_rad = (display.machine.field.mirror_rad(at_m) for at_m in (display.layout.x_m, display.layout.y_m))
+    x_rad, y_rad = display.machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
     pairs = rng.integers(len(display.layout), size=(count, 2))
     pairs = np.concatenate([pairs, [[k, min(k + 1, len(x_rad) - 1)] for k in range(len(x_rad))]])
     codes = [np.abs(np.diff(scale.codes(angle_rad)[pairs], axis=1)[:, 0]) for angle_rad in (x_rad, y_rad)]

@@ -321,6 +321,21 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
     assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
 
 
+@pytest.mark.parametrize("kind", [m.HelloReply.TYPE, m.ClockReply.TYPE])
+def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
+    """Heat is kept in the board's time: it would move by all the time that the board has run."""
+    rig.run(3.0)
+    rig.session.drop()
+    rig.link.keep_back = lambda frame: frame.type == kind
+    with pytest.raises(LinkError):
+        rig.connect()
+    assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
+    rig.link.keep_back = lambda frame: False
+    before_s = rig.session.board_s()
+    rig.connect()
+    assert rig.session.board_s() - before_s < CONNECT_TIMEOUT_S
+
+
 def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
     rig.arm()
     asked = plan(100)
@@ -380,6 +395,29 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     job = rig.play(asked)
     rig.until(lambda: job.finished)
     assert job.executed(asked, 2.45, 1e-6).complete
+
+
+def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_limits_first(rig):
+    rig.arm()
+    rig.play(plan(500))
+    rig.run(0.3)
+    hellos, rig.link.sent = [], []
+
+    def keep_back(frame):
+        hellos.extend([frame] if frame.type == m.Hello.TYPE else [])
+        return frame.type == m.Hello.TYPE and len(hellos) == 1
+
+    rig.link.keep_back = keep_back
+    rig.session.abort()
+    assert not rig.session.aborted
+    rig.until(lambda: rig.session.aborted)
+    assert rig.core.state == rig.session.board.state == "DISARMED"
+    assert not rig.session.quiet
+    rig.arm()
+    assert len(hellos) == 2
+    told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
+    assert told == [m.Limits.TYPE, m.ArmReq.TYPE]
+    assert rig.core._limits.spot_uj < OWN.spot_uj
 
 
 def test_flush_in_mid_job_stays_armed_for_the_next(rig):

@@ -10,7 +10,14 @@ from optodrive.limit.mirrors import Motion, acceleration2_after, late_s, left_of
 from warmth import _coil
 
 SERVO = Mirrors(
-    omega_per_s=2 * np.pi * 1700, damping=0.7, delay_s=3e-5, slew_rad_per_s=100.0, lead_s=5e-3, mean_s=1.0, code_rad=0.0
+    omega_per_s=2 * np.pi * 1700,
+    damping=0.7,
+    delay_s=3e-5,
+    slew_rad_per_s=100.0,
+    lead_s=5e-3,
+    mean_s=1.0,
+    code_rad=0.0,
+    early_s=0.0,
 )
 AT_REST = Motion(0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -79,6 +86,7 @@ def motions(draw):
         lead_s=draw(st.sampled_from([1e-3, 5e-3])),
         mean_s=draw(st.sampled_from([0.05, 0.3, 1.0])),
         code_rad=0.0,
+        early_s=0.0,
     )
     now_s, at_rad, rows = 0.0, 0.0, []
     for _ in range(draw(st.integers(1, 30))):

@@ -3,11 +3,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.physics.drive import DriveRange, pulse_for_peak, pulse_peak, reach_m
+from optodrive.physics.drive import DriveRange, pulse_peak, reach_m, shortest
 from optodrive.physics.pixel import Pixel, advance
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
 DRIVE = DriveRange.of(2.45, 5000.0, 0.050)
+
+
+def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, least_periods=1, from_s=0.0):
+    goal_k = target_m / pixel.kappa_m_per_k
+    span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+    periods, duty = shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
+    return (periods, duty) if periods else None
 
 
 def test_range_counts_whole_periods():
@@ -60,11 +67,11 @@ def test_a_target_out_of_reach_gets_the_longest_pulse():
 @given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), least=st.integers(1, 300))
 def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, least):
     target = share * reach_m(PIXEL, DRIVE)
-    shortest, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
-    if shortest is None:
+    narrow, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
+    if narrow is None:
         assert wide is None
         return
-    assert wide[0] == max(shortest[0], min(least, DRIVE.max_periods))
+    assert wide[0] == max(narrow[0], min(least, DRIVE.max_periods))
     peak = pulse_peak(PIXEL, theta, 0.0, wide[1] * 2.45, wide[0] * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
     assert peak == pytest.approx(target, rel=1e-6)
 

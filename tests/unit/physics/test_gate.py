@@ -48,7 +48,9 @@ def still_to_come(pole, phases):
     return np.abs((np.exp(1j * phases[:, None] + pole * t_s)).real).max(axis=1)
 
 
-@pytest.mark.parametrize("damping", [0.3, 0.5, 0.7, 0.9])
+@pytest.mark.parametrize(
+    "damping", [0.3, *(pytest.param(damping, marks=pytest.mark.slow) for damping in (0.5, 0.7, 0.9))]
+)
 def test_what_outlasts_a_tolerance_is_bounded_over_all_phases_and_tightly(damping):
     servo = Servo(1000.0, damping, 0.0, 100.0)
     pole, phases, most = pole_per_s(servo), np.linspace(0, np.pi, 721), 0.0

@@ -80,10 +80,10 @@ def test_no_pulse_is_left_out_where_the_membrane_still_rises_as_the_next_one_com
     train = HeightTrain(17, 0.0, 0.5, period_s, 100e-6, None if swing_um is None else swing_um * 1e-6)
     result = prepared(train)
     peaks_um, troughs_um = felt(result, train)
-    assert len(result.plan) == len(peaks_um)
+    assert np.count_nonzero(np.isfinite(result.plan.target_m)) == len(peaks_um)  # a head has no height of its own
     assert peaks_um[3:] == pytest.approx(np.full(len(peaks_um) - 3, 100.0), rel=0.01)
     if swing_um is not None:
-        assert (peaks_um - troughs_um)[10:] == pytest.approx(np.full(len(peaks_um) - 10, swing_um), rel=0.06)
+        assert (peaks_um - troughs_um)[10:] == pytest.approx(np.full(len(peaks_um) - 10, swing_um), rel=0.03)
 
 
 def test_planned_for_their_peaks_such_cycles_leave_out_every_other_pulse(monkeypatch):

@@ -7,11 +7,10 @@ from optodrive.plan.field import IdealField
 from optodrive.plan.order import serpentine
 
 
-def test_field_there_and_back():
-    field = IdealField(0.22)
-    position = np.linspace(-0.076, 0.076, 9)
-    assert np.allclose(field.position_m(field.mirror_rad(position)), position, atol=1e-15)
-    assert field.mirror_rad(np.array([0.044]))[0] == pytest.approx(0.1)
+def test_the_beam_turns_by_twice_the_mirror_s_angle():
+    x_rad, y_rad = IdealField(0.22).angles_rad(np.array([0.044, 0.0]), np.array([0.0, -0.022]))
+    assert x_rad == pytest.approx([0.1, 0.0])
+    assert y_rad == pytest.approx([0.0, -0.05])
 
 
 @given(st.lists(st.integers(0, 99), min_size=1, unique=True))

@@ -13,7 +13,7 @@ from optodrive.plan.order import path_rad, serpentine, visiting_order, warm
 
 DISPLAY = DISPLAYS["display-437"]
 LAYOUT, FIELD = DISPLAY.layout, DISPLAY.machine.field
-X_RAD, Y_RAD = FIELD.mirror_rad(LAYOUT.x_m), FIELD.mirror_rad(LAYOUT.y_m)
+X_RAD, Y_RAD = FIELD.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
 PITCH_RAD = float(np.diff(np.unique(X_RAD)).min())
 COUNT = len(LAYOUT)
 

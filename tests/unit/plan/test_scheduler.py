@@ -83,7 +83,7 @@ def test_a_plan_leaves_time_to_come_from_any_pixel_to_its_first(any_display):
     layout, field, moves = any_display.layout, any_display.machine.field, any_display.machine.moves
     last = len(layout) - 1
     result = prepared(any_display, frame(any_display, {last: 40}))
-    x_rad, y_rad = field.mirror_rad(layout.x_m), field.mirror_rad(layout.y_m)
+    x_rad, y_rad = field.angles_rad(layout.x_m, layout.y_m)
     longest = max(moves.time_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
     assert result.plan.start_s[0] >= longest * 1e-6 - 1e-12
     assert result.lead_s == pytest.approx(result.plan.start_s[0])

@@ -117,6 +117,17 @@ class Bench:
         """(index, gate on, gate off) of every pulse, from the log."""
         return [(entry["index"], entry["on_us"], entry["off_us"]) for entry in self.of("pulse")]
 
+    def condition(self):
+        """All that junk on the line must leave as it is."""
+        core = self.core
+        job, lease = core._job, core._lease_until_us
+        return core.state, core.gate, list(core._queue), job, core._current, core._next_index, lease
+
+    def bad_frames(self):
+        """Frames counted as no frames: CRC, form."""
+        counted = self.core._link.decoder.counters
+        return [counted.crc_errors, counted.format_errors]
+
     def status(self):
         (status,) = [x for x in self.say(m.Get()) if isinstance(x, m.Status)]
         return status

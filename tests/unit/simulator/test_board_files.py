@@ -70,13 +70,13 @@ def test_script_is_sorted_and_has_defaults(file):
     steps = load_script(
         file(
             '[[step]]\nat_s = 2\ndo = "flip_bits"\nrate = 0.5\n'
-            '[[step]]\nat_s = 1.5\nset = "key"\n[[step]]\nat_s = 3\ndo = "hang"'
+            '[[step]]\nat_s = 1.5\nset = "key"\n[[step]]\nat_s = 3\ndo = "hang"\nfrom = "light"'
         )
     )
     assert steps == [
         Step(1.5, "set", "key", value=False, rate=0.01),
         Step(2.0, "do", "flip_bits", rate=0.5),
-        Step(3.0, "do", "hang", rate=0.01),
+        Step(3.0, "do", "hang", rate=0.01, from_light=True),
     ]
     assert load_script(file("")) == []
 
@@ -96,6 +96,7 @@ def test_script_is_sorted_and_has_defaults(file):
         ('[[step]]\nat_s = 1\nset = "key"\nvlaue = true', "nearest is 'value'"),
         ('[[step]]\nat_s = 1\nset = "key"\ndo = "reset"', "got 'do'"),
         ('[[step]]\nat_s = 1\ndo = "flip_bits"\nrate = 2', "rate: got 2"),
+        ('[[step]]\nat_s = 1\ndo = "hang"\nfrom = "dawn"', "from: got 'dawn'"),
         ('[step]\nat_s = 1\ndo = "reset"', "two brackets"),
         ("steps = 1", "nothing but"),
     ],

@@ -5,7 +5,7 @@ from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
 from optodrive.pipeline import prepare
 from optodrive.simulator.run import execute
 from optodrive.simulator.sensor import INSTRUMENT_SIGMA, measure
-from optodrive.simulator.truth import trace
+from optodrive.simulator.traces import trace
 
 
 def sequence(display, count=30, height_m=50e-6):

@@ -237,6 +237,30 @@ def test_abort_goes_ahead_of_all_and_nothing_else_follows(host):
     assert host.peer is None
 
 
+def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_begins(host):
+    event = m.Event(state=m.STATES.index("DISARMED"), reason=m.REASONS.index("abort"), fault=0, tick=7)
+    host.abort()
+    host.hello(3)
+    assert host.receive_bytes(wire(event), 0.0) == [event]
+    assert host.receive_bytes(wire(event, session=SESSION ^ 1), 0.0) == []
+    assert host.receive_bytes(wire(m.Ack(0, 0, 0, 0)), 0.0) == []
+    host.receive_bytes(wire(hello_reply(3, 222), session=222), 0.0)
+    assert host.receive_bytes(wire(event), 0.0) == []
+    host.hello(4)  # greeted anew without an abort: nothing of before counts
+    assert host.receive_bytes(wire(event, session=222), 0.0) == []
+
+
+def test_what_is_queued_for_the_next_session_waits_through_repeated_hellos(host):
+    host.abort()
+    host.hello(3)
+    host.send(data(0))
+    host.hello(4)
+    host.receive_bytes(wire(hello_reply(4, 222), session=222), 0.0)
+    host.send(m.Flush(), first=True)
+    host.bytes_to_send(0.0, PLENTY)
+    assert host.outstanding == 2
+
+
 def test_abort_then_hello_keep_their_order(host):
     host.send(m.Get())
     host.abort()

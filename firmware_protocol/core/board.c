@@ -1,0 +1,257 @@
+/* Power-up, the safety tick, the main loop's turn: what happens when. */
+
+#include <string.h>
+
+#include "core.h"
+
+#define NEVER UINT64_MAX
+
+/* --- what falls due, in this order where several do at once --- */
+
+static uint64_t lease_due_us(const struct board *b) {
+#if MUTANT == 3
+    return NEVER;
+#endif
+    return is_leased(b->state) ? b->lease_until_us : NEVER;
+}
+
+static uint64_t arming_due_us(const struct board *b) {
+    if (b->state != STATE_ARMING) {
+        return NEVER;
+    }
+    return b->arming_since_us + (b->confirmed ? INDICATOR_US : ARMING_TIMEOUT_US);
+}
+
+static uint64_t hold_due_us(const struct board *b) {
+    if (b->state == STATE_HOLD) {
+        return b->hold_since_us + HOLD_MAX_US;
+    }
+    bool waits = b->state == STATE_RUNNING && !b->has_current && b->job.exists && !enough_queued(b);
+    return waits ? b->job.start_us + HOLD_MAX_US : NEVER;
+}
+
+static uint64_t point_due_us(const struct board *b) {
+    if (b->state != STATE_RUNNING) {
+        return NEVER;
+    }
+    if (b->has_current) {
+        return b->due_us;
+    }
+    if (!enough_queued(b)) {
+        return NEVER;
+    }
+    return b->job.start_us > b->now_us ? b->job.start_us : b->now_us;
+}
+
+uint64_t board_next_due_us(const struct board *b) {
+    uint64_t due[] = {lease_due_us(b), arming_due_us(b), hold_due_us(b), point_due_us(b)}, next = NEVER;
+    for (size_t k = 0; k < sizeof due / sizeof due[0]; k++) {
+        next = due[k] < next ? due[k] : next;
+    }
+    return next;
+}
+
+static void do_due(struct board *b) {
+    if (lease_due_us(b) <= b->now_us) {
+        fail(b, FAULT_LINK);
+    } else if (arming_due_us(b) <= b->now_us) {
+        if (b->confirmed) {
+            set_state(b, STATE_ARMED, REASON_ARMED);
+        } else {
+            disarm(b, REASON_ARMING_TIMED_OUT);
+        }
+    } else if (hold_due_us(b) <= b->now_us) {
+        disarm(b, REASON_HOLD_TOO_LONG);
+    } else {
+        point_due(b);
+    }
+}
+
+/* Everything that falls due up to now_us, in order and at its exact time. */
+static void advance(struct board *b, uint64_t now_us) {
+    for (uint64_t due_us; (due_us = board_next_due_us(b)) <= now_us && due_us != NEVER;) {
+        b->now_us = due_us > b->now_us ? due_us : b->now_us;
+        do_due(b);
+    }
+    b->now_us = now_us > b->now_us ? now_us : b->now_us;
+}
+
+/* --- the safety tick --- */
+
+static uint8_t unsafe(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
+
+/* B9: what becomes unsafe is a fault; what was unsafe at power-up keeps the board from arming. */
+static void watch_inputs(struct board *b) {
+    uint8_t inputs = b->hal.inputs(b->hal.context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
+    uint8_t became_unsafe = (uint8_t)(unsafe(inputs) & ~unsafe(b->inputs));
+    b->key_turned = b->key_turned || (inputs & ~b->inputs & INPUT_KEY);
+    b->inputs = inputs;
+#if MUTANT != 9
+    if (became_unsafe & INPUT_INTERLOCK) {
+        fail(b, FAULT_INTERLOCK);
+    } else if (became_unsafe & INPUT_KEY) {
+        fail(b, FAULT_KEY);
+    } else if (became_unsafe) {
+        fail(b, FAULT_ESTOP);
+    }
+#else
+    (void)became_unsafe;
+#endif
+}
+
+/* B14. A fault of the board itself goes dark now, before what fell due meanwhile is done. */
+static void fail_at(struct board *b, enum fault fault, uint64_t now_us) {
+#if MUTANT != 14
+    b->now_us = now_us > b->now_us ? now_us : b->now_us;
+    fail(b, fault);
+#else
+    (void)b, (void)fault, (void)now_us;
+#endif
+}
+
+static void watch_tick(struct board *b, uint64_t now_us) {
+    uint64_t since_us = now_us > b->ticked_us ? now_us - b->ticked_us : 0;
+    b->ticked_us += since_us;
+    if (since_us > BOARD_TICK_US + BOARD_TICK_LATE_US) {
+        fail_at(b, FAULT_TICK, now_us);
+    }
+}
+
+/* Looks before this tick changes the command: a gate that is just being switched is not compared. */
+static void watch_readback(struct board *b, uint64_t now_us) {
+    bool differs = b->hal.gate_readback(b->hal.context) != b->gate;
+    if (differs && !b->differs) {
+        b->differs_since_us = now_us;
+    }
+    b->differs = differs;
+    if (differs && now_us > b->differs_since_us + BOARD_READBACK_US) {
+        fail_at(b, FAULT_READBACK, now_us);
+    }
+}
+
+void board_tick(struct board *b, uint64_t now_us) {
+    watch_tick(b, now_us);
+    watch_readback(b, now_us);
+    advance(b, now_us);
+    watch_inputs(b);
+#if MUTANT != 15
+    if (b->loop_ran)
+#endif
+    {
+        b->hal.feed_watchdog(b->hal.context);
+    }
+    b->loop_ran = false;
+}
+
+/* --- the main loop --- */
+
+static void report(struct board *b) {
+    uint8_t body[BODY_MAX];
+    size_t length, count;
+    if (b->records.reported < records_oldest(&b->records)) {
+        b->records.reported = records_oldest(&b->records);
+    }
+    while ((count = records_report(&b->records, b->records.reported, body, &length)) > 0) {
+        b->records.reported += (uint32_t)count;
+        send_message(b, MESSAGE_EXECUTED, body, length);
+    }
+}
+
+static void refuse(struct board *b, uint8_t reason) {
+    uint8_t body[NAK_SIZE];
+    body[NAK_NEXT_SEQ_AT] = b->link.expected;
+    body[NAK_REASON_AT] = reason;
+    send_message(b, MESSAGE_NAK, body, sizeof body);
+}
+
+static void take_in_order(struct board *b, const struct frame *frame) {
+    uint8_t refusal;
+    if (link_accepts(&b->link, frame->seq, &refusal)) {
+        refusal = obey_sequenced(b, frame);
+        if (refusal != NAK_NO_ROOM) {
+            link_consumed(&b->link, refusal);
+        }
+    }
+    if (refusal == REFUSED_NOTHING) {
+        b->link.ack_due = true;
+    } else {
+        refuse(b, refusal);
+    }
+}
+
+static void take(struct board *b, const struct frame *frame) {
+    enum order order;
+    if (!frame_has_form(frame, &order)) {
+        b->link.receiver.format_errors++;
+    } else if (frame->type == MESSAGE_ABORT) {
+        disarm(b, REASON_ABORT);
+    } else if (frame->type == MESSAGE_HELLO) {
+        obey_hello(b, frame);
+    } else if (order == ORDER_NONE || frame->session != b->link.session || b->link.session == 0) {
+        b->link.seq_errors++;
+    } else if (order == ORDER_SEQUENCED) {
+        take_in_order(b, frame);
+    } else {
+        obey_unsequenced(b, frame);
+    }
+}
+
+static void acknowledge(struct board *b) {
+    uint8_t body[ACK_SIZE];
+    body[ACK_NEXT_SEQ_AT] = b->link.expected;
+    put_u16(body + ACK_FREE_POINTS_AT, (uint16_t)(b->config.queue_points - b->queue.count));
+    put_u32(body + ACK_DONE_INDEX_AT, b->done_index);
+    body[ACK_STATE_AT] = b->state;
+    send_message(b, MESSAGE_ACK, body, sizeof body);
+}
+
+static uint32_t bad_frames(const struct board *b) {
+    return b->link.receiver.crc_errors + b->link.receiver.format_errors;
+}
+
+void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now_us) {
+    struct frame frame;
+    uint32_t bad = bad_frames(b);
+    b->loop_ran = true;
+    advance(b, now_us);
+    report(b);
+    for (size_t k = 0; k < n; k++) {
+        if (receiver_take(&b->link.receiver, bytes[k], &frame)) {
+            take(b, &frame);
+        }
+    }
+    if (bad_frames(b) != bad && b->hal.trace) {
+        struct board_trace what = {.at_us = b->now_us, .kind = TRACE_RX_ERROR, .index = bad_frames(b)};
+        b->hal.trace(b->hal.context, &what);
+    }
+    if (b->link.ack_due) {
+        b->link.ack_due = false;
+        acknowledge(b);
+    }
+    advance(b, now_us);
+    report(b);
+}
+
+void board_link_lost(struct board *b, uint64_t now_us) {
+    advance(b, now_us);
+    report(b);
+    disarm(b, REASON_LINK_LOST);
+}
+
+/* --- power-up --- */
+
+void board_init(struct board *b, const struct board_hal *hal, const struct board_config *config,
+                enum reset_cause cause, uint64_t now_us) {
+    hal->gate(hal->context, false, 0); /* before anything else */
+    memset(b, 0, sizeof *b);
+    b->hal = *hal;
+    b->config = *config;
+    b->limits = config->limits;
+    b->now_us = b->epoch_us = b->settled_us = b->ticked_us = now_us;
+    b->reset_cause = (uint8_t)cause;
+    b->x = b->y = CENTRE;
+    hal->mirrors(hal->context, b->x, b->y); /* a reset may have come upon them anywhere */
+    b->inputs = hal->inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
+    link_begin(&b->link, 0);
+    set_state(b, STATE_DISARMED, REASON_BOOT);
+}

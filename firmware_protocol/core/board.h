@@ -1,0 +1,191 @@
+/* The board of PROTOCOL.md, portable: no allocation, no globals, no waiting. The caller owns one struct board and a
+   struct board_hal, calls board_tick from a timer and board_receive from the main loop. See README.md. */
+
+#ifndef BOARD_H
+#define BOARD_H
+
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+
+#include "messages.h"
+
+/* Sizes: define them for the compiler where memory is short. What does not fit is refused or dark, never guessed. */
+#ifndef BOARD_QUEUE_POINTS
+#define BOARD_QUEUE_POINTS 4096u /* 10 bytes each */
+#endif
+#ifndef BOARD_RECORDS
+#define BOARD_RECORDS EXECUTED_RING /* 16 bytes each */
+#endif
+#ifndef BOARD_PULSES
+#define BOARD_PULSES 8192u /* pulses within a second, 16 bytes each; more: fault MEAN_POWER */
+#endif
+#ifndef BOARD_CELLS
+#define BOARD_CELLS 1024u /* warm cells in each of four grids, 32 bytes each, a power of two; more: fault SPOT */
+#endif
+
+#define BOARD_TICK_US 100u       /* board_tick is called at least so often */
+#ifndef BOARD_TICK_LATE_US
+#define BOARD_TICK_LATE_US 500u  /* later than that by more than this: fault TICK */
+#endif
+#define BOARD_READBACK_US 100u   /* the gate differs from its command for longer: fault READBACK */
+
+/* What happened, for a log; seen from outside the same as the edges of gate and state. */
+enum board_trace_kind { TRACE_GATE, TRACE_STATE, TRACE_FAULT, TRACE_PULSE, TRACE_RX_ERROR };
+
+struct board_trace {
+    uint64_t at_us;
+    enum board_trace_kind kind;
+    bool on, is_point;      /* gate: its command; whether a point did it, else reason */
+    uint8_t state, before;  /* state */
+    uint8_t reason, fault;  /* gate and state; fault */
+    uint16_t x, y, duty;    /* pulse */
+    uint32_t index;         /* point's number, of gate and pulse; rx_error: bad frames since power-up */
+    uint64_t on_us, off_us; /* pulse: times of the gate's edges */
+};
+
+/* What a port gives. README.md says what each must guarantee. */
+struct board_hal {
+    void *context;
+    void (*gate)(void *context, bool on, uint16_t duty);
+    bool (*gate_readback)(void *context);
+    void (*mirrors)(void *context, uint16_t x, uint16_t y);
+    uint8_t (*inputs)(void *context); /* INPUT_ bits */
+    void (*indicator)(void *context, bool lit);
+    void (*relay)(void *context, bool closed);
+    uint32_t (*entropy)(void *context);
+    int16_t (*temperature_dc)(void *context);
+    void (*send)(void *context, const uint8_t *frame, size_t length); /* whole or not at all */
+    void (*forget)(void *context);                                    /* whole frames that have not begun to leave */
+    void (*feed_watchdog)(void *context);
+    void (*trace)(void *context, const struct board_trace *what); /* may be NULL */
+};
+
+#define LIMIT_MEMBER(name, bits, at, way) uint##bits##_t name;
+struct board_limits {
+    LIMITS_FIELDS(LIMIT_MEMBER)
+};
+#undef LIMIT_MEMBER
+
+struct board_config {
+    struct board_limits limits;
+    uint8_t uid[12];
+    uint32_t firmware;
+    uint16_t cell_codes;   /* at least 1 */
+    uint16_t queue_points; /* DATA_ITEMS_MAX to BOARD_QUEUE_POINTS */
+    bool key_edge;
+};
+
+enum reset_cause { RESET_POWER_UP, RESET_RESET, RESET_BROWN_OUT, RESET_WATCHDOG };
+
+/* --- what a board remembers; for ports and tests to read, not to write --- */
+
+struct point {
+    uint16_t x, y, dark_us, on_us, duty;
+};
+
+struct queue {
+    struct point points[BOARD_QUEUE_POINTS];
+    uint32_t first, count;
+};
+
+struct record {
+    uint64_t on_tick;
+    uint32_t number;
+    uint16_t on_ticks, duty;
+};
+
+struct records {
+    struct record ring[BOARD_RECORDS];
+    uint32_t made, reported; /* of the session */
+};
+
+struct pulse {
+    uint64_t start_us;
+    uint16_t on_us, duty;
+};
+
+struct cell {
+    uint64_t ended_us, since_us;
+    uint32_t key, on_us, level_uj;
+    bool used;
+};
+
+struct guards {
+    struct cell cells[4][BOARD_CELLS];
+    struct pulse pulses[BOARD_PULSES];
+    uint32_t first, count;
+    uint64_t sum;
+};
+
+struct receiver {
+    uint8_t bytes[RAW_MAX + 1];
+    uint16_t length;
+    bool overlong;
+    uint32_t crc_errors, format_errors;
+};
+
+struct link {
+    struct receiver receiver;
+    uint32_t seq_errors;
+    uint16_t session;
+    uint8_t expected, last_refusal;
+    bool ack_due;
+};
+
+struct job {
+    uint64_t start_us;
+    uint32_t number, end_index;
+    uint16_t watermark;
+    bool exists, ends;
+};
+
+struct board {
+    struct board_hal hal;
+    struct board_config config;
+    struct board_limits limits;
+    uint64_t now_us, epoch_us;
+    uint8_t state, fault, reset_cause, inputs;
+
+    struct link link;
+    struct queue queue;
+    struct records records;
+    struct guards guards;
+
+    struct job job;
+    struct point current;
+    uint32_t current_number;
+    bool has_current, gate;
+    uint64_t lit_us, due_us, settled_us;
+    uint16_t x, y;
+    uint32_t next_index, done_index;
+
+    uint64_t lease_until_us, arming_since_us, hold_since_us;
+    uint32_t board_nonce, host_nonce;
+    bool nonce_good, confirmed, key_turned, version_fits;
+
+    uint64_t underruns_us[UNDERRUNS_MAX];
+    uint32_t underruns_known, underruns_total;
+    uint64_t laser_on; /* µs × duty */
+
+    uint64_t ticked_us, differs_since_us;
+    bool differs, loop_ran;
+};
+
+/* Power-up or reset: everything forgotten, gate off, DISARMED. now_us: any 64-bit time in µs that never goes back. */
+void board_init(struct board *b, const struct board_hal *hal, const struct board_config *config,
+                enum reset_cause cause, uint64_t now_us);
+
+/* The safety tick: does all that falls due up to now_us, then looks at inputs, readback and watchdog. */
+void board_tick(struct board *b, uint64_t now_us);
+
+/* The main loop's turn: takes n bytes that arrived by now_us, answers, reports; call it with n = 0 too. */
+void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now_us);
+
+/* BREAK, DTR dropped, cable pulled: as an ABORT. */
+void board_link_lost(struct board *b, uint64_t now_us);
+
+/* When something falls due next, UINT64_MAX where nothing does: for a port that sets a timer for it. */
+uint64_t board_next_due_us(const struct board *b);
+
+#endif

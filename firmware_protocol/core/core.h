@@ -1,0 +1,114 @@
+/* What the core's files share among themselves. */
+
+#ifndef CORE_H
+#define CORE_H
+
+#include "board.h"
+
+/* make MUTANT=n breaks guard Bn at the one place that enforces it, to prove that a test notices; 101 and 102 leave out
+   what keeps the receiver within its buffer. */
+#ifndef MUTANT
+#define MUTANT 0
+#endif
+
+#define CENTRE 32768u
+#define FRAME_OVERHEAD 8u                 /* header and CRC */
+#define BODY_MAX (RAW_MAX - FRAME_OVERHEAD)
+#define WIRE_MAX (RAW_MAX + 2u)           /* COBS code and delimiter */
+#define REFUSED_NOTHING 0xffu             /* in place of a NAK reason */
+
+/* --- bytes --- */
+
+static inline uint16_t get_u16(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
+static inline uint32_t get_u32(const uint8_t *at) { return get_u16(at) | (uint32_t)get_u16(at + 2) << 16; }
+static inline uint64_t get_u64(const uint8_t *at) { return get_u32(at) | (uint64_t)get_u32(at + 4) << 32; }
+
+static inline void put_u16(uint8_t *at, uint16_t value) {
+    at[0] = (uint8_t)value;
+    at[1] = (uint8_t)(value >> 8);
+}
+static inline void put_u32(uint8_t *at, uint32_t value) {
+    put_u16(at, (uint16_t)value);
+    put_u16(at + 2, (uint16_t)(value >> 16));
+}
+static inline void put_u64(uint8_t *at, uint64_t value) {
+    put_u32(at, (uint32_t)value);
+    put_u32(at + 4, (uint32_t)(value >> 32));
+}
+
+/* Not plain crc32: zlib's, in a process that has it loaded, would answer in its place. */
+uint32_t frame_crc32(const uint8_t *bytes, size_t n);
+
+/* COBS of at most RAW_MAX bytes; the number of bytes written, at most n + 1, without a delimiter. */
+size_t cobs_encode(uint8_t *encoded, const uint8_t *raw, size_t n);
+/* In place; the number of bytes, 0 where these are no COBS of at most RAW_MAX bytes. */
+size_t cobs_decode(uint8_t *bytes, size_t n);
+
+/* --- link --- */
+
+struct frame {
+    const uint8_t *body;
+    size_t length;
+    uint16_t session;
+    uint8_t type, seq;
+};
+
+enum order { ORDER_NONE, ORDER_HOST, ORDER_SEQUENCED };
+
+/* Takes one byte; true when it completes an intact frame, which lasts until the next byte. */
+bool receiver_take(struct receiver *r, uint8_t byte, struct frame *frame);
+/* Whether type, length and enumerations are a message's; order: who may say it, and how. */
+bool frame_has_form(const struct frame *frame, enum order *order);
+/* A frame as it goes over the wire, delimiter included; the number of bytes. wire: WIRE_MAX bytes. */
+size_t frame_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
+/* Whether a sequenced frame is the one expected; refusal: what to answer where it is not. */
+bool link_accepts(struct link *link, uint8_t seq, uint8_t *refusal);
+void link_consumed(struct link *link, uint8_t refusal);
+void link_begin(struct link *link, uint16_t session);
+
+/* --- queue, records --- */
+
+bool queue_push(struct queue *q, const struct point *point);
+struct point queue_pop(struct queue *q);
+void records_clear(struct records *r);
+void records_add(struct records *r, const struct record *record);
+/* The body of one EXECUTED from the position at on, as many as it can tell; their number, 0: nothing there. */
+size_t records_report(const struct records *r, uint32_t at, uint8_t *body, size_t *length);
+/* Position of the first record kept with this number or a later one. */
+uint32_t records_find(const struct records *r, uint32_t number);
+uint32_t records_oldest(const struct records *r);
+
+/* --- limits, guards --- */
+
+void limits_get(struct board_limits *limits, const uint8_t *from);
+void limits_put(const struct board_limits *limits, uint8_t *to);
+void limits_tighten(struct board_limits *limits, const struct board_limits *asked);
+/* B4, B5, B8: the fault that queueing this point is, FAULT_NONE where it may be queued. */
+enum fault guards_look(const struct board_limits *limits, const struct point *point);
+/* B4 to B6: the fault that lighting it now would be; where it may be lit it is counted. */
+enum fault guards_fire(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+                       const struct point *point, uint64_t now_us);
+
+/* --- states and points --- */
+
+bool is_leased(uint8_t state);
+void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
+void trace_gate(struct board *b, bool on, bool is_point, uint32_t what);
+void set_gate(struct board *b, bool on, uint16_t duty);
+void set_state(struct board *b, enum state state, enum reason reason);
+void disarm(struct board *b, enum reason reason);
+void fail(struct board *b, enum fault fault);
+void drop_queue(struct board *b);
+
+bool enough_queued(const struct board *b);
+void point_due(struct board *b);
+void refill(struct board *b);
+void record_point(struct board *b, uint64_t on_at_us, uint64_t on_us);
+
+/* Carries out what is not sequenced. */
+void obey_hello(struct board *b, const struct frame *frame);
+void obey_unsequenced(struct board *b, const struct frame *frame);
+/* Carries a sequenced message out; the NAK reason, or REFUSED_NOTHING. */
+uint8_t obey_sequenced(struct board *b, const struct frame *frame);
+
+#endif

@@ -1,0 +1,304 @@
+/* What the messages ask for, and when it is refused. Each refusal is looked at in the order of PROTOCOL.md. */
+
+#include <string.h>
+
+#include "core.h"
+
+#define ENTROPY_TRIES 16u
+#define INDEX_MAX UINT32_MAX
+#define CAPABILITY_KEY_EDGE 1u
+#define MS 1000u
+
+static bool inputs_safe(const struct board *b) { return b->inputs == (INPUT_INTERLOCK | INPUT_KEY); }
+
+static bool takes_points(const struct board *b) {
+    return b->state == STATE_ARMED || b->state == STATE_RUNNING || b->state == STATE_HOLD;
+}
+
+/* --- not sequenced --- */
+
+/* Not 0 and not the last one. A source that repeats itself must not keep the board here for ever. */
+static uint16_t new_session(struct board *b) {
+    for (uint32_t k = 0; k < ENTROPY_TRIES; k++) {
+        uint16_t session = (uint16_t)b->hal.entropy(b->hal.context);
+        if (session != 0 && session != b->link.session) {
+            return session;
+        }
+    }
+    return b->link.session == UINT16_MAX ? 1 : (uint16_t)(b->link.session + 1);
+}
+
+void obey_hello(struct board *b, const struct frame *frame) {
+    uint8_t body[HELLO_REPLY_SIZE];
+    disarm(b, REASON_HELLO);
+    link_begin(&b->link, new_session(b));
+    b->limits = b->config.limits;
+    b->next_index = b->done_index = 0;
+    records_clear(&b->records);
+    b->hal.forget(b->hal.context);
+    b->version_fits = frame->body[HELLO_MAJOR_AT] == PROTOCOL_MAJOR;
+    body[HELLO_REPLY_MAJOR_AT] = PROTOCOL_MAJOR;
+    body[HELLO_REPLY_MINOR_AT] = PROTOCOL_MINOR;
+    memcpy(body + HELLO_REPLY_HOST_NONCE_AT, frame->body + HELLO_HOST_NONCE_AT, 4);
+    put_u16(body + HELLO_REPLY_SESSION_AT, b->link.session);
+    put_u32(body + HELLO_REPLY_FIRMWARE_AT, b->config.firmware);
+    memcpy(body + HELLO_REPLY_UID_AT, b->config.uid, sizeof b->config.uid);
+    put_u32(body + HELLO_REPLY_CAPABILITIES_AT, b->config.key_edge ? CAPABILITY_KEY_EDGE : 0);
+    put_u32(body + HELLO_REPLY_TICK_HZ_AT, TICK_HZ);
+    put_u16(body + HELLO_REPLY_QUEUE_POINTS_AT, b->config.queue_points);
+    put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);
+    put_u16(body + HELLO_REPLY_CELL_CODES_AT, b->config.cell_codes);
+    body[HELLO_REPLY_RESET_CAUSE_AT] = b->reset_cause;
+    limits_put(&b->limits, body + HELLO_REPLY_LIMITS_AT);
+    send_message(b, MESSAGE_HELLO_REPLY, body, sizeof body);
+}
+
+static void renew_lease(struct board *b, uint16_t asked_ms) {
+    uint16_t ms = asked_ms < b->limits.lease_ms ? asked_ms : b->limits.lease_ms;
+    uint64_t until_us = b->now_us + (uint64_t)ms * MS;
+    if (is_leased(b->state) && until_us > b->lease_until_us) {
+        b->lease_until_us = until_us;
+    }
+}
+
+static void tell_clock(struct board *b, const uint8_t *asked) {
+    uint8_t body[CLOCK_REPLY_SIZE];
+    memcpy(body + CLOCK_REPLY_HOST_T_AT, asked + CLOCK_HOST_T_AT, 4);
+    put_u64(body + CLOCK_REPLY_TICK_AT, b->now_us - b->epoch_us);
+    send_message(b, MESSAGE_CLOCK_REPLY, body, sizeof body);
+}
+
+static void tell_status(struct board *b) {
+    uint8_t body[STATUS_SIZE];
+    body[STATUS_STATE_AT] = b->state;
+    body[STATUS_FAULT_AT] = b->fault;
+    body[STATUS_INPUTS_AT] = b->inputs;
+    put_u64(body + STATUS_TICK_AT, b->now_us - b->epoch_us);
+    put_u32(body + STATUS_DONE_INDEX_AT, b->done_index);
+    put_u16(body + STATUS_QUEUED_AT, (uint16_t)b->queue.count);
+    put_u16(body + STATUS_CRC_ERRORS_AT, (uint16_t)b->link.receiver.crc_errors);
+    put_u16(body + STATUS_FORMAT_ERRORS_AT, (uint16_t)b->link.receiver.format_errors);
+    put_u16(body + STATUS_SEQ_ERRORS_AT, (uint16_t)b->link.seq_errors);
+    put_u16(body + STATUS_UNDERRUNS_AT, (uint16_t)b->underruns_total);
+    put_u64(body + STATUS_LASER_ON_US_AT, b->laser_on / 65535u);
+    put_u16(body + STATUS_TEMPERATURE_DC_AT, (uint16_t)b->hal.temperature_dc(b->hal.context));
+    send_message(b, MESSAGE_STATUS, body, sizeof body);
+}
+
+static void tell_executed(struct board *b, uint32_t first_index) {
+    uint8_t body[BODY_MAX];
+    size_t length;
+    if (records_report(&b->records, records_find(&b->records, first_index), body, &length) > 0) {
+        send_message(b, MESSAGE_EXECUTED, body, length);
+    }
+}
+
+void obey_unsequenced(struct board *b, const struct frame *frame) {
+    switch (frame->type) {
+    case MESSAGE_LEASE:
+        renew_lease(b, get_u16(frame->body + LEASE_MS_AT));
+        break;
+    case MESSAGE_CLOCK:
+        tell_clock(b, frame->body);
+        break;
+    case MESSAGE_GET:
+        tell_status(b);
+        break;
+    case MESSAGE_GET_EXECUTED:
+        tell_executed(b, get_u32(frame->body + GET_EXECUTED_FIRST_INDEX_AT));
+        break;
+    default:
+        break;
+    }
+}
+
+/* --- sequenced --- */
+
+static uint8_t limit(struct board *b, const uint8_t *body) {
+    struct board_limits asked;
+    if (b->state != STATE_DISARMED && b->state != STATE_FAULT) {
+        return NAK_STATE;
+    }
+    limits_get(&asked, body + LIMITS_LIMITS_AT);
+    limits_tighten(&b->limits, &asked);
+    return REFUSED_NOTHING;
+}
+
+static struct point point_get(const uint8_t *at) {
+    return (struct point){
+        .x = get_u16(at + POINT_X_AT),
+        .y = get_u16(at + POINT_Y_AT),
+        .dark_us = get_u16(at + POINT_DARK_US_AT),
+        .on_us = get_u16(at + POINT_ON_US_AT),
+        .duty = get_u16(at + POINT_DUTY_AT),
+    };
+}
+
+static uint8_t data(struct board *b, const uint8_t *body, size_t length) {
+    uint32_t first = get_u32(body + DATA_FIRST_INDEX_AT), count = (uint32_t)((length - DATA_SIZE) / POINT_SIZE);
+    bool idle = !b->job.exists && b->queue.count == 0;
+    if (!takes_points(b)) {
+        return NAK_STATE;
+    }
+#if MUTANT != 12
+    if (first < b->next_index || (first > b->next_index && !idle)) {
+        return NAK_INDEX;
+    }
+#endif
+    if (count > INDEX_MAX - first) {
+        return NAK_INDEX;
+    }
+    if (b->queue.count + count > b->config.queue_points) {
+        return NAK_NO_ROOM;
+    }
+    for (uint32_t k = 0; k < count; k++) {
+        struct point point = point_get(body + DATA_SIZE + k * POINT_SIZE);
+        enum fault fault = guards_look(&b->limits, &point);
+        if (fault != FAULT_NONE) {
+            fail(b, fault);
+            return NAK_STATE;
+        }
+    }
+    if (idle) {
+        b->done_index = first;
+    }
+    for (uint32_t k = 0; k < count; k++) {
+        struct point point = point_get(body + DATA_SIZE + k * POINT_SIZE);
+        queue_push(&b->queue, &point);
+    }
+    b->next_index = first + count;
+    refill(b);
+    return REFUSED_NOTHING;
+}
+
+static uint8_t start(struct board *b, const uint8_t *body) {
+    uint64_t tick = get_u64(body + START_START_TICK_AT);
+    if (b->state != STATE_ARMED) {
+        return NAK_STATE;
+    }
+    if (get_u32(body + START_FIRST_INDEX_AT) != b->next_index - b->queue.count) {
+        return NAK_INDEX;
+    }
+    b->job = (struct job){.exists = true, .number = get_u32(body + START_JOB_AT), .start_us = b->now_us};
+    b->job.watermark = get_u16(body + START_WATERMARK_AT);
+    if (tick > b->now_us - b->epoch_us) {
+        /* Beyond what the clock can count is never; the hold's second must not wrap either. */
+        uint64_t last = UINT64_MAX - HOLD_MAX_US - 1 - b->epoch_us;
+        b->job.start_us = b->epoch_us + (tick < last ? tick : last);
+    }
+    set_state(b, STATE_RUNNING, REASON_START);
+    return REFUSED_NOTHING;
+}
+
+static uint8_t end(struct board *b, const uint8_t *body) {
+    uint32_t end_index = get_u32(body + END_END_INDEX_AT);
+    if (!b->job.exists || b->job.number != get_u32(body + END_JOB_AT)) {
+        return NAK_STATE;
+    }
+    if (end_index != b->next_index) {
+        return NAK_INDEX;
+    }
+    b->job.end_index = end_index;
+    b->job.ends = true;
+    if (b->done_index >= end_index) {
+        b->job.exists = false;
+        set_state(b, STATE_ARMED, REASON_JOB_DONE);
+    }
+    refill(b);
+    return REFUSED_NOTHING;
+}
+
+static uint8_t arm(struct board *b, const uint8_t *asked) {
+    uint8_t body[ARM_CHALLENGE_SIZE];
+    if (b->state != STATE_DISARMED) {
+        return NAK_STATE;
+    }
+    if (!b->version_fits) {
+        return NAK_VERSION;
+    }
+    if (!inputs_safe(b)) {
+        return NAK_INPUT;
+    }
+    if (b->config.key_edge && !b->key_turned) {
+        return NAK_KEY_EDGE;
+    }
+    b->board_nonce = b->hal.entropy(b->hal.context);
+    b->nonce_good = true;
+    b->host_nonce = get_u32(asked + ARM_REQ_HOST_NONCE_AT);
+    b->arming_since_us = b->now_us;
+    b->confirmed = false;
+    b->lease_until_us = b->now_us + (uint64_t)b->limits.lease_ms * MS;
+    set_state(b, STATE_ARMING, REASON_ARM_REQUESTED);
+    put_u32(body + ARM_CHALLENGE_HOST_NONCE_AT, b->host_nonce);
+    put_u32(body + ARM_CHALLENGE_BOARD_NONCE_AT, b->board_nonce);
+    send_message(b, MESSAGE_ARM_CHALLENGE, body, sizeof body);
+    return REFUSED_NOTHING;
+}
+
+/* B11: a nonce is good for one answer, right or wrong. */
+static uint8_t confirm(struct board *b, const uint8_t *body) {
+    bool echoed = b->nonce_good && get_u32(body + ARM_CONFIRM_BOARD_NONCE_AT) == b->board_nonce &&
+                  get_u32(body + ARM_CONFIRM_HOST_NONCE_AT) == b->host_nonce;
+#if MUTANT == 11
+    echoed = true;
+#endif
+    b->nonce_good = false;
+    if (b->state != STATE_ARMING || b->confirmed) {
+        return NAK_STATE;
+    }
+    if (!echoed) {
+        disarm(b, REASON_DISARM);
+        return NAK_NONCE;
+    }
+    b->confirmed = true;
+    b->key_turned = false;
+    return REFUSED_NOTHING;
+}
+
+static uint8_t clear_fault(struct board *b) {
+    if (b->state != STATE_FAULT) {
+        return NAK_STATE;
+    }
+    if (!inputs_safe(b)) {
+        return NAK_INPUT;
+    }
+    b->fault = FAULT_NONE;
+    b->underruns_known = 0;
+    set_state(b, STATE_DISARMED, REASON_FAULT_CLEARED);
+    return REFUSED_NOTHING;
+}
+
+static uint8_t flush(struct board *b) {
+    if (!takes_points(b)) {
+        return NAK_STATE;
+    }
+    if (b->state != STATE_ARMED) {
+        set_state(b, STATE_ARMED, REASON_FLUSH);
+    }
+    drop_queue(b);
+    return REFUSED_NOTHING;
+}
+
+uint8_t obey_sequenced(struct board *b, const struct frame *frame) {
+    switch (frame->type) {
+    case MESSAGE_LIMITS:
+        return limit(b, frame->body);
+    case MESSAGE_DATA:
+        return data(b, frame->body, frame->length);
+    case MESSAGE_START:
+        return start(b, frame->body);
+    case MESSAGE_END:
+        return end(b, frame->body);
+    case MESSAGE_ARM_REQ:
+        return arm(b, frame->body);
+    case MESSAGE_ARM_CONFIRM:
+        return confirm(b, frame->body);
+    case MESSAGE_DISARM:
+        disarm(b, REASON_DISARM);
+        return REFUSED_NOTHING;
+    case MESSAGE_CLEAR_FAULT:
+        return clear_fault(b);
+    default:
+        return flush(b); /* the only sequenced message left */
+    }
+}

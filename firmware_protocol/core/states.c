@@ -1,0 +1,101 @@
+/* The states, and what each change of them turns off, drops, tells. */
+
+#include "core.h"
+
+bool is_leased(uint8_t state) {
+    return state == STATE_ARMING || state == STATE_ARMED || state == STATE_RUNNING || state == STATE_HOLD;
+}
+
+void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) {
+    uint8_t wire[WIRE_MAX];
+    if (b->link.session) {
+        b->hal.send(b->hal.context, wire, frame_encode(wire, type, 0, b->link.session, body, n));
+    }
+}
+
+static void trace(struct board *b, struct board_trace what) {
+    if (b->hal.trace) {
+        what.at_us = b->now_us;
+        b->hal.trace(b->hal.context, &what);
+    }
+}
+
+void set_gate(struct board *b, bool on, uint16_t duty) {
+    b->gate = on;
+    b->hal.gate(b->hal.context, on, on ? duty : 0);
+}
+
+void trace_gate(struct board *b, bool on, bool is_point, uint32_t what) {
+    trace(b, (struct board_trace){.kind = TRACE_GATE, .on = on, .is_point = is_point,
+                                  .index = is_point ? what : 0, .reason = is_point ? 0 : (uint8_t)what});
+}
+
+/* Adds the current point to the records, with what was really done. */
+void record_point(struct board *b, uint64_t on_at_us, uint64_t on_us) {
+    const struct point *point = &b->current;
+    struct record record = {.number = b->current_number, .on_tick = on_at_us - b->epoch_us};
+    record.on_ticks = on_us > UINT16_MAX ? UINT16_MAX : (uint16_t)on_us;
+    record.duty = on_us ? point->duty : 0;
+    records_add(&b->records, &record);
+    b->done_index = b->current_number + 1;
+    b->laser_on += on_us * point->duty;
+    if (on_us) {
+        trace(b, (struct board_trace){.kind = TRACE_PULSE, .index = b->current_number, .x = point->x, .y = point->y,
+                                      .duty = point->duty, .on_us = on_at_us, .off_us = on_at_us + on_us});
+    }
+}
+
+/* Gate off; what a pulse that is cut short really did is recorded. */
+static void go_dark(struct board *b, enum reason reason) {
+    bool lit = b->gate;
+    if (MUTANT != 1) {
+        set_gate(b, false, 0);
+    }
+    if (MUTANT != 1 && lit) {
+        trace_gate(b, false, false, reason);
+    }
+    if (b->has_current && lit) {
+        record_point(b, b->lit_us, b->now_us - b->lit_us);
+    }
+    b->has_current = false;
+}
+
+void set_state(struct board *b, enum state state, enum reason reason) {
+    if (state != STATE_RUNNING) {
+        go_dark(b, reason);
+    }
+    uint8_t before = b->state, body[EVENT_SIZE];
+    b->state = (uint8_t)state;
+    b->hal.indicator(b->hal.context, is_leased(b->state));
+    b->hal.relay(b->hal.context, state != STATE_FAULT);
+    trace(b, (struct board_trace){.kind = TRACE_STATE, .state = b->state, .before = before, .reason = (uint8_t)reason});
+    body[EVENT_STATE_AT] = b->state;
+    body[EVENT_FAULT_AT] = b->fault;
+    body[EVENT_REASON_AT] = (uint8_t)reason;
+    put_u64(body + EVENT_TICK_AT, b->now_us - b->epoch_us);
+    send_message(b, MESSAGE_EVENT, body, sizeof body);
+}
+
+void drop_queue(struct board *b) {
+    b->queue.count = 0;
+    b->job.exists = false;
+    b->done_index = b->next_index;
+}
+
+void disarm(struct board *b, enum reason reason) {
+    b->confirmed = b->nonce_good = false;
+    if (b->state != STATE_DISARMED && b->state != STATE_FAULT) {
+        set_state(b, STATE_DISARMED, reason);
+    }
+    drop_queue(b);
+}
+
+void fail(struct board *b, enum fault fault) {
+    if (b->state != STATE_FAULT) {
+        b->fault = (uint8_t)fault;
+        trace(b, (struct board_trace){.kind = TRACE_FAULT, .fault = b->fault});
+        set_state(b, STATE_FAULT, REASON_FAULT);
+    }
+    b->confirmed = b->nonce_good = false;
+    drop_queue(b);
+}

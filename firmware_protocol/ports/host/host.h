@@ -1,0 +1,131 @@
+/* The board as a process on Linux: options, files, a pty with its line's pace and faults, a log, the core's HAL. */
+
+#ifndef HOST_H
+#define HOST_H
+
+#include <stdio.h>
+
+#include "board.h"
+
+#define PROGRAM "board"
+#define STEPS_MAX 1000u
+
+/* --- files: TOML as far as these two need it --- */
+
+enum toml_kind { TOML_INTEGER, TOML_FLOAT, TOML_BOOLEAN, TOML_STRING };
+
+struct toml_entry {
+    unsigned table; /* 0: the top; n: the n-th [[step]] */
+    enum toml_kind kind;
+    double number;
+    long long integer;
+    bool truth;
+    char key[32], text[64], raw[64];
+};
+
+struct toml {
+    struct toml_entry entries[4 * STEPS_MAX];
+    size_t count;
+    unsigned tables;
+};
+
+/* One line on stderr: where, what was there, what was expected; ends with status 2. */
+_Noreturn void bad_input(const char *where, const char *value, const char *expected);
+void toml_read(struct toml *toml, const char *path);
+const struct toml_entry *toml_find(const struct toml *toml, unsigned table, const char *key);
+
+void settings_default(struct board_config *config);
+void settings_read(struct board_config *config, const char *path);
+
+enum step_kind {
+    STEP_SET,
+    STEP_FLIP_BITS,
+    STEP_DROP_BYTES,
+    STEP_HANG,
+    STEP_REPAIR,
+    STEP_RESET,
+    STEP_CLOSE,
+    STEP_STOP_LOOP,  /* the main loop turns no more, until the watchdog bites */
+    STEP_LATE_TICK,  /* the safety tick stays away for a millisecond */
+    STEP_STICK_GATE, /* the gate's readback stays as it is, until repair */
+};
+
+struct step {
+    uint64_t at_us;
+    enum step_kind kind;
+    uint8_t input; /* INPUT_ bit */
+    bool value;
+    double rate;
+};
+
+struct script {
+    struct step steps[STEPS_MAX];
+    size_t count, next;
+};
+
+void script_read(struct script *script, const char *path);
+const char *input_name(uint8_t bit);
+
+/* --- log --- */
+
+struct log {
+    int fd;             /* -1: none */
+    const char *failed; /* why it can no longer be written */
+};
+
+void log_trace(struct log *log, const struct board_trace *what);
+void log_input(struct log *log, uint64_t at_us, const char *name, bool value);
+void log_port(struct log *log, uint64_t at_us, bool open);
+
+/* --- line --- */
+
+#define OUT_MAX 262144u
+#define READ_MAX 4096u
+
+struct pace {
+    double bytes_per_s, tokens;
+    uint64_t at_us;
+};
+
+struct line {
+    const char *path;
+    int master;
+    bool open, was_open, mid_frame;
+    uint64_t closed_since_us;
+    struct pace in, out;
+    double drop_rate, flip_rate;
+    bool hung;
+    uint8_t waiting[OUT_MAX];
+    size_t waiting_count;
+};
+
+/* false, with a reason in errno, where no pty can be had. */
+bool line_make(struct line *line);
+void line_close(struct line *line);
+bool line_hung_up(const struct line *line);
+/* Up to READ_MAX bytes as they arrive, at the line's pace; 0 where there are none. last: all at once. */
+size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last);
+void line_send(struct line *line, const uint8_t *frame, size_t n);
+void line_forget(struct line *line);
+void line_write(struct line *line, uint64_t now_us);
+bool line_may_read(struct line *line, uint64_t now_us);
+
+/* --- the port --- */
+
+struct port {
+    struct board board;
+    struct board_config config;
+    struct board_hal hal;
+    struct line line;
+    struct script script;
+    struct log log;
+    uint64_t started_ns, at_us, fed_us, ticks_again_us;
+    uint64_t exit_closed_us; /* UINT64_MAX: never */
+    uint8_t inputs;
+    bool lit, stuck, stuck_on, loop_stopped;
+};
+
+/* Until stopped by a signal, the port being closed for long, or the log; dark then. */
+void port_run(struct port *port);
+
+#endif

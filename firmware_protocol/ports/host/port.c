@@ -1,0 +1,272 @@
+/* The core between a pty and the machine's clock.
+
+   No ordinary Linux gives a process every 100 µs. So ticks are made up for: a turn does all ticks that have passed
+   since the last one, each with its own time, before it looks at the port. The core sees a board whose ticks come on
+   time; only a script makes one late. */
+
+#define _GNU_SOURCE
+
+#include <poll.h>
+#include <signal.h>
+#include <sys/prctl.h>
+#include <sys/random.h>
+#include <time.h>
+#include <unistd.h>
+
+#include "host.h"
+
+#define TURN_MAX_US 5000u
+#define CLOSED_TURN_US 1000u
+#define PACED_TURN_US 500u
+#define WATCHDOG_US 50000u
+#define LATE_TICK_US 1000u
+#define TIMER_SLACK_NS 1000ul
+
+static volatile sig_atomic_t stopped;
+
+static void on_signal(int number) {
+    (void)number;
+    stopped = 1;
+}
+
+static uint64_t clock_ns(void) {
+    struct timespec now;
+    clock_gettime(CLOCK_MONOTONIC, &now);
+    return (uint64_t)now.tv_sec * 1000000000u + (uint64_t)now.tv_nsec;
+}
+
+static uint64_t now_us(const struct port *port) { return (clock_ns() - port->started_ns) / 1000u; }
+
+/* --- the HAL --- */
+
+static void gate(void *context, bool on, uint16_t duty) {
+    (void)duty;
+    ((struct port *)context)->lit = on;
+}
+static bool gate_readback(void *context) {
+    const struct port *port = context;
+    return port->stuck ? port->stuck_on : port->lit;
+}
+static void mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
+static void lamp(void *context, bool on) { (void)context, (void)on; }
+static uint8_t inputs(void *context) { return ((struct port *)context)->inputs; }
+static int16_t temperature_dc(void *context) {
+    (void)context;
+    return 250;
+}
+static uint32_t entropy(void *context) {
+    uint32_t value = 0;
+    (void)context;
+    while (getrandom(&value, sizeof value, 0) != sizeof value) {
+    }
+    return value;
+}
+static void send(void *context, const uint8_t *frame, size_t n) { line_send(&((struct port *)context)->line, frame, n); }
+static void forget(void *context) { line_forget(&((struct port *)context)->line); }
+static void feed_watchdog(void *context) {
+    struct port *port = context;
+    port->fed_us = port->at_us;
+}
+static void trace(void *context, const struct board_trace *what) { log_trace(&((struct port *)context)->log, what); }
+
+/* --- time --- */
+
+static void reset(struct port *port, enum reset_cause cause) {
+    if (port->lit) {
+        log_trace(&port->log, &(struct board_trace){.at_us = port->at_us, .kind = TRACE_GATE});
+    }
+    board_init(&port->board, &port->hal, &port->config, cause, port->at_us);
+    port->fed_us = port->at_us;
+    port->loop_stopped = false;
+}
+
+static void tick(struct port *port) {
+    board_tick(&port->board, port->at_us);
+    if (!port->loop_stopped) {
+        board_receive(&port->board, NULL, 0, port->at_us);
+    }
+    if (port->at_us - port->fed_us > WATCHDOG_US) {
+        reset(port, RESET_WATCHDOG);
+    }
+}
+
+/* Makes up for all ticks up to until_us. */
+static void run_to(struct port *port, uint64_t until_us) {
+    while (port->at_us < until_us) {
+        uint64_t next_us = port->at_us + BOARD_TICK_US;
+        if (next_us < port->ticks_again_us) {
+            next_us = port->ticks_again_us;
+        }
+        if (next_us > until_us && until_us < port->ticks_again_us) {
+            return;
+        }
+        port->at_us = next_us < until_us ? next_us : until_us;
+        tick(port);
+    }
+}
+
+/* --- script --- */
+
+static void port_closed(struct port *port) {
+    log_port(&port->log, port->at_us, false);
+    board_link_lost(&port->board, port->at_us);
+    port->line.closed_since_us = port->at_us;
+    port->line.open = false;
+}
+
+static void set_input(struct port *port, const struct step *step) {
+    port->inputs = (uint8_t)(step->value ? port->inputs | step->input : port->inputs & ~step->input);
+    log_input(&port->log, port->at_us, input_name(step->input), step->value);
+    board_tick(&port->board, port->at_us);
+}
+
+static void take_step(struct port *port, const struct step *step) {
+    switch (step->kind) {
+    case STEP_SET:
+        set_input(port, step);
+        break;
+    case STEP_FLIP_BITS:
+        port->line.flip_rate = step->rate;
+        break;
+    case STEP_DROP_BYTES:
+        port->line.drop_rate = step->rate;
+        break;
+    case STEP_HANG:
+        port->line.hung = true;
+        break;
+    case STEP_REPAIR:
+        port->line.drop_rate = port->line.flip_rate = 0;
+        port->line.hung = port->stuck = false;
+        break;
+    case STEP_RESET:
+        port->line.waiting_count = 0;
+        reset(port, RESET_RESET);
+        break;
+    case STEP_CLOSE:
+        port_closed(port);
+        line_close(&port->line);
+        stopped = !line_make(&port->line);
+        break;
+    case STEP_STOP_LOOP:
+        port->loop_stopped = true;
+        break;
+    case STEP_LATE_TICK:
+        port->ticks_again_us = port->at_us + LATE_TICK_US;
+        break;
+    case STEP_STICK_GATE:
+        port->stuck_on = port->lit;
+        port->stuck = true;
+        break;
+    }
+}
+
+static void follow_script(struct port *port) {
+    struct script *script = &port->script;
+    while (script->next < script->count && script->steps[script->next].at_us <= now_us(port)) {
+        const struct step *step = &script->steps[script->next++];
+        run_to(port, step->at_us);
+        take_step(port, step);
+    }
+}
+
+/* --- a turn --- */
+
+static void receive(struct port *port, bool last) {
+    uint8_t bytes[READ_MAX];
+    size_t n;
+    while ((n = line_read(&port->line, bytes, port->at_us, last)) > 0) {
+        board_receive(&port->board, bytes, n, port->at_us);
+        if (!last) {
+            return;
+        }
+    }
+}
+
+/* What a host wrote before it closed is taken first, so that no later host finds it in the line. */
+static void watch_line(struct port *port) {
+    struct line *line = &port->line;
+    bool hung_up = line_hung_up(line);
+    if (line->open && hung_up) {
+        receive(port, true);
+        port_closed(port);
+    } else if (!line->open && !hung_up) {
+        log_port(&port->log, port->at_us, true);
+        line->was_open = true;
+    }
+    line->open = !hung_up;
+    if (line->was_open && hung_up && port->exit_closed_us != UINT64_MAX &&
+        port->at_us - line->closed_since_us > port->exit_closed_us) {
+        stopped = 1;
+    }
+}
+
+static uint64_t earlier(uint64_t wait_us, uint64_t due_us, uint64_t now) {
+    uint64_t left_us = due_us > now ? due_us - now : 0;
+    return left_us < wait_us ? left_us : wait_us;
+}
+
+static void wait(struct port *port) {
+    const struct script *script = &port->script;
+    uint64_t now = now_us(port), wait_us = earlier(TURN_MAX_US, board_next_due_us(&port->board), now);
+    struct pollfd look = {.fd = port->line.master, .events = POLLIN};
+    if (script->next < script->count) {
+        wait_us = earlier(wait_us, script->steps[script->next].at_us, now);
+    }
+    nfds_t count = 1;
+    if (!port->line.open) {
+        count = 0;
+        wait_us = wait_us > CLOSED_TURN_US ? wait_us : CLOSED_TURN_US;
+    } else if (!line_may_read(&port->line, now) || port->loop_stopped) {
+        count = 0;
+        wait_us = wait_us < PACED_TURN_US ? wait_us : PACED_TURN_US;
+    } else if (port->line.waiting_count > 0) {
+        wait_us = wait_us < PACED_TURN_US ? wait_us : PACED_TURN_US;
+    }
+    struct timespec span = {.tv_nsec = (long)wait_us * 1000};
+    ppoll(&look, count, &span, NULL);
+}
+
+static void turn(struct port *port) {
+    follow_script(port);
+    run_to(port, now_us(port));
+    bool serving = !port->loop_stopped && port->at_us >= port->ticks_again_us;
+    if (serving) {
+        watch_line(port);
+    }
+    if (!port->line.open) {
+        port->line.waiting_count = 0;
+    } else if (serving) {
+        receive(port, false);
+        line_write(&port->line, port->at_us);
+    }
+    wait(port);
+}
+
+void port_run(struct port *port) {
+    port->hal = (struct board_hal){
+        .context = port,
+        .gate = gate,
+        .gate_readback = gate_readback,
+        .mirrors = mirrors,
+        .inputs = inputs,
+        .indicator = lamp,
+        .relay = lamp,
+        .entropy = entropy,
+        .temperature_dc = temperature_dc,
+        .send = send,
+        .forget = forget,
+        .feed_watchdog = feed_watchdog,
+        .trace = trace,
+    };
+    signal(SIGTERM, on_signal);
+    signal(SIGINT, on_signal);
+    prctl(PR_SET_TIMERSLACK, TIMER_SLACK_NS);
+    port->inputs = INPUT_INTERLOCK | INPUT_KEY;
+    port->started_ns = clock_ns();
+    board_init(&port->board, &port->hal, &port->config, RESET_POWER_UP, 0);
+    while (!stopped && !port->log.failed) {
+        turn(port);
+    }
+    board_link_lost(&port->board, port->at_us);
+    unlink(port->line.path);
+}

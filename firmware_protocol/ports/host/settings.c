@@ -1,0 +1,97 @@
+/* What this board is: its own limits and identity, the same as the simulated board's unless --limits says otherwise. */
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "host.h"
+
+#define FIRMWARE 0x00010000u
+
+void settings_default(struct board_config *config) {
+    *config = (struct board_config){
+        .limits = {.max_on_us = 50000,
+                   .max_duty = 65535,
+                   .mean_duty = 65535,
+                   .spot_uj = 150000,
+                   .spot_leak_uw = 1400000,
+                   .full_power_uw = 2450000,
+                   .x_min = 0,
+                   .x_max = 65535,
+                   .y_min = 0,
+                   .y_max = 65535,
+                   .settle_us = 200,
+                   .settle_ns_per_code = 50,
+                   .rest_us = 500,
+                   .lease_ms = 100},
+        .firmware = FIRMWARE,
+        .cell_codes = 1300,
+        .queue_points = 4096,
+    };
+    memcpy(config->uid, "host board 1", sizeof config->uid);
+}
+
+static uint32_t whole(const char *path, const struct toml_entry *entry, long long low, long long high) {
+    if (entry->kind != TOML_INTEGER || entry->integer < low || entry->integer > high) {
+        char where[300], expected[80];
+        snprintf(where, sizeof where, "%s: %s", path, entry->key);
+        snprintf(expected, sizeof expected, "a whole number from %lld to %lld", low, high);
+        bad_input(where, entry->raw, expected);
+    }
+    return (uint32_t)entry->integer;
+}
+
+static void read_uid(struct board_config *config, const char *path, const struct toml_entry *entry) {
+    char where[300];
+    snprintf(where, sizeof where, "%s: uid", path);
+    if (entry->kind != TOML_STRING || strlen(entry->text) != 24 ||
+        strspn(entry->text, "0123456789abcdefABCDEF") != 24) {
+        bad_input(where, entry->raw, "24 hexadecimal digits");
+    }
+    for (size_t k = 0; k < sizeof config->uid; k++) {
+        char byte[3] = {entry->text[2 * k], entry->text[2 * k + 1], 0};
+        config->uid[k] = (uint8_t)strtoul(byte, NULL, 16);
+    }
+}
+
+static bool read_entry(struct board_config *config, const char *path, const struct toml_entry *entry) {
+#define READ(name, bits, at, way) \
+    if (strcmp(entry->key, #name) == 0) { \
+        config->limits.name = (uint##bits##_t)whole(path, entry, 0, UINT##bits##_MAX); \
+        return true; \
+    }
+    LIMITS_FIELDS(READ)
+#undef READ
+    if (strcmp(entry->key, "cell_codes") == 0) {
+        config->cell_codes = (uint16_t)whole(path, entry, 1, UINT16_MAX);
+    } else if (strcmp(entry->key, "queue_points") == 0) {
+        config->queue_points = (uint16_t)whole(path, entry, DATA_ITEMS_MAX, BOARD_QUEUE_POINTS);
+    } else if (strcmp(entry->key, "uid") == 0) {
+        read_uid(config, path, entry);
+    } else if (strcmp(entry->key, "key_edge") == 0) {
+        if (entry->kind != TOML_BOOLEAN) {
+            char where[300];
+            snprintf(where, sizeof where, "%s: key_edge", path);
+            bad_input(where, entry->raw, "true or false");
+        }
+        config->key_edge = entry->truth;
+    } else {
+        return false;
+    }
+    return true;
+}
+
+void settings_read(struct board_config *config, const char *path) {
+    static struct toml read;
+    struct toml *toml = &read;
+    toml_read(toml, path);
+    for (size_t k = 0; k < toml->count; k++) {
+        if (toml->entries[k].table || !read_entry(config, path, &toml->entries[k])) {
+#define NAME(name, bits, at, way) #name ", "
+            bad_input(path, toml->entries[k].key,
+                      "a known key: one of " LIMITS_FIELDS(NAME) "uid, cell_codes, queue_points, key_edge");
+        }
+    }
+    if (toml->tables) {
+        bad_input(path, "[[step]]", "no tables");
+    }
+}

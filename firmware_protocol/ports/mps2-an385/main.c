@@ -1,0 +1,227 @@
+/* The board's core on a Cortex-M3: UART 0 is the host, UART 1 a witness that writes down what happens, UART 2 the bench.
+
+   The bench stands for the world outside: it says what the board is before it starts (the configuration, whenever the
+   witness asks with C), and later what inputs read (I, one byte), that the link was lost (L), a reset (R), and what
+   fails: the main loop hangs (H), no tick comes for too long (T), the gate's readback sticks (S). */
+
+#include <string.h>
+
+#include "board.h"
+#include "chip.h"
+
+static struct board board;
+static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
+static bool gate_on, stuck, stuck_on, hung;
+static uint32_t entropy_state;
+
+/* --- witness: one line of numbers each; the bench gives them names --- */
+
+static void write_numbers(char kind, const uint64_t *numbers, size_t n) {
+    uint8_t line[256], digits[20];
+    size_t length = 0;
+    line[length++] = (uint8_t)kind;
+    for (size_t k = 0; k < n; k++) {
+        size_t count = 0;
+        uint64_t left = numbers[k];
+        do {
+            digits[count++] = (uint8_t)('0' + left % 10u);
+            left /= 10u;
+        } while (left);
+        line[length++] = ' ';
+        while (count) {
+            line[length++] = digits[--count];
+        }
+    }
+    line[length++] = '.'; /* without it a reset cut the line short */
+    line[length++] = '\n';
+    chip_write(UART_WITNESS, line, length);
+}
+
+static void on_trace(void *context, const struct board_trace *what) {
+    (void)context;
+    uint64_t numbers[] = {what->at_us, (uint64_t)what->kind, what->on,    what->is_point, what->state,
+                          what->before, what->reason,        what->fault, what->x,        what->y,
+                          what->duty,   what->index,         what->on_us, what->off_us};
+    write_numbers('T', numbers, sizeof numbers / sizeof numbers[0]);
+}
+
+/* --- the HAL --- */
+
+static void on_gate(void *context, bool on, uint16_t duty) {
+    (void)context;
+    if (on != gate_on) {
+        uint64_t numbers[] = {chip_now_us(), on, duty}; /* when the pin really changed */
+        write_numbers('G', numbers, 3);
+    }
+    gate_on = on;
+}
+
+static bool on_gate_readback(void *context) {
+    (void)context;
+    return stuck ? stuck_on : gate_on;
+}
+
+static void on_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
+
+static uint8_t on_inputs(void *context) {
+    (void)context;
+    return inputs;
+}
+
+static void on_switch(void *context, bool on) { (void)context, (void)on; }
+
+/* The emulated chip has no source of entropy: the bench gives a seed with the configuration. */
+static uint32_t on_entropy(void *context) {
+    (void)context;
+    entropy_state += 0x9e3779b9u;
+    uint32_t mixed = entropy_state;
+    mixed = (mixed ^ mixed >> 16) * 0x85ebca6bu;
+    mixed = (mixed ^ mixed >> 13) * 0xc2b2ae35u;
+    return mixed ^ mixed >> 16;
+}
+
+static int16_t on_temperature(void *context) {
+    (void)context;
+    return 250;
+}
+
+static void on_send(void *context, const uint8_t *frame, size_t length) {
+    (void)context;
+    chip_write(UART_HOST, frame, length);
+}
+
+static void on_forget(void *context) { (void)context; /* frames leave at once, nothing waits */ }
+
+static void on_feed_watchdog(void *context) {
+    (void)context;
+    chip_feed_watchdog();
+}
+
+static const struct board_hal hal = {
+    .gate = on_gate,
+    .gate_readback = on_gate_readback,
+    .mirrors = on_mirrors,
+    .inputs = on_inputs,
+    .indicator = on_switch,
+    .relay = on_switch,
+    .entropy = on_entropy,
+    .temperature_dc = on_temperature,
+    .send = on_send,
+    .forget = on_forget,
+    .feed_watchdog = on_feed_watchdog,
+    .trace = on_trace,
+};
+
+/* --- the bench --- */
+
+static struct board_config config;
+
+static void wait_for(uint8_t *bytes, size_t n) {
+    for (size_t have = 0; have < n;) {
+        have += chip_read(UART_BENCH, bytes + have, n - have);
+        if (have < n) {
+            chip_sleep(UINT64_MAX);
+        }
+    }
+}
+
+/* The configuration as the bench packs it: u32 seed, u32 firmware, u8[12] uid, u16 cell_codes, u16 queue_points,
+   u8 key_edge, u8 inputs, then the limits as in LIMITS. */
+#define CONFIG_SIZE (4u + 4u + 12u + 2u + 2u + 1u + 1u + LIMITS_SIZE)
+
+static uint16_t u16_at(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
+static uint32_t u32_at(const uint8_t *at) { return u16_at(at) | (uint32_t)u16_at(at + 2) << 16; }
+
+static void configure(void) {
+    uint8_t bytes[CONFIG_SIZE];
+    chip_write(UART_WITNESS, (const uint8_t *)"\n", 1); /* ends what a reset cut short */
+    write_numbers('C', NULL, 0);
+    wait_for(bytes, sizeof bytes);
+    entropy_state = u32_at(bytes);
+    config.firmware = u32_at(bytes + 4);
+    memcpy(config.uid, bytes + 8, 12);
+    config.cell_codes = u16_at(bytes + 20);
+    config.queue_points = u16_at(bytes + 22);
+    config.key_edge = bytes[24] != 0;
+    inputs = bytes[25];
+    const uint8_t *at = bytes + 26;
+#define TAKE(name, bits, offset, way) config.limits.name = (uint##bits##_t)(bits == 16 ? u16_at(at + (offset)) : u32_at(at + (offset)));
+    LIMITS_FIELDS(TAKE)
+#undef TAKE
+}
+
+static void reset(void) {
+    uint64_t now_us = chip_now_us();
+    if (gate_on) {
+        on_trace(NULL, &(struct board_trace){.at_us = now_us, .kind = TRACE_GATE});
+    }
+    board_init(&board, &hal, &config, RESET_RESET, now_us);
+}
+
+/* With a tick at the same time: an emulator that is kept from its host's processor has no next one within a millisecond. */
+static void set_inputs(uint8_t value, uint64_t now_us) {
+    uint64_t numbers[] = {now_us, value};
+    write_numbers('I', numbers, 2);
+    inputs = value;
+    board_tick(&board, now_us);
+}
+
+static void miss_ticks(void) {
+    uint64_t until_us = chip_now_us() + BOARD_TICK_LATE_US + 2u * BOARD_TICK_US;
+    while (chip_now_us() < until_us) {
+        chip_sleep(until_us);
+    }
+}
+
+static void obey_bench(void) {
+    uint8_t order, value;
+    while (chip_read(UART_BENCH, &order, 1)) {
+        switch (order) {
+        case 'I':
+            wait_for(&value, 1);
+            set_inputs(value, chip_now_us());
+            break;
+        case 'L':
+            board_link_lost(&board, chip_now_us());
+            break;
+        case 'R':
+            reset();
+            break;
+        case 'H':
+            hung = true;
+            break;
+        case 'T':
+            miss_ticks();
+            break;
+        case 'S':
+            stuck_on = gate_on;
+            stuck = true;
+            break;
+        }
+    }
+}
+
+static void turn_loop(void) {
+    uint8_t bytes[256];
+    size_t n = chip_read(UART_HOST, bytes, sizeof bytes);
+    uint64_t until_us = board.lease_until_us, now_us = chip_now_us();
+    board_receive(&board, bytes, n, now_us);
+    if (board.lease_until_us != until_us) {
+        uint64_t numbers[] = {now_us, board.lease_until_us};
+        write_numbers('P', numbers, 2); /* the permit to emit */
+    }
+}
+
+int main(void) {
+    bool by_watchdog = chip_start();
+    configure();
+    board_init(&board, &hal, &config, by_watchdog ? RESET_WATCHDOG : RESET_POWER_UP, chip_now_us());
+    for (;;) {
+        chip_sleep(board_next_due_us(&board));
+        board_tick(&board, chip_now_us());
+        obey_bench();
+        if (!hung) {
+            turn_loop();
+        }
+    }
+}

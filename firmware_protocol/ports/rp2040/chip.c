@@ -1,0 +1,239 @@
+#include "chip.h"
+
+#include "registers.h"
+#include "settings.h"
+
+#define CRYSTAL_MHZ 12u
+#define WATCHDOG_US 40000u
+#define RX_RING 1024u /* powers of two */
+#define TX_RING 4096u
+#define NOISE_BITS 512u
+
+/* --- clocks --- */
+
+static void until(uint32_t address, uint32_t bits) {
+    while ((REGISTER(address) & bits) != bits) {
+    }
+}
+
+/* The crystal for reference and time, 12 MHz × 125 / 6 / 2 from the PLL for all else. */
+static void start_clocks(void) {
+    REGISTER(XOSC_STARTUP) = 47; /* × 256 cycles: 1 ms */
+    REGISTER(XOSC_CTRL) = 0xfabu << 12 | 0xaa0u;
+    until(XOSC_STATUS, BIT(31));
+    REGISTER(CLK_REF_CTRL) = 2;
+    until(CLK_REF_SELECTED, BIT(2));
+    CLEAR(CLK_SYS_CTRL) = 1; /* off the PLL, should it run from before */
+    until(CLK_SYS_SELECTED, BIT(0));
+    SET(RESETS) = RESET_PLL_SYS;
+    CLEAR(RESETS) = RESET_PLL_SYS;
+    until(RESETS_DONE, RESET_PLL_SYS);
+    REGISTER(PLL_CS) = 1;
+    REGISTER(PLL_FBDIV) = CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ;
+    CLEAR(PLL_PWR) = BIT(0) | BIT(5);
+    until(PLL_CS, BIT(31));
+    REGISTER(PLL_PRIM) = 6u << 16 | 2u << 12;
+    CLEAR(PLL_PWR) = BIT(3);
+    REGISTER(CLK_SYS_CTRL) = 0; /* from the PLL, when the switch below is turned */
+    SET(CLK_SYS_CTRL) = 1;
+    until(CLK_SYS_SELECTED, BIT(1));
+    REGISTER(CLK_PERI_CTRL) = CLK_ENABLE;
+    REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal: slow, and good enough for a temperature */
+    REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* the microsecond of timer and watchdog */
+}
+
+enum reset_cause chip_reset_cause(void) {
+    if (REGISTER(WATCHDOG_REASON) & 1u) {
+        return RESET_WATCHDOG;
+    }
+    return REGISTER(CHIP_RESET) & BIT(16) ? RESET_RESET : RESET_POWER_UP; /* the chip tells no brown-out apart */
+}
+
+/* --- time --- */
+
+uint64_t chip_now_us(void) {
+    for (uint32_t high = REGISTER(TIMER_RAW_HIGH);;) {
+        uint32_t low = REGISTER(TIMER_RAW_LOW), again = REGISTER(TIMER_RAW_HIGH);
+        if (again == high) {
+            return (uint64_t)high << 32 | low;
+        }
+        high = again;
+    }
+}
+
+void chip_wait_us(uint32_t us) {
+    for (uint64_t until_us = chip_now_us() + us + 1; chip_now_us() < until_us;) {
+    }
+}
+
+void chip_alarm(uint64_t at_us) {
+    REGISTER(TIMER_ALARM0) = (uint32_t)at_us;
+    if (chip_now_us() >= at_us) {
+        SET(TIMER_INTF) = 1; /* it compares for equality and would wait for more than an hour */
+    }
+}
+
+void timer_came(void) {
+    CLEAR(TIMER_INTF) = 1;
+    REGISTER(TIMER_INTR) = 1;
+    on_alarm();
+}
+
+static void fence(void) { __asm volatile("dsb\n\tisb" ::: "memory"); }
+
+void chip_hold_alarm(void) {
+    REGISTER(NVIC_DISABLE) = TIMER_IRQ;
+    fence();
+}
+
+void chip_release_alarm(void) {
+    fence();
+    REGISTER(NVIC_ENABLE) = TIMER_IRQ;
+}
+
+/* --- bytes: both interrupts have the same priority, so neither comes upon the other --- */
+
+static struct {
+    uint8_t bytes[RX_RING];
+    volatile uint32_t in, out;
+    volatile bool broke;
+} came;
+
+static struct {
+    uint8_t bytes[TX_RING];
+    uint32_t in, out;
+    bool mid_frame;
+} leaves;
+
+static void pump(void) {
+    while (leaves.out != leaves.in && !(REGISTER(UART_FR) & BIT(5))) {
+        uint8_t byte = leaves.bytes[leaves.out++ % TX_RING];
+        leaves.mid_frame = byte != 0;
+        REGISTER(UART_DR) = byte;
+    }
+}
+
+void uart_came(void) {
+    REGISTER(UART_ICR) = 0x7ffu;
+    while (!(REGISTER(UART_FR) & BIT(4))) {
+        uint32_t byte = REGISTER(UART_DR);
+        if (byte & BIT(10)) {
+            came.broke = true;
+        } else if (came.in - came.out < RX_RING) {
+            came.bytes[came.in % RX_RING] = (uint8_t)byte;
+            came.in++;
+        }
+    }
+    pump();
+}
+
+static void start_uart(void) {
+    uint32_t divisor = CLOCK_HZ * 4u / HOST_BAUD; /* 64ths of 16 bit times */
+    REGISTER(UART_IBRD) = divisor >> 6;
+    REGISTER(UART_FBRD) = divisor & 63u;
+    REGISTER(UART_LCR_H) = 3u << 5 | BIT(4);
+    REGISTER(UART_CR) = BIT(0) | BIT(8) | BIT(9);
+    REGISTER(UART_IFLS) = 1u << 3 | 1u; /* at a quarter, both ways */
+    REGISTER(UART_IMSC) = BIT(4) | BIT(5) | BIT(6) | BIT(9);
+    REGISTER(NVIC_ENABLE) = UART_IRQ;
+}
+
+size_t chip_read(uint8_t *bytes, size_t size) {
+    size_t n = 0;
+    while (n < size && came.out != came.in) {
+        bytes[n++] = came.bytes[came.out % RX_RING];
+        came.out = came.out + 1;
+    }
+    return n;
+}
+
+bool chip_break(void) {
+    bool broke = came.broke;
+    came.broke = false;
+    return broke;
+}
+
+static void hold_uart(void) {
+    REGISTER(NVIC_DISABLE) = UART_IRQ;
+    fence();
+}
+
+static void release_uart(void) {
+    fence();
+    REGISTER(NVIC_ENABLE) = UART_IRQ;
+}
+
+void chip_send(const uint8_t *frame, size_t n) {
+    hold_uart();
+    if (TX_RING - (leaves.in - leaves.out) >= n) {
+        for (size_t k = 0; k < n; k++) {
+            leaves.bytes[leaves.in++ % TX_RING] = frame[k];
+        }
+    }
+    pump();
+    release_uart();
+}
+
+void chip_forget(void) {
+    hold_uart();
+    uint32_t end = leaves.out;
+    if (leaves.mid_frame) {
+        while (leaves.bytes[end % TX_RING] != 0) {
+            end++;
+        }
+        end++;
+    }
+    leaves.in = end;
+    release_uart();
+}
+
+/* --- watchdog --- */
+
+void chip_start_watchdog(void) {
+    REGISTER(PSM_WDSEL) = 0x1fffcu; /* everything but the oscillators, so every pin lets go */
+    chip_feed_watchdog();
+    REGISTER(WATCHDOG_CTRL) = BIT(30);
+}
+
+/* The chip counts two for each microsecond (its erratum E1). */
+void chip_feed_watchdog(void) { REGISTER(WATCHDOG_LOAD) = 2u * WATCHDOG_US; }
+
+/* --- noise, temperature --- */
+
+static uint64_t pool;
+
+/* A bit of the ring oscillator's jitter, and when it was looked at. The multiplier is Knuth's for 64 bits. */
+void chip_stir(void) {
+    pool = (pool ^ (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1) * 6364136223846793005u + 1u;
+}
+
+uint32_t chip_entropy(void) {
+    chip_stir();
+    uint64_t mixed = pool ^ pool >> 29;
+    mixed *= 0xd6e8feb86659fd93u;
+    return (uint32_t)(mixed >> 32);
+}
+
+int16_t chip_temperature_dc(void) {
+    int32_t uv = (int32_t)((uint64_t)(REGISTER(ADC_RESULT) & 0xfffu) * 3300000u / 4096u);
+    return (int16_t)(270 - (uv - 706000) * 10 / 1721); /* 0.706 V at 27 °C, 1.721 mV less for each more */
+}
+
+/* --- all together --- */
+
+void chip_start(void) {
+    static const uint32_t USED = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 | RESET_TIMER | RESET_UART0;
+    CLEAR(WATCHDOG_CTRL) = BIT(30); /* should it run from before */
+    start_clocks();
+    SET(RESETS) = USED; /* pins too: they let go, and pull-downs hold them */
+    CLEAR(RESETS) = USED;
+    until(RESETS_DONE, USED);
+    REGISTER(TIMER_INTE) = 1;
+    start_uart();
+    REGISTER(ADC_CS) = 1u | BIT(1);
+    REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* the temperature, again and again */
+    for (uint32_t k = 0; k < NOISE_BITS; k++) {
+        chip_stir();
+        chip_wait_us(1);
+    }
+}

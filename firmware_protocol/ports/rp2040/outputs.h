@@ -1,0 +1,16 @@
+/* Light and mirrors. */
+
+#ifndef OUTPUTS_H
+#define OUTPUTS_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+/* Dark, relay open, mirrors' converter ready. */
+void outputs_start(void);
+void outputs_gate(bool on, uint16_t duty);
+void outputs_mirrors(uint16_t x, uint16_t y);
+void outputs_set(uint32_t pin, bool high);
+bool outputs_get(uint32_t pin);
+
+#endif

@@ -1,0 +1,22 @@
+/* Which pin of the Pico does what; docs/wiring.md has the circuit around them. Numbers are GPIOs. */
+
+#ifndef PINS_H
+#define PINS_H
+
+#define PIN_HOST_TX 0u     /* to the adapter's RXD */
+#define PIN_HOST_RX 1u     /* from the adapter's TXD */
+#define PIN_HOST_CLOSED 2u /* from the adapter's DTR#: low while a program has the port open */
+#define PIN_ESTOP 8u       /* high while the emergency stop is not pressed */
+#define PIN_KEY 9u         /* high while the key is on */
+#define PIN_INTERLOCK 10u  /* high while the interlock is closed */
+#define PIN_INDICATOR 11u
+#define PIN_RELAY 12u
+#define PIN_READBACK 13u   /* high while light may come from the driver's input */
+#define PIN_GATE 14u       /* PWM slice 7, channel A */
+#define GATE_SLICE 7u
+#define PIN_DAC_SYNC 17u
+#define PIN_DAC_CLOCK 18u
+#define PIN_DAC_DATA 19u
+#define PIN_TICK 22u       /* high while the tick runs: for a scope */
+
+#endif

@@ -1,0 +1,1 @@
+"""Per-pixel gain and beam offset from measured heights."""

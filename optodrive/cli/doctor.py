@@ -1,0 +1,58 @@
+"""`optodrive doctor`: everything that can be checked before a display is driven."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, print_json
+
+if TYPE_CHECKING:
+    from optodrive.cli.doctor_finding import Finding
+
+MARKS = {"ok": "ok     ", "warning": "warning", "problem": "PROBLEM"}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command()(doctor)
+
+
+def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Check computer, port and board beforehand; nothing is armed. Exit 1 where there is a problem."""
+    findings = examine(config)
+    problems = sum(finding.grade == "problem" for finding in findings)
+    warnings = sum(finding.grade == "warning" for finding in findings)
+    if json:
+        counts = {"problems": problems, "warnings": warnings}
+        print_json({"ok": not problems, **counts, "findings": [finding._asdict() for finding in findings]})
+    else:
+        for finding in findings:
+            print(f"{MARKS[finding.grade]}  {finding.check:14} {finding.seen}")
+            if finding.remedy:
+                print(f"{'':9}{'':14} {finding.remedy}")
+        print(f"{problems} problems, {warnings} warnings")
+    if problems:
+        raise typer.Exit(1)
+
+
+def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
+    """All findings in order; root: the folder that stands for /."""
+    from optodrive.cli import doctor_host as host
+    from optodrive.cli.doctor_board import check_board
+    from optodrive.cli.doctor_finding import problem
+    from optodrive.cli.doctor_port import check_port
+    from optodrive.clock import MonotonicClock
+    from optodrive.config import load_config
+    from optodrive.errors import InputError
+
+    clock = MonotonicClock()
+    findings = [host.check_python(), *host.check_packages()]
+    try:
+        loaded = load_config(config)
+    except InputError as error:
+        return [*findings, problem("configuration", str(error), "correct it; `optodrive config check` tells more")]
+    findings += [host.check_clock(clock, loaded.board.lease_s), host.check_governor(root)]
+    findings += [*host.check_disk(), host.check_kernels()]
+    port, free = check_port(loaded.board, root)
+    return [*findings, *port, *(check_board(loaded, clock) if free else [])]

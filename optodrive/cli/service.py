@@ -1,0 +1,91 @@
+"""`optodrive service install | remove | show`: the daemon as a service. Writes files, starts nothing."""
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, print_json
+
+RootOption = Annotated[
+    Path, typer.Option("--root", metavar="DIR", help="Below this folder instead of /, for packages and tests.")
+]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(help="The daemon as a systemd service; nothing here starts it.", no_args_is_help=True)
+    for command in (install, remove, show):
+        group.command()(command)
+    app.add_typer(group, name="service")
+
+
+def install(
+    config: ConfigOption = None,
+    root: RootOption = Path("/"),
+    program: Annotated[
+        Path | None, typer.Option("--program", metavar="PATH", help="The optodrive that is started, if not this one.")
+    ] = None,
+    json: JsonOption = False,
+) -> None:
+    """Write unit, user, udev rules and configuration; what somebody edited is never overwritten."""
+    from optodrive.cli.service_files import CONFIG, LINK, Installation, service_files
+
+    installation = Installation(root)
+    there = installation.place(CONFIG)
+    # Installed again, for an upgrade: the configuration that is there goes on.
+    source = there if config is None and there.exists() else config
+    loaded, files = service_files(source, program or Path(sys.executable).with_name("optodrive"))
+    done = installation.put(files)
+    if json:
+        print_json({"files": [{"path": str(path), "done": what} for path, what in done]})
+        return
+    _print(done)
+    if loaded.board.vendor_id is None and loaded.board.transport == "serial":
+        print(f"no udev rules: give [board] vendor_id and product_id for {LINK} and for ModemManager to leave it alone")
+    elif loaded.board.transport == "serial" and loaded.board.port != LINK:
+        print(f"[board] port is {loaded.board.port}; {LINK} is the name that stays")
+    print(f"next, as root, once {CONFIG} is as it should be:")
+    for line in (
+        "systemd-sysusers optodrive.conf",
+        "udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb",
+        "systemctl daemon-reload && systemctl enable --now optodrive",
+    ):
+        print(f"    {line}")
+    print("The laser stays off: the daemon arms nothing, `optodrive arm` does.")
+
+
+def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
+    """Remove what install wrote and nobody edited."""
+    from optodrive.cli.service_files import Installation
+
+    done = Installation(root).take_away()
+    if json:
+        print_json({"files": [{"path": str(path), "done": what} for path, what in done]})
+        return
+    _print(done)
+    if not done:
+        print("nothing is installed")
+    else:
+        print("stop it first if it runs: systemctl disable --now optodrive; then systemctl daemon-reload")
+        print("left: /var/lib/optodrive (tokens, audit file), the user optodrive")
+
+
+def show(root: RootOption = Path("/"), json: JsonOption = False) -> None:
+    """Show which files are installed, and which of them were edited."""
+    from optodrive.cli.service_files import Installation
+
+    installation = Installation(root)
+    stands = [(path, str(installation.standing(path))) for path in installation.known()]
+    if json:
+        print_json({"files": [{"path": str(path), "standing": standing} for path, standing in stands]})
+        return
+    _print(stands)
+    if not stands:
+        print("nothing is installed")
+
+
+def _print(lines: list[tuple[Path, str]]) -> None:
+    for path, what in lines:
+        print(f"{path}: {what}")

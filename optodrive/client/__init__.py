@@ -1,0 +1,8 @@
+"""The driver from Python: `Display`, and `AsyncDisplay` for asyncio, over a running daemon (docs/client.md)."""
+
+from optodrive.client.answers import FrameResult, Plan, State
+from optodrive.client.asynchronous import AsyncDisplay, AsyncStream
+from optodrive.client.display import Display
+from optodrive.client.stream import Stream
+
+__all__ = ["AsyncDisplay", "AsyncStream", "Display", "FrameResult", "Plan", "State", "Stream"]

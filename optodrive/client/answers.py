@@ -1,0 +1,187 @@
+"""What the daemon answers, typed; `answer` keeps all of it."""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+
+from optodrive.config import PixelLayout
+from optodrive.errors import OptodriveError, RefusedError
+from optodrive.flow import FloatArray, freeze_arrays
+from optodrive.remote import Answer, problem_error
+
+RUNNING = ("queued", "running")
+
+
+class State(NamedTuple):
+    """The daemon's state. board: DISARMED, ARMING, ARMED, …; fault, hint: what is wrong and what to do; answer: all."""
+
+    display: str
+    pixels: int
+    board: str
+    fault: str | None
+    hint: str
+    link: str
+    waiting: int
+    running: str | None
+    underruns: int
+    answer: Answer
+
+    @classmethod
+    def of(cls, answer: Answer) -> Self:
+        """From GET /v1/state."""
+        board, queue = answer["board"], answer["queue"]
+        return cls(
+            display=answer["display"],
+            pixels=answer["pixels"],
+            board=board["state"],
+            fault=board["fault"],
+            hint=board["hint"],
+            link=answer["link"]["state"],
+            waiting=queue["waiting"],
+            running=queue["running"],
+            underruns=board["underruns"],
+            answer=answer,
+        )
+
+    @property
+    def armed(self) -> bool:
+        """Whether the board takes plans."""
+        return self.board in ("ARMED", "RUNNING", "HOLD")
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A plan: asked for, planned, executed.
+
+    fits: whether all of it fits on the beam, None where that was not asked (a stream)
+    heights_um: [p] tallest peak of each pixel, reckoned from what was executed where that is known, else predicted;
+    None where the daemon did not list the pulses
+    """
+
+    plan_id: str
+    name: str
+    status: str
+    error: str | None
+    planned: int
+    sent: int
+    executed: int
+    dropped: int
+    fits: bool | None
+    duration_s: float
+    heights_um: FloatArray | None
+    layout: PixelLayout
+    answer: Answer
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @classmethod
+    def of(cls, answer: Answer, layout: PixelLayout) -> Self:
+        """From an answer of /v1/plans or /v1/patterns."""
+        admission = answer["summary"]["admission"]
+        return cls(
+            plan_id=answer["plan"],
+            name=answer["name"],
+            status=answer["status"],
+            error=answer["error"],
+            planned=answer["planned"],
+            sent=answer["sent"],
+            executed=answer["executed"],
+            dropped=answer["dropped"],
+            fits=None if admission is None else admission["fits"],
+            duration_s=answer["summary"]["duration_s"],
+            heights_um=_tallest_um(answer, len(layout)),
+            layout=layout,
+            answer=answer,
+        )
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will happen to it."""
+        return self.status not in RUNNING
+
+    @property
+    def trimmed(self) -> int:
+        """Pulses that the limiter took energy from."""
+        return int(self.answer["summary"]["trimmed"]["pulses"])
+
+    @property
+    def predicted_max_um(self) -> float:
+        """The tallest peak predicted, µm."""
+        return float(self.answer["summary"]["predicted_max_um"])
+
+    @property
+    def simulated_max_um(self) -> float | None:
+        """The tallest peak reckoned from what was executed, µm; None before that is known."""
+        value = self.answer["simulated_max_um"]
+        return None if value is None else float(value)
+
+    def checked(self) -> Self:
+        """Itself; RefusedError where it failed."""
+        if self.status == "failed":
+            raise RefusedError(f"plan {self.plan_id} failed: {self.error}")
+        return self
+
+    def __repr__(self) -> str:
+        tallest = "" if self.heights_um is None else f", tallest {self.heights_um.max():.1f} µm"
+        return f"<Plan {self.plan_id} {self.name!r}: {self.status}, {self.executed} of {self.planned} pulses{tallest}>"
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks: its heights on the display."""
+        if self.heights_um is None:
+            return None
+        from optodrive.client.picture import png
+
+        return png(self.layout, self.heights_um)
+
+
+def _tallest_um(answer: Answer, pixels: int) -> FloatArray | None:
+    executed: dict[str, Any] | None = answer["executed_pulses"]
+    if executed is not None and executed["simulated_um"]:
+        pixel, height_um = executed["pixel"], executed["simulated_um"]
+    elif answer["pulses"] is not None:
+        pixel, height_um = answer["pulses"]["pixel"], answer["pulses"]["predicted_um"]
+    else:
+        return None
+    tallest_um = np.zeros(pixels)
+    np.maximum.at(tallest_um, np.asarray(pixel, dtype=np.int64), np.asarray(height_um, dtype=np.float64))
+    return tallest_um
+
+
+class FrameResult(NamedTuple):
+    """What became of a stream's frame: planned, then done, superseded, failed or cancelled; or refused, with the error.
+
+    frame: its number, None where the daemon could not read it; latency: planned_s, first_byte_s, first_light_s
+    """
+
+    frame: int | None
+    status: str
+    plan_id: str | None
+    error: OptodriveError | None
+    simulated_max_um: float | None
+    latency: dict[str, float | None]
+    answer: Answer
+
+    @classmethod
+    def of(cls, answer: Answer) -> Self:
+        """From one answer of the stream."""
+        error = answer.get("error")
+        if isinstance(error, dict):
+            error = problem_error(int(error["status"]), error)
+        elif error is not None:
+            error = RefusedError(f"frame {answer['frame']}: {error}")
+        return cls(
+            frame=answer["frame"],
+            status=answer["status"],
+            plan_id=answer.get("plan"),
+            error=error,
+            simulated_max_um=answer.get("simulated_max_um"),
+            latency=answer.get("latency") or {},
+            answer=answer,
+        )
+
+    @property
+    def final(self) -> bool:
+        """Whether nothing more comes of this frame."""
+        return self.status != "planned"

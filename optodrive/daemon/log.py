@@ -1,0 +1,84 @@
+"""What the daemon has to say while it runs: lines on stderr, or entries with fields where stderr is the journal's.
+
+The journal's own socket rather than lines with a priority in front: a datagram that does not wait. A pipe to a journal
+that stands still would hold up whoever writes to it, and the engine's loop is one of them.
+"""
+
+import logging
+import os
+import socket
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal
+
+JOURNAL = Path("/run/systemd/journal/socket")
+LINE_MAX = 8000
+Level = Literal["err", "warning", "notice", "info"]
+PRIORITY: dict[Level, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
+
+
+class Log:
+    """Where lines go. journal: the journal's socket, None for stderr."""
+
+    def __init__(self, journal: Path | None = None) -> None:
+        self._journal = None if journal is None else str(journal)
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+
+    def say(self, line: str, level: Level = "info", **fields: object) -> None:
+        """Say a line; what cannot be said is lost. fields: upper-case names, for the journal only."""
+        with suppress(OSError):  # a log that cannot be written must not end what it is about
+            if self._journal is None:
+                sys.stderr.write(f"optodrive: {line}\n")
+                sys.stderr.flush()
+            else:
+                self._socket.sendto(entry(line, level, fields), self._journal)
+
+    def warn(self, line: str) -> None:
+        """Say that something is not as it should be."""
+        self.say(line, "warning")
+
+    def close(self) -> None:
+        """Give the socket back."""
+        self._socket.close()
+
+    def take_logging(self) -> None:
+        """Say what libraries log, from warnings on."""
+        handler = _Handler(self)
+        handler.setLevel(logging.WARNING)
+        logging.getLogger().addHandler(handler)
+
+
+def entry(line: str, level: Level, fields: dict[str, object]) -> bytes:
+    """An entry in the journal's own form; values of several lines are sent by their length."""
+    named = {"MESSAGE": line, "PRIORITY": PRIORITY[level], "SYSLOG_IDENTIFIER": "optodrive"}
+    named |= {f"OPTODRIVE_{name}": value for name, value in fields.items()}
+    parts = []
+    for name, value in named.items():
+        data = str(value)[:LINE_MAX].encode()
+        if b"\n" in data:
+            parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
+        else:
+            parts.append(name.encode() + b"=" + data + b"\n")
+    return b"".join(parts)
+
+
+def daemon_log() -> Log:
+    """The journal where it says that stderr is its own ($JOURNAL_STREAM), else stderr."""
+    with suppress(OSError, ValueError):
+        device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
+        there = os.fstat(2)
+        if (there.st_dev, there.st_ino) == (int(device), int(inode)) and JOURNAL.exists():
+            return Log(JOURNAL)
+    return Log()
+
+
+class _Handler(logging.Handler):
+    def __init__(self, log: Log) -> None:
+        super().__init__()
+        self._log = log
+
+    def emit(self, record: logging.LogRecord) -> None:
+        level: Level = "err" if record.levelno >= logging.ERROR else "warning"
+        self._log.say(self.format(record), level, LOGGER=record.name)

@@ -1,0 +1,36 @@
+"""How often a caller may ask: a bucket each, which fills at a steady rate."""
+
+from collections import OrderedDict
+from collections.abc import Hashable
+from dataclasses import dataclass
+
+CALLERS_MAX = 1024
+"""So many callers are remembered; whoever asked longest ago is forgotten first, and has a full bucket again."""
+
+
+@dataclass
+class _Bucket:
+    level: float
+    at_s: float
+
+
+class Rates:
+    """Requests of each caller, per_s for ever and burst at once."""
+
+    def __init__(self, per_s: float, burst: float) -> None:
+        self._per_s = per_s
+        self._burst = max(burst, 1.0)
+        self._buckets: OrderedDict[Hashable, _Bucket] = OrderedDict()
+
+    def wait_s(self, caller: Hashable, now_s: float) -> float:
+        """Count a request: 0 where it may be answered, else how long to wait before asking again, s."""
+        bucket = self._buckets.pop(caller, None) or _Bucket(self._burst, now_s)
+        bucket.level = min(self._burst, bucket.level + (now_s - bucket.at_s) * self._per_s)
+        bucket.at_s = now_s
+        self._buckets[caller] = bucket
+        while len(self._buckets) > CALLERS_MAX:
+            self._buckets.popitem(last=False)
+        if bucket.level < 1.0:
+            return (1.0 - bucket.level) / self._per_s
+        bucket.level -= 1.0
+        return 0.0

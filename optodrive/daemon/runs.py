@@ -1,0 +1,27 @@
+"""Plans on their way through the board, and notes of how far they came, for who looks on from another thread."""
+
+from typing import NamedTuple
+
+from optodrive.board.job import Job
+from optodrive.daemon.plans import PlanRecord
+
+
+class Run(NamedTuple):
+    """A plan, and its points on their way."""
+
+    record: PlanRecord
+    job: Job
+
+
+class Progress(NamedTuple):
+    """Pulses begin to end of a run, in order of its points, are done, as far as they ever will be."""
+
+    run: Run
+    begin: int
+    end: int
+
+
+class ClockMoved(NamedTuple):
+    """The board's clock was set anew: what was known happened so much later on it."""
+
+    delay_s: float

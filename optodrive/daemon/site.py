@@ -1,0 +1,89 @@
+"""The page: its files, who may have them, and what a browser is told to allow (docs/page.md).
+
+A browser cannot send a bearer header for a page, so `/` and `/page/*` take the token from a cookie too, for GET alone;
+what the page asks of the daemon carries the header as everyone's calls do. Cookies know no ports: the port is in the
+cookie's name.
+"""
+
+from http.cookies import CookieError, SimpleCookie
+from importlib.resources import files
+from importlib.resources.abc import Traversable
+from mimetypes import guess_type
+
+from fastapi import FastAPI
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+LOGIN = ("/page/login.js", "/page/login.css", "/page/colours.css")
+"""What the page that asks for the token is made of; there is no secret in it."""
+HEADERS = {
+    "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
+    "Cache-Control": "no-store",
+}
+TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
+
+
+def is_page(method: str, path: str) -> bool:
+    """Whether a request is for a part of the page."""
+    return method == "GET" and (path == "/" or path.startswith("/page/"))
+
+
+def cookie_token(headers: dict[str, str]) -> str:
+    """The token that a browser's cookie holds, '' without one."""
+    try:
+        cookies = SimpleCookie(headers.get("cookie", ""))
+    except CookieError:
+        return ""
+    found = cookies.get(f"optodrive-{_port(headers.get('host', ''))}")
+    return "" if found is None else found.value
+
+
+def _port(host: str) -> str:
+    port = host.rpartition(":")[2]
+    return port if port.isdigit() else "80"
+
+
+def login_page() -> bytes:
+    """The page that asks for the token."""
+    return _folder().joinpath("login.html").read_bytes()
+
+
+def _folder() -> Traversable:
+    return files("optodrive.daemon").joinpath("page")
+
+
+def add_page(app: FastAPI) -> None:
+    """Serve the page at `/`, and its files below `/page/`; all are read beforehand, so no path leads anywhere else."""
+    held = dict(_read(_folder(), ""))
+
+    @app.get("/", include_in_schema=False)
+    async def index() -> Response:
+        return _answer("index.html", held["index.html"])
+
+    @app.get("/page/{name:path}", include_in_schema=False)
+    async def part(name: str) -> Response:
+        if name not in held:
+            raise HTTPException(404)
+        return _answer(name, held[name])
+
+
+def _read(folder: Traversable, prefix: str) -> list[tuple[str, bytes]]:
+    held: list[tuple[str, bytes]] = []
+    for item in folder.iterdir():
+        if item.is_dir():
+            held += _read(item, f"{prefix}{item.name}/")
+        else:
+            held.append((prefix + item.name, item.read_bytes()))
+    return held
+
+
+def _answer(name: str, content: bytes) -> Response:
+    ending = "." + name.rpartition(".")[2]
+    return Response(content, media_type=TYPES.get(ending) or guess_type(name)[0] or "text/plain", headers=HEADERS)

@@ -1,0 +1,1 @@
+"""A Helios laser DAC: its bytes, the board itself, the proof of a plan in its bytes, and the player."""

@@ -1,0 +1,35 @@
+"""What `mkdocs build` takes from beside docs/: the protocols, the REST reference from OpenAPI, all decisions."""
+
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+from rest_reference import rest_reference
+
+ROOT = Path(__file__).resolve().parent.parent
+BESIDE = "firmware_protocol"
+PAGES = ("PROTOCOL.md", "SENSOR.md")
+
+
+def on_config(config):
+    """Every decision is in the navigation."""
+    decisions = sorted(
+        path.relative_to(config.docs_dir).as_posix() for path in Path(config.docs_dir).glob("decisions/*")
+    )
+    config.nav.append({"Decisions": decisions})
+    return config
+
+
+def on_files(files, config):
+    """Pages that are no files of docs/."""
+    files.append(File.generated(config, "rest.md", content=rest_reference()))
+    for name in PAGES:
+        files.append(File.generated(config, name, content=(ROOT / BESIDE / name).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown, page, config, files):
+    """The protocols are pages here; what they link to beside docs/ is named, not linked."""
+    if page.file.src_uri in PAGES:
+        return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
+    return re.sub(rf"\]\((?:\.\./)+{BESIDE}/({'|'.join(map(re.escape, PAGES))})(#[^)]*)?\)", r"](\1\2)", markdown)

@@ -1,0 +1,66 @@
+"""The REST reference, from the application's own OpenAPI: `python scripts/rest_reference.py` prints it."""
+
+from optodrive.clock import MonotonicClock
+from optodrive.config import load_config
+from optodrive.daemon.api import make_app
+from optodrive.daemon.engine import Engine
+from optodrive.pipeline import Display
+from optodrive.transport.registry import transport_maker
+
+HEAD = """# REST
+
+Generated from the daemon's OpenAPI, which it answers itself at `/openapi.json`. Every route but `/v1/health` needs
+`Authorization: Bearer TOKEN`; errors are problem documents (RFC 9457) with a stable `code`. The WebSocket is in
+[streaming](streaming.md), the client from Python in [client](client.md).
+"""
+
+
+def openapi():
+    """The application's OpenAPI; nothing is connected for it."""
+    config = load_config()
+    engine = Engine(Display.of(config), transport_maker(config.board)(), MonotonicClock())
+    try:
+        return make_app(engine, "unused").openapi()
+    finally:
+        engine.close()
+
+
+def rest_reference():
+    """Markdown, a section a route."""
+    sections = [HEAD]
+    for path, methods in openapi()["paths"].items():
+        for method, route in methods.items():
+            sections.append(section(f"{method.upper()} {path}", route))
+    return "\n".join(sections)
+
+
+def section(title, route):
+    """One route: what it does, what it takes, what it answers."""
+    lines = [f"## {title}", "", route.get("description", ""), ""]
+    rows = [
+        f"| `{item['name']}` | {item['in']} | {kind(item['schema'])} | {cell(item.get('description', ''))} |"
+        for item in route.get("parameters", ())
+    ]
+    if rows:
+        lines += ["| parameter | in | type | |", "|---|---|---|---|", *rows, ""]
+    if "requestBody" in route:
+        lines += [f"Body: {route['requestBody'].get('description', 'JSON')}.", ""]
+    answers = [f"{status} {answer['description'].rstrip('.')}" for status, answer in sorted(route["responses"].items())]
+    return "\n".join([*lines, "Answers: " + "; ".join(answers) + ".", ""])
+
+
+def kind(schema):
+    """A parameter's type in words."""
+    told = schema.get("type", "any")
+    if "enum" in schema:
+        told = ", ".join(f"`{value}`" for value in schema["enum"])
+    return cell(told + (f", {schema['default']} if left out" if "default" in schema else ""))
+
+
+def cell(text):
+    """Text that does not end a table's cell."""
+    return str(text).replace("|", "\\|").replace("\n", " ")
+
+
+if __name__ == "__main__":
+    print(rest_reference())

@@ -1,0 +1,99 @@
+"""Builds the wheel, installs it into an empty environment, and runs `optodrive serve` from it outside the checkout."""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import sysconfig
+import tempfile
+import venv
+from pathlib import Path
+
+import httpx
+
+ROOT = Path(__file__).resolve().parent.parent
+TOKEN = "a-token-for-a-wheel"
+PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
+
+
+def build(folder):
+    """The wheel, built in isolation."""
+    subprocess.run([*PIP, "wheel", "-q", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
+    (wheel,) = folder.glob("optodrive-*.whl")
+    return wheel
+
+
+def install(wheel, folder, quick):
+    """An environment with nothing but the wheel and what it asks for; quick: what it asks for is lent by this one."""
+    venv.create(folder, with_pip=False)
+    python = folder / "bin" / "python"
+    target = f"{wheel}" if quick else f"{wheel}[analysis]"
+    subprocess.run([*PIP, "--python", python, "install", "-q", *(["--no-deps"] if quick else []), target], check=True)
+    if quick:
+        (site,) = folder.glob("lib/python*/site-packages")
+        # A plain line adds the folder after the environment's own, and does not follow what that folder leads to.
+        (site / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
+    return folder / "bin" / "optodrive"
+
+
+def tried(optodrive, outside):
+    """What was found: the daemon from the wheel, asked by HTTP; the shipped configurations, read."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    environment |= {"OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(outside)}
+
+    def told(*arguments):
+        command = [optodrive.with_name("python"), *arguments]
+        return subprocess.run(command, cwd=outside, env=environment, check=True, text=True, capture_output=True).stdout
+
+    place = Path(told("-c", "import optodrive; print(optodrive.__file__)").strip())
+    if optodrive.parent.parent not in place.parents:
+        raise SystemExit(f"scripts/wheel: {place} was tried, which is not the wheel")
+    names = json.loads(told("-c", "import json; from optodrive.config import *; print(json.dumps(shipped_configs()))"))
+    for name in names:
+        told("-m", "optodrive.cli.main", "config", "check", "--config", name)
+    daemon = subprocess.Popen(
+        [optodrive, "serve", "--config", "display-16", "--port", "0"],
+        cwd=outside,
+        env=environment,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        url = re.search(r"http://[\d.:]+", daemon.stdout.readline())[0]
+        with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60) as client:
+            display = client.get("/v1/state").raise_for_status().json()["display"]
+            frames = {"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"3": 60}}]}
+            plan = client.post("/v1/plans", params={"dry_run": True}, json=frames).raise_for_status().json()
+            paths = client.get("/openapi.json").raise_for_status().json()["paths"]
+            page = (place.parent / "daemon" / "page").is_dir()
+            if page:
+                client.get("/", headers={"Accept": "text/html"}).raise_for_status()
+    finally:
+        daemon.terminate()
+        status = daemon.wait(timeout=20)
+        daemon.stdout.close()
+    return {"configs": names, "display": display, "planned": plan["planned"], "paths": len(paths), "page": page,
+            "status": status}  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="scripts/wheel", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="lend the environment this one's libraries")
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="where the wheel goes")
+    options = parser.parse_args()
+    options.out.mkdir(parents=True, exist_ok=True)
+    for old in options.out.glob("optodrive-*.whl"):
+        old.unlink()
+    wheel = build(options.out)
+    with tempfile.TemporaryDirectory() as folder:
+        outside = Path(folder) / "outside"
+        outside.mkdir()
+        found = tried(install(wheel, Path(folder) / "environment", options.quick), outside)
+    print(json.dumps({"wheel": str(wheel), "bytes": wheel.stat().st_size, **found}))
+    return 0 if found["planned"] == 1 and found["status"] == 0 and len(found["configs"]) == 5 else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

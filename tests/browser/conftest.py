@@ -1,0 +1,33 @@
+from pathlib import Path
+
+import pytest
+
+from benches import at_rest, board_at_rest, daemon_at_rest, kept, make_board, make_daemon  # noqa: F401 - fixtures
+from window import PATIENCE_MS, Visit, chromium
+
+
+@pytest.fixture(scope="module")  # its loop runs in this process meanwhile: tests with loops of their own come after
+def browser():
+    with chromium() as browser:
+        from playwright.sync_api import expect
+
+        expect.set_options(timeout=PATIENCE_MS)
+        yield browser
+
+
+@pytest.fixture
+def visit(browser):
+    visits = []
+
+    def open_visit(host, **options):
+        visits.append(Visit(browser, host.url, **options))
+        return visits[-1]
+
+    yield open_visit
+    for visit in visits:
+        visit.context.close()
+
+
+@pytest.fixture(scope="session")
+def axe():
+    return (Path(__file__).parent / "vendor" / "axe-core" / "axe.min.js").read_text(encoding="utf-8")

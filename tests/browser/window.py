@@ -1,0 +1,63 @@
+"""Chromium on a daemon's page, for the browser tests, the pictures and the benchmark."""
+
+import os
+import shutil
+from contextlib import contextmanager
+
+from rig import TOKEN
+
+CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+PATIENCE_MS = 30_000
+WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+
+
+@contextmanager
+def chromium():
+    """A browser without windows, with a new profile: what one run leaves, no other finds."""
+    assert CHROMIUM, "the page is tested in Chromium, which is missing: apt-get install chromium"
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=list(FLAGS), headless=True)
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+class Visit:
+    """A window on a daemon's page, which notes what the page complains of."""
+
+    def __init__(self, browser, url, viewport=WIDE, **options):
+        self.context = browser.new_context(viewport=viewport, **options)
+        self.page = self.context.new_page()
+        self.page.set_default_timeout(PATIENCE_MS)
+        self.complaints = []
+        self.page.on("console", lambda line: line.type in ("error", "warning") and self.complaints.append(line.text))
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.url = url
+
+    def open(self, token=TOKEN):
+        """Log in by the address that a terminal shows; the page, once it is live."""
+        self.page.goto(f"{self.url}/#token={token}")
+        try:
+            self.page.get_by_text("live", exact=True).wait_for()
+        except Exception as error:
+            raise AssertionError(
+                f"the page did not come to life: {self.page.inner_text('body')[:500]!r} {self.complaints}"
+            ) from error
+        return self.page
+
+    def complaints_but(self, *expected):
+        """What the page complained of, less what was meant to go wrong; the 401 that asks for the token is one."""
+        expected = ("401", *expected)
+        return [line for line in self.complaints if not any(part in line for part in expected)]

@@ -1,0 +1,49 @@
+"""The table of docs/board.md: for each guard what looks at it, counted from the suite. Run, it prints it."""
+
+from collections import Counter
+
+from bench import BOARD_KINDS
+from scenario import GUARDS, SCENARIOS
+from test_conform_mutants import MUTANTS
+
+ENFORCED = {
+    "B1": "dark unless running",
+    "B2": "an empty queue is dark",
+    "B3": "silence of the host is dark: the lease",
+    "B4": "gate-on time, of a point and of a cell",
+    "B5": "power, of a point and over any second",
+    "B6": "energy of a cell",
+    "B7": "no light before the mirrors have settled",
+    "B8": "the field",
+    "B9": "interlock, key, emergency stop",
+    "B10": "limits only tighten",
+    "B11": "arming is fresh",
+    "B12": "each point once, in order",
+    "B13": "junk changes counters only",
+    "B14": "tick and gate watched by the board itself",
+    "B15": "a watchdog whose reset is dark",
+}
+
+
+def scenarios_of(guard):
+    """Names of its scenarios in code; × how many cases where there are several."""
+    counts = Counter(case.name.partition("-")[0] for case in SCENARIOS if case.subject == guard)
+    return ", ".join(f"`{name}`" + (f" ×{count}" if count > 1 else "") for name, count in counts.items())
+
+
+def row(guard):
+    """A line of the table."""
+    boards = [kind.name for kind in BOARD_KINDS if not kind.spares(guard)]
+    broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
+    killed = ", ".join(f"{board} {count}" for board, count in broken.items())
+    return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"
+
+
+def table():
+    """All of it, as Markdown."""
+    head = ["| | enforced | scenarios | on | mutants killed |", "|---|---|---|---|---|"]
+    return "\n".join([*head, *map(row, GUARDS)]) + "\n"
+
+
+if __name__ == "__main__":
+    print(table(), end="")

@@ -1,0 +1,50 @@
+"""Each kind of board in turn, and a module's scenarios played at once."""
+
+from functools import cache
+
+import pytest
+
+pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
+
+from bench import BOARD_KINDS  # noqa: E402
+from scenario import run_all  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def ready(tmp_path_factory):
+    """A kind with its program built, of a mutant where one is named; each once."""
+
+    @cache
+    def build(name, mutant):
+        (kind,) = [kind for kind in BOARD_KINDS if kind.name == name]
+        return kind.ready(tmp_path_factory.mktemp(name), mutant)
+
+    return build
+
+
+@pytest.fixture(scope="module", params=[kind.name for kind in BOARD_KINDS])
+def board_kind(request, ready):
+    return ready(request.param, 0)
+
+
+@pytest.fixture(scope="module")
+def outcomes(board_kind, request):
+    """Futures by the scenario's name, of those that were asked for in this module."""
+    here = [item for item in request.session.items if item.module is request.module and hasattr(item, "callspec")]
+    asked = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
+    futures = run_all(board_kind, [case for case in asked.values() if not board_kind.spares(case.subject)])
+    yield futures
+    for future in futures.values():
+        future.cancel()
+
+
+@pytest.fixture
+def conforms(board_kind, outcomes):
+    """Raises what a scenario found; skips one that this kind of board cannot be asked for."""
+
+    def look(case):
+        if why := board_kind.spares(case.subject):
+            pytest.skip(f"{board_kind.name}: {why}")
+        outcomes[case.name].result()
+
+    return look

@@ -1,0 +1,83 @@
+"""The real session as its owner drives it, whatever link is below: connect, arm by hand, stream points."""
+
+import numpy as np
+
+from displays import DISPLAYS
+from optodrive.config import Config
+from optodrive.errors import LinkError
+from optodrive.wire.quantise import WirePoints
+
+STEP_S = 0.002
+PLACES = ((30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500))
+
+
+def configured(lease_s=0.1, baud=1_000_000):
+    """The smallest display, with a lease and a line."""
+    table = DISPLAYS["display-16"].config.model_dump()
+    table["board"] |= {"lease_s": lease_s, "baud": baud}
+    return Config.model_validate(table)
+
+
+class Points:
+    """Makes points no two of which are alike."""
+
+    def __init__(self):
+        self._serial = 0
+
+    def make(self, count, dark_us=200):
+        """[count] lit points at four places in turn, eight at each; about half a millisecond each."""
+        serial = self._serial + np.arange(count)
+        self._serial += count
+        places = np.array(PLACES)[serial // 8 % 4]
+        places[:, 1] += serial // 60_000
+        columns = (places, np.full(count, dark_us), np.full(count, 350), 1 + serial % 60_000)
+        return WirePoints(np.column_stack(columns).astype(np.uint16), np.arange(count))
+
+
+class FireHost:
+    """Has a session, a clock, points, and fire on both ways."""
+
+    def __init__(self, session, clock, up, down):
+        self.session, self.clock, self.up, self.down = session, clock, up, down
+        self.points = Points()
+
+    @property
+    def faults(self):
+        """Faults injected so far."""
+        return sum(self.up.counts.values()) + sum(self.down.counts.values())
+
+    def until(self, condition, patience_s):
+        """Step until condition() or too late; whether it came true. LinkError where the session gives up."""
+        give_up_s = self.clock.now_s() + patience_s
+        while not condition():
+            if self.clock.now_s() > give_up_s:
+                return False
+            self.session.step(STEP_S, lease=True)
+        return True
+
+    def armed(self, patience_s=4.0):
+        """Arm once, as a person would press the button; whether it came to that."""
+        if self.session.board.state == "FAULT":
+            self.session.disarm()
+            self.until(lambda: self.session.board.state == "DISARMED", 1.0)
+        if self.session.board.state != "DISARMED":
+            return False
+        self.session.arm()
+        return self.until(lambda: self.session.ready, patience_s)
+
+    def begin(self, count, dark_us=200, ahead_s=0.25):
+        """Stream points, from a little later on."""
+        return self.session.begin(self.points.make(count, dark_us), self.session.board_s() + 0.05, ahead_s)
+
+    def live(self, count, patience_s):
+        """One session from its greeting to its end: arm, stream, and whatever the link makes of it."""
+        session = self.session
+        try:
+            session.connect()
+            if self.armed():
+                job = self.begin(count)
+                self.until(lambda: job.finished or session.board.state in ("DISARMED", "FAULT"), patience_s)
+        except LinkError:
+            session.drop()
+        else:
+            session.close()

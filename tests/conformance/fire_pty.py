@@ -1,0 +1,122 @@
+"""The real session on a real serial port, a board's process on another, and a proxy with fire between the two."""
+
+import os
+import select
+import threading
+import time
+import tty
+from contextlib import suppress
+
+import serial
+from bench import Bench
+from fire import Fire, Witness
+from fire_host import FireHost, configured
+from scenario import audit_log
+
+from optodrive.board.requirements import Requirements
+from optodrive.board.session import Session
+from optodrive.clock import MonotonicClock
+from optodrive.transport.serial_port import SerialPort
+
+TURN_S = 0.002
+READ_MAX = 4096
+
+
+class Proxy(threading.Thread):
+    """A pty for the host, passed on to the board's; the board's port is open for as long as the host's is."""
+
+    def __init__(self, board_port, link, up, down):
+        super().__init__(daemon=True)
+        self._board_port, self._link, self._up, self._down = board_port, link, up, down
+        self._ending, self._cutting = threading.Event(), threading.Event()
+        self._make_pty()
+        self.start()
+
+    def _make_pty(self):
+        self._master, slave = os.openpty()
+        tty.setraw(slave)
+        os.set_blocking(self._master, False)
+        self._link.unlink(missing_ok=True)
+        self._link.symlink_to(os.ttyname(slave))
+        os.close(slave)
+
+    def cut(self):
+        """The host's port vanishes and comes back, as if unplugged."""
+        self._cutting.set()
+
+    @property
+    def cutting(self):
+        """Whether the port has still to come back."""
+        return self._cutting.is_set()
+
+    def end(self):
+        """Stop, and wait for it."""
+        self._ending.set()
+        self.join()
+        os.close(self._master)
+
+    def run(self):
+        while not self._ending.is_set():
+            if self._host_there():
+                with serial.Serial(str(self._board_port), 1_000_000, timeout=0, exclusive=True) as board:
+                    self._pass(board)
+            else:
+                self._ending.wait(TURN_S)
+            if self._cutting.is_set():
+                os.close(self._master)
+                self._make_pty()
+                self._cutting.clear()
+
+    def _host_there(self):
+        poller = select.poll()
+        poller.register(self._master, select.POLLIN)
+        return not any(flags & select.POLLHUP for _, flags in poller.poll(0))
+
+    def _pass(self, board):
+        while self._host_there() and not self._ending.is_set() and not self._cutting.is_set():
+            select.select([self._master, board.fileno()], [], [], TURN_S)
+            now_s = time.monotonic()
+            with suppress(OSError):  # nothing there, or the host has just closed
+                board.write(self._up.carry(self._from_host(), now_s))
+                os.write(self._master, self._down.carry(board.read(READ_MAX), now_s))
+
+    def _from_host(self):
+        with suppress(BlockingIOError):
+            return os.read(self._master, READ_MAX)
+        return b""
+
+
+class WitnessedPort(SerialPort):
+    """A serial port that notes what is written before it leaves."""
+
+    def __init__(self, port, witness):
+        super().__init__(port, 1_000_000)
+        self._witness = witness
+
+    def write(self, data):
+        self._witness.wrote(data)
+        super().write(data)
+
+
+class PtyRig(FireHost):
+    """A board of a kind behind a proxy; its lease, and the configuration's, are a second."""
+
+    def __init__(self, kind, folder, seed, loss=0.0, extra=0.0, pauses=0.0):
+        up, down = (Fire(2 * seed + way, loss, extra, pauses) for way in (0, 1))
+        self._bench = Bench(kind, folder)
+        self.board = self._bench.board(lease_ms=1000)
+        self.witness = Witness()
+        link = folder / "host"
+        self.proxy = Proxy(self.board.port, link, up, down)
+        clock = MonotonicClock()
+        port = WitnessedPort(str(link), self.witness)
+        super().__init__(Session(port, clock, Requirements.of(configured(lease_s=1.0))), clock, up, down)
+
+    def finish(self):
+        """End host, proxy and board; the number of pulses in its log, which keeps its word."""
+        self.session.close()
+        self.proxy.end()
+        self._bench.finish(lambda board: None)
+        events = self.board.events()
+        audit_log(events)
+        return self.witness.check(events)

@@ -1,0 +1,327 @@
+"""B1 to B8: light only when, where, as long and as bright as it may be."""
+
+import time
+
+from bench import BRIGHT, CENTRE, PATIENT, TooLateError, here
+from scenario import scenario
+from spoken import HOST, body_of, frame
+
+OTHER_CELL = CENTRE + 2000
+INSTANT = dict(settle_us=0, settle_ns_per_code=0)
+SCRIPTED_S = 8.0
+"""When scripts act: a host has armed and lit by then."""
+
+
+def shine(host, seconds=9.0):
+    """A job that is lit all the time, running; no end is named."""
+    points = [here(60_000, duty=2000)] * int(seconds / 0.06)
+    assert host.play(*points, end=False) == []
+    host.wait(host.board.lit, "light")
+
+
+def sees(host, condition, what):
+    """Wait for the board's log without saying anything but leases."""
+    host.wait(lambda: condition(host.board), what)
+
+
+# --- B1 -------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B1")
+def dark_until_a_job_s_first_point_is_due(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(1000)))
+    host.pause(0.05)
+    assert host.board.of("gate") == [], "lit in ARMED"
+    start = host.status().tick + 1_000_000
+    assert host.order(host.frame("START", job=1, first_index=0, start_tick=start, watermark=1)) == []
+    host.pause(0.1)
+    assert host.status().state == "RUNNING"
+    assert host.board.of("gate") == [], "lit before its tick"
+    sees(host, lambda board: board.fired(), "the pulse")
+    (pulse,) = host.board.of("pulse")
+    (event,) = [m for m in host.of("EVENT") if m.reason == "start"]
+    (started,) = [entry for entry in host.board.of("state") if entry["reason"] == "start"]
+    on_tick = pulse["on_us"] - (started["t_us"] - event.tick)
+    assert 0 <= on_tick - start <= host.board.late_us
+
+
+ENDS = {
+    "flush": ("flush", lambda host: host.say("FLUSH")),
+    "disarm": ("disarm", lambda host: host.say("DISARM")),
+    "abort": ("abort", lambda host: host.say("ABORT")),
+    "hello": ("hello", lambda host: host.say("HELLO", major=1, minor=0, host_nonce=77)),
+    "closed port": ("link lost", lambda host: host.close()),
+}
+
+
+@scenario("B1", ENDS)
+def leaving_running_is_dark_before_anything_else(bench, end):
+    reason, act = end
+    host = bench.ready(**BRIGHT)
+    board = host.board
+    shine(host)
+    act(host)
+    until = time.monotonic() + 5
+    while board.states()[-1][1] != reason:
+        assert time.monotonic() < until, f"{board.states()} does not end with {reason}"
+        time.sleep(0.005)
+    assert dark_by(board, board.of("state")[-1])
+
+
+@scenario("B1", {"an input": ("interlock", "fault"), "a reset": ("reset", "boot")})
+def what_comes_from_outside_is_dark_at_once(bench, case):
+    what, reason = case
+    verb = 'set = "interlock"\nvalue = false' if what == "interlock" else 'do = "reset"'
+    host = bench.ready(f"[[step]]\nat_s = {SCRIPTED_S}\n{verb}\n", **BRIGHT)
+    shine(host)
+    sees(host, lambda board: len(board.states()) > 4, "the end")
+    assert host.board.states()[-1][1] == reason
+    assert dark_by(host.board, host.board.of("state")[-1])
+
+
+def dark_by(board, change):
+    """Whether the last edge is off, and no later than a state's change."""
+    edge = board.of("gate")[-1]
+    events = board.events()
+    return not edge["on"] and edge["t_us"] <= change["t_us"] and events.index(edge) < events.index(change)
+
+
+# --- B2 -------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B2")
+def the_light_goes_off_in_time_whether_or_not_more_is_queued(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(here(10_000), here(500, dark_us=20_000), end=False)
+    sees(host, lambda board: board.states()[-1][0] == "HOLD", "HOLD")
+    edges = [(entry["t_us"], entry["on"]) for entry in host.board.of("gate")]
+    assert [on for _, on in edges] == [True, False, True, False]
+    for (on_us, _), (off_us, _), width_us in zip(edges[::2], edges[1::2], (10_000, 500), strict=True):
+        assert 0 <= off_us - on_us - width_us <= min(100, host.board.late_us)
+    hold = host.board.of("state")[-1]
+    assert hold["reason"] == "queue empty"
+    assert 0 <= hold["t_us"] - edges[-1][0] <= host.board.late_us
+    assert host.status().underruns == 1
+
+
+# --- B3 -------------------------------------------------------------------------------------------------------------
+
+LEASE_MS = 600
+WAYS = {"ARMING": None, "ARMED": None, "RUNNING": 40, "HOLD": 1}
+
+
+@scenario("B3", {state: state for state in WAYS})
+def silence_is_a_fault_and_nothing_but_a_lease_of_this_session_renews(bench, state):
+    host = bench.greeted(**{**BRIGHT, "lease_ms": LEASE_MS})
+    if state == "ARMING":
+        host.challenge()
+    else:
+        host.arm()
+    if WAYS[state]:
+        host.play(*[here(50_000, duty=2000)] * WAYS[state], end=False)
+        host.wait(lambda: ("HOLD", "queue empty") in host.board.states() or state == "RUNNING", state)
+        if host.board.states()[-1][0] != state:
+            raise TooLateError  # a hold lasts a second, and ours was over before we saw it
+    asked = host.frame("CLOCK", host_t=1), host.frame("CLOCK", host_t=2)
+    # Both clocks bracket the lease; the board's cap holds, and a shorter lease takes nothing back.
+    host.raw(asked[0] + host.frame("LEASE", ms=60_000) + host.frame("LEASE", ms=1) + asked[1])
+    useless = b"".join(
+        [
+            host.frame("LEASE", ms=60_000, session=host.session ^ 1),
+            host.frame("LEASE", ms=60_000, session=0),
+            host.frame("LEASE", ms=60_000)[:-3] + b"\0",
+            frame(HOST["LEASE"][0] | 0x80, 0, host.session, body_of("LEASE", ms=60_000)),
+            host.frame("GET"),
+            host.frame("CLOCK", host_t=3),
+            host.frame("DATA", seq=(host.seq + 9) % 256, first_index=0, points=[here(1)]),
+        ]
+    )
+    until = time.monotonic() + 5
+    while host.status().state != "FAULT":
+        assert time.monotonic() < until, f"{state}: no fault without a lease"
+        host.raw(useless)
+        host.pause(0.02, lease=False)
+    before, after = [m.tick for m in host.of("CLOCK_REPLY") if m.host_t in (1, 2)]
+    (fault,) = [m for m in host.of("EVENT") if m.state == "FAULT"]
+    assert fault.fault == "LINK"
+    assert before + LEASE_MS * 1000 <= fault.tick <= after + LEASE_MS * 1000 + host.board.late_us
+    host.say("LEASE", ms=600)
+    assert host.status().state == "FAULT"
+    assert not host.board.lit()
+
+
+# --- B4 -------------------------------------------------------------------------------------------------------------
+
+SPLITS = {
+    "the same place": [here(30_000), here(20_001)],
+    "a border between": [here(30_000, x=CENTRE + 649, y=CENTRE - 651), here(20_001, x=CENTRE + 650, y=CENTRE - 650)],
+    "no rest between": [here(30_000), here(20_001, dark_us=499)],
+    "hardly any power": [here(25_000, duty=655), here(25_001, duty=655)],
+}
+
+
+@scenario("B4")
+def a_point_longer_than_allowed_is_refused_when_queued(bench):
+    host = bench.ready(**PATIENT)
+    assert host.order(host.data(here(50_000)), host.data(here(50_001, duty=0))) == ["STATE"]
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
+
+
+@scenario("B4", SPLITS)
+def a_cell_s_light_in_pieces_counts_as_one(bench, points):
+    host = bench.ready(**PATIENT)
+    host.play(*points)
+    sees(host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.fired()) >= 1, "the end")
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
+    assert host.board.fired() == [0]
+
+
+@scenario("B4")
+def a_glance_elsewhere_is_no_rest_and_a_rest_is(bench):
+    host = bench.ready(settle_us=100, settle_ns_per_code=0, **PATIENT)
+    dim = dict(duty=999)
+    rest = here(0, dark_us=500)
+    host.play(here(30_000, **dim), here(20_000, **dim), rest, here(50_000, **dim))
+    sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
+    assert len(host.board.fired()) == 3, "50 ms in two pieces, and again after 500 µs of rest"
+    host.play(here(0, dark_us=600), here(30_000, **dim), here(100, x=OTHER_CELL), here(30_000, **dim))
+    sees(host, lambda board: board.of("fault") or len(board.fired()) == 6, "the fault")
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
+    assert len(host.board.fired()) == 5
+
+
+# --- B5 -------------------------------------------------------------------------------------------------------------
+
+
+def sweep(count, on_us=20_000):
+    """Pulses, each in a cell of its own."""
+    return [here(on_us, x=1000 + 2000 * k) for k in range(count)]
+
+
+@scenario("B5")
+def a_brighter_point_than_allowed_is_refused_when_queued(bench):
+    host = bench.ready(max_duty=40_000, **PATIENT)
+    assert host.order(host.data(here(0, duty=40_000)), host.data(here(0, duty=40_001))) == ["STATE"]
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["DUTY"]
+
+
+@scenario("B5", {"just too much": (6553, 4), "just enough": (6554, 5)})
+def mean_power_over_any_second(bench, case):
+    mean_duty, allowed = case
+    host = bench.ready(mean_duty=mean_duty, **INSTANT, **PATIENT)
+    old = [here(0, dark_us=60_000, duty=0)] * 15
+    more = [*old, *sweep(5), here(100, dark_us=60_000)] if allowed == 5 else []
+    host.play(*sweep(5), *more)
+    sees(host, lambda board: board.of("fault"), "the fault")
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["MEAN_POWER"]
+    # 20 ms of full power five times are 6554 in a second; what is older than one no longer counts.
+    assert len(host.board.fired()) == (10 if allowed == 5 else 4)
+
+
+# --- B6 -------------------------------------------------------------------------------------------------------------
+
+BUCKETS = {
+    "too soon": ([here(45_000), here(45_000, dark_us=1000)], "SPOT", 1),
+    "across a border": ([here(45_000, x=CENTRE + 649), here(45_000, dark_us=1000, x=CENTRE + 650)], "SPOT", 1),
+    "another cell": (
+        [here(45_000), here(45_000, dark_us=1000, x=OTHER_CELL), here(45_000, dark_us=1000)],
+        "",
+        3,
+    ),  # 110.25 mJ each of 150, and 1.4 W leak
+    "more than leaks": ([here(15_000, dark_us=5000)] * 24, "SPOT", 13),
+    "less than leaks": ([here(10_000, dark_us=9000)] * 24, "", 24),
+}
+
+
+@scenario("B6", BUCKETS)
+def energy_of_a_cell(bench, case):
+    points, fault, count = case
+    host = bench.ready(**PATIENT)
+    host.play(*points)
+    sees(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
+    assert [entry["fault"] for entry in host.board.of("fault")] == [fault] * bool(fault)
+    assert len(host.board.fired()) == count
+
+
+# --- B7 -------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B7")
+def no_gate_before_the_move_and_the_dark_time_are_over(bench):
+    host = bench.ready(**BRIGHT)
+    walk = [
+        (here(100), 0),
+        (here(100, x=CENTRE + 1), 201),
+        (here(100, x=CENTRE + 10_001, y=CENTRE + 3000), 700),
+        (here(100, x=CENTRE + 10_001, y=CENTRE - 7000, dark_us=699), 700),
+        (here(100, x=CENTRE + 10_001, y=CENTRE + 3000, dark_us=701), 701),
+        (here(100, x=CENTRE + 10_001, y=CENTRE + 3000, dark_us=4000), 4000),
+        (here(100, x=CENTRE + 10_022, y=CENTRE + 3000), 202),
+    ]
+    host.play(*[point for point, _ in walk])
+    sees(host, lambda board: len(board.fired()) == len(walk), "all pulses")
+    before_us = next(entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start")
+    for pulse, (_, dark_us) in zip(host.board.of("pulse"), walk, strict=True):
+        assert 0 <= pulse["on_us"] - before_us - dark_us <= host.board.late_us, pulse
+        before_us = pulse["off_us"]
+
+
+@scenario("B7")
+def a_move_that_was_broken_off_is_still_under_way(bench):
+    host = bench.ready(settle_ns_per_code=40_000, **{**BRIGHT, "settle_us": 1000})
+    move_us = 1000 + 20_000 * 40
+    host.play(here(100, x=CENTRE + 20_000))
+    host.pause(0.05)
+    assert host.tell("FLUSH") == []
+    host.play(here(100, x=CENTRE + 20_000), here(100, x=CENTRE + 20_000, dark_us=10))
+    sees(host, lambda board: len(board.fired()) == 2, "the pulses")
+    started = [entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start"]
+    assert len(started) == 2
+    if started[1] > started[0] + move_us:
+        raise TooLateError
+    first, _ = host.board.of("pulse")
+    assert 0 <= first["on_us"] - started[0] - move_us <= host.board.late_us
+
+
+@scenario("B7")
+def settling_that_a_host_asked_for(bench):
+    host = bench.host(bench.board(**BRIGHT))
+    own = host.hello()
+    limits = {name: getattr(own, name) for name in own.__dict__ if name in LIMIT_NAMES}
+    assert host.tell("LIMITS", **{**limits, "settle_us": 3000, "settle_ns_per_code": 100}) == []
+    host.arm()
+    host.play(here(100), here(100, x=CENTRE + 10))
+    sees(host, lambda board: len(board.fired()) == 2, "the pulses")
+    first, second = host.board.of("pulse")
+    assert 0 <= second["on_us"] - first["off_us"] - 3001 <= host.board.late_us
+
+
+LIMIT_NAMES = HOST["LIMITS"][2]
+
+# --- B8 -------------------------------------------------------------------------------------------------------------
+
+FIELD = dict(x_min=1000, x_max=64_000, y_min=2000, y_max=63_000)
+OUTSIDE = {
+    "left": here(1000, x=999),
+    "right": here(0, x=64_001),
+    "below": here(1000, y=1999),
+    "above": here(0, y=63_001, duty=0),
+}
+
+
+@scenario("B8", OUTSIDE)
+def outside_the_field_is_a_fault_when_queued(bench, point):
+    host = bench.ready(**FIELD, **PATIENT)
+    host.play(here(1000), here(1000), point)
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["RANGE"]
+    assert host.board.of("gate") == []
+    assert host.status().queued == 0
+
+
+@scenario("B8")
+def the_field_s_corners_are_inside(bench):
+    host = bench.ready(**FIELD, **PATIENT)
+    host.play(here(1000, x=1000, y=2000), here(1000, x=64_000, y=63_000))
+    sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
+    assert [(entry["x"], entry["y"]) for entry in host.board.of("pulse")] == [(1000, 2000), (64_000, 63_000)]

@@ -1,0 +1,235 @@
+"""Jobs, HOLD and refill, FLUSH, faults cleared, reports: what becomes of points."""
+
+from bench import BRIGHT, CENTRE, here
+from scenario import scenario
+
+DIM = dict(duty=999)
+
+
+def until(host, state, reason):
+    """Wait for a change of state in the log; its entry."""
+    host.wait(lambda: host.board.states()[-1] == (state, reason), f"{state} {reason}")
+    return host.board.of("state")[-1]
+
+
+def start(host, first=0, watermark=1, job=1, start_tick=0):
+    """START; its NAKs."""
+    return host.tell("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
+
+
+def reported(host):
+    """Records by number, as EXECUTED told them."""
+    return {m.first_index + k: record for m in host.of("EXECUTED") for k, record in enumerate(m.records)}
+
+
+# --- beginning and ending -------------------------------------------------------------------------------------------
+
+
+@scenario("jobs")
+def a_job_begins_with_its_watermark(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(100, **DIM), here(100, **DIM)))
+    assert start(host, watermark=3) == []
+    host.pause(0.1)
+    assert host.status().state == "RUNNING"
+    assert host.board.of("gate") == []
+    host.order(host.data(here(100, **DIM)))
+    host.wait(lambda: host.board.fired() == [0, 1, 2], "the points")
+    until(host, "HOLD", "queue empty")
+
+
+@scenario("jobs")
+def a_job_begins_when_all_up_to_its_end_is_here(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(100, **DIM)))
+    assert start(host, watermark=48) == []
+    host.pause(0.05)
+    assert host.board.of("gate") == []
+    assert host.tell("END", job=1, end_index=2) == ["INDEX"]
+    assert host.tell("END", job=2, end_index=1) == ["STATE"]
+    assert host.tell("END", job=1, end_index=1) == []
+    until(host, "ARMED", "job done")
+    assert host.board.fired() == [0]
+
+
+@scenario("jobs")
+def points_behind_the_end_belong_to_the_next_job(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(100, dark_us=60_000, **DIM)))
+    assert start(host) == []
+    assert host.tell("END", job=1, end_index=1) == []
+    assert host.order(host.data(here(200, **DIM), here(300, **DIM))) == []
+    until(host, "ARMED", "job done")
+    host.pause(0.05)
+    assert host.board.fired() == [0]
+    assert host.status().queued == 2
+    assert start(host, first=0) == ["INDEX"]
+    assert start(host, first=1) == []
+    assert start(host, first=1) == ["STATE"]
+    assert host.tell("END", job=1, end_index=3) == []
+    until(host, "ARMED", "job done")
+    assert host.board.fired() == [0, 1, 2]
+
+
+@scenario("jobs")
+def points_that_never_come_disarm_a_second_after_the_start(bench):
+    host = bench.ready(**BRIGHT)
+    assert start(host) == []
+    began = host.board.of("state")[-1]
+    over = until(host, "DISARMED", "hold too long")
+    assert 0 <= over["t_us"] - began["t_us"] - 1_000_000 <= host.board.late_us
+
+
+# --- HOLD -----------------------------------------------------------------------------------------------------------
+
+
+@scenario("HOLD")
+def a_hold_ends_with_the_watermark_and_the_next_dark_time_counts_from_then(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(100, **DIM), here(100, **DIM)))
+    assert start(host, watermark=2) == []
+    until(host, "HOLD", "queue empty")
+    host.order(host.data(here(100, dark_us=7000, **DIM)))
+    host.pause(0.05)
+    assert host.status().state == "HOLD"
+    host.order(host.data(here(100, dark_us=7000, **DIM)))
+    host.wait(lambda: len(host.board.fired()) == 4, "the points")
+    (refilled,) = [entry for entry in host.board.of("state") if entry["reason"] == "refilled"]
+    assert 0 <= host.board.of("pulse")[2]["on_us"] - refilled["t_us"] - 7000 <= host.board.late_us
+    assert host.board.states()[-1] == ("HOLD", "queue empty")
+    assert host.tell("END", job=1, end_index=4) == []
+    assert host.board.states()[-1] == ("ARMED", "job done")
+
+
+@scenario("HOLD")
+def a_hold_of_a_second_disarms(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(here(100, **DIM), end=False)
+    hold = until(host, "HOLD", "queue empty")
+    over = until(host, "DISARMED", "hold too long")
+    assert 0 <= over["t_us"] - hold["t_us"] - 1_000_000 <= host.board.late_us
+
+
+@scenario("HOLD")
+def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(here(100, **DIM), end=False)
+    until(host, "HOLD", "queue empty")
+    host.order(host.data(here(100, **DIM)))
+    host.wait(lambda: len(host.board.fired()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
+    host.order(host.data(here(100, **DIM)))
+    until(host, "FAULT", "fault")
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["UNDERRUN"]
+    assert host.status().underruns == 3
+    assert host.tell("CLEAR_FAULT") == []
+    host.arm()
+    host.play(here(100, **DIM), end=False)
+    until(host, "HOLD", "queue empty")
+    assert host.status().underruns == 4
+
+
+# --- FLUSH and ABORT ------------------------------------------------------------------------------------------------
+
+
+@scenario("FLUSH")
+def flush_drops_the_queue_and_stays_armed(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(60_000, **DIM)] * 24, end=False)
+    host.wait(host.board.lit, "light")
+    assert host.tell("FLUSH") == []
+    status = host.status()
+    assert (status.state, status.queued, status.done_index) == ("ARMED", 0, 24)
+    cut = host.board.of("pulse")[-1]
+    flushed = host.board.of("state")[-1]
+    assert (flushed["state"], flushed["reason"]) == ("ARMED", "flush")
+    assert cut["off_us"] == flushed["t_us"]
+    assert cut["off_us"] - cut["on_us"] <= 60_000
+    # A host that dropped points goes on with its own count, never a smaller one.
+    assert host.tell("DATA", first_index=23, points=[here(100)]) == ["INDEX"]
+    host.index = 30
+    assert host.play(here(100, **DIM)) == []
+    until(host, "ARMED", "job done")
+    assert host.board.fired()[-1] == 30
+    assert host.status().done_index == 31
+
+
+@scenario("ABORT")
+def abort_drops_everything_and_disarms(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(60_000, **DIM)] * 24, end=False)
+    host.wait(host.board.lit, "light")
+    _, status = host.ask(host.frame("ABORT"))
+    assert (status.state, status.queued) == ("DISARMED", 0)
+    assert host.board.states()[-1] == ("DISARMED", "abort")
+    count = len(host.board.fired())
+    host.arm()
+    assert host.status().queued == 0
+    assert len(host.board.fired()) == count
+
+
+@scenario("ABORT")
+def a_fault_outlives_abort_disarm_and_hello(bench):
+    host = bench.ready(**BRIGHT)
+    host.order(host.data(here(65_001)))
+    assert host.board.states()[-1] == ("FAULT", "fault")
+    host.say("ABORT")
+    assert host.tell("DISARM") == []
+    host.hello()
+    status = host.status()
+    assert (status.state, status.fault) == ("FAULT", "ON_TIME")
+    assert host.tell("CLEAR_FAULT") == []
+    assert host.board.states()[1:][-1] == ("DISARMED", "fault cleared")
+    assert host.status().fault == ""
+
+
+# --- reports --------------------------------------------------------------------------------------------------------
+
+
+@scenario("reports")
+def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
+    host = bench.ready(**BRIGHT)
+    points = [here(100 + k if k % 5 else 0, dark_us=300, duty=1000 + k, x=CENTRE + 40 * k) for k in range(60)]
+    assert host.play(*points) == []
+    host.wait(lambda: len(reported(host)) == 60, "the reports")
+    told = reported(host)
+    pulses = {entry["index"]: entry for entry in host.board.of("pulse")}
+    assert set(pulses) == {k for k in range(60) if k % 5}
+    shift = {pulse["on_us"] - told[k][0] for k, pulse in pulses.items()}
+    assert len(shift) == 1
+    for k, (_, on, duty) in told.items():
+        assert (on, duty) == ((100 + k, 1000 + k) if k % 5 else (0, 0))
+    ticks = [told[k][0] for k in range(60)]
+    assert ticks == sorted(ticks)
+    for first in (0, 37, 59):
+        said, _ = host.ask(host.frame("GET_EXECUTED", first_index=first))
+        (again,) = said
+        assert again.first_index == first
+        assert len(again.records) == min(28, 60 - first)
+        assert again.records == [told[first + k] for k in range(len(again.records))]
+    assert host.ask(host.frame("GET_EXECUTED", first_index=60))[0] == []
+
+
+@scenario("reports")
+def a_pulse_cut_short_tells_what_it_did_and_one_not_lit_nothing(bench):
+    host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
+    host.play(*[here(60_000, **DIM)] * 24, end=False)
+    host.wait(host.board.lit, "light")
+    assert host.tell("FLUSH") == []
+    cut = host.board.of("pulse")[-1]
+    host.wait(lambda: cut["index"] in reported(host), "its report")
+    assert reported(host)[cut["index"]][1:] == (cut["off_us"] - cut["on_us"], 999)
+    assert cut["index"] + 1 not in reported(host)
+    host.index = 24
+    host.play(here(100, x=CENTRE + 20_000, **DIM), here(100, **DIM), end=False)
+    assert host.tell("FLUSH") == []
+    host.index = 40
+    host.play(*[here(100, x=CENTRE + 20_000, **DIM)] * 2)
+    until(host, "ARMED", "job done")
+    host.wait(lambda: 41 in reported(host), "the reports")
+    assert 24 not in reported(host)
+    (report,) = host.ask(host.frame("GET_EXECUTED", first_index=cut["index"]))[0]
+    assert (report.first_index, len(report.records)) == (cut["index"], 1), "a gap in the numbers ends a report"
+    (report,) = host.ask(host.frame("GET_EXECUTED", first_index=cut["index"] + 1))[0]
+    assert (report.first_index, len(report.records)) == (40, 2)
+    host.hello()
+    assert host.ask(host.frame("GET_EXECUTED", first_index=0))[0] == [], "records are the session's"

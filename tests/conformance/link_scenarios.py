@@ -1,0 +1,256 @@
+"""Handshake, versions, sessions, go-back-N, NAKs, clock, status: what passes between host and board."""
+
+import time
+
+from bench import BRIGHT, PATIENT, WITH_THE_END, TooLateError, here, wait_for
+from scenario import scenario
+from spoken import HOST, body_of, frame
+
+UID = "00112233445566778899aabb"
+
+
+# --- handshake and versions -----------------------------------------------------------------------------------------
+
+
+@scenario("handshake")
+def a_board_without_a_session_answers_nothing_but_hello(bench):
+    host = bench.host(bench.board(**PATIENT))
+    wait_for(lambda: host.board.of("port"), "the port to be seen")
+    for name, fields in (("GET", {}), ("CLOCK", {"host_t": 1}), ("ARM_REQ", {"host_nonce": 1}), ("ABORT", {})):
+        host.say(name, **fields)
+    until = time.monotonic() + 0.3
+    while time.monotonic() < until:
+        host.hear()
+    assert host.heard == []
+    assert [entry["state"] for entry in host.board.of("state")] == ["DISARMED"]
+    assert host.hello().reset_cause == 0
+
+
+def _any_limits():
+    return dict.fromkeys(HOST["LIMITS"][2], 1)
+
+
+@scenario("handshake")
+def the_reply_tells_what_the_board_is(bench):
+    host = bench.host(bench.board(uid=UID, cell_codes=900, queue_points=100, key_edge=True, max_on_us=1234, y_min=77))
+    reply = host.hello()
+    assert (reply.major, reply.tick_hz) == (1, 1_000_000)
+    assert (reply.uid.hex(), reply.cell_codes, reply.queue_points) == (UID, 900, 100)
+    assert (reply.capabilities & 1, reply.max_on_us, reply.y_min) == (1, 1234, 77)
+    assert reply.session != 0
+
+
+@scenario("handshake")
+def hello_is_taken_whatever_session_stands_there_and_ends_what_goes_on(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(60_000, duty=999)] * 40, end=False)
+    host.wait(host.board.lit, "light")
+    host.raw(frame(HOST["HELLO"][0], 5, host.session ^ 0x5555, body_of("HELLO", major=1, minor=9, host_nonce=7777)))
+    host.wait(lambda: host.of("HELLO_REPLY")[-1].host_nonce == 7777, "the reply")
+    assert host.of("HELLO_REPLY")[-1].session != host.session
+    host.session, host.seq = host.of("HELLO_REPLY")[-1].session, 0
+    assert host.board.states()[-1] == ("DISARMED", "hello")
+    status = host.status()
+    assert (status.state, status.queued, status.done_index) == ("DISARMED", 0, 0)
+    host.arm()
+    assert host.order(host.frame("DATA", first_index=0, points=[here(0)])) == [], "numbers begin again"
+
+
+@scenario("versions")
+def another_major_is_greeted_and_never_armed(bench):
+    host = bench.host(bench.board(key_edge=True, **PATIENT))
+    reply = host.hello(major=2)
+    assert reply.major == 1
+    assert host.tell("ARM_REQ", host_nonce=1) == ["VERSION"]
+    assert host.status().state == "DISARMED"
+    host.hello()
+    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"]
+
+
+@scenario("handshake")
+def after_a_reset_all_is_forgotten_and_hello_tells(bench):
+    host = bench.greeted('[[step]]\nat_s = 3.0\ndo = "reset"\n', **PATIENT)
+    if len(host.board.of("state")) > 1:
+        raise TooLateError("greeted after the reset")
+    wait_for(lambda: len(host.board.of("state")) == 2, "the reset")
+    host.pause(0.2, lease=False)  # what it said before is still on its way
+    host.heard.clear()
+    host.say("GET")
+    host.pause(0.2, lease=False)
+    assert host.heard == []
+    assert host.hello().reset_cause == 1
+    assert host.tell("ARM_REQ", host_nonce=1) == []
+
+
+# --- sessions -------------------------------------------------------------------------------------------------------
+
+
+@scenario("sessions")
+def another_session_s_frames_and_a_board_s_own_do_nothing(bench):
+    host = bench.ready(**PATIENT)
+    before = host.status()
+    foreign = [host.frame(name, seq=host.seq, session=host.session ^ 1) for name in ("DISARM", "FLUSH", "GET")]
+    foreign += [host.frame("DISARM", seq=host.seq, session=0)]
+    ack = frame(0x90, 0, host.session, bytes(8))
+    said, after = host.ask(b"".join(foreign) + ack)
+    assert said == []
+    assert after.seq_errors == before.seq_errors + 5
+    assert (after.state, after.crc_errors, after.format_errors) == ("ARMED", before.crc_errors, before.format_errors)
+
+
+@scenario("sessions")
+def abort_is_taken_in_any_session(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(60_000, duty=999)] * 40, end=False)
+    host.wait(host.board.lit, "light")
+    host.ask(host.frame("ABORT", session=host.session ^ 0x1234))
+    assert host.board.states()[-1] == ("DISARMED", "abort")
+    status = host.status()
+    assert (status.state, status.queued) == ("DISARMED", 0)
+
+
+@scenario("sessions")
+def a_port_that_is_closed_and_opened_again_is_not_armed(bench):
+    host = bench.ready(**BRIGHT)
+    host.play(*[here(60_000, duty=999)] * 40, end=False)
+    host.wait(host.board.lit, "light")
+    host.close()
+    wait_for(lambda: host.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
+    again = bench.host(host.board)
+    again.hello()
+    assert again.status().state == "DISARMED"
+    again.arm()
+    assert again.status().queued == 0
+    assert [entry["open"] for entry in host.board.of("port")] == [True, False, True]
+
+
+# --- go-back-N ------------------------------------------------------------------------------------------------------
+
+
+@scenario("go-back-N")
+def a_gap_is_told_at_once_and_filled_in_order(bench):
+    host = bench.ready(**PATIENT)
+    first, second, third = (host.data(here(0, dark_us=k)) for k in range(3))
+    before = host.status().seq_errors
+    said, status = host.ask(second + third)
+    assert {(m.name, m.reason, m.next_seq) for m in said} == {("NAK", "SEQUENCE", (host.seq - 3) % 256)}
+    assert (status.queued, status.seq_errors) == (0, before + 2)
+    said, status = host.ask(first + second + third)
+    assert {m.name for m in said} == {"ACK"}
+    assert said[-1].next_seq == host.seq
+    assert status.queued == 3
+
+
+@scenario("go-back-N")
+def a_frame_that_comes_again_is_answered_again_and_not_carried_out(bench):
+    host = bench.ready(**PATIENT)
+    taken = host.data(here(0))
+    assert host.order(taken) == []
+    said, status = host.ask(taken)
+    assert [(m.name, m.next_seq, m.free_points) for m in said] == [("ACK", host.seq, 4096 - 1)]
+    assert status.queued == 1
+    refused = host.frame("START", job=1, first_index=9, start_tick=0, watermark=1)
+    for _ in range(3):
+        said, status = host.ask(refused)
+        assert [(m.name, m.reason, m.next_seq) for m in said] == [("NAK", "INDEX", host.seq)]
+    assert status.state == "ARMED"
+
+
+@scenario("go-back-N")
+def ahead_and_behind_meet_halfway(bench):
+    host = bench.greeted(**PATIENT)
+    assert host.tell("DISARM") == []
+    before = host.status().seq_errors
+    for distance, name in ((1, "NAK"), (127, "NAK"), (128, "ACK"), (255, "ACK")):
+        said, status = host.ask(host.frame("CLEAR_FAULT", seq=(host.seq + distance) % 256))
+        assert [(m.name, m.next_seq) for m in said] == [(name, host.seq)], distance
+    assert status.seq_errors == before + 2
+    assert status.state == "DISARMED"
+
+
+@scenario("go-back-N")
+def numbers_wrap_at_256_and_begin_again_with_hello(bench):
+    host = bench.greeted(**PATIENT)
+    assert host.order(*[host.frame("DISARM") for _ in range(270)]) == []
+    said, _ = host.ask(host.frame("DISARM"))
+    assert said[-1].next_seq == 271 % 256
+    host.hello()
+    said, _ = host.ask(host.frame("DISARM"))
+    assert said[-1].next_seq == 1
+
+
+@scenario("NAK")
+def each_order_out_of_place_is_refused_by_its_reason(bench):
+    host = bench.greeted(**PATIENT)
+    start = dict(job=1, first_index=0, start_tick=0, watermark=1)
+    assert host.order(host.frame("DATA", first_index=0, points=[here(0)])) == ["STATE"]
+    assert host.tell("START", **start) == ["STATE"]
+    assert host.tell("END", job=1, end_index=0) == ["STATE"]
+    assert host.tell("FLUSH") == ["STATE"]
+    assert host.tell("CLEAR_FAULT") == ["STATE"]
+    assert host.tell("ARM_CONFIRM", host_nonce=1, board_nonce=1) == ["STATE"]
+    assert host.tell("DISARM") == []
+    host.arm()
+    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.tell("LIMITS", **_any_limits()) == ["STATE"]
+    assert host.tell("START", **{**start, "first_index": 1}) == ["INDEX"]
+    assert host.tell("END", job=1, end_index=0) == ["STATE"]
+    assert host.status().state == "ARMED"
+
+
+# --- clock and status -----------------------------------------------------------------------------------------------
+
+
+@scenario("clock")
+def a_tick_is_a_microsecond_and_questions_come_back_unchanged(bench):
+    host = bench.greeted(**PATIENT)
+    asked = []
+    for stamp in (0, 0xFFFF_FFFF, 0x0100_0001):
+        sent_s = time.monotonic()
+        host.say("CLOCK", host_t=stamp)
+        host.wait(lambda: host.of("CLOCK_REPLY"), "the clock", lease=False)
+        heard_s = time.monotonic()
+        (reply,) = host.of("CLOCK_REPLY")
+        assert reply.host_t == stamp
+        host.heard.clear()
+        asked.append((sent_s, reply.tick, heard_s))
+        host.pause(0.3, lease=False)
+    (sent_s, first, heard_s), _, (later_sent_s, last, later_heard_s) = asked
+    passed_s = (last - first) * 1e-6
+    assert (later_sent_s - heard_s) * 0.999 - 0.001 <= passed_s <= (later_heard_s - sent_s) * 1.001 + 0.001
+
+
+@scenario("status")
+def status_and_events_tell_what_the_log_tells(bench):
+    host = bench.ready(**BRIGHT)
+    points = here(10_000, duty=65535), here(10_000, dark_us=50, duty=32768), here(0, dark_us=100, duty=0)
+    host.play(*points, watermark=WITH_THE_END)
+    host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
+    status = host.status()
+    assert (status.state, status.fault, status.inputs, status.queued, status.underruns) == ("ARMED", "", 0b011, 0, 0)
+    assert status.done_index == 3
+    assert abs(status.laser_on_us - 15_000) <= 1
+    host.say("ABORT")
+    host.wait(lambda: host.board.states()[-1][1] == "abort" and host.status().state == "DISARMED", "the abort")
+    told = [(m.state, m.reason, m.tick) for m in host.of("EVENT")]
+    logged = [(entry["state"], entry["reason"], entry["t_us"]) for entry in host.board.of("state")][1:]
+    assert [event[:2] for event in told] == [event[:2] for event in logged]
+    assert len({logged_us - tick for (*_, tick), (*_, logged_us) in zip(told, logged, strict=True)}) == 1
+
+
+@scenario("credits")
+def points_that_do_not_fit_are_refused_whole_and_may_come_again(bench):
+    host = bench.ready(queue_points=30, **BRIGHT)
+    assert host.order(host.data(*[here(0, dark_us=20_000)] * 24)) == []
+    assert host.of("ACK")[-1].free_points == 6
+    over = host.data(*[here(0, dark_us=100)] * 7)
+    said, status = host.ask(over)
+    assert [(m.name, m.reason, m.next_seq) for m in said] == [("NAK", "NO_ROOM", (host.seq - 1) % 256)]
+    assert status.queued == 24
+    host.seq, host.index = (host.seq - 1) % 256, 24  # it was not consumed
+    assert host.tell("START", job=1, first_index=0, start_tick=0, watermark=1) == []
+    host.wait(lambda: host.status().queued <= 20, "room")
+    assert host.order(host.data(*[here(0, dark_us=100)] * 7)) == []
+    assert host.tell("END", job=1, end_index=31) == []
+    host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
+    assert host.status().done_index == 31

@@ -1,0 +1,287 @@
+"""Python boards that break one rule each: python mutants.py NAME --pty LINK ..., as the board's own process."""
+
+import sys
+from types import SimpleNamespace
+
+from optodrive.errors import RemoteProtocolError
+from optodrive.simulator import board
+from optodrive.simulator import core as core_module
+from optodrive.simulator.core import BoardCore
+from optodrive.simulator.guards import Guards
+from optodrive.simulator.limits import OWN
+from optodrive.wire import messages as m
+from optodrive.wire.cobs import CRC, HEADER, Frame, FrameDecoder, cobs_decode
+from optodrive.wire.connection import BoardLink
+
+# Each function gives what is patched: (owner, name, what takes its place).
+
+
+def b1_states_do_not_darken():
+    return BoardCore, "_go_dark", lambda self, reason: setattr(self, "_current", None)
+
+
+def b1_start_tick_is_not_awaited():
+    start = BoardCore._start
+    return BoardCore, "_start", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
+
+
+def b2_lit_until_more_comes():
+    finish = BoardCore._finish_point
+
+    def burn_on(self, point):
+        if self._queue:
+            finish(self, point)
+        else:
+            self._due_us += 1000
+
+    return BoardCore, "_finish_point", burn_on
+
+
+def b3_no_lease():
+    return BoardCore, "_lease_due_us", lambda self: None
+
+
+def b3_any_session_renews():
+    take = BoardCore._take
+    return BoardCore, "_take", lambda self, frame: take(self, frame._replace(session=self._link.session))
+
+
+def b3_anything_renews():
+    obey = BoardCore._obey_now
+
+    def renew(self, message):
+        self._lease_until_us = self._now_us + 1000 * self._limits.lease_ms
+        obey(self, message)
+
+    return BoardCore, "_obey_now", renew
+
+
+def b3_host_says_how_long():
+    obey = BoardCore._obey_now
+
+    def believe(self, message):
+        if isinstance(message, m.Lease):
+            self._lease_until_us = max(self._lease_until_us, self._now_us + 1000 * message.ms)
+        else:
+            obey(self, message)
+
+    return BoardCore, "_obey_now", believe
+
+
+def b3_a_short_lease_takes_time_back():
+    obey = BoardCore._obey_now
+
+    def shorten(self, message):
+        if isinstance(message, m.Lease):
+            self._lease_until_us = self._now_us + 1000 * min(message.ms, self._limits.lease_ms)
+        else:
+            obey(self, message)
+
+    return BoardCore, "_obey_now", shorten
+
+
+def b4_points_are_not_looked_at():
+    static = BoardCore._static_fault
+    return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(on_us=0))
+
+
+def b4_no_account_of_cells():
+    return Guards, "on_time_us", lambda self, limits, cell, at_us: 0
+
+
+def b4_by_position_and_not_by_cell():
+    return Guards, "cells", lambda self, x, y: [(0, x, y)]
+
+
+def b4_one_grid_whose_borders_hide():
+    cells = Guards.cells
+    return Guards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+
+
+def b4_light_elsewhere_is_rest():
+    fire = Guards.fire
+
+    def forget(self, limits, x, y, start_us, on_us, duty):
+        mine = self.cells(x, y)
+        self._on = {cell: account for cell, account in self._on.items() if cell in mine}
+        fire(self, limits, x, y, start_us, on_us, duty)
+
+    return Guards, "fire", forget
+
+
+def b5_any_duty():
+    static = BoardCore._static_fault
+    return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(duty=0))
+
+
+def b5_no_mean():
+    return Guards, "mean_account", lambda self, start_us, on_us, duty: 0
+
+
+def b6_no_bucket():
+    return Guards, "bucket_uj", lambda self, limits, cell, at_us: 0
+
+
+def b6_bucket_never_leaks():
+    return Guards, "bucket_uj", lambda self, limits, cell, at_us: self._bucket.get(cell, (0, 0))[0]
+
+
+def b6_one_bucket_for_all():
+    return Guards, "cells", lambda self, x, y: [(0, 0, 0)]
+
+
+def b6_one_grid_whose_borders_hide():
+    cells = Guards.cells
+    return Guards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+
+
+def _begin(due):
+    def begin(self, point):
+        move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
+        settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000) if move else 0
+        self._position, self._current = (point.x, point.y), point
+        self._due_us = self._now_us + due(point.dark_us, settle_us)
+
+    return BoardCore, "_begin_point", begin
+
+
+def b7_dark_time_alone():
+    return _begin(lambda dark_us, settle_us: dark_us)
+
+
+def b7_settling_alone():
+    return _begin(lambda dark_us, settle_us: settle_us)
+
+
+def b7_forgets_a_move_that_was_broken_off():
+    return _begin(max)
+
+
+def b8_no_field():
+    return BoardCore, "_static_fault", lambda self, point: ""
+
+
+def b8_lit_points_only():
+    static = BoardCore._static_fault
+    return BoardCore, "_static_fault", lambda self, point: static(self, point) if point.on_us else ""
+
+
+def b9_inputs_are_only_reported():
+    return BoardCore, "set_input", lambda self, name, value, now_us: self.inputs.update({name: value})
+
+
+def b9_not_latched():
+    set_input = BoardCore.set_input
+
+    def forgive(self, name, value, now_us):
+        set_input(self, name, value, now_us)
+        if self.inputs == core_module.SAFE_INPUTS and self.state == "FAULT":
+            self._clear(m.ClearFault())
+
+    return BoardCore, "set_input", forgive
+
+
+def b9_cleared_without_a_look():
+    def clear(self, message):
+        self.fault = ""
+        self._set_state("DISARMED", "fault cleared")
+        return ""
+
+    return BoardCore, "_clear", clear
+
+
+def b10_takes_what_it_is_told():
+    return core_module, "tightened", lambda own, asked: asked
+
+
+def b10_against_the_first_only():
+    tightened = core_module.tightened
+    return core_module, "tightened", lambda own, asked: tightened(OWN, asked)
+
+
+def b11_any_echo():
+    def confirm(self, message):
+        self._confirmed, self._key_turned = True, False
+        return ""
+
+    return BoardCore, "_confirm", confirm
+
+
+def b11_predictable():
+    class Counting:
+        def __init__(self, seed):
+            self._last = 0
+
+        def randrange(self, low, high):
+            self._last += 1
+            return self._last
+
+        def getrandbits(self, bits):
+            return 4
+
+    return core_module, "random", SimpleNamespace(Random=Counting)
+
+
+def b11_key_may_stay():
+    confirm = BoardCore._confirm
+
+    def keep(self, message):
+        refusal = confirm(self, message)
+        self._key_turned = True
+        return refusal
+
+    return BoardCore, "_confirm", keep
+
+
+def b11_at_once():
+    return core_module, "INDICATOR_US", 1000
+
+
+def b12_duplicates_are_taken():
+    def accept(self, seq):
+        self._expected = seq
+        return True, None
+
+    return BoardLink, "accept", accept
+
+
+def b12_number_is_not_looked_at():
+    data = BoardCore._data
+    return BoardCore, "_data", lambda self, message: data(self, m.Data(self._next_index, message.points))
+
+
+def b13_no_crc():
+    def frame(self, encoded):
+        raw = cobs_decode(encoded)
+        if raw is None or len(raw) < HEADER.size + CRC.size:
+            self.counters.format_errors += 1
+            return None
+        return Frame(*HEADER.unpack(raw[: HEADER.size]), raw[HEADER.size : -CRC.size])
+
+    return FrameDecoder, "_frame", frame
+
+
+def b13_lengths_do_not_matter():
+    parse = m.parse_message
+
+    def lenient(kind, body):
+        try:
+            return parse(kind, body)
+        except RemoteProtocolError:
+            if kind == m.Abort.TYPE:
+                return m.Abort()
+            raise
+
+    return m, "parse_message", lenient
+
+
+MUTANTS = {
+    name: mutant
+    for name, mutant in list(globals().items())
+    if name.startswith("b") and name.partition("_")[0][1:].isdigit() and callable(mutant)
+}
+"""By name; what stands before the first underscore is the guard that it breaks."""
+
+if __name__ == "__main__":
+    setattr(*MUTANTS[sys.argv[1]]())
+    sys.exit(board.main(sys.argv[2:]))

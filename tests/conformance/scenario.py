@@ -1,0 +1,94 @@
+"""The scenarios by subject, played many at once: most of their time is the two seconds of arming."""
+
+import tempfile
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+from bench import Bench, BoardKind, TooLateError
+
+AT_ONCE = 12
+ATTEMPTS = 3
+GUARDS = [f"B{k}" for k in range(1, 16)]
+
+
+class Scenario(NamedTuple):
+    """One thing that must hold. subject: B1 to B15, or a section of PROTOCOL.md."""
+
+    subject: str
+    name: str
+    module: str
+    play: Callable[[Bench], Any]
+
+
+SCENARIOS: list[Scenario] = []
+
+
+def scenario(subject, cases=None):
+    """Register a function of a bench; with cases (a dict by name), once for each, as its second argument."""
+
+    def register(function):
+        name, module = function.__name__, function.__module__
+        if cases is None:
+            SCENARIOS.append(Scenario(subject, name, module, function))
+        for label, case in (cases or {}).items():
+            with_case = Scenario(subject, f"{name}-{label}", module, lambda bench, case=case: function(bench, case))
+            SCENARIOS.append(with_case)
+        return function
+
+    return register
+
+
+def judge(kind: BoardKind, case: Scenario):
+    """Play it against a board of a kind; AssertionError where the board does not conform."""
+    for attempt in range(ATTEMPTS):
+        with tempfile.TemporaryDirectory(prefix="conform-") as folder:
+            bench = Bench(kind, folder)
+            try:
+                case.play(bench)
+            except TooLateError:
+                bench.finish(audit)
+                if attempt == ATTEMPTS - 1:
+                    raise
+            except BaseException:
+                bench.finish(lambda board: None)
+                raise
+            else:
+                bench.finish(audit)
+                return
+
+
+def audit(board):
+    """A board that has ended: its whole log is sound."""
+    audit_log(board.events())
+
+
+def audit_log(events, state="BOOT"):
+    """What any log must show: light in RUNNING only, each pulse an edge on and one off. state: that before it."""
+    gate, since, lit = False, None, []
+    for entry in events:
+        if entry["event"] == "state":
+            assert entry["before"] in (state, "BOOT"), entry  # a reset goes through BOOT unseen
+            state = entry["state"]
+            assert not gate or state == "RUNNING", f"lit in {entry}"
+        elif entry["event"] == "gate":
+            assert entry["on"] != gate, f"an edge that is none: {entry}"
+            assert state == "RUNNING", f"an edge in {state}: {entry}"
+            gate = entry["on"]
+            if gate:
+                since = entry
+            else:
+                lit.append((since["reason"], since["t_us"], entry["t_us"]))
+    assert not gate, "lit when it ended"
+    told = [entry for entry in events if entry["event"] == "pulse"]
+    pulses = [(f"point {entry['index']}", entry["on_us"], entry["off_us"]) for entry in told]
+    shown = set(pulses)
+    assert [edge for edge in lit if edge in shown] == pulses, "pulses that the gate does not show"
+
+
+def run_all(kind: BoardKind, cases: list[Scenario]):
+    """Start all of them, as many at a time as run side by side; a future for each, by name."""
+    pool = ThreadPoolExecutor(kind.at_once)
+    futures = {case.name: pool.submit(judge, kind, case) for case in cases}
+    pool.shutdown(wait=False)
+    return futures

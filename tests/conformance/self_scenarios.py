@@ -1,0 +1,63 @@
+"""B14 and B15: a board that fails by itself goes dark, and says so."""
+
+from bench import BRIGHT, here
+from guard_scenarios import dark_by
+from scenario import scenario
+
+FAILS_S = 6.0
+"""A host has armed and lit by then; an emulated watchdog may take as long again."""
+WATCHDOG = 3
+"""The reset's cause in HELLO_REPLY."""
+
+
+def failing(bench, action):
+    """A board that lights and darkens when its script lets something in it fail."""
+    host = bench.ready(f'[[step]]\nat_s = {FAILS_S}\ndo = "{action}"\n', **BRIGHT)
+    assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
+    host.wait(host.board.lit, "light")
+    return host
+
+
+# --- B14 ------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B14", {"a late tick": ("late_tick", "TICK"), "a gate that sticks": ("stick_gate", "READBACK")})
+def what_fails_in_the_board_is_a_fault_at_once_and_latched(bench, case):
+    action, fault = case
+    host = failing(bench, action)
+    board = host.board
+    host.wait(lambda: board.states()[-1][0] != "RUNNING" and board.of("fault"), "the fault")
+    assert board.states()[-1] == ("FAULT", "fault")
+    assert [entry["fault"] for entry in board.of("fault")] == [fault]
+    assert dark_by(board, board.of("state")[-1])
+    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert (host.status().state, host.status().fault) == ("FAULT", fault)
+
+
+@scenario("B14")
+def a_gate_that_sticks_dark_is_a_fault_when_it_is_told_to_shine(bench):
+    host = bench.ready('[[step]]\nat_s = 0.5\ndo = "stick_gate"\n', **BRIGHT)
+    assert host.board.of("fault") == [], "it reads as it was told, until now"
+    host.play(here(60_000, duty=2000), end=False)
+    host.wait(lambda: host.board.of("fault") and host.board.states()[-1][0] == "FAULT", "the fault")
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["READBACK"]
+    assert dark_by(host.board, host.board.of("state")[-1])
+
+
+# --- B15 ------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B15")
+def a_hung_main_loop_ends_in_a_dark_reset_that_hello_tells(bench):
+    host = failing(bench, "stop_loop")
+    board = host.board
+    host.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")
+    assert not board.lit()
+    host.pause(0.2, lease=False)  # what it said before is still on its way
+    host.heard.clear()
+    host.say("GET")
+    host.pause(0.2, lease=False)
+    assert host.heard == [], "a session that outlived the reset"
+    assert host.hello().reset_cause == WATCHDOG
+    assert host.status().state == "DISARMED"
+    assert host.arm().status().state == "ARMED"

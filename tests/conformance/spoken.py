@@ -1,0 +1,120 @@
+"""What host and board say, as bytes: written by hand from PROTOCOL.md and nothing else of this project."""
+
+import struct
+import zlib
+from types import SimpleNamespace
+
+DATA_POINTS_MAX = 24
+POINT = struct.Struct("<5H")
+RECORD = struct.Struct("<IHH")
+LIMITS = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "full_power_uw")
+LIMITS += ("x_min", "x_max", "y_min", "y_max", "settle_us", "settle_ns_per_code", "rest_us", "lease_ms")
+LIMITS_CODES = "HHHIIIHHHHHHHH"
+
+HOST = {
+    "HELLO": (0x01, "BBI", ("major", "minor", "host_nonce")),
+    "LIMITS": (0x02, LIMITS_CODES, LIMITS),
+    "CLOCK": (0x03, "I", ("host_t",)),
+    "LEASE": (0x04, "H", ("ms",)),
+    "DATA": (0x10, "I", ("first_index",)),
+    "START": (0x11, "IIQH", ("job", "first_index", "start_tick", "watermark")),
+    "END": (0x12, "II", ("job", "end_index")),
+    "ABORT": (0x13, "", ()),
+    "ARM_REQ": (0x14, "I", ("host_nonce",)),
+    "ARM_CONFIRM": (0x15, "II", ("host_nonce", "board_nonce")),
+    "DISARM": (0x16, "", ()),
+    "CLEAR_FAULT": (0x17, "", ()),
+    "GET": (0x18, "", ()),
+    "FLUSH": (0x19, "", ()),
+    "GET_EXECUTED": (0x1A, "I", ("first_index",)),
+}
+SEQUENCED = ("LIMITS", "DATA", "START", "END", "ARM_REQ", "ARM_CONFIRM", "DISARM", "CLEAR_FAULT", "FLUSH")
+HELLO_REPLY = ("major", "minor", "host_nonce", "session", "firmware", "uid", "capabilities", "tick_hz", "queue_points")
+HELLO_REPLY += ("rx_window", "cell_codes", "reset_cause", *LIMITS)
+STATUS = ("state", "fault", "inputs", "tick", "done_index", "queued", "crc_errors", "format_errors", "seq_errors")
+STATUS += ("underruns", "laser_on_us", "temperature_dc")
+BOARD = {
+    0x81: ("HELLO_REPLY", "BBIHI12sIIHHHB" + LIMITS_CODES, HELLO_REPLY),
+    0x83: ("CLOCK_REPLY", "IQ", ("host_t", "tick")),
+    0x90: ("ACK", "BHIB", ("next_seq", "free_points", "done_index", "state")),
+    0x91: ("NAK", "BB", ("next_seq", "reason")),
+    0x92: ("EVENT", "BBBQ", ("state", "fault", "reason", "tick")),
+    0x94: ("ARM_CHALLENGE", "II", ("host_nonce", "board_nonce")),
+    0x98: ("STATUS", "BBBQIHHHHHQh", STATUS),
+}
+EXECUTED = 0x99
+STATES = ("BOOT", "DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT")
+FAULTS = ("", "LINK", "RANGE", "ON_TIME", "DUTY", "MEAN_POWER", "SPOT", "UNDERRUN", "INTERLOCK", "KEY", "ESTOP")
+FAULTS += ("TICK", "READBACK")
+REASONS = ("", "boot", "hello", "arm requested", "armed", "start", "job done", "queue empty", "refilled")
+REASONS += ("hold too long", "disarm", "abort", "link lost", "arming timed out", "fault", "fault cleared", "flush")
+NAKS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
+NAMES = {"state": STATES, "fault": FAULTS}
+
+
+def cobs(raw):
+    """COBS of at most 252 bytes, without the zero behind it."""
+    out = bytearray()
+    run = bytearray()
+    for byte in raw:
+        if byte:
+            run.append(byte)
+        else:
+            out += bytes([len(run) + 1]) + run
+            run = bytearray()
+    return bytes(out + bytes([len(run) + 1]) + run)
+
+
+def uncobs(coded):
+    """What was encoded."""
+    raw, at = bytearray(), 0
+    while at < len(coded):
+        code = coded[at]
+        raw += coded[at + 1 : at + code] + b"\0"
+        at += code
+    assert at == len(coded), "a board sends whole frames"
+    return bytes(raw[:-1])
+
+
+def frame(kind, seq=0, session=0, body=b""):
+    """A frame as it goes over the wire."""
+    raw = struct.pack("<BBH", kind, seq, session) + body
+    return cobs(raw + struct.pack("<I", zlib.crc32(raw))) + b"\0"
+
+
+def body_of(name, **fields):
+    """A host message's body; DATA takes points as tuples of five."""
+    _, codes, names = HOST[name]
+    points = b"".join(POINT.pack(*point) for point in fields.pop("points", ()))
+    return struct.pack("<" + codes, *(fields.pop(field) for field in names)) + points
+
+
+def understood(raw):
+    """A board's frame as a namespace: name, session and its fields, numbers with names as those names."""
+    *_, session = struct.unpack_from("<BBH", raw)
+    content, body = raw[:-4], raw[4:-4]
+    assert struct.unpack("<I", raw[-4:])[0] == zlib.crc32(content), "a board's frame with a wrong CRC"
+    if raw[0] == EXECUTED:
+        first, base = struct.unpack_from("<IQ", body)
+        records = [(base + offset, on, duty) for offset, on, duty in RECORD.iter_unpack(body[12:])]
+        assert 1 <= len(records) <= 28
+        return SimpleNamespace(name="EXECUTED", session=session, first_index=first, records=records)
+    name, codes, names = BOARD[raw[0]]
+    told = dict(zip(names, struct.unpack("<" + codes, body), strict=True))
+    for field, words in {**NAMES, "reason": NAKS if name == "NAK" else REASONS}.items():
+        if field in told:
+            told[field] = words[told[field]]
+    told["session"] = told.get("session", session)
+    return SimpleNamespace(name=name, **told)
+
+
+class Ear:
+    """Cuts a board's bytes into what it says."""
+
+    def __init__(self):
+        self._rest = b""
+
+    def take(self, data):
+        """Messages that are complete now."""
+        *pieces, self._rest = (self._rest + data).split(b"\0")
+        return [understood(uncobs(piece)) for piece in pieces if piece]

@@ -1,0 +1,11 @@
+"""docs/board.md says of the suite what the suite is."""
+
+from board_table import table
+
+from optodrive.config import shipped_path
+
+PAGE = shipped_path().parent / "docs" / "board.md"
+
+
+def test_the_page_has_the_table_of_this_suite():
+    assert table() in PAGE.read_text(), "python tests/conformance/board_table.py prints what belongs there"

@@ -1,0 +1,144 @@
+"""The real session over real ports, a board's process, and a proxy with fire between them: thousands of faults."""
+
+import random
+import time
+from collections import Counter
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from threading import Timer
+
+import pytest
+from bench import UNDER_FIRE, wait_for
+from fire_pty import PtyRig
+from spoken import HOST
+
+from optodrive.errors import LinkError
+
+STORMS = [(1, 0.01), (2, 0.03), (3, 0.08), (4, 0.2)]
+SESSIONS = 3
+KINDS = 11
+"""Kinds of faults; a port that closes is another."""
+
+
+@pytest.fixture(scope="module", params=[pytest.param("python", marks=pytest.mark.slow), "host", "qemu"])
+def board_kind(request, ready):
+    return ready(request.param, 0)
+
+
+@pytest.fixture
+def make_rig(board_kind, tmp_path):
+    if why := board_kind.spares(UNDER_FIRE):
+        pytest.skip(f"{board_kind.name}: {why}")
+    rigs = []
+
+    def make(*fire, **more):
+        folder = tmp_path / f"rig{len(rigs)}"
+        folder.mkdir()
+        rigs.append(PtyRig(board_kind, folder, *fire, **more))
+        return rigs[-1]
+
+    yield make
+    for rig in rigs:
+        if rig.board.process.poll() is None:
+            rig.finish()
+
+
+def states(rig):
+    return [state for state, _ in rig.board.states()]
+
+
+def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_is_dark(make_rig):
+    def storm(rig):
+        rig.up.never_again = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
+        for _ in range(SESSIONS):
+            rig.live(1500, patience_s=3.0)
+        return rig.finish()
+
+    rigs = [make_rig(seed, loss, extra=0.6, pauses=0.002) for seed, loss in STORMS]
+    with ThreadPoolExecutor(len(rigs)) as pool:
+        pulses = list(pool.map(storm, rigs))
+    faults = sum(rig.faults for rig in rigs)
+    assert len(sum((rig.up.counts + rig.down.counts for rig in rigs), Counter())) == KINDS
+    print(f"{faults} faults over ptys, {len(rigs) * SESSIONS} sessions, pulses {pulses}")
+    assert faults >= 3000
+    assert sum(pulses) > 0
+
+
+def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(make_rig):
+    rig = make_rig(7)
+    rig.session.connect()
+    assert rig.armed()
+    rig.up.loss = rig.down.loss = 0.05
+    job = rig.begin(1000, dark_us=2400)
+    assert rig.until(lambda: job.finished, 15.0), rig.session.board
+    print(f"{rig.faults} faults")
+    assert "HOLD" not in states(rig)
+    assert "FAULT" not in states(rig)
+    assert rig.finish() == 1000
+    assert rig.faults > 20
+
+
+def in_mid_job(rig):
+    rig.session.connect()
+    assert rig.armed()
+    job = rig.begin(3000, dark_us=900, ahead_s=1.0)
+    assert rig.until(lambda: job.executed_rows > 300, 10.0)
+    return job
+
+
+def test_a_host_that_stalls_for_a_quarter_second_harms_nothing(make_rig):
+    rig = make_rig(8)
+    job = in_mid_job(rig)
+    time.sleep(0.25)  # the stall itself
+    assert rig.until(lambda: job.finished, 15.0)
+    assert "HOLD" not in states(rig)
+    assert "FAULT" not in states(rig)
+    assert rig.finish() == 3000
+
+
+def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
+    rig = make_rig(9)
+    job = in_mid_job(rig)
+    time.sleep(1.3)
+    assert states(rig)[-1] == "FAULT"
+    assert [entry["fault"] for entry in rig.board.of("fault")] == ["LINK"]
+    assert not rig.board.lit()
+    assert not rig.until(lambda: job.finished, 0.5)
+    assert states(rig)[-1] == "FAULT"
+    assert rig.finish() < 3000
+
+
+def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_rig):
+    rig = make_rig(10)
+    in_mid_job(rig)
+    rig.proxy.cut()
+    with pytest.raises(LinkError):
+        rig.until(lambda: False, 5.0)
+    rig.session.drop()
+    wait_for(lambda: rig.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
+    assert not rig.board.lit()
+    wait_for(lambda: Path(rig.session.port).exists(), "the port's return")
+    rig.session.connect()
+    assert rig.session.board.state == "DISARMED"
+    assert rig.until(lambda: False, 0.3) is False
+    assert states(rig)[-1] == "DISARMED"
+    assert 0 < rig.finish() < 3000
+
+
+def test_a_port_that_closes_at_any_moment_under_fire(make_rig):
+    def storm(rig, seed):
+        moments = random.Random(seed)
+        for _ in range(SESSIONS):
+            closing = Timer(moments.choice([moments.uniform(0.0, 2.0), moments.uniform(2.2, 3.0)]), rig.proxy.cut)
+            closing.start()
+            rig.live(3000, patience_s=3.0)
+            closing.join()
+            wait_for(lambda: Path(rig.session.port).exists() and not rig.proxy.cutting, "the port's return")
+        return rig.finish()
+
+    rigs = [make_rig(seed, 0.03, extra=0.3, pauses=0.001) for seed in (11, 12)]
+    with ThreadPoolExecutor(len(rigs)) as pool:
+        pulses = list(pool.map(storm, rigs, (11, 12)))
+    lost = [rig.board.states().count(("DISARMED", "link lost")) for rig in rigs]
+    print(f"links lost {lost}, pulses {pulses}")
+    assert sum(lost) > 0

@@ -1,0 +1,227 @@
+"""The real session and a board, a link under fire between them, in virtual time: 200,000 faults."""
+
+import random
+from dataclasses import replace
+from math import inf
+
+import pytest
+from fire_host import configured
+from fire_virtual import FireRig
+from mutants import MUTANTS
+from spoken import HOST
+
+from optodrive.board import requirements
+from optodrive.board import session as session_module
+from optodrive.board.requirements import BITS_A_BYTE, FRAME_BYTES
+from optodrive.simulator.limits import OWN
+
+STORMS = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
+FAULTS_EACH = 25_000
+ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
+
+
+def storm(rig):
+    """Sessions until enough has gone wrong; how many, and their pulses."""
+    sessions = pulses = 0
+    while rig.faults < FAULTS_EACH:
+        rig.live(3000, patience_s=4.0)
+        pulses += rig.check()
+        sessions += 1
+    return sessions, pulses
+
+
+@pytest.mark.parametrize(("seed", "loss"), STORMS)
+def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_is_dark(seed, loss):
+    rig = FireRig(seed, loss, extra=0.6, pauses=0.001)
+    rig.up.never_again = ENDING if seed == 2 else ()
+    sessions, pulses = storm(rig)
+    kinds = rig.up.counts + rig.down.counts
+    print(f"loss {loss:.0%}: {rig.faults} faults, {sessions} sessions, {pulses} pulses; {dict(kinds)}")
+    assert pulses > 0
+    assert len(kinds) == 11, "a kind of fault that never came"
+
+
+BROKEN = [["b1_states_do_not_darken"], ["b12_duplicates_are_taken", "b12_number_is_not_looked_at"], ["b13_no_crc"]]
+
+
+@pytest.mark.parametrize("names", BROKEN, ids=lambda names: names[0])
+def test_a_board_that_breaks_its_word_is_found_out(monkeypatch, names):
+    for name in names:
+        monkeypatch.setattr(*MUTANTS[name]())
+    with pytest.raises(AssertionError):
+        storm(FireRig(5, 0.15, extra=0.6, pauses=0.001))
+
+
+def test_a_run_can_be_played_again(monkeypatch):
+    told = []
+    for _ in range(2):
+        monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
+        rig = FireRig(4, 0.1, extra=0.5, pauses=0.002)
+        for _ in range(6):
+            rig.live(1000, patience_s=4.0)
+        told.append((rig.log, rig.up.log, rig.down.log))
+    assert told[0] == told[1]
+    assert rig.faults > 500
+
+
+def test_equal_seeds_give_equal_faults():
+    one, other = (FireRig(3, 0.1, 0.5, 0.01).up for _ in range(2))
+    stream = bytes(range(256)) * 40
+    assert [one.carry(stream, k) for k in range(9)] == [other.carry(stream, k) for k in range(9)]
+    assert one.log == other.log
+    assert len(one.log) > 100
+
+
+# --- what the queue carries -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
+def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(seed):
+    rig = FireRig(seed, paced=True)
+    rig.session.connect()
+    assert rig.armed()
+    rig.up.loss = rig.down.loss = 0.05
+    job = rig.begin(2000, dark_us=2400)
+    assert rig.until(lambda: job.finished, 20.0), rig.session.board
+    assert [entry["state"] for entry in rig.log if entry["event"] == "state"][-2:] == ["RUNNING", "ARMED"]
+    rig.session.close()
+    assert rig.check() == 2000
+    print(f"{rig.faults} faults of {rig.up.frames + rig.down.frames} frames")
+    assert rig.faults > 30
+
+
+def played_in_s(loss, seed):
+    """How long 2,000 points take on the board, one every 0.55 ms."""
+    rig = FireRig(seed, paced=True)
+    rig.session.connect()
+    assert rig.armed()
+    rig.up.loss = rig.down.loss = loss
+    job = rig.begin(2000)
+    assert rig.until(lambda: job.finished, 20.0)
+    pulses = [entry for entry in rig.log if entry["event"] == "pulse"]
+    rig.session.close()
+    assert rig.check() == 2000
+    return (pulses[-1]["off_us"] - pulses[0]["on_us"]) * 1e-6
+
+
+def test_goodput_of_a_job_at_one_percent_loss():
+    clean_s = played_in_s(0.0, 0)
+    goodput = [clean_s / played_in_s(0.01, seed) for seed in range(1, 7)]
+    print(f"1,800 points/s at 1 % loss: {min(goodput):.1%} of the clean goodput at worst")
+    assert min(goodput) >= 0.95
+
+
+LINES = {115_200: 6000, 1_000_000: 20_000}
+"""Baud, and the points that keep a line busy for a while."""
+
+
+def filled_in_s(baud, loss, seed):
+    """How long a full line takes to bring points to a board that has room for them, all of them acknowledged.
+
+    With a lease of half a second: of 100 ms, 115,200 baud lose one after the other too often.
+    """
+    config, limits = configured(0.5, baud), replace(OWN, lease_ms=500)
+    rig = FireRig(seed, paced=True, config=config, queue_points=30_000, limits=limits)
+    rig.session.connect()
+    assert rig.armed()
+    rig.up.loss = rig.down.loss = loss
+    began_s = rig.clock.now_s()
+    job = rig.session.begin(rig.points.make(LINES[baud]), rig.session.board_s() + 60.0, inf)
+    assert rig.until(lambda: job.all_sent and rig.session.quiet, 50.0)
+    took_s = rig.clock.now_s() - began_s
+    rig.session.close()
+    rig.check()
+    return took_s
+
+
+@pytest.mark.parametrize("baud", LINES)
+def test_goodput_of_a_full_line_at_one_percent_loss(baud):
+    """Points delivered in a time, over what the same line delivers without loss; each lost frame costs those behind."""
+    clean_s = filled_in_s(baud, 0.0, 0)
+    assert clean_s < 1.1 * LINES[baud] * (FRAME_BYTES / 24) * BITS_A_BYTE / baud, "the line was not full"
+    lossy_s = [filled_in_s(baud, 0.01, seed) for seed in range(1, 11)]
+    goodput = clean_s * len(lossy_s) / sum(lossy_s)
+    print(f"a full line of {baud} baud at 1 % loss: {goodput:.1%}, of ten runs {clean_s / max(lossy_s):.1%} at worst")
+    assert goodput >= 0.95
+
+
+# --- ABORT behind what is in flight ---------------------------------------------------------------------------------
+
+
+def dark_after_abort_s(baud):
+    """How long after a host aborts in the middle of a full line the gate is off, s; the longest of some moments."""
+    return max(dark_after_abort_at_s(baud, executed) for executed in range(3, 35, 4))
+
+
+def dark_after_abort_at_s(baud, executed):
+    config, limits = configured(0.5, baud), replace(OWN, lease_ms=500)
+    rig = FireRig(1, paced=True, config=config, limits=limits)
+    rig.session.connect()
+    assert rig.armed()
+    job = rig.begin(4000, dark_us=4500, ahead_s=inf)  # as slow as pulses are: the line is full until all are there
+    assert rig.until(lambda: job.executed_rows > executed and rig.core.gate, 10.0)
+    assert not job.all_sent
+    aborted_s = rig.clock.now_s()
+    rig.session.abort()
+    assert rig.until(lambda: rig.core.state == "DISARMED", 1.0)
+    assert not rig.core.gate
+    return [entry["t_us"] for entry in rig.log if entry["event"] == "state"][-1] * 1e-6 - aborted_s
+
+
+def abort_bound_s(baud):
+    """What PROTOCOL.md lets be in flight, and 5 ms."""
+    return max(2 * FRAME_BYTES * BITS_A_BYTE / baud, 0.02) + 0.005
+
+
+@pytest.mark.parametrize("baud", LINES)
+def test_an_abort_is_heard_5_ms_after_what_is_in_flight(baud):
+    dark_s = dark_after_abort_s(baud)
+    print(f"{baud} baud: dark {dark_s * 1e3:.1f} ms after an abort, of {abort_bound_s(baud) * 1e3:.1f}")
+    assert dark_s <= abort_bound_s(baud)
+
+
+def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
+    monkeypatch.setattr(requirements, "FLIGHT_S", 0.1)
+    assert dark_after_abort_s(115_200) > abort_bound_s(115_200)
+
+
+# --- a host that stalls ---------------------------------------------------------------------------------------------
+
+
+def stalled(for_s, ahead_s):
+    """A host with a lease of half a second does nothing for a while in mid-job; the rig and the job, then."""
+    rig = FireRig(1, config=configured(lease_s=0.5), limits=replace(OWN, lease_ms=500))
+    rig.session.connect()
+    assert rig.armed()
+    job = rig.begin(2000, dark_us=900, ahead_s=ahead_s)
+    assert rig.until(lambda: job.executed_rows > 500, 5.0)
+    rig.clock.sleep(for_s)
+    rig.core.advance(round(rig.clock.now_s() * 1e6))
+    return rig, job
+
+
+def test_a_stall_of_a_quarter_second_harms_nothing():
+    rig, job = stalled(0.25, ahead_s=0.5)
+    assert rig.core.state == "RUNNING"
+    assert rig.until(lambda: job.finished, 10.0)
+    assert "HOLD" not in [entry["state"] for entry in rig.log if entry["event"] == "state"]
+    rig.session.close()
+    assert rig.check() == 2000
+
+
+def test_a_stall_longer_than_the_queue_is_a_dark_hold_from_which_it_goes_on():
+    rig, job = stalled(0.4, ahead_s=0.25)
+    assert rig.core.state == "HOLD"
+    assert not rig.core.gate
+    assert rig.until(lambda: job.finished, 10.0)
+    rig.session.close()
+    assert rig.check() == 2000
+
+
+def test_a_stall_longer_than_the_lease_is_a_dark_fault_and_nothing_goes_on_by_itself():
+    rig, job = stalled(0.7, ahead_s=inf)
+    assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
+    assert not rig.core.gate
+    assert not rig.until(lambda: job.finished or rig.core.state != "FAULT", 3.0)
+    rig.session.close()
+    assert 500 < rig.check() < 2000

@@ -1,0 +1,247 @@
+"""B9 to B11: inputs, limits, arming."""
+
+from itertools import pairwise
+
+from bench import BRIGHT, CENTRE, PATIENT, here, wait_for
+from guard_scenarios import LIMIT_NAMES, SCRIPTED_S, dark_by, shine
+from scenario import scenario
+
+INPUTS = {"interlock": "false", "key": "false", "estop": "true"}
+OPPOSITE = {"true": "false", "false": "true"}
+
+
+def step(at_s, name, value):
+    """One step of a script."""
+    return f'[[step]]\nat_s = {at_s}\nset = "{name}"\nvalue = {value}\n'
+
+
+# --- B9 -------------------------------------------------------------------------------------------------------------
+
+
+@scenario("B9", {name: name for name in INPUTS})
+def an_input_is_a_fault_latched_until_cleared(bench, name):
+    unsafe = INPUTS[name]
+    script = step(SCRIPTED_S, name, unsafe) + step(SCRIPTED_S + 1, name, OPPOSITE[unsafe])
+    host = bench.ready(script, **BRIGHT)
+    board = host.board
+    shine(host)
+    host.wait(lambda: board.of("fault") and board.states()[-1][0] == "FAULT", "the fault")
+    (change,), (fault,) = board.of("input"), board.of("fault")
+    assert fault["fault"] == name.upper()
+    assert 0 <= fault["t_us"] - change["t_us"] <= 1000
+    assert board.of("gate")[-1]["t_us"] <= change["t_us"] + 1000
+    assert dark_by(board, board.of("state")[-1])
+    assert host.tell("CLEAR_FAULT") == ["INPUT"], "cleared while the cause is there"
+    host.wait(lambda: len(board.of("input")) == 2, "the input's return")
+    host.pause(0.05)
+    assert host.status().state == "FAULT", "not latched"
+    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.tell("CLEAR_FAULT") == []
+    assert board.states()[-1] == ("DISARMED", "fault cleared")
+    assert host.tell("CLEAR_FAULT") == ["STATE"]
+
+
+@scenario("B9", {name: name for name in INPUTS})
+def an_input_is_a_fault_in_disarmed_too_and_nothing_but_clear_fault_ends_it(bench, name):
+    host = bench.greeted(step(0.5, name, INPUTS[name]), **PATIENT)
+    wait_for(lambda: host.board.of("fault"), "the fault")
+    host.say("ABORT")
+    host.hello()
+    assert host.order(host.frame("DISARM"), host.frame("CLEAR_FAULT")) == ["INPUT"]
+    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    status = host.status()
+    assert (status.state, status.fault) == ("FAULT", name.upper())
+    assert status.inputs == {"interlock": 0b010, "key": 0b001, "estop": 0b111}[name]
+
+
+@scenario("B9")
+def what_is_unsafe_at_power_up_is_no_fault_and_keeps_from_arming(bench):
+    reset = '[[step]]\nat_s = 0.8\ndo = "reset"\n'
+    host = bench.greeted(step(0.4, "interlock", "false") + reset + step(SCRIPTED_S / 2, "interlock", "true"), **PATIENT)
+    board = host.board
+    host.wait(lambda: [state for state, _ in board.states()] == ["DISARMED", "FAULT", "DISARMED"], "the reset")
+    host.hello()
+    assert host.tell("ARM_REQ", host_nonce=1) == ["INPUT"]
+    assert (host.status().state, host.status().inputs) == ("DISARMED", 0b010)
+    host.wait(lambda: len(board.of("input")) == 2, "the interlock")
+    assert host.arm().status().state == "ARMED"
+    assert len(board.of("fault")) == 1, "the one from before the reset"
+
+
+# --- B10 ------------------------------------------------------------------------------------------------------------
+
+OWN = dict(max_on_us=20_000, max_duty=30_000, mean_duty=20_000, spot_uj=90_000, spot_leak_uw=1_000_000)
+OWN |= dict(full_power_uw=2_000_000, x_min=100, x_max=62_000, y_min=200, y_max=62_700)
+OWN |= dict(settle_us=300, settle_ns_per_code=60, rest_us=700, lease_ms=5000)
+MORE_IS_LOOSER = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
+LOOSER = {name: min(65535, 2 * value) if name in MORE_IS_LOOSER else 0 for name, value in OWN.items()}
+DIM = dict(duty=3000)
+PAUSED = [here(0, dark_us=60_000, duty=0)]
+BEYOND = {
+    "max_on_us": (10_000, [here(10_001, **DIM)], "ON_TIME"),
+    "max_duty": (15_000, [here(100, duty=15_001)], "DUTY"),
+    "x_min": (1000, [here(0, x=999, **DIM)], "RANGE"),
+    "x_max": (60_000, [here(0, x=60_001, **DIM)], "RANGE"),
+    "y_min": (1000, [here(0, y=999, **DIM)], "RANGE"),
+    "y_max": (60_000, [here(0, y=60_001, **DIM)], "RANGE"),
+    # 20 ms of 3000/65535 are 916 µs of a second at full power, of 1000/65535 allowed: 15259 µs; seventeen are too many.
+    "mean_duty": (1000, [here(20_000, dark_us=800, x=2000 * k + 1000, **DIM) for k in range(17)], "MEAN_POWER"),
+    # 20 ms at 3000/65535 of 2 W are 1832 µJ.
+    "spot_uj": (1831, [here(20_000, **DIM)], "SPOT"),
+    "spot_leak_uw": (1000, [here(20_000, dark_us=800, duty=29_000)] * 6, "SPOT"),
+    "rest_us": (2000, [here(15_000, **DIM), here(15_000, dark_us=1000, **DIM)], "ON_TIME"),
+}
+
+
+def tightened(**values):
+    """The board's own limits, some of them tighter."""
+    return {**OWN, **values}
+
+
+@scenario("B10", BEYOND)
+def what_was_tightened_once_stays_tight(bench, case):
+    tight, points, fault = case
+    name = next(key for key, value in BEYOND.items() if value is case)
+    host = bench.greeted(**OWN)
+    for asked in (tightened(**{name: tight}), LOOSER, OWN, {**LOOSER, "full_power_uw": 1}):
+        assert host.tell("LIMITS", **asked) == []
+    host.arm()
+    assert host.tell("LIMITS", **LOOSER) == ["STATE"]
+    host.play(*points)
+    host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
+    assert [entry["fault"] for entry in host.board.of("fault")] == [fault]
+
+
+@scenario("B10")
+def settling_and_lease_stay_tight_too(bench):
+    host = bench.greeted(**OWN)
+    for asked in (tightened(settle_us=900, settle_ns_per_code=500, lease_ms=700), LOOSER, OWN):
+        assert host.tell("LIMITS", **asked) == []
+    host.arm()
+    host.play(here(100, **DIM), here(100, x=CENTRE + 1000, **DIM))
+    host.wait(lambda: len(host.board.fired()) == 2, "the pulses")
+    first, second = host.board.of("pulse")
+    assert 0 <= second["on_us"] - first["off_us"] - 1400 <= host.board.late_us
+    host.raw(host.frame("LEASE", ms=60_000) + host.frame("CLOCK", host_t=5))
+    host.wait(lambda: host.board.of("fault"), "the fault", lease=False)
+    (fault,) = [m for m in host.of("EVENT") if m.state == "FAULT"] or [host.ask() and host.of("EVENT")[-1]]
+    assert fault.fault == "LINK"
+    assert fault.tick <= host.of("CLOCK_REPLY")[-1].tick + 700_000 + host.board.late_us
+
+
+@scenario("B10")
+def a_board_s_own_limits_are_back_with_the_next_session_and_never_more(bench):
+    host = bench.host(bench.board(**OWN))
+    reply = host.hello()
+    assert {name: getattr(reply, name) for name in LIMIT_NAMES} == OWN
+    assert host.tell("LIMITS", **tightened(max_on_us=100, x_max=40_000)) == []
+    reply = host.hello()
+    assert {name: getattr(reply, name) for name in LIMIT_NAMES} == OWN
+    assert host.tell("LIMITS", **LOOSER) == []
+    host.arm()
+    host.play(here(20_000, x=62_000, **DIM))
+    host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
+    assert host.board.fired() == [0]
+    host.order(host.data(here(20_001, **DIM)))
+    assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
+
+
+# --- B11 ------------------------------------------------------------------------------------------------------------
+
+WRONG = {
+    "another board_nonce": lambda c: (c.host_nonce, c.board_nonce ^ 1),
+    "another host_nonce": lambda c: (c.host_nonce ^ 1, c.board_nonce),
+}
+
+
+@scenario("B11", WRONG)
+def a_wrong_echo_disarms_and_the_challenge_is_spent(bench, wrong):
+    host = bench.greeted(**PATIENT)
+    challenge = host.challenge()
+    host_nonce, board_nonce = wrong(challenge)
+    assert host.tell("ARM_CONFIRM", host_nonce=host_nonce, board_nonce=board_nonce) == ["NONCE"]
+    assert host.board.states()[-1] == ("DISARMED", "disarm")
+    right = dict(host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
+    assert host.tell("ARM_CONFIRM", **right) == ["STATE"]
+    again = host.challenge()
+    assert again.board_nonce != challenge.board_nonce
+    assert host.tell("ARM_CONFIRM", **right) == ["NONCE"], "an old challenge"
+    host.pause(2.1)
+    assert "ARMED" not in [state for state, _ in host.board.states()]
+
+
+@scenario("B11")
+def armed_two_seconds_after_the_request_at_the_earliest(bench):
+    host = bench.greeted(**PATIENT)
+    challenge = host.challenge()
+    confirm = dict(host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
+    assert host.tell("ARM_CONFIRM", **confirm) == []
+    assert host.tell("ARM_CONFIRM", **confirm) == ["STATE"]
+    host.wait(lambda: host.board.states()[-1][0] == "ARMED", "ARMED")
+    asked, armed = host.board.of("state")[-2:]
+    assert 0 <= armed["t_us"] - asked["t_us"] - 2_000_000 <= host.board.late_us
+
+
+@scenario("B11")
+def arming_that_is_not_confirmed_times_out(bench):
+    host = bench.greeted(**PATIENT)
+    host.challenge()
+    host.wait(lambda: host.board.states()[-1][1] == "arming timed out", "the time-out")
+    asked, over = host.board.of("state")[-2:]
+    assert 0 <= over["t_us"] - asked["t_us"] - 10_000_000 <= host.board.late_us
+
+
+@scenario("B11")
+def the_key_is_turned_before_each_arming(bench):
+    script = step(2.0, "key", "false") + step(2.3, "key", "true")
+    host = bench.greeted(script, key_edge=True, **PATIENT)
+    assert host.of("HELLO_REPLY")[-1].capabilities & 1
+    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
+    host.wait(lambda: len(host.board.of("input")) == 2, "the key")
+    assert host.tell("CLEAR_FAULT") == []
+    host.arm()
+    assert host.tell("DISARM") == []
+    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "one turn arms once"
+
+
+@scenario("B11")
+def what_a_board_chooses_is_never_the_same_again(bench):
+    nonces, sessions = [], []
+    for _ in range(2):
+        host = bench.host(bench.board(**PATIENT))
+        for _ in range(6):
+            sessions.append(host.hello().session)
+            nonces.append(host.challenge().board_nonce)
+            host.order(host.frame("DISARM"))
+    assert len(set(nonces)) == len(nonces)
+    assert 0 not in sessions
+    assert all(one != other for one, other in pairwise(sessions))
+    assert len(set(sessions)) >= len(sessions) - 2, "numbers that come back so soon can be waited for"
+    steps = {(other - one) % 65536 for one, other in pairwise(sessions[:6])}
+    assert len(steps) > 2, "numbers that count can be predicted"
+
+
+@scenario("B11", {"the same board": "same", "a new one": "new", "after a reset": "reset"})
+def a_recorded_session_played_again_never_arms(bench, where):
+    script = f'[[step]]\nat_s = {SCRIPTED_S}\ndo = "reset"\n' if where == "reset" else ""
+    host = bench.ready(script, **PATIENT)
+    host.play(here(1000))
+    host.wait(lambda: host.board.fired() == [0], "the pulse")
+    recorded = host.written
+    host.close()
+    if where == "reset":
+        wait_for(lambda: ("DISARMED", "boot") in host.board.states()[1:], "the reset")
+    else:
+        wait_for(lambda: host.board.states()[-1][1] == "link lost", "the loss")
+    board = host.board if where != "new" else bench.board(**PATIENT)
+    before = len(board.events())
+    again = bench.host(board)
+    again.hello()
+    for _, data in recorded:
+        again.raw(data)
+        again.pause(0.01, lease=False)
+    for at in range(120):  # and its leases go on, as a recording's would
+        again.raw(recorded[at % len(recorded)][1])
+        again.pause(0.02, lease=False)
+    states = {entry["state"] for entry in board.events()[before:] if entry["event"] == "state"}
+    assert not {"ARMED", "RUNNING"} & states

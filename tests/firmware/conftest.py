@@ -1,0 +1,26 @@
+import sys
+from functools import cache, partial
+from pathlib import Path
+
+import pytest
+
+for folder in ("simulator", "wire"):  # the Python side's bench, checks and vectors
+    sys.path.append(str(Path(__file__).parents[1] / "unit" / folder))
+
+from c_board import CBench, build_library  # noqa: E402 - it stands on the bench
+
+
+@pytest.fixture(scope="session")
+def libraries(tmp_path_factory):
+    """The library of a mutant, 0 for the true core; each built once."""
+    return cache(partial(build_library, tmp_path_factory.mktemp("core")))
+
+
+@pytest.fixture(scope="session")
+def library(libraries):
+    return libraries(0)
+
+
+@pytest.fixture
+def make(library):
+    return partial(CBench, library)

@@ -1,0 +1,513 @@
+/* Fuzz target: a whole board under a host, inputs and a clock that do anything, watched by the oracle.
+
+   The fuzzer's bytes are steps: frames that are framed, numbered and addressed as they should be, mostly, so that they
+   get beyond the link; waits; inputs; damage. The first byte chooses the board, and whether it is armed already: that
+   it is by a real exchange, once for each board, remembered and put back. */
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "oracle.h"
+
+#define STEPS_MAX 100u
+#define TICKS_MAX 6000u /* of one run */
+#define SLOW_TICK_US 500u
+#define BOARDS (sizeof BOARDS_LIMITS / sizeof BOARDS_LIMITS[0])
+#define COUNT(list) (sizeof(list) / sizeof *(list))
+
+struct driver {
+    struct oracle oracle;
+    uint64_t ticked_us;
+    uint32_t entropy, ticks;
+    bool stuck, stuck_on;
+};
+
+static struct driver driver, armed_drivers[8];
+static struct board *board, *armed_boards[8];
+static struct oracle *const o = &driver.oracle;
+
+/* --- boards --- */
+
+#define OWN(...) {.max_on_us = 50000, .max_duty = 65535, .mean_duty = 65535, .spot_uj = 150000, .spot_leak_uw = 1400000, \
+    .full_power_uw = 2450000, .x_max = 65535, .y_max = 65535, .settle_us = 200, .settle_ns_per_code = 50, \
+    .rest_us = 500, .lease_ms = 100, __VA_ARGS__}
+#pragma clang diagnostic ignored "-Winitializer-overrides"
+static const struct board_config BOARDS_LIMITS[] = {
+    {.limits = OWN(.lease_ms = 100), .cell_codes = 1300, .queue_points = 64},
+    {.limits = OWN(.lease_ms = 60000), .cell_codes = 1300, .queue_points = 64},
+    {.limits = OWN(.lease_ms = 60000, .mean_duty = 1500, .settle_us = 0, .settle_ns_per_code = 0), .cell_codes = 1300,
+     .queue_points = 64},
+    {.limits = OWN(.lease_ms = 60000, .spot_uj = 20000, .rest_us = 0), .cell_codes = 7, .queue_points = 30},
+    {.limits = OWN(.lease_ms = 60000, .spot_leak_uw = 0, .max_on_us = 65535), .cell_codes = 65535, .queue_points = 24},
+    {.limits = OWN(.lease_ms = 1000, .x_max = 50000, .settle_ns_per_code = 2000), .cell_codes = 1, .queue_points = 64,
+     .key_edge = true},
+};
+
+/* --- the HAL --- */
+
+static void gate(void *context, bool on, uint16_t duty) {
+    (void)context;
+    oracle_gate(o, on, duty);
+}
+static bool gate_readback(void *context) {
+    (void)context;
+    bool level = driver.stuck ? driver.stuck_on : o->lit;
+    oracle_readback(o, level);
+    return level;
+}
+static void mirrors(void *context, uint16_t x, uint16_t y) {
+    (void)context;
+    oracle_mirrors(o, x, y);
+}
+static uint8_t inputs(void *context) {
+    (void)context;
+    return o->inputs;
+}
+static void indicator(void *context, bool lit) {
+    (void)context;
+    o->indicator = lit;
+}
+static void relay(void *context, bool closed) {
+    (void)context;
+    o->relay = closed;
+}
+static uint32_t entropy(void *context) {
+    (void)context;
+    driver.entropy = driver.entropy * 1664525u + 1013904223u;
+    return driver.entropy ^ driver.entropy >> 16;
+}
+static int16_t temperature_dc(void *context) {
+    (void)context;
+    return 250;
+}
+static void send(void *context, const uint8_t *frame, size_t n) {
+    (void)context;
+    oracle_sent(o, frame, n);
+}
+static void forget(void *context) { (void)context; }
+static void feed_watchdog(void *context) {
+    (void)context;
+    oracle_fed(o);
+}
+
+static const struct board_hal HAL = {NULL,    gate,           gate_readback, mirrors, inputs,        indicator, relay,
+                                     entropy, temperature_dc, send,          forget,  feed_watchdog, NULL};
+
+/* --- time --- */
+
+static void power_up(const struct board_config *config) {
+    oracle_power_up(o, config, o->now_us);
+    driver.ticked_us = o->now_us;
+    board_init(board, &HAL, config, RESET_POWER_UP, o->now_us);
+    oracle_look(o, board);
+}
+
+static void tick(void) {
+    uint64_t since_us = o->now_us - driver.ticked_us;
+    driver.ticked_us = o->now_us;
+    driver.ticks++;
+    board_tick(board, o->now_us);
+    oracle_look(o, board);
+    oracle_after_tick(o, since_us);
+}
+
+static void turn(const uint8_t *bytes, size_t n) {
+    o->turned = true;
+    board_receive(board, bytes, n, o->now_us);
+    oracle_look(o, board);
+}
+
+/* Ticks when something is due and at least as often as a board must have them; loop: whether the main loop turns too. */
+static void wait(uint64_t us, bool loop) {
+    uint64_t until_us = o->now_us + us;
+    while (o->now_us < until_us && driver.ticks < TICKS_MAX) {
+        uint64_t next_us = driver.ticked_us + (board->state == STATE_RUNNING ? TICK_MAX_US : SLOW_TICK_US);
+        uint64_t due_us = board_next_due_us(board);
+        next_us = due_us > o->now_us && due_us < next_us ? due_us : next_us;
+        o->now_us = next_us < until_us ? next_us : until_us;
+        tick();
+        if (loop) {
+            turn(NULL, 0);
+        }
+    }
+}
+
+static void late_tick(uint64_t us) {
+    o->late_us += us;
+    o->now_us += us;
+    tick();
+}
+
+/* --- frames --- */
+
+static void unchanged(const struct board *before) {
+    struct board *now = malloc(sizeof *now);
+    memcpy(now, board, sizeof *now);
+    now->link.receiver = before->link.receiver;
+    now->link.seq_errors = before->link.seq_errors;
+    now->loop_ran = before->loop_ran;
+    if (memcmp(now, before, sizeof *now) || o->answered) {
+        violated("B13", "junk does more than count");
+    }
+    free(now);
+}
+
+/* Bytes of which the oracle knows what they are: something, or nothing at all. */
+static void give(const uint8_t *wire, size_t n, bool nothing) {
+    struct board *before = nothing ? malloc(sizeof *before) : NULL;
+    turn(NULL, 0);
+    o->answered = false;
+    if (before) {
+        memcpy(before, board, sizeof *before);
+    }
+    turn(wire, n);
+    if (before) {
+        unchanged(before);
+    }
+    free(before);
+}
+
+static void say_as(uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n) {
+    uint8_t wire[REFERENCE_WIRE_MAX];
+    struct parsed frame = {type, seq, session, body, n};
+    size_t length = reference_write(wire, type, seq, session, body, n);
+    oracle_hears(o, &frame);
+    give(wire, length, o->changes_nothing);
+}
+
+static void say(uint8_t type, const uint8_t *body, size_t n) {
+    say_as(type, reference_is_sequenced(type) ? o->next_seq : 0, o->session, body, n);
+}
+
+static void put(uint8_t **at, uint64_t value, size_t bytes) {
+    while (bytes--) {
+        *(*at)++ = (uint8_t)value;
+        value >>= 8;
+    }
+}
+
+static void hello(uint8_t major) {
+    uint8_t body[6] = {major, 0, 1, 2, 3, 4};
+    say(0x01, body, sizeof body);
+}
+
+static void lease(uint16_t ms) {
+    uint8_t body[2] = {(uint8_t)ms, (uint8_t)(ms >> 8)};
+    say(0x04, body, sizeof body);
+}
+
+static void arm_request(void) {
+    uint8_t body[4] = {9, 8, 7, 6};
+    say(0x14, body, sizeof body);
+}
+
+static void arm_confirm(uint32_t host_nonce, uint32_t board_nonce) {
+    uint8_t body[8], *at = body;
+    put(&at, host_nonce, 4);
+    put(&at, board_nonce, 4);
+    say(0x15, body, sizeof body);
+}
+
+static void start(uint32_t first, uint64_t tick, uint16_t watermark) {
+    uint8_t body[18], *at = body;
+    put(&at, o->job, 4);
+    put(&at, first, 4);
+    put(&at, tick, 8);
+    put(&at, watermark, 2);
+    say(0x11, body, sizeof body);
+}
+
+static void end(uint32_t index) {
+    uint8_t body[8], *at = body;
+    put(&at, o->job, 4);
+    put(&at, index, 4);
+    say(0x12, body, sizeof body);
+}
+
+/* --- the fuzzer's bytes --- */
+
+static const uint8_t *from, *from_end;
+
+static uint8_t byte(void) { return from < from_end ? *from++ : 0; }
+static uint16_t two(void) {
+    uint16_t low = byte();
+    return (uint16_t)(low | byte() << 8);
+}
+
+static void choose_point(uint8_t *to) {
+    static const uint16_t CODES[] = {32768, 32767, 32768, 33000, 34000, 0, 50000, 65535};
+    static const uint16_t DARK[] = {0, 100, 400, 500, 1000, 3000, 20000, 60000};
+    static const uint16_t ON[] = {1000, 0, 1, 200, 5000, 20000, 30000, 50000};
+    static const uint16_t DUTY[] = {20000, 0, 1000, 3000, 30000, 40000, 65534, 65535};
+    uint16_t chosen = two();
+    if (chosen >> 12 == 15) { /* any */
+        for (size_t k = 0; k < 10; k++) {
+            *to++ = byte();
+        }
+        return;
+    }
+    put(&to, CODES[chosen & 7], 2);
+    put(&to, CODES[chosen >> 12 & 3], 2);
+    put(&to, DARK[chosen >> 3 & 7], 2);
+    put(&to, ON[chosen >> 6 & 7], 2);
+    put(&to, DUTY[chosen >> 9 & 7], 2);
+}
+
+static void data(uint32_t first, size_t count) {
+    uint8_t body[4 + 10 * 24], *at = body;
+    put(&at, first, 4);
+    for (size_t k = 0; k < count; k++) {
+        choose_point(body + 4 + 10 * k);
+    }
+    say(0x10, body, 4 + 10 * count);
+}
+
+static void play(void) {
+    uint8_t how = byte();
+    uint32_t first = o->queue_count ? o->queue[o->queue_first % POINTS_SEEN].index : o->next_index;
+    data(o->next_index, how % 4u + 1u);
+    start(first, 0, how >> 4 & 3);
+    if (how & 4) {
+        end(o->next_index);
+    }
+}
+
+static void limits(void) {
+    uint8_t body[34], *at = body;
+    static const uint16_t AT[] = {0, 2, 4, 6, 10, 18, 20, 22, 24, 26, 28, 30, 32};
+    static const uint16_t VALUES[] = {100, 1000, 5000, 20000, 32000, 33000, 40000, 65535};
+    memset(body, 0xff, sizeof body); /* as loose as can be */
+    for (size_t k = 18; k < 32; k++) {
+        body[k] = k / 2 == 10 || k / 2 == 12 ? 0xff : 0;
+    }
+    uint8_t which = byte();
+    at += AT[which % COUNT(AT)];
+    bool wide = which % COUNT(AT) == 3 || which % COUNT(AT) == 4;
+    put(&at, VALUES[which >> 5], wide ? 4 : 2);
+    say(0x02, body, sizeof body);
+}
+
+/* A frame of any kind and content: often a right number and session, sometimes not. */
+static void anything(void) {
+    uint8_t body[244], how = byte(), type = byte(), n = how & 16 ? byte() : 4;
+    n = n > sizeof body ? sizeof body : n;
+    for (size_t k = 0; k < n; k++) {
+        body[k] = byte();
+    }
+    uint8_t seq = (uint8_t)(o->next_seq + (how & 32 ? byte() : 0));
+    say_as(type % 32 + (how & 128), seq, how & 64 ? two() : o->session, body, n);
+}
+
+/* A frame that would do something, with a bit turned: never may anything come of it. */
+static void damaged(void) {
+    static const uint8_t TYPES[] = {0x13, 0x16, 0x19, 0x01, 0x17};
+    uint8_t wire[REFERENCE_WIRE_MAX], body[6] = {1}, type = TYPES[byte() % COUNT(TYPES)], where = byte();
+    size_t n = reference_write(wire, type, o->next_seq, o->session, body, type == 0x01 ? 6 : 0);
+    size_t at = (where >> 3) % (n - 1);
+    wire[at] ^= (uint8_t)(1u << (where & 7));
+    o->pending_type = 0;
+    if (wire[at]) { /* else it is two pieces, and as short */
+        give(wire, n, true);
+    }
+}
+
+static void junk(void) {
+    uint8_t bytes[64], n = byte() % sizeof bytes;
+    for (size_t k = 0; k < n; k++) {
+        bytes[k] = byte();
+    }
+    bytes[n] = 0;
+    o->pending_type = 0;
+    give(bytes, (size_t)n + 1, true);
+}
+
+static void arm(void) {
+    arm_request();
+    if (byte() & 1) {
+        arm_confirm(o->host_nonce, byte() & 1 ? o->board_nonce : byte());
+    }
+}
+
+/* As a host does that wants to. */
+static void arm_wholly(void) {
+    hello(1);
+    say(0x17, NULL, 0);
+    arm_request();
+    arm_confirm(o->host_nonce, o->board_nonce);
+    for (unsigned n = 0; n < 41; n++) {
+        lease(65535);
+        wait(50000, true);
+    }
+}
+
+static void change_input(void) {
+    uint8_t which = byte();
+    oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
+    tick();
+    if (which & 8) { /* a short one */
+        oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
+        tick();
+    }
+}
+
+static void stick(void) {
+    uint8_t how = byte();
+    driver.stuck = how & 1;
+    driver.stuck_on = how & 2;
+}
+
+static void link_lost(void) {
+    board_link_lost(board, o->now_us);
+    oracle_look(o, board);
+    if (o->lit || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
+        violated("ABORT", "goes on after the link was lost");
+    }
+}
+
+static void abort_frame(void) {
+    say_as(0x13, byte(), byte() & 1 ? o->session : two(), NULL, 0);
+    if (o->lit || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
+        violated("ABORT", "goes on after ABORT");
+    }
+}
+
+static void step(const struct board_config *config) {
+    static const uint32_t WAITS_US[] = {1000, 1, 100, 450, 5000, 20000, 60000, 110000};
+    static const uint16_t LATE_US[] = {150, 300, 600, 601, 1000, 5000};
+    static const uint16_t LEASES_MS[] = {65535, 100, 10, 1};
+    uint8_t what = byte();
+    uint8_t detail = what / 24;
+    switch (what % 24) {
+    case 0: case 1: case 2:
+        wait(WAITS_US[detail % COUNT(WAITS_US)], true);
+        break;
+    case 3: case 4: case 5:
+        play();
+        break;
+    case 6:
+        data(o->next_index + (detail == 9 ? 5 : detail == 8 ? ~0u : 0), detail % 4 + 1u);
+        break;
+    case 7:
+        start(o->queue_count ? o->queue[o->queue_first % POINTS_SEEN].index : o->next_index, detail & 1 ? two() : 0,
+              detail >> 1);
+        break;
+    case 8:
+        end(o->next_index);
+        break;
+    case 9:
+        lease(LEASES_MS[detail % COUNT(LEASES_MS)]);
+        break;
+    case 10:
+        say(0x19, NULL, 0);
+        break;
+    case 11:
+        change_input();
+        break;
+    case 12:
+        say(detail & 1 ? 0x16 : 0x17, NULL, 0);
+        break;
+    case 13:
+        if (detail < 8) {
+            arm();
+        } else {
+            arm_wholly();
+        }
+        break;
+    case 14:
+        hello(detail != 1);
+        break;
+    case 15:
+        limits();
+        break;
+    case 16:
+        anything();
+        break;
+    case 17:
+        damaged();
+        break;
+    case 18:
+        junk();
+        break;
+    case 19:
+        late_tick(LATE_US[detail % COUNT(LATE_US)]);
+        break;
+    case 20:
+        stick();
+        break;
+    case 21:
+        wait(WAITS_US[detail % COUNT(WAITS_US)], false);
+        break;
+    case 22:
+        if (detail & 1) {
+            link_lost();
+        } else {
+            abort_frame();
+        }
+        break;
+    default:
+        if (detail == 0) {
+            power_up(config);
+        } else if (detail & 1) {
+            say(0x18, NULL, 0);
+        } else {
+            wait(2100000, true);
+        }
+        break;
+    }
+}
+
+/* --- boards that are armed --- */
+
+static void begin(const struct board_config *config) {
+    memset(&driver, 0, sizeof driver);
+    o->inputs = INPUT_INTERLOCK | INPUT_KEY;
+    o->x = o->y = 32768;
+    o->now_us = 1000;
+    power_up(config);
+}
+
+/* Off at power-up, then on: no fault. */
+static void turn_key(const struct board_config *config) {
+    oracle_inputs_change(o, INPUT_INTERLOCK);
+    power_up(config);
+    oracle_inputs_change(o, INPUT_INTERLOCK | INPUT_KEY);
+    wait(200, true);
+}
+
+int LLVMFuzzerInitialize(int *argc, char ***argv) {
+    (void)argc, (void)argv;
+    for (size_t k = 0; k < BOARDS; k++) {
+        board = armed_boards[k] = malloc(sizeof *board);
+        begin(&BOARDS_LIMITS[k]);
+        if (BOARDS_LIMITS[k].key_edge) {
+            turn_key(&BOARDS_LIMITS[k]);
+        }
+        arm_wholly();
+        if (o->state != STATE_ARMED) {
+            violated("driver", "the board does not arm");
+        }
+        driver.ticks = 0;
+        armed_drivers[k] = driver;
+    }
+    return 0;
+}
+
+int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t n) {
+    from = bytes;
+    from_end = bytes + n;
+    uint8_t which = byte();
+    const struct board_config *config = &BOARDS_LIMITS[which % BOARDS];
+    board = malloc(sizeof *board);
+    if (which & 128) {
+        begin(config);
+    } else {
+        driver = armed_drivers[which % BOARDS];
+        memcpy(board, armed_boards[which % BOARDS], sizeof *board);
+    }
+    for (unsigned k = 0; k < STEPS_MAX && from < from_end && driver.ticks < TICKS_MAX; k++) {
+        step(config);
+    }
+    wait(120000, true);
+    free(board);
+    return 0;
+}

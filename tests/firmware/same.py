@@ -1,0 +1,74 @@
+"""A Python board and a C core that get the same bytes, inputs and time, and must do the same."""
+
+import random
+
+from c_board import CBoard
+
+from optodrive.simulator.core import BoardCore
+from optodrive.wire import messages as m
+from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
+
+
+class PythonEntropy:
+    """The numbers that the C core's source gives, for the Python board's two questions."""
+
+    def __init__(self, values):
+        self._values, self._at = values, 0
+
+    def getrandbits(self, bits):
+        value = self._values[self._at % len(self._values)]
+        self._at += 1
+        return value & ((1 << bits) - 1)
+
+    def randrange(self, low, high):
+        while (value := self.getrandbits(16)) == 0:
+            pass
+        return value
+
+
+class LikePython:
+    """Both boards; whatever is done to them, bytes, log and state are compared at once."""
+
+    def __init__(self, library, settings=None, entropy=None, seed=1):
+        source = random.Random(seed)
+        values = entropy or [source.getrandbits(32) for _ in range(256)]
+        self.log, self.c_log = [], []
+        self.python = BoardCore(settings, self.log.append)
+        self.python._random = PythonEntropy(values)
+        self.c = CBoard(library, settings, self.c_log.append, values)
+        self.now_us = 0
+        self.heard = []
+        self.wire = []
+        self._decoder = FrameDecoder()
+        self.compare()
+
+    def both(self, do):
+        """Do the same to both."""
+        for board in (self.python, self.c):
+            do(board)
+        self.compare()
+
+    def compare(self):
+        answer = self.python.bytes_to_send()
+        assert self.c.bytes_to_send() == answer
+        assert self.c_log == self.log
+        assert (self.c.state, self.c.fault, self.c.gate) == (self.python.state, self.python.fault, self.python.gate)
+        self.heard += [m.parse_message(frame.type, frame.body) for frame in self._decoder.feed(answer)]
+
+    def raw(self, data):
+        self.wire.append(data)
+        self.both(lambda board: board.receive(data, self.now_us))
+
+    def frame(self, message, ahead=0, session=None):
+        """A frame with the number that is expected, or one ahead of it."""
+        link = self.python._link
+        seq = (link.expected_seq + ahead) % 256 if message.SEQUENCED else 0
+        return encode_frame(Frame(message.TYPE, seq, link.session if session is None else session, message.body()))
+
+    def say(self, *messages):
+        for message in messages:
+            self.raw(self.frame(message))
+
+    def wait(self, duration_us):
+        self.now_us += duration_us
+        self.both(lambda board: board.advance(self.now_us))

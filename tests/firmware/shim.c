@@ -1,0 +1,194 @@
+/* A board on the bench: the core with a HAL of arrays and a clock that is moved by hand. */
+
+#include <stdlib.h>
+#include <string.h>
+
+#include "core.h"
+
+#define OUT_MAX (1u << 20)
+#define TRACES_MAX (1u << 16)
+#define EDGES_MAX (1u << 16)
+#define ENTROPY_MAX 256u
+
+struct edge {
+    uint64_t at_us; /* the clock when the core called, not what it logs */
+    uint32_t on;
+    uint32_t duty;
+};
+
+struct shim {
+    struct board board;
+    uint64_t now_us, fed_us;
+    uint8_t inputs;
+    uint8_t stuck, stuck_on, lit, indicator, relay;
+    uint16_t x, y;
+    uint8_t out[OUT_MAX];
+    size_t out_length;
+    struct board_trace traces[TRACES_MAX];
+    size_t traces_count;
+    struct edge edges[EDGES_MAX];
+    size_t edges_count;
+    uint32_t entropy[ENTROPY_MAX];
+    size_t entropy_at, entropy_count;
+    struct board_hal hal;
+    struct board_config config;
+};
+
+static void gate(void *context, bool on, uint16_t duty) {
+    struct shim *s = context;
+    if (s->lit != on && s->edges_count < EDGES_MAX) {
+        s->edges[s->edges_count++] = (struct edge){s->now_us, on, duty};
+    }
+    s->lit = on;
+}
+static bool gate_readback(void *context) {
+    struct shim *s = context;
+    return s->stuck ? s->stuck_on : s->lit;
+}
+static void mirrors(void *context, uint16_t x, uint16_t y) {
+    struct shim *s = context;
+    s->x = x;
+    s->y = y;
+}
+static uint8_t inputs(void *context) { return ((struct shim *)context)->inputs; }
+static void indicator(void *context, bool lit) { ((struct shim *)context)->indicator = lit; }
+static void relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
+static uint32_t entropy(void *context) {
+    struct shim *s = context;
+    return s->entropy_count ? s->entropy[s->entropy_at++ % s->entropy_count] : 1;
+}
+static int16_t temperature_dc(void *context) {
+    (void)context;
+    return 250;
+}
+static void send(void *context, const uint8_t *frame, size_t length) {
+    struct shim *s = context;
+    if (s->out_length + length <= OUT_MAX) {
+        memcpy(s->out + s->out_length, frame, length);
+        s->out_length += length;
+    }
+}
+static void forget(void *context) { ((struct shim *)context)->out_length = 0; }
+static void feed_watchdog(void *context) {
+    struct shim *s = context;
+    s->fed_us = s->now_us;
+}
+static void trace(void *context, const struct board_trace *what) {
+    struct shim *s = context;
+    if (s->traces_count < TRACES_MAX) {
+        s->traces[s->traces_count++] = *what;
+    }
+}
+
+struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_codes, uint32_t queue_points,
+                      uint32_t key_edge) {
+    struct shim *s = calloc(1, sizeof *s);
+    s->inputs = INPUT_INTERLOCK | INPUT_KEY;
+    s->hal = (struct board_hal){s,     gate,    gate_readback,  mirrors, inputs, indicator,     relay,
+                                entropy, temperature_dc, send,    forget, feed_watchdog, trace};
+    limits_get(&s->config.limits, limits);
+    memcpy(s->config.uid, uid, sizeof s->config.uid);
+    s->config.firmware = 0x00010000u;
+    s->config.cell_codes = (uint16_t)cell_codes;
+    s->config.queue_points = (uint16_t)queue_points;
+    s->config.key_edge = key_edge;
+    return s;
+}
+
+void shim_free(struct shim *s) { free(s); }
+
+void shim_entropy(struct shim *s, const uint32_t *values, size_t count) {
+    s->entropy_count = count < ENTROPY_MAX ? count : ENTROPY_MAX;
+    memcpy(s->entropy, values, s->entropy_count * sizeof *values);
+    s->entropy_at = 0;
+}
+
+void shim_init(struct shim *s, uint32_t cause, uint64_t now_us) {
+    s->now_us = now_us;
+    board_init(&s->board, &s->hal, &s->config, cause, now_us);
+}
+
+void shim_tick(struct shim *s, uint64_t now_us) {
+    s->now_us = now_us;
+    board_tick(&s->board, now_us);
+}
+
+/* Ticks on time up to now_us. */
+void shim_run(struct shim *s, uint64_t now_us) {
+    while (s->now_us + BOARD_TICK_US < now_us) {
+        shim_tick(s, s->now_us + BOARD_TICK_US);
+    }
+    shim_tick(s, now_us);
+}
+
+void shim_receive(struct shim *s, const uint8_t *bytes, size_t n) { board_receive(&s->board, bytes, n, s->now_us); }
+void shim_link_lost(struct shim *s) { board_link_lost(&s->board, s->now_us); }
+void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }
+void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
+    s->stuck = (uint8_t)stuck;
+    s->stuck_on = (uint8_t)on;
+}
+
+/* Copies the bytes for the host and forgets them; their number. */
+size_t shim_take(struct shim *s, uint8_t *to) {
+    size_t n = s->out_length;
+    memcpy(to, s->out, n);
+    s->out_length = 0;
+    return n;
+}
+const struct board_trace *shim_traces(struct shim *s, size_t *count) {
+    *count = s->traces_count;
+    s->traces_count = 0;
+    return s->traces;
+}
+const struct edge *shim_edges(struct shim *s, size_t *count) {
+    *count = s->edges_count;
+    return s->edges;
+}
+void shim_limits(const struct shim *s, uint8_t *to) { limits_put(&s->board.limits, to); }
+
+enum { LOOK_STATE, LOOK_FAULT, LOOK_GATE, LOOK_LIT, LOOK_INDICATOR, LOOK_RELAY, LOOK_FED, LOOK_X, LOOK_Y,
+       LOOK_CRC, LOOK_FORMAT, LOOK_FINGERPRINT };
+
+/* FNV-1a of all that a board remembers but for what it counts and has not yet put together of a frame. */
+static uint64_t fingerprint(const struct shim *s) {
+    struct board *b = malloc(sizeof *b);
+    memcpy(b, &s->board, sizeof *b);
+    memset(&b->link.receiver, 0, sizeof b->link.receiver);
+    b->loop_ran = false;
+    uint64_t hash = 14695981039346656037ull;
+    for (size_t k = 0; k < sizeof *b; k++) {
+        hash = (hash ^ ((const uint8_t *)b)[k]) * 1099511628211ull;
+    }
+    free(b);
+    return hash;
+}
+
+uint64_t shim_look(const struct shim *s, uint32_t what) {
+    switch (what) {
+    case LOOK_STATE:
+        return s->board.state;
+    case LOOK_FAULT:
+        return s->board.fault;
+    case LOOK_GATE:
+        return s->board.gate;
+    case LOOK_LIT:
+        return s->lit;
+    case LOOK_INDICATOR:
+        return s->indicator;
+    case LOOK_RELAY:
+        return s->relay;
+    case LOOK_FED:
+        return s->fed_us;
+    case LOOK_X:
+        return s->x;
+    case LOOK_Y:
+        return s->y;
+    case LOOK_CRC:
+        return s->board.link.receiver.crc_errors;
+    case LOOK_FORMAT:
+        return s->board.link.receiver.format_errors;
+    default:
+        return fingerprint(s);
+    }
+}

@@ -1,0 +1,40 @@
+"""The real session and the C core, a link under fire between them, in virtual time: what the Python board bears."""
+
+import sys
+from functools import partial
+from pathlib import Path
+
+import pytest
+from c_board import CBoard
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))  # before a folder with a bench of its own
+
+import test_fire_virtual as python_board
+from fire_virtual import FireRig
+from test_fire_virtual import *  # noqa: F403
+
+# Of the fire or of the host alone; and mutants of the Python board, in whose place a core without a guard stands below.
+del test_a_board_that_breaks_its_word_is_found_out  # noqa: F821
+del test_equal_seeds_give_equal_faults  # noqa: F821
+del test_goodput_of_a_full_line_at_one_percent_loss  # noqa: F821
+del test_goodput_of_a_job_at_one_percent_loss  # noqa: F821
+
+
+class SeededCBoard(CBoard):
+    """A C core that is made, and changed by its bench, as the Python board is."""
+
+    def __init__(self, library, settings, sink, seed):
+        entropy = python_board.random.Random(seed)
+        super().__init__(library, settings, sink, [entropy.getrandbits(32) for _ in range(4096)])
+
+
+@pytest.fixture(autouse=True)
+def _c_core_in_every_rig(monkeypatch, library):
+    monkeypatch.setattr(python_board, "FireRig", partial(FireRig, make_core=partial(SeededCBoard, library)))
+
+
+@pytest.mark.parametrize("guard", [1, 12, 13])
+def test_a_core_without_a_guard_is_found_out(libraries, guard):
+    rig = FireRig(5, 0.15, extra=0.6, pauses=0.001, make_core=partial(SeededCBoard, libraries(guard)))
+    with pytest.raises(AssertionError):
+        python_board.storm(rig)

@@ -1,0 +1,55 @@
+"""The wire of the C core: every vector encodes and decodes, refused frames only count, junk in any portions."""
+
+import ctypes
+
+import pytest
+import test_messages as wire
+from c_board import CBench, CBoard
+from same import LikePython
+
+from optodrive.wire import messages as m
+
+SESSION = 0xBEEF
+
+
+def bench_in_session(library):
+    """A core that gives the vectors' session."""
+    b = CBench(library)
+    b.core = CBoard(library, sink=b.log.append, entropy=[SESSION, 0x1234_5678])
+    b.hello()
+    assert b.session == SESSION
+    return b
+
+
+@pytest.mark.parametrize("stem", wire.VECTORS)
+def test_vector_encodes(library, stem):
+    vector = wire.VECTORS[stem]
+    body = bytes.fromhex(vector["raw"])[4:-4]
+    out = ctypes.create_string_buffer(254)
+    length = library.frame_encode(out, vector["type"], vector["seq"], vector["session"], body, len(body))
+    assert ctypes.string_at(out, length).hex() == vector["wire"]
+
+
+@pytest.mark.parametrize("portion", [1, 5, 1000], ids=["byte by byte", "by fives", "whole"])
+@pytest.mark.parametrize("stem", wire.VECTORS)
+def test_vector_is_answered_as_the_python_board_answers(library, stem, portion):
+    vector = wire.VECTORS[stem]
+    both = LikePython(library, entropy=[SESSION, 7])
+    both.say(m.Hello(1, 0, 42))
+    both.say(*[m.Disarm()] * vector["seq"])
+    data = bytes.fromhex(vector["wire"])
+    for at in range(0, len(data), portion):
+        both.raw(data[at : at + portion])
+    both.say(m.Get())
+    status = both.heard[-1]
+    assert (status.crc_errors, status.format_errors) == (0, 0)
+    assert status.seq_errors == (wire.STATED[vector["message"]]["from"] == "board")
+
+
+@pytest.mark.parametrize("case", wire.REFUSED, ids=lambda case: case["what"])
+def test_refused_frames_only_count(library, case):
+    b = bench_in_session(library)
+    before = b.condition()
+    assert b.raw(bytes.fromhex(case["wire"])) == []
+    assert b.condition() == before
+    assert b.bad_frames() == [int(case["counter"] == name) for name in ("crc_errors", "format_errors")]

@@ -1,0 +1,75 @@
+"""libFuzzer on the C core: in half a minute it does nothing it must not, and cores without a guard are found out."""
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+FUZZ = Path(__file__).with_name("fuzz")
+SECONDS = 30
+MUTANT_SECONDS = 60
+LONGEST = {"decoder": 1024, "board": 512}
+FOUND_BEFORE = {
+    # A reset far from the centre, then a point there: the core took the mirrors to stand where it had not sent them.
+    "mirrors after a reset": ("board", "01 03 00 06 00 78 17 cd 03 04 00 00 02"),
+}
+
+
+def build(folder, target, mutant=0):
+    """The program of a fuzz target, built outside the source tree."""
+    missing = [tool for tool in ("clang", "make") if shutil.which(tool) is None]
+    assert not missing, f"the fuzzers need {' and '.join(missing)}: apt-get install clang libclang-rt-dev make"
+    program = folder / (f"{target}-{mutant}" if mutant else target)
+    command = ["make", "-s", "-C", FUZZ, f"BUILD={folder}", f"MUTANT={mutant}", program]
+    built = subprocess.run(command, capture_output=True, text=True)
+    assert built.returncode == 0, f"{built.stderr}\nno libclang_rt.fuzzer? apt-get install libclang-rt-dev"
+    return program
+
+
+def start(program, seconds, *inputs):
+    """The fuzzer for so long, from an empty corpus."""
+    longest = LONGEST[program.name.partition("-")[0]]
+    options = [f"-max_total_time={seconds}", f"-max_len={longest}", "-seed=1", f"-artifact_prefix={program}-found-"]
+    return subprocess.Popen([program, *options, *inputs], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("fuzz")
+
+
+def test_nothing_is_found(folder):
+    fuzzers = [start(build(folder, target), SECONDS) for target in LONGEST]
+    for fuzzer in fuzzers:
+        told = fuzzer.communicate()[1]
+        assert fuzzer.returncode == 0, told[-5000:]
+        assert "Done" in told
+
+
+@pytest.mark.parametrize("what", FOUND_BEFORE)
+def test_what_was_found_is_mended(folder, what):
+    target, steps = FOUND_BEFORE[what]
+    path = folder / "steps"
+    path.write_bytes(bytes.fromhex(steps))
+    fuzzer = start(build(folder, target), SECONDS, path)
+    told = fuzzer.communicate()[1]
+    assert fuzzer.returncode == 0, told[-5000:]
+
+
+@pytest.mark.parametrize(
+    ("target", "mutant", "says"),
+    [
+        ("board", 1, "oracle: B1: "),
+        pytest.param(*("board", 3, "oracle: B3: "), marks=pytest.mark.slow),
+        pytest.param(*("board", 7, "oracle: B7: "), marks=pytest.mark.slow),
+        ("board", 9, "oracle: B9: "),
+        ("decoder", 101, "AddressSanitizer: heap-buffer-overflow"),
+        pytest.param(*("decoder", 102, "out of bounds for type 'uint8_t[253]'"), marks=pytest.mark.slow),
+    ],
+)
+def test_a_core_without_a_check_is_found_out(folder, target, mutant, says):
+    fuzzer = start(build(folder, target, mutant), MUTANT_SECONDS)
+    told = fuzzer.communicate()[1]
+    assert fuzzer.returncode != 0, "the fuzzer does not notice"
+    assert says in told, told[-5000:]

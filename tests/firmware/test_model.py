@@ -1,0 +1,39 @@
+"""The model of link, gate and dying host, explored whole; each rule taken away is missed."""
+
+import re
+import subprocess
+
+import pytest
+
+from optodrive.config import shipped_path
+
+MODEL = shipped_path().parent / "firmware_protocol" / "model" / "board.pml"
+MUTANTS = range(1, 7)
+
+
+def explored(folder, mutant):
+    """What pan says of the model: errors, and states."""
+    for command in (
+        ["spin", f"-DMUTANT={mutant}", "-a", MODEL],
+        ["gcc", "-O2", "-DSAFETY", "-DNOFAIR", "-o", "pan", "pan.c"],
+    ):
+        subprocess.run(command, cwd=folder, check=True, capture_output=True)
+    told = subprocess.run(["./pan", "-m2000000", "-w24"], cwd=folder, check=True, capture_output=True, text=True).stdout
+    assert "Search not completed" not in told or mutant, told
+    return int(re.search(r"errors: (\d+)", told)[1]), int(re.search(r"(\d+) states, stored", told)[1]), told
+
+
+def test_nothing_forbidden_happens_in_any_order(tmp_path):
+    errors, states, told = explored(tmp_path, 0)
+    assert errors == 0, told
+    assert states > 3_000_000
+
+
+@pytest.mark.parametrize(
+    "mutant",
+    [mutant if k % 2 == 0 else pytest.param(mutant, marks=pytest.mark.slow) for k, mutant in enumerate(MUTANTS)],
+)
+def test_a_rule_taken_away_is_missed(tmp_path, mutant):
+    errors, _, told = explored(tmp_path, mutant)
+    assert errors == 1
+    assert "assertion violated" in told

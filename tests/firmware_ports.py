@@ -1,0 +1,33 @@
+"""The firmware's ports, built outside the source tree and told how to start."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+PORTS = Path(__file__).parents[1] / "firmware_protocol" / "ports"
+PACKAGES = {
+    "gcc": "gcc libc6-dev",
+    "make": "make",
+    "arm-none-eabi-gcc": "gcc-arm-none-eabi libnewlib-arm-none-eabi",
+    "qemu-system-arm": "qemu-system-arm",
+}
+NEEDS = {"host": ("gcc", "make"), "mps2-an385": ("arm-none-eabi-gcc", "qemu-system-arm", "make")}
+
+
+def require(*tools):
+    """AssertionError naming the Debian packages of the tools that are not there."""
+    missing = [PACKAGES[tool] for tool in tools if shutil.which(tool) is None]
+    assert not missing, f"the firmware's tests need more: apt-get install {' '.join(missing)}"
+
+
+def build_board(folder, mutant=0, port="host"):
+    """A port of the core as a board's process; its command without options. mutant: the guard it lacks."""
+    require(*NEEDS[port])
+    build = ["make", "-s", "-C", PORTS / port, f"BUILD={folder}", f"MUTANT={mutant}"]
+    built = subprocess.run(build, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    program = folder / (f"board-{mutant}" if mutant else "board")
+    if port == "host":
+        return (str(program),)
+    return (sys.executable, str(PORTS / port / "board.py"), "--image", f"{program}.elf")

@@ -1,0 +1,52 @@
+"""A Helios on the bench: configuration, emulated board, driver, and plans for it."""
+
+from functools import cache
+
+import numpy as np
+
+from helios.emulated import EmulatedHelios
+from optodrive.clock import ManualClock
+from optodrive.config import Config, load_config
+from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
+from optodrive.helios.board import Helios
+from optodrive.helios.points import PointScale
+from optodrive.helios.proof import prove
+from optodrive.pipeline import Display, prepare
+
+
+def config_of(name="display-16", **board):
+    """A shipped configuration with a Helios."""
+    table = load_config(name).model_dump()
+    table["board"] |= {"transport": "helios", "interlock_watched": True} | board
+    table["scanner"]["codes_a_side"] = 2047
+    return Config.model_validate(table)
+
+
+@cache
+def display_of(name="display-16", points_per_s=40_000):
+    return Display.of(config_of(name, points_per_s=points_per_s))
+
+
+def frame_of(display, height_m=20e-6, duration_s=1.0):
+    return FrameSequence((TactileFrame("f", 0.0, duration_s, np.full(len(display.pixels), height_m)),))
+
+
+def train_of(width_s=0.02, gap_s=0.02, power_w=1.0, pixel=5, duration_s=0.3):
+    return FrameSequence(trains=(PulseTrain(pixel, 0.0, duration_s, width_s, gap_s, power_w),))
+
+
+def proven_of(display, sequence):
+    """The plan and its proven frames."""
+    heat, budget = display.at_rest()
+    plan = prepare(display, sequence, heat, budget).plan
+    return plan, prove(plan, PointScale.of(display.config), budget, display.budget)
+
+
+class Bench:
+    """Driver and emulated board, not yet open."""
+
+    def __init__(self, board=None, **device):
+        self.clock = ManualClock()
+        self.emulated = EmulatedHelios(self.clock, **device)
+        self.device = self.emulated.device
+        self.helios = Helios(board or config_of().board, self.clock, self.emulated)

@@ -1,0 +1,165 @@
+"""`optodrive helios`: the command line, through the real pyusb, on the emulated board, in virtual time."""
+
+import json
+import signal
+
+import pytest
+import usb.backend.libusb1
+
+from helios.bench import Bench, display_of, frame_of, train_of
+from helios.emulated import HostDeadError
+from optodrive.cli import helios as helios_cli
+from optodrive.cli.main import run
+from optodrive.config import shipped_path
+from optodrive.errors import LinkError
+from optodrive.frames.files import sequence_to_json
+
+DAY_S = 1.7e9
+LONG = train_of(width_s=0.04, gap_s=0.004, power_w=2.0, duration_s=1.0)
+
+
+class Desk:
+    """A folder with a configuration and frames, and the emulated board where pyusb looks for libusb."""
+
+    def __init__(self, folder, monkeypatch):
+        self.folder, self.bench = folder, Bench()
+        self.clock = self.bench.clock
+        monkeypatch.setenv("XDG_STATE_HOME", str(folder))
+        monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: self.bench.emulated)
+        monkeypatch.setattr("optodrive.clock.MonotonicClock", lambda: self.clock)
+        monkeypatch.setattr(helios_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
+        self.frames = folder / "frames.json"
+        self.ask(frame_of(display_of()))
+
+    def ask(self, sequence):
+        self.frames.write_text(json.dumps(sequence_to_json(sequence)))
+
+    def config(self, watched="true", steps=2047):
+        text = shipped_path("display-16.toml").read_text()
+        text = text.replace('transport = "simulated"', f'transport = "helios"\ninterlock_watched = {watched}')
+        path = self.folder / "helios.toml"
+        path.write_text(text.replace("[scanner]", f"[scanner]\ncodes_a_side = {steps}"))
+        return ["--config", str(path)]
+
+    def play(self, *options):
+        return run(["helios", "play", str(self.frames), *self.config(), *options])
+
+
+@pytest.fixture
+def desk(tmp_path, monkeypatch):
+    return Desk(tmp_path, monkeypatch)
+
+
+def test_info_tells_who_it_is_and_whether_it_may_emit(desk, capsys):
+    assert run(["helios", "info", *desk.config(), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == {
+        "name": "Helios 1163021877",
+        "firmware": 6,
+        "ready": True,
+        "may_emit": True,
+    }
+    assert run(["helios", "info"]) == 0
+    assert "may emit         no" in capsys.readouterr().out
+
+
+def test_play_says_what_left_and_the_laser_did_it(desk, capsys):
+    assert desk.play("--json") == 0
+    figures = json.loads(capsys.readouterr().out)
+    light = desk.bench.device.light()
+    told = figures["helios"]
+    assert len(light) >= figures["pulses"] > 0
+    shone_j = sum((end_s - begin_s) * level / 255 * 2.45 for begin_s, end_s, _, _, level in light)
+    assert told["energy_j"] == pytest.approx(shone_j, rel=1e-6)
+    assert 0.9 * told["energy_planned_j"] < told["energy_j"] <= told["energy_planned_j"]
+    assert told["predicted_max_um"] < figures["predicted_max_um"]
+    assert (told["holes"], told["frames"]) == (0, desk.bench.device.frames_played)
+    assert told["points_per_s"] == pytest.approx(39_985.72, abs=0.01)
+    assert not desk.bench.device.shutter
+    assert not desk.bench.emulated.claimed
+    assert desk.play() == 0
+    assert "points/s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("after", ["at once", "killed"])
+def test_a_play_knows_what_the_one_before_left(desk, capsys, after):
+    desk.ask(LONG)
+    assert desk.play("--json") == 0
+    first = json.loads(capsys.readouterr().out)
+    if after == "killed":
+        desk.bench.emulated.dies_at_s = desk.clock.now_s() + 0.5
+        with pytest.raises(HostDeadError):
+            desk.play("--json")
+        desk.bench.emulated.dies_at_s = float("inf")
+    assert desk.play("--json") == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["headroom_min_k"] <= first["headroom_min_k"]
+    assert again["energy_j"] < first["energy_j"]
+
+
+def test_without_a_watched_interlock_one_line_and_no_light(desk, capsys):
+    assert run(["helios", "play", str(desk.frames), *desk.config("false")]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("optodrive: board.interlock_watched: got False, expected true")
+    assert error.count("\n") == 1
+    assert not desk.bench.emulated.commands
+
+
+def test_a_converter_of_another_width_is_refused(desk, capsys):
+    assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
+    assert "scanner.codes_a_side 32767 must be 2047" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("number", helios_cli.ENDED_BY)
+def test_a_signal_ends_the_light_by_a_stop(desk, capsys, number):
+    desk.ask(LONG)
+    emulated, sent = desk.bench.emulated, []
+    write = emulated.bulk_write
+
+    def write_and_signal(*transfer):
+        sent.append(emulated.clock.now_s())
+        if len(sent) == 3:
+            signal.raise_signal(number)
+            signal.raise_signal(number)  # and once more, in a hurry
+        return write(*transfer)
+
+    emulated.bulk_write = write_and_signal
+    before = signal.getsignal(number)
+    assert desk.play() == 130
+    assert len(sent) == 3
+    assert capsys.readouterr().err == f"optodrive: ended by {number.name}\n"
+    assert emulated.commands[-2:] == [b"\x01\x00", b"\x02\x00"]
+    assert desk.bench.device.dark_from_s() <= sent[-1] + 0.02
+    assert not desk.bench.device.shutter
+    assert signal.getsignal(number) is before
+
+
+def test_unplugged_in_mid_play_is_one_line_and_dark(desk, capsys):
+    desk.ask(LONG)
+    desk.bench.emulated.unplugged_at_s = desk.clock.now_s() + 0.8
+    assert desk.play() == LinkError.exit_status
+    error = capsys.readouterr().err
+    assert "unplugged" in error
+    assert error.count("\n") == 1
+    assert desk.bench.device.light()
+    assert desk.bench.device.dark_from_s() <= desk.bench.emulated.unplugged_at_s
+    assert not desk.bench.device.shutter
+
+
+def test_a_memory_that_cannot_be_kept_ends_it_before_the_light(desk, capsys, monkeypatch):
+    blocked = desk.folder / "blocked"
+    blocked.write_text("")
+    monkeypatch.setenv("XDG_STATE_HOME", str(blocked))
+    assert desk.play() == 2
+    assert "a file that can be written" in capsys.readouterr().err
+    assert not desk.bench.device.light()
+
+
+def test_no_helios_is_one_line(desk, capsys):
+    desk.bench.emulated.unplugged_at_s = 0.0
+    assert desk.play() == 2
+    assert capsys.readouterr().err == ("optodrive: board: got '1209:e500', expected a USB device that is plugged in\n")
+
+
+def test_a_daemon_on_a_helios_is_refused(desk, capsys):
+    assert run(["serve", *desk.config()]) == 2
+    assert "a Helios cannot serve a daemon, see `optodrive helios play`" in capsys.readouterr().err

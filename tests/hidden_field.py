@@ -1,0 +1,59 @@
+"""Spots of hidden geometries, and how far a field made from them is off over the whole display."""
+
+import numpy as np
+
+from optodrive.calibration.field_file import write_field
+from optodrive.calibration.fit import fit_field
+from optodrive.calibration.prior import Prior
+from optodrive.calibration.spots import Spots
+from optodrive.config import Config, load_config, pixel_layout
+from optodrive.simulator.truth import CENTRE_CODE, Truth
+
+CONFIG = load_config()
+LAYOUT = pixel_layout(CONFIG.display)
+PRIOR = Prior.of(CONFIG)
+HALF_M = float(np.abs(LAYOUT.x_m).max())
+CODE_M = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad
+NOISE_M = 10e-6
+
+
+def grid_codes(side):
+    """A square grid over the display, uncorrected codes, [side², 2]."""
+    at = np.rint(CENTRE_CODE + np.linspace(-HALF_M, HALF_M, side) / CODE_M)
+    return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+
+
+def random_codes(random, count):
+    """Anywhere on the display, [count, 2]."""
+    return np.rint(CENTRE_CODE + random.uniform(-HALF_M, HALF_M, (count, 2)) / CODE_M)
+
+
+def seen(truth, codes, random, false_share=0.02, noise_m=NOISE_M):
+    """Spots as a sensor sees them, and which are false: anywhere on the display."""
+    places = np.column_stack(truth.position_m(codes[:, 0], codes[:, 1]))
+    places = places + noise_m * random.standard_normal(places.shape)
+    false = random.random(len(codes)) < false_share
+    places[false] = random.uniform(-HALF_M, HALF_M, (int(false.sum()), 2))
+    return Spots.of(np.column_stack([codes, places])), false
+
+
+def misses_m(truth: Truth, field, count=1500):
+    """How far off the beam lands where the field sends it, anywhere on the display's square, [2, count]; codes too."""
+    wanted = np.random.default_rng(99).uniform(-HALF_M, HALF_M, (2, count))
+    codes = field.codes(*wanted)
+    return np.array(truth.position_m(*codes)) - wanted, codes
+
+
+def field_file(path, seed=0, side=17):
+    """Calibrate a hidden geometry as a user would and write its field; the geometry, and a configuration with it."""
+    truth = Truth.drawn(seed, CONFIG)
+    spots, _ = seen(truth, grid_codes(side), np.random.default_rng([seed, side]))
+    write_field(path, fit_field(spots, PRIOR))
+    return truth, aimed_by(path)
+
+
+def aimed_by(path, config=CONFIG, **scanner):
+    """The configuration with a field."""
+    table = config.model_dump()
+    table["scanner"] |= {"field": str(path)} | scanner
+    return Config.model_validate(table)

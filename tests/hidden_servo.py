@@ -1,0 +1,101 @@
+"""Servos that identification does not know, integrated by Runge and Kutta, and recordings of their steps."""
+
+from dataclasses import dataclass
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from optodrive.flow import Measurement, Run, Signal
+
+SIZES_RAD = (0.005, 0.03, 0.15)
+NO_PULSES = np.zeros((0, 4))
+SETTLING_S = np.linspace(0.0, 0.03, 60_001)
+
+
+@dataclass(frozen=True)
+class Hidden:
+    """bandwidth in Hz, damping of critical, delay in s, slew in rad/s."""
+
+    hz: float
+    damping: float
+    delay_s: float
+    slew: float
+
+    @classmethod
+    def drawn(cls, random):
+        hz, slew = (float(np.exp(random.uniform(*np.log(ends)))) for ends in ((300.0, 3000.0), (30.0, 300.0)))
+        return cls(hz, random.uniform(0.3, 1.0), random.uniform(0.0, 1e-4), slew)
+
+    def knots(self, at_s, command_rad):
+        """Where the servo's own target bends: times and places."""
+        times, places, place = [at_s[0]], [command_rad[0]], command_rad[0]
+        for row in range(1, len(at_s)):
+            begin_s = at_s[row] + self.delay_s
+            end_s = at_s[row + 1] + self.delay_s if row + 1 < len(at_s) else np.inf
+            way = command_rad[row] - place
+            takes_s = abs(way) / self.slew
+            times.append(begin_s)
+            places.append(place)
+            if begin_s + takes_s < end_s:
+                place = command_rad[row]
+                times.append(begin_s + takes_s)
+                places.append(place)
+            else:
+                place += np.sign(way) * self.slew * (end_s - begin_s)
+        return np.array(times), np.array(places)
+
+    def follow(self, at_s, command_rad, t_s):
+        """Angles at t_s, integrated from bend to bend."""
+        times, places = self.knots(at_s, command_rad)
+        omega = 2.0 * np.pi * self.hz
+
+        def rate(now_s, state):
+            target = np.interp(now_s, times, places)
+            return [state[1], omega**2 * (target - state[0]) - 2.0 * self.damping * omega * state[1]]
+
+        out, state = np.full(len(t_s), float(command_rad[0])), [command_rad[0], 0.0]
+        edges = [*times, max(t_s[-1], times[-1]) + 1e-9]
+        for begin_s, end_s in pairwise(edges):
+            inside = (t_s >= begin_s) & (t_s < end_s)
+            if end_s > begin_s:
+                solved = solve_ivp(
+                    rate, (begin_s, end_s), state, method="DOP853", rtol=1e-9, atol=1e-13, dense_output=True
+                )
+                out[inside] = solved.sol(t_s[inside])[0] if inside.any() else 0.0
+                state = solved.y[:, -1]
+        return out
+
+    @cache  # noqa: B019
+    def _off_rad(self, step_rad):
+        """How far from its end a mirror is while it makes a step, at SETTLING_S."""
+        return np.abs(self.follow(np.array([-1.0, 0.0]), np.array([0.0, step_rad]), SETTLING_S) - step_rad)
+
+    def settled_s(self, step_rad, tolerance_rad):
+        """From a step's command until it is near for good and its ramp is over, from a dense trace."""
+        last_s = SETTLING_S[np.flatnonzero(self._off_rad(step_rad) > tolerance_rad)[-1]]
+        return max(last_s, self.delay_s + step_rad / self.slew)
+
+
+def commands(random, size_rad, count=16):
+    """Steps there and back, x every time and y every other time: t_s, x_rad, y_rad."""
+    at_s = np.concatenate([[0.0], 0.002 + 0.015 * np.arange(count) + random.uniform(0.0, 1e-3, count)])
+    number = np.arange(count)
+    x_rad, y_rad = np.where(number % 2 == 0, size_rad, 0.0), np.where(number // 2 % 2 == 0, size_rad, 0.0)
+    return np.column_stack([at_s, np.append(0.0, x_rad), np.append(0.0, y_rad)])
+
+
+def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD):
+    """A run for each size; noise: of the step. servos: of x and y."""
+    runs = []
+    for number, size_rad in enumerate(sizes_rad):
+        table = commands(random, size_rad)
+        t_s = np.arange(0.0, table[-1, 0] + 0.015, 1.0 / rate_hz)
+        angles = [servo.follow(table[:, 0], table[:, 1 + axis], t_s) for axis, servo in enumerate(servos)]
+        signals = {
+            f"mirror_{axis}_rad": Signal(0, t_s, angle + noise * size_rad * random.standard_normal(len(t_s)))
+            for axis, angle in zip("xy", angles, strict=True)
+        }
+        runs.append(Run(f"run{number}", 295.0, NO_PULSES, signals, {}, table))
+    return Measurement(tuple(runs))

@@ -1,0 +1,89 @@
+"""A host that arms a board and keeps it lit until it is ended: python lit_host.py PORT; it tells lines of JSON.
+
+`clock_s`: the board's time less this machine's monotonic time, and `within_s`, how far off that may be; `lit`: a point
+that was executed, its tick. On a line on stdin it closes the port without a word to the board, tells `closed_s`, the
+time just before, and lives on in silence until stdin ends.
+"""
+
+import json
+import select
+import sys
+import time
+
+import numpy as np
+
+from optodrive.board.requirements import Requirements
+from optodrive.board.session import Session
+from optodrive.clock import MonotonicClock, claim_processor
+from optodrive.config import Config, load_config
+from optodrive.transport.serial_port import SerialPort
+from optodrive.wire import messages as m
+from optodrive.wire.cobs import FrameDecoder
+from optodrive.wire.quantise import WirePoints
+
+PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)])
+POINTS, DARK_US, ON_US, DUTY = 4000, 600, 8000, 2000
+AHEAD_S = 0.5
+BAUD = 115_200
+"""What an emulated UART takes in surely; of a faster line a burst would hold up the LEASE behind it."""
+PATIENCE_S = 4.0
+
+
+def tell(**what):
+    print(json.dumps(what), flush=True)
+
+
+class NotedPort(SerialPort):
+    """Keeps the first report of executed points."""
+
+    def __init__(self, port):
+        super().__init__(port, BAUD)
+        self.report = None
+        self._theirs = FrameDecoder()
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        for frame in self._theirs.feed(data):
+            if frame.type == m.Executed.TYPE and self.report is None:
+                self.report = m.parse_message(frame.type, frame.body)
+        return data
+
+
+def until(session, condition, patience_s=PATIENCE_S):
+    """Step until condition(); SystemExit where that takes too long, as when its lease ran out."""
+    give_up_s = time.monotonic() + patience_s
+    while not condition():
+        if time.monotonic() > give_up_s:
+            sys.exit(f"{session.board} after {patience_s} s")
+        session.step(0.002, lease=True)
+
+
+def train():
+    rows = np.arange(POINTS)
+    columns = [np.full(POINTS, value) for value in (DARK_US, ON_US, DUTY)]
+    return WirePoints(np.column_stack([PLACES[rows % len(PLACES)], *columns]).astype(np.uint16), rows)
+
+
+def main(name):
+    claim_processor()  # as the daemon's loop does
+    table = load_config("display-16").model_dump()
+    table["board"]["baud"] = BAUD
+    port = NotedPort(name)
+    session = Session(port, MonotonicClock(), Requirements.of(Config.model_validate(table)))
+    session.connect()
+    if session.board.state == "FAULT":
+        session.disarm()
+        until(session, lambda: session.board.state == "DISARMED")
+    session.arm()
+    until(session, lambda: session.ready)
+    tell(clock_s=session.board_s() - time.monotonic(), within_s=session.link_figures()["round_trip_ms"] * 0.5e-3)
+    session.begin(train(), session.board_s() + 0.05, AHEAD_S)
+    until(session, lambda: port.report is not None)
+    tell(lit={"index": port.report.first_index, "tick": port.report.records[0][0]})
+    until(session, lambda: select.select([sys.stdin], [], [], 0)[0])
+    tell(closed_s=time.monotonic())
+    session.drop()
+    sys.stdin.read()
+
+
+main(sys.argv[1])

@@ -1,0 +1,192 @@
+"""`optodrive calibrate` on a board's process and its sensor, before geometries that only test and sensor know."""
+
+import json
+import re
+import signal
+
+import numpy as np
+import pytest
+
+from optodrive.calibration.field_file import read_field
+from optodrive.calibration.spots import read_spots
+from optodrive.commissioning.predicting import display_codes
+from optodrive.config import load_config
+from optodrive.simulator.limits import OWN
+from optodrive.simulator.truth import Truth
+from rig import wait_for
+from test_home import LATENESS_US, LEASE_US, assert_dark, step_of
+
+CONFIG = load_config()
+ENDLESS = ("--goal-um", "0.1", "--spots-max", "100")
+
+
+def since_light(kind, name):
+    return step_of(1.0, kind, name) + 'from = "light"\n'
+
+
+def missed_m(field, geometry):
+    """How far a field is off the truth over the display, lengths."""
+    codes = display_codes(CONFIG, 0.0, 41)
+    truth = Truth.drawn(geometry, CONFIG)
+    return np.hypot(*(np.array(field.position_m(*codes.T)) - np.array(truth.position_m(*codes.T))))
+
+
+def rms_um(lengths_m):
+    return 1e6 * float(np.sqrt(np.mean(lengths_m**2)))
+
+
+def session_spots(out):
+    path = out.with_name(out.name + ".session.json")
+    return json.loads(path.read_text())["spots"] if path.exists() else []
+
+
+@pytest.mark.parametrize(
+    ("geometry", "more"),
+    [
+        pytest.param(0, (), marks=pytest.mark.slow),
+        (1, ("--false-share", "0.1")),
+        pytest.param(2, ("--no-readback",), marks=pytest.mark.slow),
+    ],
+)
+def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, more):
+    board, out = make_board(sensor=("--geometry", str(geometry), *more)), tmp_path / "field.toml"
+    status, told, errors = start(board, "calibrate", "--out", out, "--json").ended()
+    assert status == 0, errors
+    answer = json.loads(told)
+    assert answer["goal_reached"] is True
+    assert answer["spots"] <= 25
+    field = read_field(out)
+    assert rms_um(missed_m(field, geometry)) <= 10.0
+    spots = read_spots(tmp_path / "field.spots.csv")
+    assert len(spots) == answer["spots"]
+    nominal_m = (np.array([spots.x_code, spots.y_code]) - 32768) * CONFIG.scanner.code_rad * 2 * 0.220
+    assert np.hypot(*(nominal_m - [spots.x_m, spots.y_m])).max() > 0.3e-3  # without the field it misses
+    assert not session_spots(out)
+    pulses = assert_dark(board).of("pulse")
+    assert len(pulses) <= 3 * 25 + 3
+    assert max(pulse["duty"] for pulse in pulses) / 65535 * OWN.full_power_uw * 1e-6 <= 5e-3
+    assert max(pulse["off_us"] - pulse["on_us"] for pulse in pulses) == 20_000
+
+
+@pytest.mark.slow
+def test_ctrl_c_and_on(make_board, start, tmp_path):
+    board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
+    command = start(board, "calibrate", "--out", out)
+    wait_for(lambda: len(session_spots(out)) >= 6, "six spots", 90.0)
+    command.process.send_signal(signal.SIGINT)
+    status, _, errors = command.ended()
+    assert status == 130
+    assert errors.endswith("optodrive: interrupted\n")
+    assert not out.exists()
+    kept = session_spots(out)
+    lit = len(assert_dark(board).of("pulse"))
+
+    status, told, errors = start(board, "calibrate", "--out", out, "--json").ended()
+    assert status == 0, errors
+    assert f"going on with {len(kept)} spots" in errors
+    answer = json.loads(told)
+    assert read_spots(tmp_path / "field.spots.csv").table()[: len(kept)] == pytest.approx(np.array(kept))
+    assert len(assert_dark(board).of("pulse")) - lit <= 3 * (answer["spots"] - len(kept)) + 3
+    assert rms_um(missed_m(read_field(out), 3)) <= 10.0
+
+
+@pytest.mark.slow
+def test_a_display_that_moved_meanwhile_is_not_mixed_in(make_board, start, tmp_path):
+    board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
+    command = start(board, "calibrate", "--out", out, *ENDLESS)
+    wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
+    command.process.send_signal(signal.SIGINT)
+    assert command.ended()[0] == 130
+    path = out.with_name(out.name + ".session.json")
+    kept = json.loads(path.read_text())
+    kept["spots"] = [[x_code, y_code, x_m + 200e-6, y_m] for x_code, y_code, x_m, y_m in kept["spots"]]
+    path.write_text(json.dumps(kept))
+    lit = len(assert_dark(board).of("pulse"))
+
+    status, _, errors = start(board, "calibrate", "--out", out).ended()
+    assert status == 1
+    found = re.search(r"moved since: .* (\d+) µm off and (\d+) µm off, expected at most (\d+) µm; delete", errors)
+    assert found, errors
+    assert all(100 < int(each) < 300 for each in found.groups()[:2])
+    assert json.loads(path.read_text()) == kept
+    assert len(assert_dark(board).of("pulse")) - lit <= 2 * 3 + 2
+
+
+def test_kill_9(make_board, start, tmp_path):
+    board, out = make_board(sensor=()), tmp_path / "field.toml"
+    command = start(board, "calibrate", "--out", out, *ENDLESS)
+    wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
+    command.process.kill()
+    killed_us = board.events()[-1]["t_us"]
+    command.process.wait()
+    assert_dark(board, ("DISARMED", "FAULT"))
+    assert board.of("gate")[-1]["t_us"] <= killed_us + LEASE_US + LATENESS_US
+    assert len(session_spots(out)) >= 3
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [
+        pytest.param(
+            step_of(0.0, "do", "stick_y"),
+            r"calibrate: sensor at .*: y_m: got .* this mirror stands still",
+            marks=pytest.mark.slow,
+        ),
+        pytest.param(
+            step_of(0.0, "do", "blind_sensor"),
+            r"calibrate: 3 places one after another: sensor at .* sees no spot",
+            marks=pytest.mark.slow,
+        ),
+        (since_light("set", "interlock"), r"the board went to FAULT INTERLOCK: .*close the enclosure"),
+        pytest.param(since_light("do", "unplug_sensor"), r"sensor: link to .* lost: .*is gone", marks=pytest.mark.slow),
+        pytest.param(since_light("do", "close"), r"link to .* lost", marks=pytest.mark.slow),
+    ],
+)
+def test_what_ends_it_is_named(make_board, start, tmp_path, script, says):
+    board, out = make_board(sensor=(), script=script), tmp_path / "field.toml"
+    status, told, errors = start(board, "calibrate", "--out", out, "--json", *ENDLESS).ended()
+    assert status == 1
+    last = errors.splitlines()[-1]
+    assert re.match(f"optodrive: {says}", last), errors
+    assert not told
+    assert not out.exists()
+    assert_dark(board, ("DISARMED", "FAULT"))
+
+
+@pytest.mark.slow
+def test_nudged_by_a_person(make_board, start, tmp_path):
+    """The person sees where the spot is, 20 µm well, and says how far it is off the mark."""
+    board, out = make_board(sensor=("--geometry", "4")), tmp_path / "field.toml"
+    command = start(board, "calibrate", "--nudge", "--spots-max", "9", "--out", out, "--json")
+    truth, random = Truth.drawn(4, CONFIG), np.random.default_rng(0)
+    for line in command.process.stderr:
+        mark = re.match(r"pixel \d+, (\S+) (\S+) mm", line)
+        if not mark:
+            continue
+        mark_m, count = 1e-3 * np.array([float(each) for each in mark.groups()]), len(board.of("pulse"))
+        pulse = wait_for(lambda seen=count: len(p := board.of("pulse")) > seen + 1 and p[-1], "a flash")
+        off_um = 1e6 * (mark_m - truth.position_m(pulse["x"], pulse["y"])) + 20.0 * random.standard_normal(2)
+        command.process.stdin.write(f"{off_um[0]:.0f} {off_um[1]:.0f}\n\n")
+        command.process.stdin.flush()
+    status, told, errors = command.ended()
+    assert status == 0, errors
+    assert json.loads(told)["spots"] == 9
+    assert rms_um(missed_m(read_field(out), 4)) <= 40.0
+    assert_dark(board)
+
+
+def test_nobody_answers(board, start, tmp_path):
+    command = start(board, "calibrate", "--nudge", "--out", tmp_path / "field.toml")
+    command.process.stdin.close()
+    command.process.stdin = None
+    status, _, errors = command.ended()
+    assert status == 1
+    assert "nobody answers any more" in errors
+    assert_dark(board)
+
+
+def test_without_a_sensor_it_asks_for_one(board, start, tmp_path):
+    status, _, errors = start(board, "calibrate", "--out", tmp_path / "field.toml").ended()
+    assert status == 2
+    assert "sensor.port: got None" in errors
+    assert errors.count("\n") == 1

@@ -1,0 +1,144 @@
+"""`optodrive home` on a board's process: what it finds, how it refuses, and that every way out ends dark."""
+
+import json
+import signal
+
+import pytest
+
+from optodrive.commissioning.held import SPOT_POWER_MAX_W
+from optodrive.simulator.limits import OWN
+from rig import PATIENT_LEASE_S, wait_for
+
+STEPS = ["link", "status", "inputs", "indicator", "zero", "travel x", "travel y", "readback", "zero again"]
+LEASE_US, LATENESS_US = round(PATIENT_LEASE_S * 1e6), 30_000
+
+
+def assert_dark(board, states=("DISARMED",)):
+    wait_for(lambda: board.of("state")[-1]["state"] in states, f"the board to be {states}")
+    gates = board.of("gate")
+    assert not gates or gates[-1]["on"] is False
+    return board
+
+
+def step_of(at_s, kind, value):
+    return f'[[step]]\nat_s = {at_s}\n{kind} = "{value}"\n'
+
+
+def test_in_the_dark(make_board, start):
+    board = make_board(sensor=())
+    status, out, errors = start(board, "home", "--json").ended()
+    assert status == 0, errors
+    answer = json.loads(out)
+    assert answer["home"] is True
+    assert answer["failure"] is None
+    assert [step["step"] for step in answer["steps"]] == STEPS
+    assert not assert_dark(board).of("gate")
+    assert answer["steps"][3]["lit_s"] >= 2.0
+    states = [event["state"] for event in board.of("state")]
+    assert states[:3] == ["DISARMED", "ARMING", "ARMED"]
+    assert states[-1] == "DISARMED"
+
+
+def test_with_a_spot_and_no_position_outputs(make_board, start):
+    board = make_board(sensor=("--no-readback", "--false-share", "0.1"))
+    status, out, errors = start(board, "home", "--spot", "5").ended()
+    assert status == 0, errors
+    assert "no position outputs: not checked" in out
+    assert "seen by spot" in out
+    pulses = assert_dark(board).of("pulse")
+    assert len(pulses) == 15
+    assert max(pulse["duty"] for pulse in pulses) / 65535 * OWN.full_power_uw * 1e-6 <= 5e-3 < SPOT_POWER_MAX_W
+
+
+def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
+    status, out, errors = start(board, "home").ended()
+    assert status == 0, errors
+    assert "no sensor" in out
+    assert "nothing here sees the mirrors" in out
+    assert not assert_dark(board).of("gate")
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "says"),
+    [
+        pytest.param(
+            *("stick_x", (), "home: travel x: mirror x, sent 0.1636 rad from end to end,: got does not move"),
+            marks=pytest.mark.slow,
+        ),
+        ("stick_y", ("--spot", "5"), "home: travel y: mirror y, sent 0.1636 rad from end to end,: got does not move"),
+        pytest.param("invert_readback", (), "rad, inverted, expected 0.16364 ±", marks=pytest.mark.slow),
+        pytest.param(
+            *("blind_sensor", ("--spot", "5"), "got no spot, expected a spot: is it covered"), marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_what_is_broken_is_named(make_board, start, script, arguments, says):
+    board = make_board(sensor=(), script=step_of(0.0, "do", script))
+    status, _, errors = start(board, "home", *arguments).ended()
+    assert status == 1
+    assert says in errors
+    assert errors.count("\n") == 1
+    assert_dark(board)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("interlock", "false"), pytest.param("key", "false", marks=pytest.mark.slow), ("estop", "true")]
+)
+def test_an_input_that_is_not_safe(make_board, start, name, value):
+    board = make_board(script=step_of(0.0, "set", name) + f"value = {value}\n")
+    status, _, errors = start(board, "home").ended()
+    assert status == 1
+    assert name.upper() in errors
+    assert "ARMING" not in [event["state"] for event in assert_dark(board, ("FAULT",)).of("state")]
+
+
+def armed(board):
+    wait_for(lambda: board.of("state") and board.of("state")[-1]["state"] in ("ARMED", "RUNNING"), "ARMED", 60.0)
+
+
+@pytest.mark.parametrize(
+    "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM, signal.SIGKILL]
+)
+def test_ended_from_outside(make_board, start, number):
+    board = make_board(sensor=())
+    command = start(board, "home", "--spot", "5")
+    armed(board)
+    command.process.send_signal(number)
+    ended_us = board.events()[-1]["t_us"]
+    status, _, errors = command.ended()
+    assert_dark(board, ("DISARMED", "FAULT"))
+    if number == signal.SIGKILL:
+        gates = board.of("gate")
+        assert not gates or gates[-1]["t_us"] <= ended_us + LEASE_US + LATENESS_US
+    else:
+        assert status == 130
+        assert errors == "optodrive: interrupted\n"
+        assert board.of("state")[-1]["reason"] in ("abort", "link lost")
+
+
+@pytest.mark.parametrize(
+    ("script", "says"),
+    [(step_of(3.5, "set", "interlock"), "INTERLOCK"), (step_of(3.5, "do", "close"), "lost")],
+)
+def test_what_happens_midway(make_board, start, script, says):
+    board = make_board(sensor=(), script=script)
+    status, _, errors = start(board, "home", "--spot", "5").ended()
+    assert status == 1
+    assert says in errors
+    assert_dark(board, ("DISARMED", "FAULT"))
+
+
+def test_a_board_that_a_daemon_holds(board, daemon, start):
+    status, _, errors = start(board, "home").ended()
+    assert status == 1
+    assert "optodrive serve" in errors
+    assert daemon.board_state() == "DISARMED"
+
+
+def test_a_sensor_that_is_not_there(make_board, start):
+    board = make_board(sensor=(), script=step_of(0.0, "do", "unplug_sensor"))
+    wait_for(lambda: not board.sensor.exists(), "the sensor to be gone")
+    status, _, errors = start(board, "home").ended()
+    assert status == 2
+    assert "sensor.port" in errors
+    assert_dark(board)

@@ -1,0 +1,182 @@
+"""The link goes, for real: what the state, the failed plan and the daemon's log say of it, and what is on the tape."""
+
+import json
+import signal
+import subprocess
+
+import pytest
+
+from optodrive.transport.tape import Tape
+from rig import OPTODRIVE, Board, long_train, wait_for
+
+
+def play(daemon, seconds=5.0):
+    """Arm, and a train that runs; its id."""
+    daemon.arm()
+    plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds))["plan"]
+    wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
+    return plan
+
+
+def told(daemon, words):
+    """The state's likely cause, once it has these words; in the log by then too."""
+
+    def look():
+        cause = daemon.state()["link"]["likely_cause"]
+        return cause if cause and words in cause else None
+
+    cause = wait_for(look, words)
+    wait_for(lambda: cause in daemon.errors.read_text(), "the log's line")
+    return cause
+
+
+def test_a_board_whose_process_is_killed_is_gone_and_a_timing_error_was_known_before(board, daemon):
+    first = daemon.call("POST", "/v1/plans", status=409, json=long_train())
+    assert "arm it first" in first["detail"]
+    plan = play(daemon, 0.1)
+    answer = daemon.finished(plan)
+    timing = answer["timing_error"]
+    assert timing["pulses"] == answer["executed"] == 5
+    # Without an underrun the simulated board is off by nothing but ticks.
+    assert abs(timing["largest_s"]) <= 1e-6
+    assert daemon.state()["totals"]["timing_error"]["pulses"] == 5
+    plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
+    wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
+    board.process.kill()
+    cause = told(daemon, "is gone")
+    assert str(board.port) in cause
+    failed = daemon.finished(plan)
+    assert failed["status"] == "failed"
+    assert "likely cause: " in failed["error"]
+    assert cause in failed["error"]
+
+
+@pytest.mark.slow
+def test_a_pty_that_closes_and_a_board_that_was_reset(make_board, make_daemon):
+    script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "close"\n[[step]]\nfrom = "light"\nat_s = 6.0\ndo = "reset"\n'
+    board = make_board(script=script)
+    daemon = make_daemon(board)
+    plan = play(daemon, 30.0)
+    told(daemon, "is there again: replugged")
+    # When the plan failed the port was either gone for a moment, or there again already.
+    assert f"likely cause: {board.port}" in daemon.finished(plan)["error"]
+    wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link")
+    assert daemon.board_state() == "DISARMED"
+    assert "(reset)" in told(daemon, "the board restarted")
+
+
+@pytest.mark.slow
+def test_flipped_bits_are_named(make_board, make_daemon):
+    script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "flip_bits"\nrate = 0.3\n'
+    daemon = make_daemon(make_board(script=script))
+    plan = play(daemon, 30.0)
+    cause = told(daemon, "damaged")
+    assert "cable" in cause
+    assert daemon.finished(plan)["status"] == "failed"
+
+
+def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_daemon, tmp_path):
+    tape = tmp_path / "tape"
+    daemon = make_daemon(board, options=("--record", str(tape)))
+    plan = play(daemon)
+    daemon.process.send_signal(signal.SIGSTOP)
+    wait_for(lambda: board.of("fault"), "the lease to lapse")
+    daemon.process.send_signal(signal.SIGCONT)
+    cause = told(daemon, "this computer stood still")
+    failed = daemon.finished(plan)
+    assert cause in failed["error"]
+    assert "FAULT (LINK: this computer" in failed["error"]
+    daemon.stop()
+    assert Tape(tape).ignored == 0
+    run = subprocess.run([OPTODRIVE, "wire", "dump", tape, "--json"], capture_output=True, text=True, check=True)
+    *lines, last = map(json.loads, run.stdout.splitlines())
+    names = [line["message"] for line in lines if "message" in line]
+    assert {"HELLO", "HELLO_REPLY", "ARM_CONFIRM", "DATA", "START", "EXECUTED", "LEASE"} <= set(names)
+    assert names.count("HELLO") >= 1
+    states = [line["fields"]["state"] for line in lines if line.get("message") == "EVENT"]
+    assert states[:3] == ["ARMING", "ARMED", "RUNNING"]
+    assert "FAULT" in states
+    totals = last["totals"]
+    assert totals["ignored_bytes"] == totals["bad_bytes"] == 0
+    assert totals["host_silence_s"] > 0.09
+    assert 0 < totals["round_trip_least_s"] < 1
+
+
+@pytest.fixture
+def seeded(tmp_path):
+    """A board whose nonces repeat; the same again for the replay."""
+    boards = []
+
+    def make(folder):
+        folder.mkdir()
+        boards.append(Board(folder, seed=7))
+        return boards[-1]
+
+    yield make
+    for board in boards:
+        board.stop()
+
+
+def replay(*arguments):
+    command = [OPTODRIVE, "wire", "replay", *arguments, "--json"]
+    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert run.returncode in (0, 1), run.stderr
+    verdict = json.loads(run.stdout)
+    assert run.returncode == (not verdict["same"])
+    return verdict
+
+
+@pytest.mark.slow
+def test_a_recorded_session_is_replayed_into_a_simulated_board_and_does_not_arm_one_on_a_port(
+    seeded, make_daemon, tmp_path
+):
+    tape = tmp_path / "tape"
+    daemon = make_daemon(seeded(tmp_path / "first"), options=("--record", str(tape)))
+    plan = play(daemon, 0.3)
+    assert daemon.finished(plan)["status"] == "done"
+    daemon.stop()
+    own = ("--limits", tmp_path / "first" / "board--limits.toml")
+    verdict = replay(tape, "--board", "simulated", "--seed", "7", *own)
+    assert verdict["same"], verdict
+    assert verdict["executed"]["recorded"] >= 15
+    assert not replay(tape, "--board", "simulated", *own)["same"]
+    board = seeded(tmp_path / "second")
+    verdict = replay(tape, "--board", str(board.port))
+    assert not verdict["same"]
+    assert verdict["executed"]["replayed"] == 0
+    assert "ARMED" not in [event["state"] for event in board.of("state")]
+    assert not board.of("gate")
+
+
+def doctor(config):
+    run = subprocess.run([OPTODRIVE, "doctor", "--config", config, "--json"], capture_output=True, text=True)
+    document = json.loads(run.stdout)
+    assert run.returncode == (document["problems"] > 0)
+    return {finding["check"]: finding for finding in document["findings"]}
+
+
+@pytest.mark.slow
+def test_the_doctor_leaves_a_running_daemon_alone_and_greets_a_free_board(board, daemon):
+    plan = play(daemon, 4.0)
+    findings = doctor(daemon.config)
+    assert findings["holder"]["grade"] == "warning"
+    assert f"process {daemon.process.pid}" in findings["holder"]["seen"]
+    assert "board" not in findings
+    assert daemon.finished(plan)["status"] == "done"
+    assert daemon.board_state() == "ARMED"
+    daemon.stop()
+    armings = len([event for event in board.of("state") if event["state"] == "ARMING"])
+    findings = doctor(daemon.config)
+    assert findings["holder"]["grade"] == "ok"
+    assert "DISARMED" in findings["board"]["seen"]
+    assert len([event for event in board.of("state") if event["state"] == "ARMING"]) == armings
+    assert not board.of("fault")
+
+
+def test_a_tape_is_never_overwritten(board, tmp_path):
+    tape = tmp_path / "tape"
+    tape.write_text("precious")
+    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--record", tape], capture_output=True, text=True)
+    assert run.returncode == 2
+    assert run.stderr.splitlines()[-1].startswith("optodrive: --record")
+    assert tape.read_text() == "precious"

@@ -1,0 +1,97 @@
+"""The OpenAPI document against the daemon, by schemathesis: no 5xx, no answer that is not in it."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rig import TOKEN
+
+SCHEMATHESIS = Path(sys.executable).with_name("schemathesis")
+BOUNDS = 'lease_s = 1.0\n[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000\naudit = "{}/audit.jsonl"\n#'
+TELEMETRY = "/v1/telemetry"
+"""It does not end by itself: each case takes as long as it may."""
+KEEPS_ARMED = [part for path in ("arm", "disarm", "stop") for part in ("--exclude-path", f"/v1/{path}")]
+# What a display can show is more than a schema can say: 422 for what one allows is an answer, and documented.
+CHECKS = ["--checks", "all", "--exclude-checks", "positive_data_acceptance"]
+
+
+def schemathesis(daemon, *arguments, examples):
+    done = subprocess.run(
+        [
+            SCHEMATHESIS,
+            "run",
+            f"{daemon.url}/openapi.json",
+            *("--header", f"Authorization: Bearer {TOKEN}"),
+            *("--max-examples", str(examples), "--seed", "1", "--no-shrink", "--generation-database", "none"),
+            *CHECKS,
+            *arguments,
+        ],
+        capture_output=True,
+        text=True,
+        timeout=110,
+        cwd=daemon.config.parent,
+    )
+    assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-2000:]
+    assert "Traceback" not in daemon.errors.read_text()
+    return done.stdout
+
+
+@pytest.fixture
+def open_daemon(make_daemon, board, tmp_path):
+    return make_daemon(board, replace=[("lease_s = 1.0", BOUNDS.format(tmp_path))])
+
+
+@pytest.mark.slow
+def test_the_document_as_it_comes(open_daemon):
+    said = schemathesis(open_daemon, "--exclude-path", TELEMETRY, examples=10)
+    paths = open_daemon.call("GET", "/openapi.json")["paths"]
+    total = sum(map(len, paths.values()))
+    assert f"{total - 1} selected / {total} total" in said
+
+
+@pytest.mark.slow
+def test_what_would_disarm_is_as_documented(open_daemon):
+    only = [word.replace("exclude", "include") for word in KEEPS_ARMED]
+    assert "3 selected" in schemathesis(open_daemon, *only, "--phases", "coverage,fuzzing", examples=5)
+
+
+@pytest.mark.slow
+def test_telemetry_is_as_documented(open_daemon):
+    only = ("--include-path", TELEMETRY, "--request-timeout", "0.5", "--phases", "coverage,fuzzing")
+    assert "1 selected" in schemathesis(open_daemon, *only, examples=2)
+
+
+def test_the_document_while_armed(open_daemon):
+    open_daemon.arm()
+    schemathesis(open_daemon, *KEEPS_ARMED, "--exclude-path", TELEMETRY, examples=3)
+    assert open_daemon.state()["totals"]["executed"] > 0
+
+
+@pytest.mark.slow
+def test_the_document_for_longer(open_daemon):
+    schemathesis(open_daemon, "--exclude-path", TELEMETRY, examples=100)
+
+
+@pytest.mark.slow
+def test_a_document_that_lies_is_caught(open_daemon):
+    """A mutant: the document without a status that the daemon answers."""
+    document = open_daemon.call("GET", "/openapi.json")
+    del document["paths"]["/v1/plans/{plan_id}"]["get"]["responses"]["404"]
+    path = open_daemon.config.parent / "lies.json"
+    path.write_text(json.dumps(document))
+    done = subprocess.run(
+        [
+            *(SCHEMATHESIS, "run", path, "--url", open_daemon.url, "--header", f"Authorization: Bearer {TOKEN}"),
+            *("--include-path", "/v1/plans/{plan_id}", "--include-method", "GET", "--max-examples", "3", "--no-shrink"),
+            *("--phases", "coverage"),
+        ],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        cwd=path.parent,
+    )
+    assert done.returncode == 1, done.stdout
+    assert "[404] Not Found" in done.stdout

@@ -1,0 +1,330 @@
+"""Who may call what: every route there is, with every way of not being allowed to."""
+
+import asyncio
+import json
+import os
+import resource
+import socket
+import subprocess
+import tomllib
+from functools import partial
+
+import httpx
+import pytest
+from fastapi import FastAPI
+from starlette.routing import Mount, Route, WebSocketRoute
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from optodrive import pipeline
+from optodrive.client import AsyncDisplay, Display
+from optodrive.clock import MonotonicClock
+from optodrive.config import load_config
+from optodrive.daemon.api import make_app
+from optodrive.daemon.auth import Door
+from optodrive.daemon.engine import Engine
+from optodrive.daemon.roles import ARM, ROLES, ROUTES, STOP
+from optodrive.daemon.site import LOGIN, is_page
+from optodrive.daemon.token import Token, Tokens
+from optodrive.errors import NotReadyError
+from optodrive.transport.simulated import SimulatedBoard
+from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
+
+LAST_LINE = "lease_s = 1.0"
+
+
+OF_THE_LOGIN = {f"GET {path}" for path in LOGIN}
+"""Entries of their own within the page's route."""
+
+
+def with_daemon(text):
+    """Replaces the configuration's last line by itself and a [daemon] section."""
+    return ((LAST_LINE, f"{LAST_LINE}\n[daemon]\n{text}\n#"),)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("security")
+
+
+@pytest.fixture(scope="module")
+def running(folder):
+    board = Board(folder)
+    text = f'socket = "{folder}/s"\naudit = "{folder}/audit.jsonl"\nrequests_per_s = 1e5\nrequests_burst = 100000'
+    try:
+        daemon = Daemon(folder, board.port, replace=with_daemon(text))
+        try:
+            yield daemon
+        finally:
+            daemon.stop()
+    finally:
+        board.stop()
+
+
+@pytest.fixture(scope="module")
+def app():
+    """The application, whose engine was never started."""
+    engine = Engine(pipeline.Display.of(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    return make_app(engine, Door(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+
+
+def routes_of(application):
+    """Every route of an application, as the table writes them."""
+    found = set()
+    for route in application.routes:
+        if isinstance(route, WebSocketRoute):
+            found.add(f"WEBSOCKET {route.path}")
+        elif isinstance(route, Route):
+            # Starlette answers HEAD wherever it answers GET; the guard answers neither unless the table has it.
+            found |= {f"{method} {route.path}" for method in route.methods - {"HEAD"}}
+        elif isinstance(route, Mount):
+            found.add(f"GET {route.path}/{{path:path}}")
+        else:
+            raise AssertionError(f"a route of a kind that this test does not know: {route}")
+    return found
+
+
+def tokens(daemon):
+    path = next((daemon.config.parent / "optodrive").glob("token-*"))
+    entries = tomllib.loads(path.read_text())["token"]
+    return {entry["role"]: entry["secret"] for entry in entries}
+
+
+def bearer(secret):
+    return {"Authorization": f"Bearer {secret}"}
+
+
+def answer(daemon, key, headers):
+    """Status and code that a route answers with."""
+    method, _, template = key.partition(" ")
+    path = template.replace("{plan_id}", "p1").replace("{name}", "pixel").replace("{path:path}", "x")
+    path = path.replace("{name:path}", "index.html")
+    if method != "WEBSOCKET":
+        with httpx.stream(method, daemon.url + path, headers=headers) as response:  # telemetry has no end
+            if "json" not in response.headers["content-type"]:
+                return response.status_code, None
+            response.read()
+        return response.status_code, response.json().get("code")
+    host = headers.pop("Host", None)
+    url = daemon.url.replace("http://", "ws://") + path
+    address = daemon.url.removeprefix("http://").split(":")
+    try:
+        with socket.create_connection((address[0], int(address[1]))) as link:
+            target = url if host is None else f"ws://{host}{path}"
+            with connect(target, sock=link, additional_headers=headers, proxy=None):
+                pass
+    except InvalidStatus as refused:
+        return refused.response.status_code, json.loads(refused.response.body)["code"]
+    return 101, None
+
+
+def test_the_table_has_every_route_and_no_other(app):
+    assert routes_of(app) == set(ROUTES) - OF_THE_LOGIN
+
+
+def test_what_the_login_needs_is_open_and_holds_no_secret(running):
+    for key in OF_THE_LOGIN:
+        response = httpx.get(running.url + key.partition(" ")[2])
+        assert response.status_code == 200
+        assert TOKEN not in response.text
+
+
+def test_a_route_without_an_entry_is_not_answered_and_is_caught():
+    engine = Engine(pipeline.Display.of(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    mutant = make_app(engine, Door(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+
+    @mutant.post("/v1/laser")
+    async def laser():
+        return {"on": True}
+
+    assert routes_of(mutant) - set(ROUTES) == {"POST /v1/laser"}
+
+    async def call():
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(mutant), base_url="http://localhost") as client:
+            return await client.post("/v1/laser", headers=bearer(TOKEN))
+
+    response = asyncio.run(call())
+    assert (response.status_code, response.json()["code"]) == (404, "no_such_route")
+
+
+def test_a_guard_that_is_forgotten_is_caught():
+    assert routes_of(FastAPI()) - set(ROUTES)
+
+
+REFUSALS = {
+    "no token": ({}, (401, "bad_token")),
+    "an empty token": ({"Authorization": "Bearer"}, (401, "bad_token")),
+    "a wrong token": (bearer("wrong" * 8), (401, "bad_token")),
+    "another scheme": ({"Authorization": f"Basic {TOKEN}"}, (401, "bad_token")),
+    "a foreign Host": ({**bearer(TOKEN), "Host": "evil.example"}, (421, "foreign_host")),
+    "a Host like ours": ({**bearer(TOKEN), "Host": "localhost.evil.example"}, (421, "foreign_host")),
+    "a foreign Origin": ({**bearer(TOKEN), "Origin": "https://evil.example"}, (403, "foreign_origin")),
+    "no page's Origin": ({**bearer(TOKEN), "Origin": "null"}, (403, "foreign_origin")),
+}
+
+
+@pytest.mark.parametrize("case", REFUSALS)
+@pytest.mark.parametrize("key", sorted(ROUTES))
+def test_every_route_refuses(running, key, case):
+    headers, expected = REFUSALS[case]
+    if expected[0] == 401 and is_page(*key.split(" ")):
+        expected = (401, None)  # the page that asks for the token
+    if ROUTES[key] is None and expected[0] == 401:
+        expected = (200, None)
+    assert answer(running, key, dict(headers)) == expected
+
+
+@pytest.mark.parametrize("key", sorted(key for key, least in ROUTES.items() if least not in (None, ROLES[0])))
+def test_every_route_refuses_a_role_too_low(running, key):
+    for role in ROLES[: ROLES.index(ROUTES[key])]:
+        assert answer(running, key, bearer(tokens(running)[role])) == (403, "role_too_low")
+
+
+@pytest.mark.parametrize("key", sorted(ROUTES.keys() - {ARM}))  # armed below
+def test_every_route_lets_its_role_pass(running, key):
+    least = ROUTES[key] or ROLES[0]
+    assert answer(running, key, bearer(tokens(running)[least]))[0] not in (401, 403, 421, 429)
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("PUT", "/v1/arm", 405), ("OPTIONS", "/v1/state", 405)]
+)
+def test_what_is_not_there_asks_for_a_token_first(running, method, path, status):
+    assert httpx.request(method, running.url + path).status_code == 401
+    response = httpx.request(method, running.url + path, headers=bearer(TOKEN))
+    assert response.status_code == status
+    assert (status == 405) == ("allow" in response.headers)
+    assert "access-control-allow-origin" not in response.headers
+
+
+def test_the_unix_socket_asks_for_the_token_too(running, folder):
+    assert (folder / "s").stat().st_mode & 0o777 == 0o660
+    with httpx.Client(transport=httpx.HTTPTransport(uds=str(folder / "s")), base_url="http://localhost") as client:
+        assert client.get("/v1/health").status_code == 200
+        assert client.get("/v1/state").status_code == 401
+        assert client.get("/v1/state", headers=bearer(TOKEN)).status_code == 200
+        assert client.get("/v1/state", headers=bearer(TOKEN) | {"Host": "evil.example"}).status_code == 421
+
+
+def test_command_line_and_client_reach_the_unix_socket(running, folder):
+    place = f"unix:{folder / 's'}"
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
+    command = [OPTODRIVE, "status", "--url", place, "--json"]
+    told = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+    assert json.loads(told)["display"] == running.state()["display"]
+    with Display(place, TOKEN) as display:
+        assert display.preview({5: 60.0}).planned == 1
+        with display.stream() as stream, pytest.raises(NotReadyError):
+            stream.wait(stream.send({5: 60.0}))
+
+    async def asynchronously():
+        async with AsyncDisplay(place, TOKEN) as display, display.stream() as stream:
+            with pytest.raises(NotReadyError):
+                await stream.wait(await stream.send({5: 60.0}))
+
+    asyncio.run(asynchronously())
+    gone = subprocess.run([*command[:3], place + "x"], capture_output=True, text=True, env=environment)
+    assert gone.returncode == 1
+    assert gone.stderr.count("\n") == 1
+    assert place + "x" in gone.stderr
+
+
+def raw(daemon, request):
+    host, port = daemon.url.removeprefix("http://").split(":")
+    with socket.create_connection((host, int(port)), timeout=10) as link:
+        link.sendall(request.encode())
+        return link.recv(300).decode()
+
+
+@pytest.mark.parametrize(
+    "body", ["Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\nffffff\r\n", "\r\n"]
+)
+def test_stop_waits_for_no_body(running, body):
+    path = STOP.partition(" ")[2]
+    secret = tokens(running)["viewer"]
+    given = raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
+    assert given.startswith("HTTP/1.1 200 ")
+
+
+def audit_lines(folder):
+    return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
+
+
+def test_the_audit_file_says_who_did_what(running, folder):
+    secrets = tokens(running)
+    running.arm()
+    body = json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}}]})
+    plan = running.call("POST", "/v1/plans", content=body, headers=bearer(secrets["operator"]))["plan"]
+    running.call("POST", "/v1/arm", status=403, headers=bearer(secrets["viewer"]))
+    forged = {"X-Forwarded-For": "10.1.2.3", "X-Real-IP": "10.1.2.3"}
+    running.call("POST", "/v1/stop", headers=bearer(secrets["viewer"]) | forged)
+    running.call("GET", "/v1/state")
+
+    def look():
+        lines = audit_lines(folder)
+        begin = next(index for index, line in enumerate(lines) if line["event"] == "asked")
+        return lines[begin:] if any(line["call"] == "POST /v1/stop" for line in lines[begin:]) else None
+
+    lines = wait_for(look, "the stop's line")
+    said = [(line["name"], line["role"], line["call"], line["event"], line.get("status")) for line in lines]
+    assert said == [
+        ("armer", "armer", "POST /v1/arm", "asked", None),
+        ("armer", "armer", "POST /v1/arm", "answered", 200),
+        ("operator", "operator", "POST /v1/plans", "answered", 201),
+        ("viewer", "viewer", "POST /v1/arm", "refused", 403),
+        ("viewer", "viewer", "POST /v1/stop", "answered", 200),
+    ]
+    assert (lines[2]["plan"], lines[2]["body_bytes"]) == (plan, len(body))
+    assert len(lines[2]["body_sha256"]) == 64
+    assert {line["address"] for line in lines} == {"127.0.0.1"}
+
+
+def test_no_token_is_ever_written(running, folder):
+    running.call("GET", "/v1/state", status=401, headers=bearer("s3cret-that-is-wrong"))
+    httpx.get(f"{running.url}/v1/state?token={TOKEN}")
+    secrets = [*tokens(running).values(), "s3cret-that-is-wrong"]
+    for path in (running.errors, folder / "audit.jsonl"):
+        text = path.read_text()
+        assert not [secret for secret in secrets if secret in text], path
+
+
+def test_a_caller_that_asks_too_often_waits_others_and_stop_do_not(make_daemon, board, tmp_path):
+    daemon = make_daemon(board, replace=with_daemon("requests_per_s = 1\nrequests_burst = 20"))
+    secrets = tokens(daemon)
+    with httpx.Client(base_url=daemon.url, headers=bearer(secrets["viewer"])) as viewer:
+        given = [viewer.get("/v1/state") for _ in range(60)]
+        late = [response for response in given if response.status_code == 429]
+        assert 30 <= len(late) < 60
+        assert int(late[-1].headers["retry-after"]) >= 1
+        assert late[-1].json()["code"] == "too_many_requests"
+        assert [viewer.post("/v1/stop").status_code for _ in range(50)] == [200] * 50
+        assert 429 in {viewer.get("/v1/config").status_code for _ in range(20)}
+    assert httpx.get(f"{daemon.url}/v1/state", headers=bearer(secrets["operator"])).status_code == 200
+    assert {httpx.get(f"{daemon.url}/v1/state").status_code for _ in range(40)} == {401, 429}
+    assert httpx.post(f"{daemon.url}/v1/stop").status_code == 401
+
+
+def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board, tmp_path):
+    """A disk that is full: begun while there is room, then there is none."""
+    board = make_board()
+    audit = tmp_path / "audit.jsonl"
+    daemon = Daemon(tmp_path, board.port, replace=with_daemon(f'audit = "{audit}"'))
+    try:
+        daemon.arm()
+        plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
+        wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
+        full = partial(resource.prlimit, daemon.process.pid, resource.RLIMIT_FSIZE)
+        before = full()
+        full((audit.stat().st_size, before[1]))
+        # What runs goes on, and STOP ends it.
+        assert daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["status"] == "running"
+        assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
+        assert board.of("gate")[-1]["on"] is False
+        refused = daemon.call("POST", "/v1/arm", status=409)
+        assert refused["code"] == "not_audited"
+        assert daemon.board_state() == "DISARMED"
+        assert "arming is refused" in daemon.errors.read_text()
+        full(before)
+        assert daemon.arm()["board"]["state"] == "ARMED"
+    finally:
+        daemon.stop()

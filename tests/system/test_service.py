@@ -1,0 +1,260 @@
+"""The daemon as a service: what systemd makes of the unit, what it is told, what SIGHUP does, a locked room."""
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from locked_room import locked, why_not
+from optodrive.clock import MonotonicClock
+from optodrive.compiled import code_folder
+from optodrive.config import shipped_path
+from optodrive.daemon.notify import Notifier
+from rig import TOKEN, Daemon, long_train, wait_for
+
+TRANSPORTS = {
+    "serial": 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n',
+    "usb": 'transport = "usb"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n',
+}
+HEAD = 'format = "optodrive-tokens"\nversion = 1\n'
+ENTRY = '[[token]]\nname = "{}"\nrole = "armer"\nsecret = "{}"\n'
+EXPOSURE_MAX = "15"
+"""As --threshold= has it: 1.5."""
+
+
+@pytest.fixture(params=sorted(TRANSPORTS))
+def unit(request, tmp_path):
+    """The unit as it is installed for a board."""
+    config = tmp_path / "mine.toml"
+    text = shipped_path("display-437.toml").read_text()
+    config.write_text(text.replace('transport = "simulated"', TRANSPORTS[request.param]))
+    command = [sys.executable, "-m", "optodrive.cli.main", "service", "install", "--program", "/usr/bin/true"]
+    subprocess.run([*command, "--root", tmp_path / "root", "--config", config], check=True, capture_output=True)
+    return tmp_path / "root/etc/systemd/system/optodrive.service"
+
+
+def analyze(*arguments):
+    program = shutil.which("systemd-analyze")
+    assert program, "systemd-analyze is missing: apt-get install systemd"
+    return subprocess.run([program, *arguments], capture_output=True, text=True, timeout=60)
+
+
+def test_the_unit_is_in_order(unit):
+    done = analyze("verify", "--man=no", unit)
+    assert (done.returncode, done.stdout + done.stderr) == (0, "")
+
+
+def test_the_unit_exposes_little(unit):
+    done = analyze("security", "--offline=true", f"--threshold={EXPOSURE_MAX}", "--no-pager", unit)
+    assert done.returncode == 0, done.stdout
+
+
+def test_a_unit_that_is_open_is_caught(unit):
+    unit.write_text(unit.read_text().replace("CapabilityBoundingSet=\n", "").replace("ProtectSystem=strict\n", ""))
+    assert analyze("security", "--offline=true", f"--threshold={EXPOSURE_MAX}", "--no-pager", unit).returncode != 0
+
+
+def test_a_unit_that_is_wrong_is_caught(unit):
+    unit.write_text(unit.read_text().replace("WatchdogSec=20", "WatchdogSecs=20"))
+    assert "WatchdogSecs" in analyze("verify", "--man=no", unit).stderr
+
+
+# --- what systemd is told ---------------------------------------------------------------------------------------
+
+
+class Manager:
+    """Hears what a service says, as systemd would."""
+
+    def __init__(self, folder, monkeypatch, watchdog_us=200_000):
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(str(folder / "notify"))
+        self._socket.settimeout(0.01)
+        self.heard = []
+        monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", str(watchdog_us))
+
+    def listen(self):
+        while True:
+            try:
+                self.heard += self._socket.recv(4096).decode().split("\n")
+            except TimeoutError:
+                return self.heard
+
+    def close(self):
+        self._socket.close()
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch):
+    manager = Manager(tmp_path, monkeypatch)
+    yield manager
+    manager.close()
+
+
+def test_ready_when_it_answers_then_fed_then_stopping(manager, board, make_daemon):
+    daemon = make_daemon(board)
+    wait_for(lambda: manager.listen().count("WATCHDOG=1") >= 5, "the watchdog to be fed")
+    assert manager.heard.count("READY=1") == 1
+    daemon.stop()
+    assert "STOPPING=1" in manager.listen()
+    assert daemon.process.returncode == 0
+
+
+def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
+    """The web server's thread lives on: only the engine's loop may feed."""
+    notifier = Notifier(MonotonicClock())
+    engine.on_turn = notifier.alive
+    wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
+    go_on = threading.Event()
+    standing = engine._in_loop(lambda: go_on.wait(30))
+    try:
+        time.sleep(0.1)
+        before = len(manager.listen())
+        time.sleep(0.5)
+        assert len(manager.listen()) == before
+    finally:
+        go_on.set()
+        standing.result(10)
+    wait_for(lambda: len(manager.listen()) > before, "the watchdog to be fed again")
+    notifier.close()
+
+
+def test_a_service_that_starts_again_is_not_armed(manager, board, make_daemon):
+    daemon = make_daemon(board)
+    daemon.arm()
+    daemon.process.kill()
+    daemon.process.wait()
+    again = make_daemon(board)
+    assert again.board_state() in ("DISARMED", "FAULT")
+    again.call("POST", "/v1/plans", status=409, json=long_train(seconds=0.1))
+
+
+# --- SIGHUP -----------------------------------------------------------------------------------------------------
+
+
+def reload(daemon, manager, edit):
+    """Edit the configuration and ask for a reload; the line that came of it."""
+    daemon.config.write_text(edit(daemon.config.read_text()))
+    lines, ready = daemon.errors.read_text(), manager.listen().count("READY=1")
+    daemon.process.send_signal(signal.SIGHUP)
+    wait_for(lambda: manager.listen().count("READY=1") > ready, "the reload's end")
+    assert "RELOADING=1" in manager.heard
+    return daemon.errors.read_text().removeprefix(lines)
+
+
+def test_sighup_takes_what_can_be_taken_and_says_what_waits(manager, board, make_daemon):
+    daemon = make_daemon(board)
+    daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab.example"})
+    more = '\n[daemon]\nhosts = ["lab.example"]\nbody_max_bytes = 2000\n'
+    said = reload(daemon, manager, lambda text: text.replace("ambient_c = 20.0", "ambient_c = 25.0") + more)
+    assert said.count("\n") == 1
+    assert "taken: daemon.body_max_bytes, daemon.hosts" in said
+    assert "WAITING FOR A RESTART: ambient_c" in said
+    daemon.call("GET", "/v1/health", headers={"Host": "lab.example"})
+    daemon.call("POST", "/v1/plans", status=413, content=b" " * 3000)
+    assert daemon.call("GET", "/v1/config")["ambient_c"] == 20.0
+
+
+def test_sighup_with_a_wrong_configuration_changes_nothing(manager, board, make_daemon):
+    daemon = make_daemon(board)
+    said = reload(daemon, manager, lambda text: text.replace("damping =", "dampin =") + '\n[daemon]\nhosts = ["lab"]\n')
+    assert "not reloaded" in said
+    assert "dampin" in said
+    daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab"})
+
+
+def test_sighup_while_armed_changes_nothing_and_lights_nothing_out(manager, board, make_daemon):
+    daemon = make_daemon(board)
+    daemon.arm()
+    said = reload(daemon, manager, lambda text: text + '\n[daemon]\nhosts = ["lab"]\n')
+    assert "disarm it first" in said
+    assert daemon.board_state() == "ARMED"
+    daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab"})
+
+
+def test_sighup_takes_tokens_away(manager, board, make_daemon, tmp_path):
+    kept = tmp_path / "kept.toml"
+    kept.write_text(HEAD + ENTRY.format("rig", TOKEN) + ENTRY.format("ben", "another-token-for-ben"))
+    kept.chmod(0o600)
+    daemon = make_daemon(board, replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\ntokens = "{kept}"\n#')])
+    ben = {"Authorization": "Bearer another-token-for-ben"}
+    daemon.call("GET", "/v1/state", headers=ben)
+    kept.write_text(HEAD + ENTRY.format("rig", TOKEN))
+    reload(daemon, manager, lambda text: text)
+    daemon.call("GET", "/v1/state", status=401, headers=ben)
+    daemon.call("GET", "/v1/state")
+    kept.chmod(0o644)
+    assert "chmod 600" in reload(daemon, manager, lambda text: text)
+
+
+def test_sighup_from_a_terminal_that_closes_ends_dark(board, make_daemon):
+    daemon = make_daemon(board)
+    daemon.arm()
+    daemon.process.send_signal(signal.SIGHUP)
+    assert daemon.process.wait(15) == 0
+    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
+
+
+# --- a locked room ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
+def test_it_works_in_a_locked_room(board, tmp_path, monkeypatch):
+    """Under the unit's system calls, without capabilities or new privileges, on a file system that is read-only."""
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setattr("rig.OPTODRIVE", locked(tmp_path, writable=state))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(state))
+    kernels = code_folder()
+    if kernels is not None:  # else they are compiled in there, which takes a minute
+        shutil.copytree(kernels, state / "optodrive" / "kernels" / kernels.name)
+    (state / "tokens.toml").write_text(HEAD + ENTRY.format("rig", TOKEN))
+    (state / "tokens.toml").chmod(0o600)
+    text = f'socket = "{state}/s"\ntokens = "{state}/tokens.toml"\naudit = "{state}/audit.jsonl"'
+    daemon = Daemon(tmp_path, board.port, replace=[("lease_s = 1.0", f"lease_s = 1.0\n[daemon]\n{text}\n#")])
+    try:
+        status = innermost_status(daemon.process.pid)
+        assert (status["Seccomp"], status["NoNewPrivs"]) == ("2", "1")
+        assert int(status["CapEff"], 16) == int(status["CapPrm"], 16) == 0
+        daemon.arm()
+        plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.5))["plan"]
+        assert daemon.finished(plan)["status"] == "done"
+        daemon.call("POST", "/v1/stop")
+        events = [json.loads(line)["event"] for line in (state / "audit.jsonl").read_text().splitlines()]
+        assert events[:2] == ["started", "asked"]
+    finally:
+        daemon.stop()
+
+
+@pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
+def test_a_room_that_is_open_is_caught(tmp_path, monkeypatch):
+    """What the walls are for: outside they do not hold this back, inside they do."""
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setattr("locked_room.OPTODRIVE", sys.executable)
+    inside = locked(tmp_path, writable=state)
+    tries = {
+        "a file of the system": f"open({str(tmp_path / 'elsewhere')!r}, 'w')",
+        "a call that the unit does not allow": "import os; os.setpriority(os.PRIO_PROCESS, 0, 5)",
+        "another user": "import os; os.setuid(1234)",
+    }
+    for what, code in tries.items():
+        done = subprocess.run([inside, "-c", code], capture_output=True, text=True)
+        assert done.returncode == 1, what
+        assert "Error" in done.stderr, what
+    assert subprocess.run([inside, "-c", f"open({str(state / 'x')!r}, 'w').write('y')"]).returncode == 0
+
+
+def innermost_status(pid):
+    """/proc/PID/status of the daemon; bubblewrap waits outside it."""
+    while children := Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+        pid = int(children[0])
+    lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    return dict(line.split(":\t", 1) for line in lines if ":\t" in line)

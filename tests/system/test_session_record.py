@@ -1,0 +1,88 @@
+"""`optodrive serve --record-session`: the file against what the daemon answered and the board's log."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from optodrive.flow import Measurement, Run, Signal
+from optodrive.recording import read_recording, write_recording
+from rig import long_train, wait_for
+
+OPTODRIVE = Path(sys.executable).with_name("optodrive")
+
+
+def writer_of(daemon):
+    children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children").read_text().split()
+    found = [int(pid) for pid in children if b"session_writer" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert len(found) == 1
+    return found[0]
+
+
+def test_asked_planned_executed_and_reckoned_and_a_merge(board, make_daemon, tmp_path):
+    path = tmp_path / "session.h5"
+    daemon = make_daemon(board, options=("--record-session", str(path)))
+    daemon.arm()
+    frames = {"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"17": 90, "18": 60}}]}
+    answers = [daemon.finished(daemon.call("POST", "/v1/plans", json=body)["plan"]) for body in (frames, frames)]
+    daemon.call("POST", "/v1/plans", json=long_train())
+    wait_for(lambda: len(board.of("pulse")) > 15, "pulses")
+    daemon.call("POST", "/v1/stop")
+    stopped = daemon.finished("p3")
+    daemon.stop()
+    assert "recording" not in daemon.errors.read_text()
+    with h5py.File(path) as file:
+        runs, plans = file["runs"], file["plans"]
+        assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "failed"]
+        np.testing.assert_allclose(plans["p1/asked_um"][0, [17, 18]], [90, 60])
+        for answer in answers:
+            kept, told = plans[answer["plan"]], answer["executed_pulses"]
+            np.testing.assert_allclose(1e6 * kept["simulated_m"][:], told["simulated_um"])
+            np.testing.assert_allclose(kept["executed"][:, 1], told["width_s"])
+            assert kept["executed"][:, 3].tolist() == told["pixel"]
+            np.testing.assert_allclose(kept["planned"][:, 0], answer["pulses"]["start_s"])
+        assert len(plans["p3/executed"]) == len(plans["p3/simulated_m"]) == stopped["executed"]
+        run = plans["p1"].attrs["run"]
+        pulses = runs[run]["pulses"][:]
+        count = sum(len(runs[name]["pulses"]) for name in runs)
+        assert count == sum(answer["executed"] for answer in (*answers, stopped))
+    lab = tmp_path / "lab"
+    t_s = np.linspace(0, 1, 40)
+    signal = Signal(17, t_s, 1e-6 * t_s, 1e-7)
+    write_recording(lab, Measurement((Run(run, 293.0, np.zeros((0, 4)), {"displacement_m": signal}, {}),)))
+    merge = [OPTODRIVE, "recording", "merge", path, lab, "--out", tmp_path / "both.h5"]
+    subprocess.run(merge, check=True, timeout=60)
+    np.testing.assert_array_equal(read_recording(tmp_path / "both.h5").runs[0].pulses, pulses)
+
+
+@pytest.mark.slow
+def test_a_full_disk_ends_the_recording_and_the_display_goes_on(board, make_daemon, tmp_path):
+    folder = tmp_path / "sessions"
+    folder.mkdir()
+    record = f'[daemon]\nrecord = "{folder}"\n\n[board]'
+    daemon = make_daemon(board, replace=(("[board]", record),))
+    (path,) = folder.iterdir()
+    limit = path.stat().st_size
+    subprocess.run(["/usr/bin/prlimit", f"--fsize={limit}", "--pid", str(writer_of(daemon))], check=True)
+    daemon.arm()
+    plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=3.0))["plan"]
+    assert daemon.finished(plan)["status"] == "done"
+    wait_for(lambda: "stopped" in daemon.errors.read_text(), "the line")
+    assert daemon.finished(daemon.call("POST", "/v1/plans", json=long_train(seconds=0.5))["plan"])["status"] == "done"
+    assert daemon.state()["board"]["underruns"] == 0
+    assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
+    assert board.of("gate")[-1]["on"] is False
+    daemon.stop()
+    errors = daemon.errors.read_text()
+    assert errors.count("recording to") == errors.count("the display goes on") == 1
+    with h5py.File(path) as file:
+        assert list(file["plans"]) == ["config"]
+
+
+def test_a_name_that_is_taken_is_refused_before_anything_starts(board, make_daemon, tmp_path):
+    (tmp_path / "taken.h5").write_text("dear")
+    with pytest.raises(AssertionError, match="a name that is free"):
+        make_daemon(board, options=("--record-session", str(tmp_path / "taken.h5")))

@@ -1,0 +1,260 @@
+"""The telemetry of a real daemon: what comes, how often, and that nothing waits for who reads it."""
+
+import base64
+import json
+import os
+import pty
+import re
+import socket
+import subprocess
+import threading
+import time
+
+import httpx
+import numpy as np
+import pytest
+
+from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
+from optodrive.config import load_config
+from optodrive.pipeline import Display
+from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
+
+
+class Reader:
+    """Follows the telemetry in a thread: events as (time, kind, data)."""
+
+    def __init__(self, daemon, query=""):
+        self.events = []
+        self.ended = threading.Event()
+        self._closing = False
+        self._url = f"{daemon.url}/v1/telemetry{query}"
+        self._thread = threading.Thread(target=self._read, daemon=True)
+        self._thread.start()
+
+    def _read(self):
+        headers = {"Authorization": f"Bearer {TOKEN}"}
+        kind = None
+        try:
+            with httpx.stream("GET", self._url, headers=headers, timeout=30) as answer:
+                assert answer.headers["content-type"].startswith("text/event-stream")
+                for line in answer.iter_lines():
+                    if line.startswith("event: "):
+                        kind = line[7:]
+                    elif line.startswith("data: "):
+                        self.events.append((time.monotonic(), kind, json.loads(line[6:])))
+                    if self._closing:
+                        return
+        except httpx.TransportError:
+            pass
+        finally:
+            self.ended.set()
+
+    def of(self, kind):
+        return [(at_s, data) for at_s, name, data in list(self.events) if name == kind]
+
+    def last(self, kind):
+        found = self.of(kind)
+        return found[-1][1] if found else None
+
+    def close(self):
+        self._closing = True
+        self._thread.join(10)
+
+
+@pytest.fixture
+def reader(daemon):
+    readers = []
+
+    def make(query=""):
+        readers.append(Reader(daemon, query))
+        return readers[-1]
+
+    yield make
+    for item in readers:
+        item.close()
+
+
+def executed(follower, plan):
+    """What was told of a plan's pulses; of those before it something may be told once more."""
+    told = [batch for _, event in follower.of("pulses") for batch in event["executed"]]
+    return [batch for batch in told if batch["plan"] == plan]
+
+
+def heights_um(event):
+    return np.frombuffer(base64.b64decode(event["height"]), dtype="<u2") / 10
+
+
+def celsius(event):
+    return np.frombuffer(base64.b64decode(event["absorber"]), dtype="<u2") / 10
+
+
+def test_everything_is_told_at_once_and_state_goes_on(daemon, reader):
+    follower = reader()
+    wait_for(lambda: {"state", "display", "budget", "fault"} <= {kind for _, kind, _ in follower.events}, "one of each")
+    assert follower.last("state")["board"]["state"] == "DISARMED"
+    assert follower.last("fault")["fault"] is None
+    assert len(heights_um(follower.last("display"))) == 437
+    wait_for(lambda: not follower.last("display")["warm"], "the last test's heat to be gone")
+    assert set(celsius(follower.last("display")).tolist()) == {20.0}
+    wait_for(lambda: len(follower.of("state")) >= 6, "states")
+    times = [at_s for at_s, _ in follower.of("state")]
+    assert (times[-1] - times[0]) / (len(times) - 1) < 0.8
+
+
+def test_what_is_shown_is_what_was_executed(daemon, reader):
+    follower = reader("?rate_hz=60")
+    daemon.arm()
+    answer = daemon.call(
+        "POST", "/v1/plans", json={"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"17": 150}}]}
+    )
+    done = daemon.finished(answer["plan"])
+    wait_for(
+        lambda: (
+            follower.of("display")
+            and not follower.last("display")["warm"]
+            and any(e["warm"] for _, e in follower.of("display"))
+        ),
+        "warm, then cold",
+    )
+    batches = executed(follower, answer["plan"])
+    assert [(batch["plan"], batch["pixel"], batch["row"]) for batch in batches] == [(answer["plan"], [17], [0])]
+    (batch,) = batches
+    heat = Display.of(load_config()).heat_at_rest()
+    heat.pulses(*(np.array(batch[key]) for key in ("pixel", "start_s", "width_s", "power_w")))
+    told = [event for _, event in follower.of("display") if heights_um(event).any()]
+    assert len(told) > 3
+    for event in told:
+        expected = heat.at(event["board_s"])
+        assert heights_um(event) == pytest.approx(expected.displacement_m * 1e6, abs=0.2)
+        assert celsius(event) == pytest.approx(20.0 + expected.absorber_k, abs=0.2)
+    assert max(heights_um(event)[17] for event in told) < done["simulated_max_um"] + 0.2
+    told = [batch for _, event in follower.of("pulses") for batch in event["planned"]]
+    planned = [batch for batch in told if batch["plan"] == answer["plan"]]
+    assert planned[0]["start_s"] == pytest.approx(batches[0]["start_s"], abs=2e-3)
+    assert planned[0]["width_s"] == pytest.approx(batches[0]["width_s"], abs=1e-6)
+
+
+def test_every_executed_pulse_is_told_once_though_nobody_looked_at_first(daemon, reader):
+    daemon.arm()
+    before = daemon.state()["totals"]["executed"]
+    answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=2.0))
+    wait_for(lambda: daemon.state()["totals"]["executed"] > before + 20, "light before anyone looks")
+    follower = reader()
+    daemon.finished(answer["plan"])
+
+    def rows():
+        return [row for batch in executed(follower, answer["plan"]) for row in batch["row"]]
+
+    wait_for(lambda: len(rows()) >= answer["planned"], "all pulses")
+    assert sorted(rows()) == list(range(answer["planned"]))
+
+
+def test_a_stop_is_told_and_what_was_not_executed_never_counts(daemon, reader):
+    follower = reader()
+    daemon.arm()
+    answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
+    wait_for(lambda: executed(follower, answer["plan"]), "pulses")
+    daemon.call("POST", "/v1/stop")
+    wait_for(lambda: follower.last("state")["board"]["state"] == "DISARMED", "it is told")
+    plan = daemon.finished(answer["plan"])
+
+    def rows():
+        return sum(len(batch["row"]) for batch in executed(follower, answer["plan"]))
+
+    wait_for(lambda: rows() == plan["executed"], "what was executed")
+    wait_for(lambda: not follower.last("display")["warm"], "cold")
+
+
+def test_trimmed_pulses_come_with_their_reason_and_the_budget_rises(daemon, reader):
+    follower = reader()
+    daemon.arm()
+    train = long_train(seconds=3.0)
+    train["trains"][0] |= {"pulse_width_s": 0.040, "gap_s": 0.001, "power_w": 2.4}
+    answer = daemon.call("POST", "/v1/plans", json=train)
+    assert answer["summary"]["trimmed"]["pulses"]
+    daemon.finished(answer["plan"])
+    told = executed(follower, answer["plan"])
+    reasons = {
+        reason for batch in told for reason, taken in zip(batch["reason"], batch["trimmed_j"], strict=True) if taken
+    }
+    assert reasons == set(answer["summary"]["trimmed"]["by_reason"])
+    shares = {cap["cap"]: [] for cap in follower.last("budget")["caps"]}
+    for _, event in follower.of("budget"):
+        for cap in event["caps"]:
+            shares[cap["cap"]].append(cap["share"])
+            assert cap["share"] <= 1.01
+    assert max(max(values) for values in shares.values()) > 0.7
+
+
+def test_a_reader_that_does_not_read_holds_nothing_up(daemon, reader):
+    stuck = socket.create_connection(("127.0.0.1", daemon.client.base_url.port))
+    stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    request = f"GET /v1/telemetry?rate_hz=60 HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
+    stuck.sendall(request.encode())
+    follower = reader()
+    daemon.arm()
+    answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=3.0))
+    assert daemon.finished(answer["plan"])["status"] == "done"
+    assert daemon.state()["board"]["underruns"] == 0
+    assert len(follower.of("display")) > 10
+    stuck.close()
+    assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
+
+
+def test_a_pushed_state_is_not_waited_for_by_sigterm(make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    follower = Reader(daemon)
+    wait_for(lambda: follower.events, "events")
+    daemon.process.terminate()
+    assert daemon.process.wait(timeout=10) == 0
+    assert follower.ended.wait(5)
+    assert "Traceback" not in daemon.errors.read_text()
+
+
+def test_rates_out_of_bounds_are_refused(daemon):
+    for rate in ("0", "61", "fast", "nan"):
+        daemon.call("GET", f"/v1/telemetry?rate_hz={rate}", status=422)
+
+
+def test_the_page_is_served_whole_and_nothing_else(daemon):
+    index = daemon.client.get("/")
+    assert index.headers["content-type"].startswith("text/html")
+    assert "default-src 'self'" in index.headers["content-security-policy"]
+    parts = [part.split('"')[0] for part in index.text.split('="/page/')[1:]]
+    assert "main.js" in parts
+    for part in parts:
+        answer = daemon.client.get(f"/page/{part}")
+        assert answer.status_code == 200
+        assert answer.headers["x-content-type-options"] == "nosniff"
+    for path in ("/page/../api.py", "/page/%2e%2e/api.py", "/page/vendor", "/page/"):
+        assert daemon.client.get(path).status_code == 404
+
+
+def test_no_token_is_printed_where_no_terminal_is(make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    daemon.process.terminate()
+    assert TOKEN not in daemon.process.stdout.read()
+    assert TOKEN not in daemon.errors.read_text()
+
+
+def test_a_terminal_alone_is_shown_the_address_with_the_token(make_board, tmp_path):
+    config = tmp_path / "config.toml"
+    config.write_text(config_text(make_board().port))
+    leader, follower = pty.openpty()
+    environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(tmp_path)}
+    process = subprocess.Popen(
+        [OPTODRIVE, "serve", "--config", config, "--port", "0"], stdout=follower, env=environment
+    )
+    os.close(follower)
+    try:
+        text = ""
+        while "arm with" not in text:
+            text += os.read(leader, 4096).decode()
+        address = re.search(r"(http://127\.0\.0\.1:\d+/)#token=(\S+)", text)
+        assert address
+        assert address.group(2) == TOKEN
+        assert httpx.get(address.group(1)).status_code == 401
+    finally:
+        process.terminate()
+        process.wait(timeout=10)
+        os.close(leader)

@@ -1,0 +1,45 @@
+"""The wheel, installed into an empty environment: what is in it, and the daemon from it outside the checkout."""
+
+import json
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "scripts"))
+
+from wheel import build  # noqa: E402 - a script
+
+
+def made(tmp_path, *options):
+    command = [sys.executable, ROOT / "scripts" / "wheel.py", "--out", tmp_path, *options]
+    finished = subprocess.run(command, text=True, capture_output=True, timeout=600)
+    assert finished.returncode == 0, finished.stderr
+    return json.loads(finished.stdout.splitlines()[-1])
+
+
+@pytest.mark.timeout(300)
+def test_everything_is_inside(tmp_path):
+    with zipfile.ZipFile(build(tmp_path)) as wheel:
+        inside = set(wheel.namelist())
+    shipped = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*") if path.is_file()}
+    assert {f"optodrive/_shipped/{path}" for path in shipped} <= inside
+    own = {path.relative_to(ROOT).as_posix() for path in (ROOT / "optodrive").rglob("*") if path.is_file()}
+    assert {path for path in own if "__pycache__" not in path} <= inside  # modules, the page, py.typed
+    assert not [path for path in inside if path.startswith(("tests", "scripts", "firmware"))]
+
+
+@pytest.mark.slow  # its kernels are compiled anew, too
+@pytest.mark.timeout(300)
+def test_the_daemon_runs_from_the_wheel(tmp_path):
+    """Libraries are lent by this environment; the next test installs them too."""
+    assert made(tmp_path, "--quick")["display"] == "display-16"
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_an_empty_environment_gets_all_it_needs_from_the_index(tmp_path):
+    assert made(tmp_path)["planned"] == 1

@@ -1,0 +1,229 @@
+"""The doctor: each check on a small tree of files that stands for the system, or on the real thing."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from optodrive.cli import doctor_host as host
+from optodrive.cli.doctor_board import check_board
+from optodrive.cli.doctor_finding import ok
+from optodrive.cli.doctor_port import check_port
+from optodrive.cli.main import run
+from optodrive.clock import ManualClock, MonotonicClock
+from optodrive.config import BoardSection, load_config, shipped_path
+
+
+@pytest.fixture
+def tmp_path():
+    """A folder that nobody else closes: pytest's own are for its user alone."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+SERIAL = BoardSection(transport="serial", port="/dev/ttyACM0")
+
+
+@pytest.fixture
+def tree(tmp_path):
+    """A system with one board at /dev/ttyACM0 and nothing wrong but its name."""
+    for folder in ("dev/serial/by-id", "proc/77/fd", "sys/class/tty/ttyACM0/device", "run/udev/data"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "dev/ttyACM0").touch()
+    (tmp_path / "dev/serial/by-id/usb-board").symlink_to("../../ttyACM0")
+    (tmp_path / "proc/77/comm").write_text("bash\n")
+    (tmp_path / "sys/class/tty/ttyACM0/dev").write_text("166:0\n")
+    return tmp_path
+
+
+def of(findings, check):
+    (finding,) = [finding for finding in findings if finding.check == check]
+    return finding
+
+
+def port_findings(tree, board=SERIAL):
+    return check_port(board, tree)
+
+
+def test_a_port_in_order_may_be_asked_and_is_better_named_by_id(tree):
+    findings, free = port_findings(tree)
+    assert free
+    assert of(findings, "name").grade == "warning"
+    assert 'board.port = "/dev/serial/by-id/usb-board"' in of(findings, "name").remedy
+    assert {finding.grade for finding in findings if finding.check != "name"} == {"ok"}
+    by_id = BoardSection(transport="serial", port="/dev/serial/by-id/usb-board")
+    findings, free = port_findings(tree, by_id)
+    assert free
+    assert {finding.grade for finding in findings} == {"ok"}
+    shutil.rmtree(tree / "dev/serial")
+    assert "no by-id link" in of(port_findings(tree)[0], "name").remedy
+
+
+def test_a_port_that_is_not_there_names_those_that_are(tree):
+    (tree / "dev/ttyACM0").rename(tree / "dev/ttyACM1")
+    (finding,), free = port_findings(tree)
+    assert not free
+    assert finding.grade == "problem"
+    assert "/dev/ttyACM1" in finding.seen
+
+
+def test_a_held_port_is_left_alone_and_its_holder_named(tree):
+    (tree / "proc/77/fd/5").symlink_to("/dev/ttyACM0")
+    findings, free = port_findings(tree)
+    assert not free
+    assert of(findings, "holder").grade == "warning"
+    assert "bash, process 77" in of(findings, "holder").seen
+    (tree / "proc/77/comm").write_text("ModemManager\n")
+    assert of(port_findings(tree)[0], "holder").grade == "problem"
+
+
+def test_modem_manager_is_a_warning_unless_told_to_ignore_the_port(tree):
+    (tree / "proc/77/comm").write_text("ModemManager\n")
+    finding = of(port_findings(tree)[0], "modem manager")
+    assert finding.grade == "warning"
+    assert "ID_MM_DEVICE_IGNORE" in finding.remedy
+    (tree / "run/udev/data/c166:0").write_text("S:serial/by-id/usb-board\nE:ID_MM_DEVICE_IGNORE=1\n")
+    assert of(port_findings(tree)[0], "modem manager").grade == "ok"
+
+
+@pytest.mark.parametrize(("text", "grade"), [("16\n", "warning"), ("1\n", "ok"), ("?", "ok")])
+def test_the_latency_timer_of_an_ftdi_converter(tree, text, grade):
+    (tree / "sys/class/tty/ttyACM0/device/latency_timer").write_text(text)
+    assert of(port_findings(tree)[0], "latency").grade == grade
+
+
+def test_missing_permission_for_real(tree):
+    path = tree / "dev/ttyACM0"
+    path.chmod(0o000)
+    for parent in (tree, *list(tree.parents)[:2]):
+        parent.chmod(0o755)
+    was = os.geteuid()
+    if was == 0:
+        os.seteuid(65534)
+    try:
+        findings, free = port_findings(tree)
+    finally:
+        os.seteuid(was)
+    assert not free
+    assert of(findings, "permission").grade == "problem"
+    assert f"usermod -aG {path.group()}" in of(findings, "permission").remedy
+
+
+def test_a_pty_held_by_another_process_for_real(tmp_path):
+    master, slave = os.openpty()
+    board = BoardSection(transport="serial", port=os.ttyname(slave))
+    os.close(slave)
+    code = "import os, sys; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(flush=True); sys.stdin.read()"
+    assert check_port(board)[1]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, board.port], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        process.stdout.readline()
+        findings, free = check_port(board)
+        process.stdin.close()
+    assert not free
+    assert f"process {process.pid}" in of(findings, "holder").seen
+    os.close(master)
+
+
+class Sluggish(ManualClock):
+    """A clock whose naps take longer by so much."""
+
+    def __init__(self, late_s):
+        super().__init__()
+        self.late_s = late_s
+
+    def sleep(self, duration_s):
+        super().sleep(duration_s + self.late_s)
+
+
+@pytest.mark.parametrize(("late_s", "grade"), [(0.0, "ok"), (0.009, "ok"), (0.011, "warning"), (0.06, "problem")])
+def test_a_computer_that_wakes_late(late_s, grade):
+    finding = host.check_clock(Sluggish(late_s), lease_s=0.1)
+    assert finding.grade == grade
+    assert f"{late_s * 1e3:.2f} ms" in finding.seen
+
+
+@pytest.mark.parametrize(
+    ("governors", "grade"),
+    [((), "ok"), (("performance",) * 2, "ok"), (("performance", "powersave"), "warning"), (("schedutil",), "ok")],
+)
+def test_the_processor_s_governor(tmp_path, governors, grade):
+    for k, governor in enumerate(governors):
+        folder = tmp_path / f"sys/devices/system/cpu/cpu{k}/cpufreq"
+        folder.mkdir(parents=True)
+        (folder / "scaling_governor").write_text(governor + "\n")
+    assert host.check_governor(tmp_path).grade == grade
+
+
+@pytest.mark.parametrize(("free_bytes", "grade"), [(5e9, "ok"), (5e8, "warning"), (1e7, "problem")])
+def test_the_disk_s_room(free_bytes, grade):
+    assert host.check_room(Path("/var"), int(free_bytes)).grade == grade
+
+
+def test_packages_missing_or_too_old_are_named():
+    assert [finding.grade for finding in host.check_packages()] == ["ok"]
+    assert "not installed" in host.check_packages("no-such-package")[0].seen
+    assert host._complaint("no-such-package>=1") == "no-such-package is missing"
+    assert "older than 999" in host._complaint("numpy>=999")
+    assert host._complaint("numpy[dev] >=1.2") is None
+    assert host.check_python().grade == "ok"
+
+
+@pytest.mark.parametrize(
+    ("cached", "cold", "grade"), [(True, False, "ok"), (True, True, "warning"), (False, True, "warning")]
+)
+def test_the_compiled_kernels(monkeypatch, cached, cold, grade):
+    monkeypatch.setattr("optodrive.compiled.CACHED", cached)
+    monkeypatch.setattr("optodrive.compiled.cold", lambda: cold)
+    assert host.check_kernels().grade == grade
+
+
+# --- the board, and all of it ---------------------------------------------------------------------------------------
+
+
+def simulated(**changes):
+    config = load_config("display-16")
+    return config.model_copy(update={"board": config.board.model_copy(update=changes)})
+
+
+def test_the_simulated_board_is_greeted_and_not_armed():
+    findings = check_board(simulated(), MonotonicClock())
+    assert of(findings, "board").grade == "warning", "no uid is configured"
+    uid = of(findings, "board").remedy.split('"')[1]
+    assert "DISARMED" in of(findings, "board").seen
+    assert {of(findings, check).grade for check in ("limits", "inputs")} == {"ok"}
+    findings = check_board(simulated(uid=uid), MonotonicClock())
+    assert of(findings, "board").grade == "ok"
+
+
+def test_another_board_than_the_configured_one_is_a_problem():
+    (finding,) = check_board(simulated(uid="ff" * 12), MonotonicClock())
+    assert finding.grade == "problem"
+    assert "board.uid" in finding.seen
+
+
+def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, monkeypatch):
+    # Whether this computer wakes in time is not what is tested here.
+    monkeypatch.setattr(host, "check_clock", lambda clock, lease_s: ok("clock", "left out"))
+    assert run(["doctor", "--config", "display-16", "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document["ok"]
+    assert document["problems"] == 0
+    assert {finding["grade"] for finding in document["findings"]} <= {"ok", "warning"}
+    text = shipped_path("display-16.toml").read_text()
+    path = tmp_path / "config.toml"
+    path.write_text(text.replace('transport = "simulated"', f'transport = "serial"\nport = "{tmp_path}/tty"'))
+    assert run(["doctor", "--config", str(path)]) == 1
+    out = capsys.readouterr().out
+    assert f"PROBLEM  port           {tmp_path}/tty does not exist" in out
+    assert "1 problems" in out
+    path.write_text("format = 3")
+    assert run(["doctor", "--config", str(path)]) == 1
+    assert "PROBLEM  configuration" in capsys.readouterr().out

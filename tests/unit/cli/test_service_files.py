@@ -1,0 +1,159 @@
+import json
+
+import pytest
+
+from optodrive.cli.main import run
+from optodrive.cli.service_files import CONFIG, INSTALLED, RULES, UNIT, USERS
+from optodrive.config import load_config, shipped_path
+
+PROGRAM = "/opt/optodrive/bin/optodrive"
+USB = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'
+
+
+@pytest.fixture
+def install(tmp_path, capsys):
+    def go(*arguments, command="install", status=0):
+        program = ["--program", PROGRAM] if command == "install" and "--program" not in arguments else []
+        assert run(["service", command, "--root", str(tmp_path / "root"), *program, *map(str, arguments)]) == status
+        return capsys.readouterr()
+
+    return go
+
+
+@pytest.fixture
+def at(tmp_path):
+    return lambda path: tmp_path / "root" / path.relative_to("/")
+
+
+def board_config(folder, board):
+    text = shipped_path("display-437.toml").read_text()
+    path = folder / "mine.toml"
+    path.write_text(text.replace('transport = "simulated"', board))
+    return path
+
+
+def test_what_is_written_is_in_order(install, at):
+    said = install().out
+    assert all(at(path).is_file() for path in (UNIT, USERS, CONFIG, INSTALLED))
+    assert f"ExecStart={PROGRAM} serve --config {CONFIG}\n" in at(UNIT).read_text()
+    assert "@" not in at(UNIT).read_text().replace("~@", "").replace("=@", "").replace(" @", "")
+    daemon = load_config(at(CONFIG)).daemon
+    assert (daemon.socket, daemon.tokens, daemon.audit) == (
+        "/run/optodrive/optodrive.sock",
+        "/var/lib/optodrive/tokens.toml",
+        "/var/lib/optodrive/audit.jsonl",
+    )
+    assert daemon.host == "127.0.0.1"
+    assert "enable --now" in said
+    assert "arms nothing" in said
+
+
+def test_once_more_changes_nothing(install, at):
+    install()
+    before = {path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT, USERS, CONFIG)}
+    assert install().out.count("there already") == 3
+    assert before == {path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT, USERS, CONFIG)}
+
+
+def test_an_edited_unit_is_not_overwritten_and_nothing_else_is(install, at):
+    install()
+    at(UNIT).write_text("[Service]\nNice=0\n")
+    at(USERS).unlink()
+    said = install("--program", "/opt/other/optodrive", status=1).err
+    assert said.count("\n") == 1
+    assert str(at(UNIT)) in said
+    assert at(UNIT).read_text() == "[Service]\nNice=0\n"
+    assert not at(USERS).exists()
+
+
+def test_a_file_that_somebody_else_put_there_is_not_overwritten(install, at):
+    at(USERS).parent.mkdir(parents=True)
+    at(USERS).write_text("u other\n")
+    install(status=1)
+    assert at(USERS).read_text() == "u other\n"
+    assert not at(UNIT).exists()
+
+
+def test_an_upgrade_replaces_what_was_not_edited_and_keeps_the_configuration(install, at, tmp_path):
+    install("--config", "display-16")
+    assert install("--program", "/opt/new/optodrive").out.count("replaced") == 1
+    assert "/opt/new/optodrive" in at(UNIT).read_text()
+    assert load_config(at(CONFIG)).name == "display-16"
+    at(CONFIG).write_text(at(CONFIG).read_text().replace("ambient_c = 20.0", "ambient_c = 25.0"))
+    said = install("--program", "/opt/newer/optodrive").out
+    assert f"{CONFIG}: edited, left as it is" in said
+    assert load_config(at(CONFIG)).ambient_c == 25.0
+
+
+def test_remove_leaves_what_was_edited(install, at):
+    install()
+    at(CONFIG).write_text(at(CONFIG).read_text() + "# mine\n")
+    said = install(command="remove").out
+    assert f"{CONFIG}: edited, left as it is" in said
+    assert not at(UNIT).exists()
+    assert at(CONFIG).exists()
+    at(CONFIG).unlink()
+    install(command="remove")
+    assert not at(INSTALLED).exists()
+    assert install(command="remove").out == "nothing is installed\n"
+
+
+def test_show(install, at):
+    assert install(command="show").out == "nothing is installed\n"
+    install()
+    at(UNIT).write_text("")
+    at(USERS).unlink()
+    shown = json.loads(install("--json", command="show").out)["files"]
+    assert {item["path"]: item["standing"] for item in shown} == {
+        str(UNIT): "edited",
+        str(USERS): "missing",
+        str(CONFIG): "as installed",
+    }
+
+
+def test_rules_name_the_board(install, at, tmp_path):
+    install("--config", board_config(tmp_path, USB + 'serial_number = "E6-1"\n'))
+    lines = [line for line in at(RULES).read_text().splitlines() if "idVendor" in line]
+    assert len(lines) == 2
+    for line in lines:
+        for part in (
+            'ATTRS{idVendor}=="2e8a"',
+            'ATTRS{idProduct}=="000a"',
+            'ATTRS{serial}=="E6-1"',
+            'ENV{ID_MM_DEVICE_IGNORE}="1"',
+            'GROUP="dialout"',
+            'MODE="0660"',
+        ):
+            assert part in line
+    assert 'SYMLINK+="optodrive-board"' in lines[0]
+
+
+@pytest.mark.parametrize("serial", ['x", RUN+="/bin/sh', "a b", "ü", "a$b"])
+def test_a_serial_number_that_is_more_than_one_is_refused(install, at, tmp_path, serial):
+    quoted = json.dumps(serial, ensure_ascii=False)
+    said = install("--config", board_config(tmp_path, f"{USB}serial_number = {quoted}\n"), status=2).err
+    assert "board.serial_number" in said
+    assert not at(UNIT).exists()
+
+
+@pytest.mark.parametrize("program", ["/home/anna/.venv/bin/optodrive", "/root/x/optodrive", "/tmp/optodrive"])
+def test_a_program_that_the_service_cannot_see_is_refused(install, program):
+    assert "--program" in install("--program", program, status=1).err
+
+
+@pytest.mark.parametrize("program", ["optodrive", "/opt/a b/optodrive", "/opt/%h/optodrive", "/opt/x\nUser=root"])
+def test_a_program_that_is_more_than_a_path_is_refused(install, program):
+    assert install("--program", program, status=2).err.count("\n") == 1
+
+
+def test_only_a_board_on_usb_gets_usb_devices(install, at, tmp_path):
+    install()
+    assert "usb_device" not in at(UNIT).read_text()
+    install("--config", board_config(tmp_path, USB.replace('"serial"', '"usb"')))
+    assert "DeviceAllow=char-usb_device rw\n" in at(UNIT).read_text()
+
+
+def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
+    (tmp_path / "root").write_text("a file")
+    said = install(status=2).err
+    assert said.count("\n") == 1

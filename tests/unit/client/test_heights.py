@@ -1,0 +1,74 @@
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from displays import DISPLAYS
+from optodrive.client.heights import by_pixel, layout_of, to_bytes, to_json
+from optodrive.client.picture import colour, png
+from optodrive.daemon.resolved import resolved_config
+from optodrive.errors import InputError
+from optodrive.frames.live import parse_live_frame
+
+LAYOUT = DISPLAYS["display-437"].layout
+
+
+def test_the_layout_comes_out_of_the_daemons_configuration(any_display):
+    layout = layout_of(resolved_config(any_display))
+    for name in ("x_m", "y_m", "row", "column"):
+        np.testing.assert_array_equal(getattr(layout, name), getattr(any_display.layout, name))
+
+
+def test_a_pixel_an_array_and_a_picture_ask_for_the_same():
+    by_place = np.full((21, 21), np.nan)
+    by_place[LAYOUT.row[17], LAYOUT.column[17]] = 120.0
+    by_index = np.zeros(437)
+    by_index[17] = 120.0
+    for given_um in ({17: 120.0}, by_index, by_index.tolist(), by_place):
+        np.testing.assert_array_equal(by_pixel(given_um, LAYOUT), by_index)
+    assert to_json(by_index) == {"17": 120.0}
+
+
+@pytest.mark.parametrize(
+    ("heights_um", "where"),
+    [
+        ({437: 1.0}, "heights_um"),
+        ({"17": 1.0}, "heights_um"),
+        ({17: "high"}, "heights_um"),
+        ({17: -1.0}, r"heights_um\[17\]"),
+        ({17: float("inf")}, r"heights_um\[17\]"),
+        (np.zeros(436), "heights_um"),
+        (np.zeros((21, 20)), "heights_um"),
+        ("tall", "heights_um"),
+        ([[1.0], [2.0, 3.0]], "heights_um"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(heights_um, where):
+    with pytest.raises(InputError, match=where) as refused:
+        by_pixel(heights_um, LAYOUT)
+    assert "\n" not in str(refused.value)
+
+
+@given(st.integers(0, 2**33), st.lists(st.floats(0, 6553.5), min_size=437, max_size=437))
+def test_the_daemon_reads_a_streams_bytes_back(number, heights_um):
+    read, sequence = parse_live_frame(to_bytes(number, np.array(heights_um)), 0, 437)
+    assert read == number % 2**32
+    np.testing.assert_allclose(1e6 * sequence.frames[0].target_m, heights_um, atol=0.0501)
+
+
+def test_a_height_beyond_a_streams_bits_is_refused():
+    with pytest.raises(InputError, match=r"6553\.5"):
+        to_bytes(0, by_pixel({3: 6553.6}, LAYOUT))
+
+
+def test_the_picture_has_its_size_and_its_colours_only_grow_lighter(any_display):
+    layout = any_display.layout
+    written = png(layout, np.linspace(0.0, 50.0, len(layout)))
+    width, height = struct.unpack(">II", written[16:24])
+    assert 200 < width <= 700
+    assert 40 < height <= 720
+    lightness = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in (colour(k / 50) for k in range(51))]
+    assert lightness == sorted(lightness)
+    assert png(layout, np.zeros(len(layout)))[:4] == b"\x89PNG"

@@ -1,0 +1,85 @@
+import logging
+import os
+import socket
+from contextlib import closing
+
+import pytest
+
+from optodrive.daemon import log as log_module
+from optodrive.daemon.log import Log, daemon_log, entry
+
+
+def fields(data):
+    """Read an entry of the journal's native form."""
+    found = {}
+    while data:
+        name, _, rest = data.partition(b"\n")
+        if b"=" in name:
+            key, _, value = name.partition(b"=")
+            data = rest
+        else:
+            key, size = name, int.from_bytes(rest[:8], "little")
+            value, data = rest[8 : 8 + size], rest[9 + size :]
+        found[key.decode()] = value.decode()
+    return found
+
+
+@pytest.fixture
+def journal(tmp_path):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listener:
+        listener.bind(str(tmp_path / "journal"))
+        listener.setblocking(False)
+        yield listener
+
+
+def test_an_entry_has_its_fields():
+    made = fields(entry("dark", "err", {"EVENT": "fault"}))
+    assert made == {"MESSAGE": "dark", "PRIORITY": "3", "SYSLOG_IDENTIFIER": "optodrive", "OPTODRIVE_EVENT": "fault"}
+
+
+def test_a_value_cannot_forge_another_field():
+    made = fields(entry("a\nPRIORITY=0\nMESSAGE=b", "info", {}))
+    assert made["MESSAGE"] == "a\nPRIORITY=0\nMESSAGE=b"
+    assert made["PRIORITY"] == "6"
+
+
+def test_lines_go_to_the_journal(journal, tmp_path, capsys):
+    with closing(Log(tmp_path / "journal")) as log:
+        log.warn("the link went")
+    assert fields(journal.recv(9000))["MESSAGE"] == "the link went"
+    assert capsys.readouterr().err == ""
+
+
+def test_a_journal_that_is_gone_or_stands_still_holds_nothing_up(journal, tmp_path):
+    for path in (tmp_path / "journal", tmp_path / "nowhere"):
+        with closing(Log(path)) as log:
+            for _ in range(5000):
+                log.warn("x" * 1000)
+
+
+def test_the_journal_is_used_only_where_stderr_is_its_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(log_module, "JOURNAL", tmp_path)
+    there = os.fstat(2)
+    for stream, expected in (
+        ("", None),
+        ("nonsense", None),
+        (f"{there.st_dev}:{there.st_ino + 1}", None),
+        (f"{there.st_dev}:{there.st_ino}", str(tmp_path)),
+    ):
+        monkeypatch.setenv("JOURNAL_STREAM", stream)
+        with closing(daemon_log()) as log:
+            assert log._journal == expected
+
+
+def test_what_libraries_log_is_said(capsys):
+    root = logging.getLogger()
+    before = list(root.handlers)
+    log = Log()
+    log.take_logging()
+    try:
+        logging.getLogger("uvicorn.error").error("no good")
+        logging.getLogger("uvicorn.error").info("nothing")
+    finally:
+        root.handlers[:] = before
+        log.close()
+    assert capsys.readouterr().err == "optodrive: no good\n"
