@@ -319,12 +319,14 @@ def main(arguments: list[str] | None = None, make_core: MakeCore = BoardCore, ac
     except OSError as error:
         print(f"optodrive.simulator.board: --log {options.log}: {error.strerror}", file=sys.stderr)
         return 2
-    if make_core is BoardCore:
+    simulated = make_core is BoardCore
+    if simulated:
         make_core = partial(BoardCore, seed=options.seed, steer=bench.mirrors.go if bench else None)
     board = PtyBoard(
         options.pty, log, settings, script, options.baud, options.exit_when_closed, make_core, actions, bench
     )
-    claim_processor()  # a real board waits for none
+    if simulated:
+        claim_processor()  # a real board waits for none; before an emulator's, it would starve what it serves
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     board.run()

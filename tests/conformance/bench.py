@@ -57,7 +57,7 @@ TOO_FAST = "its witness leaves the emulator byte by byte, some 2 ms a pulse: too
 BOARD_KINDS = [
     BoardKind("python", SIMULATED, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
     BoardKind("host", port="host"),
-    BoardKind("qemu", port="mps2-an385", spared={UNDER_FIRE: TOO_FAST}, at_once=6),
+    BoardKind("qemu", port="mps2-an385", spared={UNDER_FIRE: TOO_FAST}, at_once=4),
 ]
 """One line for each implementation."""
 
@@ -67,6 +67,7 @@ class BoardProcess:
 
     def __init__(self, kind, folder, limits, script):
         self.port, self.late_us = folder / "tty", kind.late_us
+        self._script = script
         self._log = folder / "log"
         self._events, self._read = [], 0
         arguments = ["--pty", self.port, "--log", self._log]
@@ -105,6 +106,11 @@ class BoardProcess:
         """Whether the gate is on."""
         edges = self.of("gate")
         return bool(edges) and edges[-1]["on"]
+
+    def kept(self):
+        """Whether its log says that this machine was too busy: a late tick nobody ordered, a HOLD of a whole second."""
+        ticked_late = "TICK" in [entry["fault"] for entry in self.of("fault")] and "late_tick" not in self._script
+        return ticked_late or ("DISARMED", "hold too long") in self.states()
 
     def end(self):
         """Stop it."""
@@ -294,6 +300,10 @@ class Bench:
     def ready(self, script="", **limits):
         """A host that has armed a new board."""
         return self.greeted(script, **limits).arm()
+
+    def kept(self):
+        """Whether a board of it was kept from the processor, or from its host, too long to be judged."""
+        return any(board.kept() for board in self._boards)
 
     def finish(self, audit):
         """Close everything; audit gets each board's whole log."""
