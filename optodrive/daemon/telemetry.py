@@ -21,7 +21,7 @@ from optodrive.clock import Clock, MonotonicClock
 from optodrive.daemon.engine import Engine
 from optodrive.daemon.live_heat import Executed, LiveHeat
 from optodrive.daemon.plans import PlanRecord
-from optodrive.daemon.runs import ClockMoved
+from optodrive.daemon.runs import ClockMoved, joined
 from optodrive.errors import NotReadyError
 from optodrive.flow import FloatArray, IntArray
 from optodrive.limit.usage import Usage
@@ -166,7 +166,7 @@ class Telemetry:
         self._latest[kind] = number, f"event: {kind}\ndata: {json.dumps(data, separators=(',', ':'))}\n\n"
 
     def _take_executed(self) -> None:
-        for told in self._engine.take_told():
+        for told in joined(self._engine.take_told()):
             if isinstance(told, ClockMoved):
                 self._live.clock_moved(told.delay_s)
                 continue
