@@ -302,6 +302,7 @@ def test_hidden_windows_leave_their_connection_to_others(visit, daemon):
     expect(page.locator("#stopping")).to_be_hidden()
 
 
+@pytest.mark.slow
 def test_frames_come_while_something_plays_on_1511_pixels(visit, make_board, make_daemon):
     daemon = make_daemon(make_board(), name="display-1511")
     window = visit(daemon)

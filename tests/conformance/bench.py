@@ -55,9 +55,9 @@ ABOUT_ITSELF = "the simulated board does B1 to B13: it has no tick, readback or 
 UNDER_FIRE = "link under fire"
 TOO_FAST = "its witness leaves the emulator byte by byte, some 2 ms a pulse: too slow for a point every 1.2 ms"
 BOARD_KINDS = [
-    BoardKind("python", SIMULATED, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
+    BoardKind("python", SIMULATED, at_once=8, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
     BoardKind("host", port="host"),
-    BoardKind("qemu", port="mps2-an385", spared={UNDER_FIRE: TOO_FAST}, at_once=4),
+    BoardKind("qemu", port="mps2-an385", spared={UNDER_FIRE: TOO_FAST}, at_once=6),
 ]
 """One line for each implementation."""
 

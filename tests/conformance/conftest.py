@@ -12,12 +12,13 @@ from scenario import run_all  # noqa: E402
 
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory):
-    """A kind with its program built, of a mutant where one is named; each once."""
+    """A kind with its program built, of a mutant where one is named; each once, whichever thread asks."""
+    boards = tmp_path_factory.mktemp("boards")
 
     @cache
     def build(name, mutant):
         (kind,) = [kind for kind in BOARD_KINDS if kind.name == name]
-        return kind.ready(tmp_path_factory.mktemp(name), mutant)
+        return kind.ready(boards / f"{name}-{mutant}", mutant)
 
     return build
 

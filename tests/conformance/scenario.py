@@ -39,7 +39,7 @@ def scenario(subject, cases=None):
     return register
 
 
-def judge(kind: BoardKind, case: Scenario):
+def judge(kind: BoardKind, case: Scenario, excused=Bench.kept):
     """Play it against a board of a kind; AssertionError where the board does not conform.
 
     Played again where this machine was too busy to tell: a fault of the board fails every time.
@@ -50,7 +50,7 @@ def judge(kind: BoardKind, case: Scenario):
             try:
                 case.play(bench)
             except (TooLateError, AssertionError) as error:
-                again = isinstance(error, TooLateError) or bench.kept()
+                again = isinstance(error, TooLateError) or excused(bench)
                 bench.finish(audit if again else unseen)
                 if not again or attempt == ATTEMPTS - 1:
                     raise

@@ -219,7 +219,9 @@ def test_the_session_works_over_the_real_port(board):
 # --- scripts, limits, exits -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("name", "unsafe"), [("interlock", "false"), ("estop", "true")])
+@pytest.mark.parametrize(
+    ("name", "unsafe"), [("interlock", "false"), pytest.param("estop", "true", marks=pytest.mark.slow)]
+)
 def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host, name, unsafe):
     # A long lease: this test's own loop may be scheduled late, and only the input is to end the job.
     script = f'[[step]]\nat_s = 5.0\nset = "{name}"\nvalue = {unsafe}\n'

@@ -318,7 +318,8 @@ def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board,
         full((audit.stat().st_size, before[1]))
         # What runs goes on, and STOP ends it.
         assert daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["status"] == "running"
-        assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
+        stopped = daemon.call("POST", "/v1/stop")["board"]
+        assert stopped["state"] == "DISARMED", (stopped, board.events()[-6:])
         assert board.of("gate")[-1]["on"] is False
         refused = daemon.call("POST", "/v1/arm", status=409)
         assert refused["code"] == "not_audited"

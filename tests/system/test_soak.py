@@ -22,7 +22,7 @@ def test_few_pulses_all_arrive():
     assert set(failed) <= {"the board ran out of points"}
 
 
-@pytest.mark.parametrize("missing", [0, 1, 7])
+@pytest.mark.parametrize("missing", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 7))])
 def test_the_witness_notices_a_pulse_that_is_missing(tmp_path, missing):
     log = tmp_path / "log"
     pulse = '{{"t_us": 0, "event": "pulse", "index": {0}, "x": 0, "y": 0, "duty": 1, "on_us": 0, "off_us": {1}}}\n'
