@@ -13,6 +13,7 @@ from firmware_ports import build_board
 from rig import SIMULATED
 
 PATIENCE_S = 15.0
+START_S = 60.0
 CENTRE = 32768
 WINDOW = 8
 WITH_THE_END = 65_535
@@ -77,7 +78,13 @@ class BoardProcess:
                 path.write_text(text)
                 arguments += [option, path]
         self.process = subprocess.Popen([*kind.command, *arguments])
-        wait_for(self.port.exists, "the board's port")
+        try:
+            wait_for(lambda: self.port.exists() or self.process.poll() is not None, "the board's port", START_S)
+            assert self.process.poll() is None, f"the board ended by itself: {self.process.returncode}"
+        except BaseException:
+            self.process.kill()
+            self.process.wait()
+            raise
 
     def events(self):
         """The log so far."""

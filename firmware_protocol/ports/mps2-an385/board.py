@@ -34,6 +34,8 @@ FIRMWARE = 0x0001_0000
 LOOK_US = 1_000
 """The sockets are looked at so often."""
 PATIENCE_S = 5.0
+START_S = 40.0
+"""An emulator that is read from a disk for the first time, beside others, may take so long to open its sockets."""
 FAILURES = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}
 KINDS = ("gate", "state", "fault", "pulse", "rx_error")
 
@@ -82,7 +84,7 @@ class QemuCore:
         self._until(lambda: self._states > 0)
 
     def _connected(self, port: Path) -> socket.socket:
-        give_up_s = time.monotonic() + PATIENCE_S
+        give_up_s = time.monotonic() + START_S
         while True:
             link = socket.socket(socket.AF_UNIX)
             try:
