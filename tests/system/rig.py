@@ -19,6 +19,7 @@ from optodrive.config import shipped_path
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
+START_S = 60.0
 PATIENT_LEASE_S = 1.0
 """Of what is not about the lease: the longest there is, for a busy machine may keep a host waiting for 0.1 s."""
 ENDED = ("done", "superseded", "failed", "cancelled")
@@ -73,7 +74,7 @@ class Board:
             preexec_fn=disk_bytes and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (disk_bytes, disk_bytes)),
         )
         self._forgotten = 0
-        wait_for(self.port.exists, "the board's port")
+        wait_for(self.port.exists, "the board's port", START_S)
 
     def events(self):
         if not self.log.exists():
