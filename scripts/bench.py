@@ -18,18 +18,18 @@ from rich.table import Table
 from scipy.integrate import solve_ivp
 from scipy.sparse import csr_array
 
-from optodrive.board.requirements import Requirements
-from optodrive.config import load_config
-from optodrive.flow import FrameSequence, TactileFrame
-from optodrive.limit.limiter import limit, shifted, verify
-from optodrive.neighbours import Neighbours
-from optodrive.physics.array import DisplayHeat
-from optodrive.physics.lattice import LatticeHeat, Modes, Walls, conductances_w_per_k
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config import load_config
+from optodrive.device.neighbours import Neighbours
+from optodrive.link.protocol.quantisation import decode, quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.simulator.virtual_run import execute
+from optodrive.physics.nominal_display import DisplayHeat
 from optodrive.physics.parameters import load_parameters
-from optodrive.pipeline import Display, prepare
-from optodrive.plan.scheduler import Scheduler
-from optodrive.simulator.run import execute
-from optodrive.wire.quantise import decode, quantise
+from optodrive.physics.wall_coupling import LatticeHeat, Modes, Walls, conductances_w_per_k
+from optodrive.planning.limiter.limiter import limit, shifted, verify
+from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.scheduler.scheduler import Scheduler
 
 RUNS = 7
 
@@ -276,9 +276,9 @@ def bench_display():
     """A recording of 100 pixels, 15 runs each, diagnosed pixel by pixel on two worker processes. One run."""
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
     from display_lab import display_lab
-    from optodrive.analysis.display import PixelTask, diagnose_pixel, warm
-    from optodrive.analysis.workers import crew, done
-    from optodrive.recording import DisplayRuns, write_recording
+    from optodrive.lab.diagnosis.dask_workers import crew, done
+    from optodrive.lab.diagnosis.display_diagnosis import PixelTask, diagnose_pixel, warm
+    from optodrive.lab.recording import DisplayRuns, write_recording
 
     hidden = {pixel: HIDDEN[pixel % 10] if pixel % 10 < len(HIDDEN) else {} for pixel in range(DISPLAY_PIXELS)}
     with tempfile.TemporaryDirectory() as folder:

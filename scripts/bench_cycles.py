@@ -13,12 +13,12 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optodrive.config import load_config
-from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.pipeline import Display, prepare
-from optodrive.plan import scheduler
-from optodrive.plan.cycles import at_target, with_room
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
+from optodrive.device.config import load_config
+from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.scheduler import scheduler
+from optodrive.planning.scheduler.periodic_pulses import at_target, with_room
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from pixel_ode import height_um

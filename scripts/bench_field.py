@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.calibration.columns import write_columns
-from optodrive.calibration.field_file import write_field
-from optodrive.calibration.fit import fit_field
-from optodrive.calibration.prior import Prior
-from optodrive.calibration.spots import Spots
-from optodrive.config import load_config, pixel_layout
-from optodrive.simulator.truth import CENTRE_CODE, Truth
+from optodrive.core.numeric_tables import write_columns
+from optodrive.device.config import load_config, pixel_layout
+from optodrive.lab.calibration.field_fit import fit_field
+from optodrive.lab.calibration.field_prior import Prior
+from optodrive.lab.calibration.field_writer import write_field
+from optodrive.lab.calibration.spots import Spots
+from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
 
 GEOMETRIES, POINTS, RUNS = 10, 1_000_000, 7
 NOISE_M, FALSE = 10e-6, 0.02

@@ -11,11 +11,11 @@ import time
 import elkai
 import numpy as np
 
-from optodrive.config import load_config
-from optodrive.flow import FrameSequence, TactileFrame
-from optodrive.frames.patterns import build_pattern
-from optodrive.pipeline import Display, prepare
-from optodrive.plan.order import visiting_order
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config import load_config
+from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.scheduler.visiting_path import visiting_order
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 NAIVE_SETTLE_S = 4e-4
 LKH_RUNS = 10

@@ -18,9 +18,9 @@ def look_rows():
     """Wall time of one look at heat and of one at the budget, half of the display lit."""
     import numpy as np
 
-    from optodrive.config import load_config
-    from optodrive.daemon.live_heat import Executed, LiveHeat
-    from optodrive.pipeline import Display, warm_up
+    from optodrive.daemon.engine.display_snapshot import Executed, LiveHeat
+    from optodrive.device.config import load_config
+    from optodrive.planning.pipeline import Display, warm_up
 
     display = Display.of(load_config("display-1511"))
     warm_up(display)

@@ -20,13 +20,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optodrive.board.requirements import Requirements
-from optodrive.board.session import Session
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.errors import OptodriveError
-from optodrive.transport.serial_port import SerialPort
-from optodrive.wire.quantise import CENTRE_CODE, WirePoints
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.errors import OptodriveError
+from optodrive.device.config import load_config
+from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.transport.serial_port import SerialPort
 
 HOST_PORT = Path(__file__).parents[1] / "firmware_protocol" / "ports" / "host"
 BAUD = 4_000_000

@@ -52,12 +52,12 @@ def random_frame(rng):
 
 def planning_rows():
     """CPU time of everything between a frame and its proven bytes: plan, limit, predict, quantise, decode, verify."""
-    from optodrive.board.requirements import Requirements
-    from optodrive.config import load_config
-    from optodrive.flow import FrameSequence, TactileFrame
-    from optodrive.limit.limiter import verify
-    from optodrive.pipeline import Display, prepare
-    from optodrive.wire.quantise import decode, quantise
+    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+    from optodrive.device.config import load_config
+    from optodrive.link.protocol.quantisation import decode, quantise
+    from optodrive.link.session.board_requirements import Requirements
+    from optodrive.planning.limiter.limiter import verify
+    from optodrive.planning.pipeline import Display, prepare
 
     display = Display.of(load_config("display-1511"))
     scale = Requirements.of(display.config).scale
@@ -136,12 +136,12 @@ def pushed(url):
 
 def a_minute():
     """Full frames that ripple over the display, as fast as 16 a second, without other callers; from rest to the end."""
-    from optodrive.clock import MonotonicClock
-    from optodrive.config import load_config
-    from optodrive.daemon.engine import Engine
-    from optodrive.flow import FrameSequence, TactileFrame
-    from optodrive.pipeline import Display
-    from optodrive.transport.simulated import SimulatedBoard
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+    from optodrive.daemon.engine.engine import Engine
+    from optodrive.device.config import load_config
+    from optodrive.link.transport.simulated import SimulatedBoard
+    from optodrive.planning.pipeline import Display
 
     display = Display.of(load_config("display-1511"))
     board = SimulatedBoard("", 1_000_000)

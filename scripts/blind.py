@@ -61,10 +61,10 @@ def thin(path: Path, seed: int) -> None:
 
 def answered(path: Path) -> dict[str, Any]:
     """The answer as the command line gives it."""
-    from optodrive.analysis.prior import prior_of
-    from optodrive.analysis.story import answer
-    from optodrive.analysis.study import diagnose
-    from optodrive.recording import read_recording
+    from optodrive.lab.diagnosis.diagnose import diagnose
+    from optodrive.lab.diagnosis.narrative import answer
+    from optodrive.lab.diagnosis.priors import prior_of
+    from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)
     prior, epsilon, _ = prior_of(measurement, None)

@@ -11,8 +11,8 @@ import sys
 import numpy as np
 from scipy.optimize import least_squares
 
-from optodrive.physics.extended import outcomes
-from optodrive.physics.facts import paper_facts
+from optodrive.lab.validation.extended_outcomes import outcomes
+from optodrive.physics.paper_facts import paper_facts
 from optodrive.physics.parameters import Parameter, load_parameters
 
 HALVES = {

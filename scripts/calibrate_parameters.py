@@ -7,9 +7,9 @@ from statistics import stdev
 
 from scipy.optimize import brentq
 
-from optodrive.config import shipped_path
-from optodrive.physics.facts import paper_facts
-from optodrive.physics.paper import FITTED_ON, OUTCOMES
+from optodrive.device.config import shipped_path
+from optodrive.lab.validation.paper_outcomes import FITTED_ON, OUTCOMES
+from optodrive.physics.paper_facts import paper_facts
 from optodrive.physics.parameters import Parameter, ParameterSet, load_parameters
 
 BRACKETS = {"kappa": (1e-7, 1e-4), "tau_g": (2e-4, 5e-2), "phi": (1e-6, 1e-1)}

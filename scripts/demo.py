@@ -11,9 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from optodrive.daemon.token import token_path
-from optodrive.errors import LinkError, OptodriveError, RefusedError
-from optodrive.remote import Remote
+from optodrive.client.http import Remote
+from optodrive.core.errors import LinkError, OptodriveError, RefusedError
+from optodrive.daemon.web.tokens import token_path
 
 PROGRAMME = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
 START_TIMEOUT_S = 30.0

@@ -49,12 +49,12 @@ class Rig:
     """Board and daemon, both processes of their own."""
 
     def __init__(self, folder, config):
-        from optodrive.config import shipped_path
+        from optodrive.device.config import shipped_path
 
         self.log = folder / "board.jsonl"
         port = folder / "tty"
         self.board = subprocess.Popen(
-            [sys.executable, "-m", "optodrive.simulator.board", "--pty", port, "--log", self.log]
+            [sys.executable, "-m", "optodrive.link.simulator.board_process", "--pty", port, "--log", self.log]
         )
         while not port.exists():
             time.sleep(0.01)

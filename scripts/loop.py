@@ -28,7 +28,7 @@ def main() -> None:
     from blind_causes import CATALOGUE
     from blind_lab import draw
     from blind_loop import close_loop
-    from optodrive.errors import InputError
+    from optodrive.core.errors import InputError
 
     rows = []
     for number, cause in enumerate(options.causes or CATALOGUE):

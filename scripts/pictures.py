@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from optodrive.config import load_config
-from optodrive.frames.patterns import build_pattern
-from optodrive.pipeline import Display, prepare
-from optodrive.simulator.run import execute
-from optodrive.simulator.traces import trace
+from optodrive.device.config import load_config
+from optodrive.link.simulator.traces import trace
+from optodrive.link.simulator.virtual_run import execute
+from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"
 SCALE = 22

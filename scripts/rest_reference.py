@@ -1,11 +1,11 @@
 """The REST reference, from the application's own OpenAPI: `python scripts/rest_reference.py` prints it."""
 
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.daemon.api import make_app
-from optodrive.daemon.engine import Engine
-from optodrive.pipeline import Display
-from optodrive.transport.registry import transport_maker
+from optodrive.core.clock import MonotonicClock
+from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.web.api import make_app
+from optodrive.device.config import load_config
+from optodrive.link.transport.registry import transport_maker
+from optodrive.planning.pipeline import Display
 
 HEAD = """# REST
 

@@ -3,12 +3,12 @@
 import argparse
 from pathlib import Path
 
-from optodrive.analysis.paper import story
-from optodrive.analysis.paper.data import LEFT_OUT
-from optodrive.analysis.paper.study import study
-from optodrive.cli.validate import HEADINGS, cells, validate_table
-from optodrive.physics.facts import paper_facts
-from optodrive.physics.paper import SILENT
+from optodrive.cli.validation_table import HEADINGS, cells, validate_table
+from optodrive.lab.validation import narrative
+from optodrive.lab.validation.measured_facts import LEFT_OUT
+from optodrive.lab.validation.paper_outcomes import SILENT
+from optodrive.lab.validation.study import study
+from optodrive.physics.paper_facts import paper_facts
 from optodrive.physics.parameters import load_parameters
 
 INTRODUCTION = """\
@@ -51,7 +51,8 @@ DIAGNOSED = """\
 ## What `optodrive validate --diagnose` makes of it
 
 It takes the twelve measured outcomes for a recording and the literal set for the model, chooses among the causes of
-`optodrive/analysis/paper/causes.py`, and redoes choice and fit without each group of facts to predict that group. It
+`optodrive/lab/validation/candidate_causes.py`, and redoes choice and fit without each group of facts to predict that
+group. It
 prints:
 """
 
@@ -122,12 +123,12 @@ def document():
 def diagnosed():
     """The story of the paper's facts, with its table."""
     found = study(paper_facts(), load_parameters("paper_s1_literal"))
-    lines = [story.HEADINGS, ("---",) * len(story.HEADINGS), *story.rows(found)]
+    lines = [narrative.HEADINGS, ("---",) * len(narrative.HEADINGS), *narrative.rows(found)]
     parts = [
         DIAGNOSED,
-        quoted(story.before_table(found)),
+        quoted(narrative.before_table(found)),
         "".join("| " + " | ".join(line) + " |\n" for line in lines),
-        quoted([*story.after_table(found), "", *story.assumptions(found)]),
+        quoted([*narrative.after_table(found), "", *narrative.assumptions(found)]),
         DISCUSSED,
         bullets(LEFT_OUT.items()),
         KEYS,

@@ -50,7 +50,9 @@ def tried(optodrive, outside):
     place = Path(told("-c", "import optodrive; print(optodrive.__file__)").strip())
     if optodrive.parent.parent not in place.parents:
         raise SystemExit(f"scripts/wheel: {place} was tried, which is not the wheel")
-    names = json.loads(told("-c", "import json; from optodrive.config import *; print(json.dumps(shipped_configs()))"))
+    names = json.loads(
+        told("-c", "import json; from optodrive.device.config import *; print(json.dumps(shipped_configs()))")
+    )
     for name in names:
         told("-m", "optodrive.cli.main", "config", "check", "--config", name)
     daemon = subprocess.Popen(

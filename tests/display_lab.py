@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from labs import lab
-from optodrive.flow import Measurement
+from optodrive.core.types.measurements import Measurement
 
 
 def display_lab(hidden, seed=0, **design):

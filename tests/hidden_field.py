@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from optodrive.calibration.field_file import write_field
-from optodrive.calibration.fit import fit_field
-from optodrive.calibration.prior import Prior
-from optodrive.calibration.spots import Spots
-from optodrive.config import Config, load_config, pixel_layout
-from optodrive.simulator.truth import CENTRE_CODE, Truth
+from optodrive.device.config import Config, load_config, pixel_layout
+from optodrive.lab.calibration.field_fit import fit_field
+from optodrive.lab.calibration.field_prior import Prior
+from optodrive.lab.calibration.field_writer import write_field
+from optodrive.lab.calibration.spots import Spots
+from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
 
 CONFIG = load_config()
 LAYOUT = pixel_layout(CONFIG.display)

@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from optodrive.flow import Measurement, Run, Signal
+from optodrive.core.types.measurements import Measurement, Run, Signal
 
 SIZES_RAD = (0.005, 0.03, 0.15)
 NO_PULSES = np.zeros((0, 4))

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from optodrive.flow import Measurement, Run, Signal
-from optodrive.physics.forward import Active, Scene, observe
+from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.physics.pixel import Pixel
+from optodrive.physics.pixel_ode import Active, Scene, observe
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.cli.main import run
-from optodrive.config import load_config
-from optodrive.pixel_map import map_of, with_map
-from optodrive.simulator.pixel_truth import PixelTruth
+from optodrive.device.config import load_config
+from optodrive.device.pixel_map import map_of, with_map
+from optodrive.link.simulator.true_pixels import PixelTruth
 
 FOREVER = 5.0
 """Times between frames in which every pixel is cold again, s."""

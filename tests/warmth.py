@@ -6,11 +6,11 @@ from math import inf
 import numba
 import numpy as np
 
-from optodrive.config import DisplaySection
-from optodrive.flow import EMPTY_PLAN, PulsePlan
-from optodrive.limit.budget import Caps
-from optodrive.limit.corner import Declared, Touch, Uncertainty, Walls
-from optodrive.neighbours import Neighbours
+from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
+from optodrive.device.config import DisplaySection
+from optodrive.device.neighbours import Neighbours
+from optodrive.planning.limiter.budget import Caps
+from optodrive.planning.limiter.worst_case import Declared, Touch, Uncertainty, Walls
 
 NO_CAPS = Caps(
     absorber_k=1e6,

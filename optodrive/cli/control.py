@@ -34,7 +34,7 @@ def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def _call(url: str, method: str, path: str) -> dict[str, Any]:
-    from optodrive.remote import Remote
+    from optodrive.client.http import Remote
 
     return Remote(url).call(method, path)
 

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from optodrive.cli.options import ConfigOption, announce_compilation, print_json
-from optodrive.errors import InputError
+from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from optodrive.config import Config
-    from optodrive.flow import Measurement
-    from optodrive.recording import DisplayRuns
+    from optodrive.core.types.measurements import Measurement
+    from optodrive.device.config import Config
+    from optodrive.lab.recording import DisplayRuns
 
 RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING…", help="HDF5 files or CSV folders.")]
 STDOUT = "-"
@@ -60,9 +60,9 @@ def diagnose(
 ) -> None:
     """Name what the simulation gets wrong in measured data, and what mending it gains."""
     _check_extra()
-    from optodrive.analysis.display import TOGETHER
-    from optodrive.config import load_config
-    from optodrive.recording import DisplayRuns
+    from optodrive.device.config import load_config
+    from optodrive.lab.diagnosis.display_diagnosis import TOGETHER
+    from optodrive.lab.recording import DisplayRuns
 
     _check_targets(json, out)
     if dask is not None and workers is not None:
@@ -79,11 +79,11 @@ def diagnose(
 
 def _together(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _Told:
     """One pixel, or a few as one set of numbers."""
-    from optodrive.analysis.model_file import model_toml
-    from optodrive.analysis.prior import prior_of
-    from optodrive.analysis.report import report
-    from optodrive.analysis.story import answer, story
-    from optodrive.analysis.study import diagnose as study
+    from optodrive.lab.diagnosis.diagnose import diagnose as study
+    from optodrive.lab.diagnosis.model_file import model_toml
+    from optodrive.lab.diagnosis.narrative import answer, story
+    from optodrive.lab.diagnosis.priors import prior_of
+    from optodrive.lab.diagnosis.report import report
 
     measurement = _joined(recordings)
     prior, epsilon, width_m = prior_of(measurement, config)
@@ -98,10 +98,10 @@ def _each(
     runs: "DisplayRuns", title: str, seed: int, config: "Config | None", dask: str | None, workers: int | None
 ) -> _Told:
     """Many pixels, each for itself."""
-    from optodrive.analysis.display_report import display_report
-    from optodrive.analysis.display_story import display_answer, display_story
-    from optodrive.analysis.model_file import model_toml
     from optodrive.cli.diagnose_display import diagnose_display
+    from optodrive.lab.diagnosis.display_narrative import display_answer, display_story
+    from optodrive.lab.diagnosis.display_report import display_report
+    from optodrive.lab.diagnosis.model_file import model_toml
 
     announce_compilation()
     found = diagnose_display(runs, seed, config, dask, workers)
@@ -149,8 +149,8 @@ def _check_targets(json: str | None, out: Path | None) -> None:
 def _joined(paths: list[Path]) -> "Measurement":
     from dataclasses import replace
 
-    from optodrive.flow import Measurement
-    from optodrive.recording import read_recording
+    from optodrive.core.types.measurements import Measurement
+    from optodrive.lab.recording import read_recording
 
     if len(paths) == 1:
         return read_recording(paths[0])
@@ -165,7 +165,7 @@ def _text(document: dict[str, object]) -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    from optodrive.files import written_whole
+    from optodrive.core.files import written_whole
 
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

@@ -6,13 +6,13 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from optodrive.errors import InputError
-from optodrive.recording.form import Words
+from optodrive.core.errors import InputError
+from optodrive.lab.recording.storage import Words
 
 if TYPE_CHECKING:
-    from optodrive.analysis.display import DisplayAnswer
-    from optodrive.config import Config
-    from optodrive.recording import DisplayRuns
+    from optodrive.device.config import Config
+    from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer
+    from optodrive.lab.recording import DisplayRuns
 
 LINES = 10
 """Of progress, where stderr is no terminal."""
@@ -22,8 +22,8 @@ def diagnose_display(
     runs: "DisplayRuns", seed: int, config: "Config | None", dask: str | None, workers: int | None
 ) -> "DisplayAnswer":
     """Every pixel for itself, on local processes or a cluster; InputError where not one has an answer."""
-    from optodrive.analysis.display import DisplayAnswer, PixelAnswer, PixelTask, diagnose_pixel, warm
-    from optodrive.analysis.workers import crew, done
+    from optodrive.lab.diagnosis.dask_workers import crew, done
+    from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelTask, diagnose_pixel, warm
 
     began_s = perf_counter()
     tasks = [PixelTask(item.pixel, item.read, seed, config) for item in runs.pixels]

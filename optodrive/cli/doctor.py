@@ -42,9 +42,9 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     from optodrive.cli.doctor_board import check_board
     from optodrive.cli.doctor_finding import problem
     from optodrive.cli.doctor_port import check_port
-    from optodrive.clock import MonotonicClock
-    from optodrive.config import load_config
-    from optodrive.errors import InputError
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.core.errors import InputError
+    from optodrive.device.config import load_config
 
     clock = MonotonicClock()
     findings = [host.check_python(), *host.check_packages()]

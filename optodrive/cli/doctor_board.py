@@ -1,14 +1,14 @@
 """What the doctor asks the board itself: a handshake and nothing more; it is never armed."""
 
-from optodrive.board.faults import hint
-from optodrive.board.requirements import Requirements
-from optodrive.board.session import Session
 from optodrive.cli.doctor_finding import Finding, ok, problem, warning
-from optodrive.clock import Clock
-from optodrive.config import Config
-from optodrive.errors import InputError, LinkError
-from optodrive.transport.registry import transport_maker
-from optodrive.wire.messages import INPUTS
+from optodrive.core.clock import Clock
+from optodrive.core.errors import InputError, LinkError
+from optodrive.device.config import Config
+from optodrive.link.protocol.messages import INPUTS
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.fault_hints import hint
+from optodrive.link.session.session import Session
+from optodrive.link.transport.registry import transport_maker
 
 ROUND_TRIP_NOTICED_S = 0.01
 SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}

@@ -9,8 +9,8 @@ from importlib import metadata
 from pathlib import Path
 
 from optodrive.cli.doctor_finding import Finding, ok, problem, warning
-from optodrive.clock import Clock
-from optodrive.transport.port_state import ROOT, under
+from optodrive.core.clock import Clock
+from optodrive.link.transport.port_state import ROOT, under
 
 PYTHON_LEAST = (3, 11)
 NAP_S = 0.001
@@ -115,7 +115,7 @@ def check_room(folder: Path, free_bytes: int) -> Finding:
 
 def check_kernels() -> Finding:
     """Whether machine code is there already."""
-    from optodrive.compiled import CACHED, cold
+    from optodrive.core.kernels import CACHED, cold
 
     if not CACHED:
         return warning(

@@ -5,8 +5,8 @@ import os
 from pathlib import Path
 
 from optodrive.cli.doctor_finding import Finding, ok, problem, warning
-from optodrive.config import BoardSection
-from optodrive.transport.port_state import ROOT, command, device_name, holders, serial_ports, under
+from optodrive.device.config import BoardSection
+from optodrive.link.transport.port_state import ROOT, command, device_name, holders, serial_ports, under
 
 LATENCY_MAX_MS = 1
 RULES = "/etc/udev/rules.d/99-optodrive.rules"

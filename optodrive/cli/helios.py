@@ -22,16 +22,16 @@ from optodrive.cli.options import (
     progress,
     report_lines,
 )
-from optodrive.errors import OptodriveError
+from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
-    from optodrive.clock import Clock
-    from optodrive.flow import BudgetState
-    from optodrive.helios.board import Helios
-    from optodrive.helios.memory import Memory
-    from optodrive.helios.player import Played
-    from optodrive.helios.proof import ProvenFrames
-    from optodrive.pipeline import Display, Prepared
+    from optodrive.core.clock import Clock
+    from optodrive.core.types.plans import BudgetState
+    from optodrive.link.helios.dac import Helios
+    from optodrive.link.helios.heat_memory import Memory
+    from optodrive.link.helios.player import Played
+    from optodrive.link.helios.verification import ProvenFrames
+    from optodrive.planning.pipeline import Display, Prepared
 
 ENDED_BY = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -53,8 +53,8 @@ def register(app: typer.Typer) -> None:
 
 def info(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Say which Helios is plugged in, and whether it may emit; it is stopped, and its shutter closed."""
-    from optodrive.clock import MonotonicClock
-    from optodrive.helios.board import Helios
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.link.helios.dac import Helios
 
     board = configured(config, None).board
     with Helios(board, MonotonicClock()) as helios:
@@ -83,15 +83,15 @@ def play(
     json: JsonOption = False,
 ) -> None:
     """Plan, limit and prove frames, play them on a Helios, and say what left; Ctrl-C ends the light."""
-    from optodrive.admission import admit
-    from optodrive.clock import MonotonicClock
-    from optodrive.frames.files import load_sequence
-    from optodrive.helios.board import Helios
-    from optodrive.helios.memory import Memory
-    from optodrive.helios.points import PointScale
-    from optodrive.helios.proof import prove
-    from optodrive.pipeline import Display, chosen
-    from optodrive.summary import summary
+    from optodrive.core.clock import MonotonicClock
+    from optodrive.link.helios.dac import Helios
+    from optodrive.link.helios.encoding import PointScale
+    from optodrive.link.helios.heat_memory import Memory
+    from optodrive.link.helios.verification import prove
+    from optodrive.planning.feasibility import admit
+    from optodrive.planning.pipeline import Display, chosen
+    from optodrive.planning.plan_summary import summary
+    from optodrive.planning.stimuli.sequence_file import load_sequence
 
     display, clock = Display.of(configured(config, model)), MonotonicClock()
     helios = Helios(display.config.board, clock)
@@ -159,8 +159,8 @@ def _played(
     tick: Callable[[float], None],
 ) -> "Played":
     """Play, the memory written before the first light, and again after the last: a killed play counts in full."""
-    from optodrive.helios.memory import AHEAD_S
-    from optodrive.helios.player import play
+    from optodrive.link.helios.heat_memory import AHEAD_S
+    from optodrive.link.helios.player import play
 
     memory.keep(prepared.budget, time_of_day() + AHEAD_S)
     try:
@@ -170,8 +170,8 @@ def _played(
 
 
 def _figures(display: "Display", prepared: "Prepared", proven: "ProvenFrames", played: "Played") -> dict[str, Any]:
-    from optodrive.helios.points import PointScale
-    from optodrive.units import m_to_um
+    from optodrive.core.units import m_to_um
+    from optodrive.link.helios.encoding import PointScale
 
     pulses, plan = proven.pulses, prepared.plan
     shown = display.heat_at_rest().pulses(plan.pixel[proven.row], pulses.start_s, pulses.width_s, pulses.power_w)

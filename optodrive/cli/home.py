@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption, print_json
-from optodrive.errors import OptodriveError
+from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
-    from optodrive.commissioning.home import Done
+    from optodrive.lab.commissioning.homing import Done
 
 
 def register(app: typer.Typer) -> None:
@@ -28,9 +28,9 @@ def home(
     json: JsonOption = False,
 ) -> None:
     """Bring the mirrors to their middle, look at travel, position outputs, interlock, key, stop, indicator."""
-    from optodrive.cli.bench import bench
-    from optodrive.commissioning.held import check_power
-    from optodrive.commissioning.home import Homing
+    from optodrive.cli.board_access import bench
+    from optodrive.lab.commissioning.exclusive_board import check_power
+    from optodrive.lab.commissioning.homing import Homing
 
     done: list[Done] = []
 

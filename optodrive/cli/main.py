@@ -7,24 +7,24 @@ from typing import Any
 import typer
 
 from optodrive.cli import (
-    calibrate,
-    config_cmd,
+    config,
     control,
     diagnose,
     doctor,
-    field_cmd,
+    field,
     helios,
     home,
     plan,
     play,
-    recording_cmd,
+    recording,
     serve,
     service,
     simulate,
-    validate_cmd,
-    wire_cmd,
+    validate,
+    wire,
 )
-from optodrive.errors import OptodriveError
+from optodrive.cli.calibrate import field as calibrate
+from optodrive.core.errors import OptodriveError
 
 INTERRUPTED = 130
 UsageError: Any = typer.BadParameter.__bases__[0]
@@ -41,18 +41,18 @@ for module in (
     serve,
     home,
     calibrate,
-    field_cmd,
+    field,
     service,
     control,
     play,
     plan,
     simulate,
     helios,
-    recording_cmd,
+    recording,
     diagnose,
-    validate_cmd,
-    config_cmd,
-    wire_cmd,
+    validate,
+    config,
+    wire,
     doctor,
 ):
     module.register(app)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from optodrive.errors import InputError
+from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
-    from optodrive.config import Config
+    from optodrive.device.config import Config
 
 ConfigOption = Annotated[
     str | None, typer.Option("--config", metavar="FILE", help="Configuration file, or a shipped name.")
@@ -64,8 +64,8 @@ def configured(
     pixels_map: Path | None = None,
 ) -> "Config":
     """The configuration, following a model and what was calibrated where given; InputError with one line."""
-    from optodrive.config import load_config, with_mirrors
-    from optodrive.pixel_map import with_map
+    from optodrive.device.config import load_config, with_mirrors
+    from optodrive.device.pixel_map import with_map
 
     # A file of mirrors lowers a cap: the one asked for here stands in place of the configuration's, not on top of it.
     loaded = load_config(config) if mirrors is None else with_mirrors(load_config(config, measured=False), mirrors)
@@ -88,7 +88,7 @@ def print_json(document: dict[str, Any]) -> None:
 
 def announce_compilation() -> None:
     """Say on stderr why the first run after an install or upgrade takes so long."""
-    from optodrive.compiled import cold
+    from optodrive.core.kernels import cold
 
     if cold():
         print("optodrive: compiling kernels, half a minute, once", file=sys.stderr)

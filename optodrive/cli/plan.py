@@ -44,10 +44,10 @@ def plan(
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
-    from optodrive.admission import admit
-    from optodrive.frames.files import load_sequence
-    from optodrive.pipeline import Display, chosen
-    from optodrive.summary import summary, write_plan_csv
+    from optodrive.planning.feasibility import admit
+    from optodrive.planning.pipeline import Display, chosen
+    from optodrive.planning.plan_summary import summary, write_plan_csv
+    from optodrive.planning.stimuli.sequence_file import load_sequence
 
     display = Display.of(configured(config, model, field, mirrors, pixels_map))
     sequence = load_sequence(frames, display.config)

@@ -18,10 +18,10 @@ from optodrive.cli.options import (
     progress,
     report_lines,
 )
-from optodrive.errors import InputError, RefusedError
+from optodrive.core.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
-    from optodrive.remote import Remote
+    from optodrive.client.http import Remote
 
 POLL_S = 0.1
 
@@ -46,7 +46,7 @@ def push(
     json: JsonOption = False,
 ) -> None:
     """Plan frames and trains, show them, and say what was executed."""
-    from optodrive.remote import Remote
+    from optodrive.client.http import Remote
 
     try:
         body = frames.read_bytes()
@@ -70,7 +70,7 @@ def play(
     json: JsonOption = False,
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
-    from optodrive.remote import Remote
+    from optodrive.client.http import Remote
 
     given = _parameters(pattern, values or [])
     remote = Remote(url)
@@ -81,7 +81,7 @@ def play(
 
 def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """List the patterns and their parameters; needs no daemon."""
-    from optodrive.frames.patterns import describe_patterns
+    from optodrive.planning.stimuli.pattern_registry import describe_patterns
 
     described = describe_patterns()
     if json:
@@ -95,7 +95,7 @@ def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def _parameters(pattern: str, values: list[str]) -> dict[str, str]:
-    from optodrive.frames.patterns import find_pattern
+    from optodrive.planning.stimuli.pattern_registry import find_pattern
 
     known = find_pattern(pattern).parameters
     given: dict[str, str] = {}

@@ -16,7 +16,7 @@ from optodrive.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from optodrive.config import Config
+    from optodrive.device.config import Config
 
 
 def register(app: typer.Typer) -> None:

@@ -9,9 +9,9 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
-from optodrive.config import DEFAULT_CONFIG, Config, load_config, shipped_path
-from optodrive.errors import InputError, RefusedError
-from optodrive.files import written_whole
+from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.files import written_whole
+from optodrive.device.config import DEFAULT_CONFIG, Config, load_config, shipped_path
 
 CONFIG = Path("/etc/optodrive/config.toml")
 UNIT = Path("/etc/systemd/system/optodrive.service")

@@ -19,17 +19,18 @@ from optodrive.cli.options import (
     report_lines,
 )
 from optodrive.cli.plan import FramesArgument
-from optodrive.errors import InputError
+from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
 
-    from optodrive.admission import Admission
-    from optodrive.config import Config
-    from optodrive.flow import ExecutedPulses, PixelTrace
-    from optodrive.physics.heat import Heat
-    from optodrive.pipeline import Display, Prepared
-    from optodrive.simulator.pixel_truth import PixelTruth
+    from optodrive.core.types.measurements import PixelTrace
+    from optodrive.core.types.plans import ExecutedPulses
+    from optodrive.device.config import Config
+    from optodrive.link.simulator.true_pixels import PixelTruth
+    from optodrive.physics.thermal_state import Heat
+    from optodrive.planning.feasibility import Admission
+    from optodrive.planning.pipeline import Display, Prepared
 
 PIXELS_MAX = 16
 """Without --pixels, so many of the driven pixels are looked at, the tallest first."""
@@ -69,12 +70,12 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and measure what the pixels do."""
-    from optodrive.admission import admit
-    from optodrive.frames.files import load_sequence
-    from optodrive.pipeline import Display
-    from optodrive.simulator.pixel_truth import PixelTruth
-    from optodrive.simulator.run import execute
-    from optodrive.simulator.traces import trace, trace_near
+    from optodrive.link.simulator.traces import trace, trace_near
+    from optodrive.link.simulator.true_pixels import PixelTruth
+    from optodrive.link.simulator.virtual_run import execute
+    from optodrive.planning.feasibility import admit
+    from optodrive.planning.pipeline import Display
+    from optodrive.planning.stimuli.sequence_file import load_sequence
 
     if not 1e-6 <= dt <= 1.0:
         raise InputError("--dt", dt, "a time between 1e-6 and 1 s")
@@ -120,9 +121,9 @@ def simulate(
 
 def _really(config: "Config", drawn: "PixelTruth | None") -> "Heat":
     """The display as it is: of the configuration's model, its pixels as drawn, or all alike; no map says what is."""
-    from optodrive.physics.heat import heat_at_rest
+    from optodrive.device.pixel_map import without_map
     from optodrive.physics.parameters import display_pixels, load_parameters
-    from optodrive.pixel_map import without_map
+    from optodrive.physics.thermal_state import heat_at_rest
 
     parameters = load_parameters(config.pixel_model.parameters)
     alike = display_pixels(without_map(config), parameters)
@@ -153,10 +154,10 @@ def _write(
     """One recording of all traces; each with the pulses that fall into its time."""
     import numpy as np
 
-    from optodrive.flow import Measurement, Run
-    from optodrive.pixel_map import map_of
-    from optodrive.recording import write_recording
-    from optodrive.simulator.sensor import measure
+    from optodrive.core.types.measurements import Measurement, Run
+    from optodrive.device.pixel_map import map_of
+    from optodrive.lab.recording import write_recording
+    from optodrive.link.simulator.instruments import measure
 
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
     known, random = map_of(display.config), np.random.default_rng(seed)
@@ -177,8 +178,8 @@ def _report(
     traced: "list[PixelTrace]",
     real: "Heat",
 ) -> dict[str, Any]:
-    from optodrive.summary import pulse_columns, summary
-    from optodrive.units import m_to_um
+    from optodrive.core.units import m_to_um
+    from optodrive.planning.plan_summary import pulse_columns, summary
 
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     simulated_m = real.copy().pulses(*columns).displacement_m

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from optodrive.cli.options import announce_compilation, print_json
 
 if TYPE_CHECKING:
-    from optodrive.analysis.paper.study import Answer
+    from optodrive.lab.validation.study import Answer
 
 LITERAL = "paper_s1_literal"
 TABLE_WIDTH = 110
@@ -16,9 +16,9 @@ TABLE_WIDTH = 110
 
 def diagnose(json: bool = False) -> None:
     """Print the story, or one JSON object."""
-    from optodrive.analysis.paper.story import answer
-    from optodrive.analysis.paper.study import study
-    from optodrive.physics.facts import paper_facts
+    from optodrive.lab.validation.narrative import answer
+    from optodrive.lab.validation.study import study
+    from optodrive.physics.paper_facts import paper_facts
     from optodrive.physics.parameters import load_parameters
 
     announce_compilation()
@@ -34,7 +34,7 @@ def _print_story(found: "Answer") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from optodrive.analysis.paper.story import HEADINGS, after_table, assumptions, before_table, rows
+    from optodrive.lab.validation.narrative import HEADINGS, after_table, assumptions, before_table, rows
 
     console = Console(width=max(Console().width, TABLE_WIDTH))
 

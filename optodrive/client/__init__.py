@@ -1,7 +1,7 @@
 """The driver from Python: `Display`, and `AsyncDisplay` for asyncio, over a running daemon (docs/client.md)."""
 
 from optodrive.client.answers import FrameResult, Plan, State
-from optodrive.client.asynchronous import AsyncDisplay, AsyncStream
+from optodrive.client.async_display import AsyncDisplay, AsyncStream
 from optodrive.client.display import Display
 from optodrive.client.stream import Stream
 

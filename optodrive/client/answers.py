@@ -5,10 +5,10 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from optodrive.config import PixelLayout
-from optodrive.errors import OptodriveError, RefusedError
-from optodrive.flow import FloatArray, freeze_arrays
-from optodrive.remote import Answer, problem_error
+from optodrive.client.http import Answer, problem_error
+from optodrive.core.errors import OptodriveError, RefusedError
+from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.config import PixelLayout
 
 RUNNING = ("queued", "running")
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from optodrive.client.answers import Plan, State
 from optodrive.client.heights import Heights, by_pixel, layout_of
-from optodrive.client.orders import Fit, Order, Policy, frame_body, plan_path, play_order, push_order
+from optodrive.client.http import DEFAULT_URL, Answer, Remote
+from optodrive.client.requests import Fit, Order, Policy, frame_body, plan_path, play_order, push_order
 from optodrive.client.stream import Stream
-from optodrive.config import PixelLayout
-from optodrive.errors import OptodriveError
-from optodrive.remote import DEFAULT_URL, Answer, Remote
+from optodrive.core.errors import OptodriveError
+from optodrive.device.config import PixelLayout
 
 POLL_S = 0.03
 PATIENCE_S = 5.0

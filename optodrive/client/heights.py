@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from optodrive.config import DisplaySection, PixelLayout, pixel_layout
-from optodrive.errors import InputError
-from optodrive.flow import FloatArray
-from optodrive.frames.live import HEADER, MAGIC, NUMBER_MAX, UNIT_M
-from optodrive.units import um_to_m
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.units import um_to_m
+from optodrive.device.config import DisplaySection, PixelLayout, pixel_layout
+from optodrive.planning.stimuli.streamed_frame import HEADER, MAGIC, NUMBER_MAX, UNIT_M
 
 Heights = Mapping[int, float] | ArrayLike
 """Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by place; NaN or 0 where nothing is asked."""

@@ -4,8 +4,8 @@ import io
 
 from PIL import Image, ImageDraw, ImageFont
 
-from optodrive.config import PixelLayout
-from optodrive.flow import FloatArray
+from optodrive.core.types.arrays import FloatArray
+from optodrive.device.config import PixelLayout
 
 WIDTH_MAX, STEP_MAX = 640, 24
 MARGIN, FOOT = 12, 34

@@ -14,10 +14,10 @@ from websockets.sync.client import ClientConnection, connect
 
 from optodrive.client.answers import FrameResult
 from optodrive.client.heights import Heights, by_pixel, to_bytes
-from optodrive.client.orders import Policy
-from optodrive.config import PixelLayout
-from optodrive.errors import LinkError, OptodriveError
-from optodrive.remote import RETRY_S, Access, problem_error
+from optodrive.client.http import RETRY_S, Access, problem_error
+from optodrive.client.requests import Policy
+from optodrive.core.errors import LinkError, OptodriveError
+from optodrive.device.config import PixelLayout
 
 KEPT = 1000
 """Results kept for a caller who does not ask for them; the oldest go first."""

@@ -5,7 +5,7 @@ import socket
 from collections.abc import Mapping
 from contextlib import suppress
 
-from optodrive.clock import Clock
+from optodrive.core.clock import Clock
 
 WATCHDOG_SHARE = 0.2
 """The watchdog is fed after this share of the time it allows."""

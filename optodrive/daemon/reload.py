@@ -4,15 +4,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from optodrive.config import Config
-from optodrive.daemon.auth import Door
-from optodrive.daemon.engine import Engine
+from optodrive.core.errors import NotReadyError, OptodriveError
+from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.log import Log
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.token import private_tokens
-from optodrive.daemon.web import Server
-from optodrive.errors import NotReadyError, OptodriveError
-from optodrive.pipeline import Display
+from optodrive.daemon.web.access_policy import Door
+from optodrive.daemon.web.tokens import private_tokens
+from optodrive.daemon.web.web_server import Server
+from optodrive.device.config import Config
+from optodrive.planning.pipeline import Display
 
 TAKEN_AT_ONCE = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
 """Keys of [daemon]; the file of tokens is read again too."""

@@ -8,24 +8,24 @@ from pathlib import Path
 
 import uvicorn
 
-from optodrive.clock import MonotonicClock
-from optodrive.config import Config
-from optodrive.daemon.api import make_app
-from optodrive.daemon.audit import Audit
-from optodrive.daemon.auth import Door
-from optodrive.daemon.engine import Engine
-from optodrive.daemon.listeners import tcp_listener, unix_listener
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.errors import LinkError
+from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.session_notes import recorder_of
 from optodrive.daemon.log import daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import Reloading
-from optodrive.daemon.session_notes import recorder_of
-from optodrive.daemon.token import daemon_tokens
-from optodrive.daemon.web import Server
-from optodrive.errors import LinkError
-from optodrive.pipeline import Display
-from optodrive.transport.recorded import RecordedTransport
-from optodrive.transport.registry import transport_maker
-from optodrive.transport.tape import TapeWriter
+from optodrive.daemon.web.access_policy import Door
+from optodrive.daemon.web.api import make_app
+from optodrive.daemon.web.audit import Audit
+from optodrive.daemon.web.listeners import tcp_listener, unix_listener
+from optodrive.daemon.web.tokens import daemon_tokens
+from optodrive.daemon.web.web_server import Server
+from optodrive.device.config import Config
+from optodrive.link.transport.link_capture import TapeWriter
+from optodrive.link.transport.recorded import RecordedTransport
+from optodrive.link.transport.registry import transport_maker
+from optodrive.planning.pipeline import Display
 
 GRACE_S = 2
 

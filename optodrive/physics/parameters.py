@@ -8,13 +8,13 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from optodrive.config import Config, check_format, input_error, pixel_layout, shipped_path
-from optodrive.errors import InputError, nearest
-from optodrive.files import read_toml
-from optodrive.flow import FloatArray, freeze_arrays
+from optodrive.core.errors import InputError, nearest
+from optodrive.core.files import read_toml
+from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.config import Config, check_format, input_error, pixel_layout, shipped_path
+from optodrive.device.pixel_map import map_of
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import check_needs, find_term, known_terms
-from optodrive.pixel_map import map_of
 
 FORMAT = "optodrive-parameters"
 VERSION = 1

@@ -12,7 +12,7 @@ other kernels call them at no cost.
 from math import exp, expm1, log1p
 from typing import NamedTuple
 
-from optodrive.compiled import kernel
+from optodrive.core.kernels import kernel
 
 GAS_FRACTION = 0.5
 """Steady gas rise over absorber rise: the air conducts equally to absorber and wall (Text S1)."""

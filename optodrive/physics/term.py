@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.flow import FloatArray
-from optodrive.neighbours import Neighbours
+from optodrive.core.types.arrays import FloatArray
+from optodrive.device.neighbours import Neighbours
 
 Values = Mapping[str, float]
 """A term's parameters, SI, by name."""

@@ -11,14 +11,15 @@ import numpy as np
 
 from blind_display import respond
 from blind_lab import Case
-from optodrive.analysis.model_file import model_toml
-from optodrive.analysis.prior import prior_of
-from optodrive.analysis.study import diagnose
-from optodrive.config import load_config
-from optodrive.flow import Discrepancy, FrameSequence, TactileFrame
-from optodrive.pipeline import Display, Prepared, prepare
-from optodrive.recording import read_recording
-from optodrive.units import ZERO_CELSIUS_K
+from optodrive.core.types.discrepancy import Discrepancy
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.device.config import load_config
+from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.model_file import model_toml
+from optodrive.lab.diagnosis.priors import prior_of
+from optodrive.lab.recording import read_recording
+from optodrive.planning.pipeline import Display, Prepared, prepare
 
 WIDTH_M = 0.4e-3
 SHARES = (0.15, 0.6)

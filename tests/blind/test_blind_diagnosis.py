@@ -9,10 +9,10 @@ import secrets
 import pytest
 
 from blind_lab import draw
-from optodrive.analysis.prior import prior_of
-from optodrive.analysis.story import answer
-from optodrive.analysis.study import diagnose
-from optodrive.recording import read_recording
+from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.narrative import answer
+from optodrive.lab.diagnosis.priors import prior_of
+from optodrive.lab.recording import read_recording
 
 SEED = int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000)
 NULLS, SINGLES, PAIRS, UNKNOWNS = 2, 4, 1, 2

@@ -3,9 +3,9 @@
 import numpy as np
 
 from displays import DISPLAYS
-from optodrive.config import Config
-from optodrive.errors import LinkError
-from optodrive.wire.quantise import WirePoints
+from optodrive.core.errors import LinkError
+from optodrive.device.config import Config
+from optodrive.link.protocol.quantisation import WirePoints
 
 STEP_S = 0.002
 PLACES = ((30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500))

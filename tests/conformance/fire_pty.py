@@ -13,10 +13,10 @@ from fire import Fire, Witness
 from fire_host import FireHost, configured
 from scenario import audit_log
 
-from optodrive.board.requirements import Requirements
-from optodrive.board.session import Session
-from optodrive.clock import MonotonicClock
-from optodrive.transport.serial_port import SerialPort
+from optodrive.core.clock import MonotonicClock
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.transport.serial_port import SerialPort
 
 TURN_S = 0.002
 READ_MAX = 4096

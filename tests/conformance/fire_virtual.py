@@ -4,13 +4,13 @@ from fire import Fire, Witness
 from fire_host import FireHost, configured
 from scenario import audit_log
 
-from optodrive.board.requirements import BITS_A_BYTE, Requirements
-from optodrive.board.session import Session
-from optodrive.clock import ManualClock
-from optodrive.errors import LinkError
-from optodrive.simulator.core import BoardCore
-from optodrive.simulator.limits import BoardSettings
-from optodrive.simulator.memory_link import PASSAGE_S, MemoryLink
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import LinkError
+from optodrive.link.session.board_requirements import BITS_A_BYTE, Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.memory_link import PASSAGE_S, MemoryLink
 
 
 class Line:

@@ -3,15 +3,15 @@
 import sys
 from types import SimpleNamespace
 
-from optodrive.errors import RemoteProtocolError
-from optodrive.simulator import board
-from optodrive.simulator import core as core_module
-from optodrive.simulator.core import BoardCore
-from optodrive.simulator.guards import Guards
-from optodrive.simulator.limits import OWN
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import CRC, HEADER, Frame, FrameDecoder, cobs_decode
-from optodrive.wire.connection import BoardLink
+from optodrive.core.errors import RemoteProtocolError
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.connection import BoardLink
+from optodrive.link.protocol.framing import CRC, HEADER, Frame, FrameDecoder, cobs_decode
+from optodrive.link.simulator import board_core as core_module
+from optodrive.link.simulator import board_process
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import OWN
+from optodrive.link.simulator.guards import Guards
 
 # Each function gives what is patched: (owner, name, what takes its place).
 
@@ -284,4 +284,4 @@ MUTANTS = {
 
 if __name__ == "__main__":
     setattr(*MUTANTS[sys.argv[1]]())
-    sys.exit(board.main(sys.argv[2:]))
+    sys.exit(board_process.main(sys.argv[2:]))

@@ -2,7 +2,7 @@
 
 from board_table import table
 
-from optodrive.config import shipped_path
+from optodrive.device.config import shipped_path
 
 PAGE = shipped_path().parent / "docs" / "board.md"
 

@@ -12,7 +12,7 @@ from bench import UNDER_FIRE, wait_for
 from fire_pty import PtyRig
 from spoken import HOST
 
-from optodrive.errors import LinkError
+from optodrive.core.errors import LinkError
 
 STORMS = [(1, 0.01), (2, 0.03), (3, 0.08), (4, 0.2)]
 SESSIONS = 3

@@ -16,8 +16,8 @@ from hypothesis.stateful import (
 )
 from spoken import HOST
 
-from optodrive.board.session import Session
-from optodrive.errors import LinkError
+from optodrive.core.errors import LinkError
+from optodrive.link.session.session import Session
 
 UNSAFE = (("interlock", False), ("key", False), ("estop", True))
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))

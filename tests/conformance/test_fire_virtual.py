@@ -10,10 +10,10 @@ from fire_virtual import FireRig
 from mutants import MUTANTS
 from spoken import HOST
 
-from optodrive.board import requirements
-from optodrive.board import session as session_module
-from optodrive.board.requirements import BITS_A_BYTE, FRAME_BYTES
-from optodrive.simulator.limits import OWN
+from optodrive.link.session import board_requirements
+from optodrive.link.session import session as session_module
+from optodrive.link.session.board_requirements import BITS_A_BYTE, FRAME_BYTES
+from optodrive.link.simulator.board_limits import OWN
 
 STORMS = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
 FAULTS_EACH = 25_000
@@ -181,7 +181,7 @@ def test_an_abort_is_heard_5_ms_after_what_is_in_flight(baud):
 
 
 def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
-    monkeypatch.setattr(requirements, "FLIGHT_S", 0.1)
+    monkeypatch.setattr(board_requirements, "FLIGHT_S", 0.1)
     assert dark_after_abort_s(115_200) > abort_bound_s(115_200)
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 from board_bench import Bench
 
 from firmware_ports import require
-from optodrive.simulator.limits import OWN, BoardSettings
-from optodrive.wire import messages as m
+from optodrive.link.protocol import messages as m
+from optodrive.link.simulator.board_limits import OWN, BoardSettings
 
 FIRMWARE = Path(__file__).parents[2] / "firmware_protocol"
 INPUT_BITS = {name: 1 << k for k, name in enumerate(m.INPUTS)}

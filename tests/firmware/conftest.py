@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-for folder in ("simulator", "wire"):  # the Python side's bench, checks and vectors
-    sys.path.append(str(Path(__file__).parents[1] / "unit" / folder))
+for folder in ("simulator", "protocol"):  # the Python side's bench, checks and vectors
+    sys.path.append(str(Path(__file__).parents[1] / "unit" / "link" / folder))
 
 from c_board import CBench, build_library  # noqa: E402 - it stands on the bench
 

@@ -4,9 +4,9 @@ import random
 
 from c_board import CBoard
 
-from optodrive.simulator.core import BoardCore
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
+from optodrive.link.simulator.board_core import BoardCore
 
 
 class PythonEntropy:

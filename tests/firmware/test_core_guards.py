@@ -8,7 +8,7 @@ import test_board_guards as python_board
 from board_bench import CENTRE, here, naks
 from c_board import CBench, CBoard
 
-from optodrive.wire import messages as m
+from optodrive.link.protocol import messages as m
 
 CHECKS = {n: getattr(python_board, f"check_b{n}") for n in range(1, 14)}
 

@@ -4,9 +4,9 @@ from hypothesis import event, given, settings
 from hypothesis import strategies as st
 from same import LikePython
 
-from optodrive.simulator.limits import OWN, BoardSettings
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import Frame, encode_frame
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import Frame, encode_frame
+from optodrive.link.simulator.board_limits import OWN, BoardSettings
 
 CENTRE = 32768
 PATIENT = {"lease_ms": 60_000}

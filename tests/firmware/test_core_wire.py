@@ -7,7 +7,7 @@ import test_messages as wire
 from c_board import CBench, CBoard
 from same import LikePython
 
-from optodrive.wire import messages as m
+from optodrive.link.protocol import messages as m
 
 SESSION = 0xBEEF
 

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from optodrive.config import shipped_path
+from optodrive.device.config import shipped_path
 
 MODEL = shipped_path().parent / "firmware_protocol" / "model" / "board.pml"
 MUTANTS = range(1, 7)

@@ -5,13 +5,13 @@ from functools import cache
 import numpy as np
 
 from helios.emulated import EmulatedHelios
-from optodrive.clock import ManualClock
-from optodrive.config import Config, load_config
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.helios.board import Helios
-from optodrive.helios.points import PointScale
-from optodrive.helios.proof import prove
-from optodrive.pipeline import Display, prepare
+from optodrive.core.clock import ManualClock
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.device.config import Config, load_config
+from optodrive.link.helios.dac import Helios
+from optodrive.link.helios.encoding import PointScale
+from optodrive.link.helios.verification import prove
+from optodrive.planning.pipeline import Display, prepare
 
 
 def config_of(name="display-16", **board):

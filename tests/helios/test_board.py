@@ -6,12 +6,12 @@ import pytest
 
 from helios.bench import Bench, config_of
 from helios.emulated import EmulatedHelios, HostDeadError
-from optodrive.clock import ManualClock
-from optodrive.errors import InputError, LinkError, LocalProtocolError
-from optodrive.helios import board as board_module
-from optodrive.helios.board import Helios
-from optodrive.helios.frames import HeliosFrame
-from optodrive.transport.usb_device import find_device
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import InputError, LinkError, LocalProtocolError
+from optodrive.link.helios import dac as board_module
+from optodrive.link.helios.dac import Helios
+from optodrive.link.helios.frames import HeliosFrame
+from optodrive.link.transport.usb_device import find_device
 
 
 def frame(points=100, rate=40_000, level=0):

@@ -7,7 +7,7 @@ import usb.core
 import usb.util
 
 from helios.emulated import BYTES_PER_S, CLOCK_HZ, EmulatedHelios
-from optodrive.clock import ManualClock
+from optodrive.core.clock import ManualClock
 
 
 class Raw:

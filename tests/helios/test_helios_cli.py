@@ -10,9 +10,9 @@ from helios.bench import Bench, display_of, frame_of, train_of
 from helios.emulated import HostDeadError
 from optodrive.cli import helios as helios_cli
 from optodrive.cli.main import run
-from optodrive.config import shipped_path
-from optodrive.errors import LinkError
-from optodrive.frames.files import sequence_to_json
+from optodrive.core.errors import LinkError
+from optodrive.device.config import shipped_path
+from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
 DAY_S = 1.7e9
 LONG = train_of(width_s=0.04, gap_s=0.004, power_w=2.0, duration_s=1.0)
@@ -26,7 +26,7 @@ class Desk:
         self.clock = self.bench.clock
         monkeypatch.setenv("XDG_STATE_HOME", str(folder))
         monkeypatch.setattr(usb.backend.libusb1, "get_backend", lambda: self.bench.emulated)
-        monkeypatch.setattr("optodrive.clock.MonotonicClock", lambda: self.clock)
+        monkeypatch.setattr("optodrive.core.clock.MonotonicClock", lambda: self.clock)
         monkeypatch.setattr(helios_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
         self.frames = folder / "frames.json"
         self.ask(frame_of(display_of()))

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from helios.bench import display_of, train_of
-from optodrive.errors import InputError
-from optodrive.flow import BudgetState
-from optodrive.helios.memory import AHEAD_S, Memory
-from optodrive.limit.limiter import fresh_state
-from optodrive.pipeline import prepare
+from optodrive.core.errors import InputError
+from optodrive.core.types.plans import BudgetState
+from optodrive.link.helios.heat_memory import AHEAD_S, Memory
+from optodrive.planning.limiter.limiter import fresh_state
+from optodrive.planning.pipeline import prepare
 
 DAY_S = 1.7e9
 

@@ -5,11 +5,11 @@ import pytest
 
 from helios.bench import Bench, config_of, display_of, frame_of, proven_of, train_of
 from helios.emulated import HostDeadError
-from optodrive.errors import InputError, LinkError
-from optodrive.helios import player as player_module
-from optodrive.helios.frames import DARK_WITHIN_S, POINT_BYTES
-from optodrive.helios.player import play
-from optodrive.helios.points import PointScale
+from optodrive.core.errors import InputError, LinkError
+from optodrive.link.helios import player as player_module
+from optodrive.link.helios.encoding import PointScale
+from optodrive.link.helios.frames import DARK_WITHIN_S, POINT_BYTES
+from optodrive.link.helios.player import play
 
 
 def light_of(bench, since_s=0.0):

@@ -9,12 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from helios.bench import display_of, frame_of, proven_of, train_of
-from optodrive.errors import LocalProtocolError
-from optodrive.flow import EMPTY_PLAN, FrameSequence, PulseTrain, TactileFrame
-from optodrive.helios.frames import FRAME_MAX_S, HeliosFrame, fills_packets, point_ticks, points_of
-from optodrive.helios.points import PointScale, decode, encode
-from optodrive.helios.proof import check
-from optodrive.limit.limiter import limit
+from optodrive.core.errors import LocalProtocolError
+from optodrive.core.types.plans import EMPTY_PLAN
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.link.helios.encoding import PointScale, decode, encode
+from optodrive.link.helios.frames import FRAME_MAX_S, HeliosFrame, fills_packets, point_ticks, points_of
+from optodrive.link.helios.verification import check
+from optodrive.planning.limiter.limiter import limit
 
 
 @pytest.mark.parametrize(("asked", "true"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])

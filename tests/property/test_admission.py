@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.admission import admit, admitting, breach, scaled, stretched, trials, without
-from optodrive.errors import InputError, RefusedError
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.frames.trains import check_trains
-from optodrive.limit.limiter import limit
-from optodrive.physics.array import DisplayHeat
+from optodrive.core.errors import InputError, RefusedError
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.physics.nominal_display import DisplayHeat
+from optodrive.planning.feasibility import admit, check, order_search, scaled, stretched, violation, without
+from optodrive.planning.limiter.limiter import limit
+from optodrive.planning.stimuli.train_json import check_trains
 
 DISPLAY = DISPLAYS["display-16"]
 MACHINE = DISPLAY.machine
@@ -194,7 +194,7 @@ def agrees(seed):
     if admission.fits:
         assert misses(sequence, prepared) == []
         for source, frame in enumerate(sequence.frames):
-            bound_s = trials.least_s(DISPLAY, sequence, heat, source, LEAD_US * 1e-6)
+            bound_s = order_search.least_s(DISPLAY, sequence, heat, source, LEAD_US * 1e-6)
             assert bound_s <= frame.duration_s + 1e-6, (seed, source)
     else:
         assert admission.proof in ("searched", "bound")
@@ -257,44 +257,44 @@ def test_best_effort_fits_or_says_that_nothing_does(fit, seed):
 
 
 def _last_deadline_ignored(monkeypatch):
-    true = breach.deadlines_s
+    true = violation.deadlines_s
 
     def ignoring(sequence, lead_s):
         due_s = true(sequence, lead_s)
         due_s[-1:] = np.inf
         return due_s
 
-    for module in (trials, admitting):
+    for module in (order_search, check):
         monkeypatch.setattr(module, "deadlines_s", ignoring)
 
 
 def _only_the_planners_order(monkeypatch):
-    monkeypatch.setattr(trials.Trials, "_search", lambda self, sequence: None)
+    monkeypatch.setattr(order_search.Trials, "_search", lambda self, sequence: None)
 
 
 def _bound_too_high(monkeypatch):
-    true = trials.least_s
-    monkeypatch.setattr(trials, "least_s", lambda *given: 1.05 * true(*given))
+    true = order_search.least_s
+    monkeypatch.setattr(order_search, "least_s", lambda *given: 1.05 * true(*given))
 
 
 def _orders_passed_over(monkeypatch):
-    true = trials._broken_at
+    true = order_search._broken_at
 
     def too_early(*given):
         source, place = true(*given)
         return source, max(0, place - 2)
 
-    monkeypatch.setattr(trials, "_broken_at", too_early)
+    monkeypatch.setattr(order_search, "_broken_at", too_early)
 
 
 def _trains_may_be_late(monkeypatch):
-    true = breach.first_breach
+    true = violation.first_breach
 
     def lenient(plan, due_s):
         found = true(plan, due_s)
         return None if found is not None and found.source >= len(due_s) else found
 
-    for module in (trials, admitting):
+    for module in (order_search, check):
         monkeypatch.setattr(module, "first_breach", lenient)
 
 

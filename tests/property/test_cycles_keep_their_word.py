@@ -7,10 +7,10 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from optodrive.config import load_config
-from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, HeightTrain
-from optodrive.pipeline import Display, prepare
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import FrameSequence, HeightTrain
+from optodrive.device.config import load_config
+from optodrive.planning.pipeline import Display, prepare
 from pixel_ode import height_um
 
 PIXELS = (25, 26, 47, 46)

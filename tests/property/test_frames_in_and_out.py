@@ -7,11 +7,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
-from optodrive.config import load_config
-from optodrive.errors import InputError
-from optodrive.frames.braille import DIGITS, PUNCTUATION
-from optodrive.frames.files import parse_sequence, sequence_to_json
-from optodrive.frames.patterns import build_pattern
+from optodrive.core.errors import InputError
+from optodrive.device.config import load_config
+from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
 CONFIG = load_config("display-16")
 HEIGHTS = st.floats(0, 2000, allow_subnormal=False)
@@ -129,7 +129,7 @@ def test_known_text_is_shown_whole(text):
 
 
 def _dots(text):
-    from optodrive.frames.braille import word_cells
+    from optodrive.planning.stimuli.braille import word_cells
 
     return sum(len(cell) for word in text.split() for cell in word_cells(word))
 

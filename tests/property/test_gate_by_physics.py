@@ -10,16 +10,16 @@ from pydantic import ValidationError
 
 from displays import DISPLAYS
 from hidden_field import field_file
-from optodrive.board.requirements import Requirements
-from optodrive.config import Config
-from optodrive.errors import InputError
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.frames.patterns import build_pattern
-from optodrive.helios.frames import points_of
-from optodrive.helios.points import PointScale, decode, encode
-from optodrive.pipeline import Display, prepare
-from optodrive.plan.galvo import MoveModel
-from optodrive.wire.quantise import CENTRE_CODE, quantise
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.device.config import Config
+from optodrive.device.settling import MoveModel
+from optodrive.link.helios.encoding import PointScale, decode, encode
+from optodrive.link.helios.frames import points_of
+from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 GRID_S = 1e-6
 ROUNDING_M = 1e-9

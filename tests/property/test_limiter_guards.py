@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.guard import declared
-from optodrive.limit.budget import Budget
-from optodrive.limit.corner import Uncertainty, heat_bound
-from optodrive.limit.limiter import fresh_state, limit
-from optodrive.neighbours import Neighbours
+from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
-from optodrive.units import ZERO_CELSIUS_K
+from optodrive.planning.budget_setup import declared
+from optodrive.planning.limiter.budget import Budget
+from optodrive.planning.limiter.limiter import fresh_state, limit
+from optodrive.planning.limiter.worst_case import Uncertainty, heat_bound
 from warmth import NO_CAPS, as_plan, galvo_peak, truth, upper, window_peak_w
 
 

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
-from optodrive.errors import InputError
-from optodrive.limit.budget import Budget, Mirrors
-from optodrive.limit.corner import heat_bound
-from optodrive.limit.limiter import fired, fresh_state, limit, shifted
+from optodrive.core.errors import InputError
+from optodrive.planning.limiter.budget import Budget, Mirrors
+from optodrive.planning.limiter.limiter import fired, fresh_state, limit, shifted
+from optodrive.planning.limiter.worst_case import heat_bound
 from warmth import KINDS, NO_CAPS, as_plan, galvo_peak, random_model, sequence, truth, upper, window_peak_w, within
 
 FULL_W = 2.45

@@ -5,11 +5,11 @@ from itertools import pairwise
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
 
-from optodrive.simulator.core import BoardCore
-from optodrive.simulator.limits import OWN, BoardSettings
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
-from optodrive.wire.connection import HostConnection
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.connection import HostConnection
+from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import OWN, BoardSettings
 
 TURN_US = 2000
 FLIGHT_BYTES = 600

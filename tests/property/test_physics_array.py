@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.physics.array import DisplayHeat
+from optodrive.physics.nominal_display import DisplayHeat
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 

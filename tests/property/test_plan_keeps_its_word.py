@@ -6,9 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.physics.drive import reach_m
-from optodrive.pipeline import prepare
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.physics.pulse_for_height import reach_m
+from optodrive.planning.pipeline import prepare
 
 STEP_S = 2e-5
 

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optodrive.config import DisplaySection
-from optodrive.neighbours import Neighbours
-from optodrive.physics.model import STEPS, Drive, Model
+from optodrive.device.config import DisplaySection
+from optodrive.device.neighbours import Neighbours
+from optodrive.physics.numpy_model import STEPS, Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import known_terms

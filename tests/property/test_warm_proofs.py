@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from optodrive.board.requirements import Requirements
-from optodrive.config import load_config
-from optodrive.daemon.thermal import Thermal
-from optodrive.flow import FrameSequence, PulseTrain
-from optodrive.limit.limiter import fired, verify
-from optodrive.pipeline import Display, prepare
-from optodrive.wire.quantise import decode, quantise
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+from optodrive.daemon.engine.thermal_estimate import Thermal
+from optodrive.device.config import load_config
+from optodrive.link.protocol.quantisation import decode, quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.planning.limiter.limiter import fired, verify
+from optodrive.planning.pipeline import Display, prepare
 
 CONFIG = load_config()
 DISPLAY = Display.of(CONFIG)

@@ -1,11 +1,11 @@
 import pytest
 
 from benches import at_rest, board, daemon, kept, make_board, make_daemon, start  # noqa: F401 - fixtures
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.daemon.engine import Engine
-from optodrive.pipeline import Display
-from optodrive.transport.serial_port import SerialPort
+from optodrive.core.clock import MonotonicClock
+from optodrive.daemon.engine.engine import Engine
+from optodrive.device.config import load_config
+from optodrive.link.transport.serial_port import SerialPort
+from optodrive.planning.pipeline import Display
 from rig import config_text
 
 

@@ -12,14 +12,14 @@ import time
 
 import numpy as np
 
-from optodrive.board.requirements import Requirements
-from optodrive.board.session import Session
-from optodrive.clock import MonotonicClock, claim_processor
-from optodrive.config import Config, load_config
-from optodrive.transport.serial_port import SerialPort
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import FrameDecoder
-from optodrive.wire.quantise import WirePoints
+from optodrive.core.clock import MonotonicClock, claim_processor
+from optodrive.device.config import Config, load_config
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import FrameDecoder
+from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.transport.serial_port import SerialPort
 
 PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)])
 POINTS, DARK_US, ON_US, DUTY = 4000, 600, 8000, 2000

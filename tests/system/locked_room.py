@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import optodrive
-from optodrive.config import shipped_path
+from optodrive.device.config import shipped_path
 from rig import OPTODRIVE
 
 SCMP_ACT_ALLOW = 0x7FFF0000

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import httpx
 
-from optodrive.config import shipped_path
+from optodrive.device.config import shipped_path
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
@@ -46,7 +46,7 @@ def ended(engine, answer):
     return wait_for(look, "the plan's end")
 
 
-SIMULATED = (sys.executable, "-m", "optodrive.simulator.board")
+SIMULATED = (sys.executable, "-m", "optodrive.link.simulator.board_process")
 
 
 class Board:

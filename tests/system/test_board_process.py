@@ -10,13 +10,13 @@ from itertools import pairwise
 import pytest
 import serial
 
-from optodrive.board.requirements import Requirements
-from optodrive.board.session import Session
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.transport.serial_port import SerialPort
-from optodrive.wire import messages as m
-from optodrive.wire.cobs import Frame, FrameDecoder, encode_frame
+from optodrive.core.clock import MonotonicClock
+from optodrive.device.config import load_config
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.transport.serial_port import SerialPort
 from rig import wait_for
 
 FIELDS = {
@@ -259,7 +259,7 @@ def test_limits_come_from_the_file(make_board, open_host):
 
 
 def start(*arguments, **options):
-    command = [sys.executable, "-m", "optodrive.simulator.board", *map(str, arguments)]
+    command = [sys.executable, "-m", "optodrive.link.simulator.board_process", *map(str, arguments)]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
 
 
@@ -288,7 +288,7 @@ def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
     board = start(*arguments, option, value if value is not None else path)
     _, error = board.communicate(timeout=20)
     assert board.returncode == 2
-    assert error.startswith("optodrive.simulator.board: ")
+    assert error.startswith("optodrive.link.simulator.board_process: ")
     assert error.count("\n") == 1
     assert says in error
     assert not (tmp_path / "tty").exists()

@@ -7,12 +7,12 @@ import signal
 import numpy as np
 import pytest
 
-from optodrive.calibration.field_file import read_field
-from optodrive.calibration.spots import read_spots
-from optodrive.commissioning.predicting import display_codes
-from optodrive.config import load_config
-from optodrive.simulator.limits import OWN
-from optodrive.simulator.truth import Truth
+from optodrive.device.config import load_config
+from optodrive.device.field_file import read_field
+from optodrive.lab.calibration.spots import read_spots
+from optodrive.lab.commissioning.predicted_error import display_codes
+from optodrive.link.simulator.board_limits import OWN
+from optodrive.link.simulator.true_geometry import Truth
 from rig import wait_for
 from test_home import LATENESS_US, LEASE_US, assert_dark, step_of
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from hidden_field import CONFIG, LAYOUT, field_file
-from optodrive.calibration.field_file import read_field
-from optodrive.pixel_map import DEAD, MEASURED, PixelMap, write_map
+from optodrive.device.field_file import read_field
+from optodrive.device.pixel_map import DEAD, MEASURED, PixelMap, write_map
 from rig import Board, Daemon
 
 PIXELS = (0, 20, 218, 400, 436)

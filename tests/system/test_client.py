@@ -11,7 +11,7 @@ import pytest
 
 from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
 from optodrive.client import AsyncDisplay, Display
-from optodrive.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError, RefusedError
+from optodrive.core.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError, RefusedError
 from rig import TOKEN, long_train, wait_for
 
 

@@ -5,8 +5,8 @@ import signal
 
 import pytest
 
-from optodrive.commissioning.held import SPOT_POWER_MAX_W
-from optodrive.simulator.limits import OWN
+from optodrive.lab.commissioning.exclusive_board import SPOT_POWER_MAX_W
+from optodrive.link.simulator.board_limits import OWN
 from rig import PATIENT_LEASE_S, wait_for
 
 STEPS = ["link", "status", "inputs", "indicator", "zero", "travel x", "travel y", "readback", "zero again"]

@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from optodrive.transport.tape import Tape
+from optodrive.link.transport.link_capture import Tape
 from rig import OPTODRIVE, Board, long_train, wait_for
 
 

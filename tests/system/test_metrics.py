@@ -3,7 +3,7 @@
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from optodrive.daemon.metrics import PlanTally
+from optodrive.daemon.engine.metrics import PlanTally
 from rig import ended, long_train, wait_for
 
 
@@ -74,6 +74,6 @@ def test_a_tally_starts_with_every_status_at_nought():
 
 
 def _frames(engine):
-    from optodrive.frames.patterns import build_pattern
+    from optodrive.planning.stimuli.pattern_registry import build_pattern
 
     return build_pattern("pixel", {}, engine.display.config)

@@ -16,18 +16,18 @@ from starlette.routing import Mount, Route, WebSocketRoute
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from optodrive import pipeline
 from optodrive.client import AsyncDisplay, Display
-from optodrive.clock import MonotonicClock
-from optodrive.config import load_config
-from optodrive.daemon.api import make_app
-from optodrive.daemon.auth import Door
-from optodrive.daemon.engine import Engine
-from optodrive.daemon.roles import ARM, ROLES, ROUTES, STOP
-from optodrive.daemon.site import LOGIN, is_page
-from optodrive.daemon.token import Token, Tokens
-from optodrive.errors import NotReadyError
-from optodrive.transport.simulated import SimulatedBoard
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.errors import NotReadyError
+from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.web.access_policy import Door
+from optodrive.daemon.web.api import make_app
+from optodrive.daemon.web.roles import ARM, ROLES, ROUTES, STOP
+from optodrive.daemon.web.static_files import LOGIN, is_page
+from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.device.config import load_config
+from optodrive.link.transport.simulated import SimulatedBoard
+from optodrive.planning import pipeline
 from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
 
 LAST_LINE = "lease_s = 1.0"

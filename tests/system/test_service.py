@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from locked_room import locked, why_not
-from optodrive.clock import MonotonicClock
-from optodrive.compiled import code_folder
-from optodrive.config import shipped_path
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.kernels import code_folder
 from optodrive.daemon.notify import Notifier
+from optodrive.device.config import shipped_path
 from rig import TOKEN, Daemon, long_train, wait_for
 
 TRANSPORTS = {

@@ -8,8 +8,8 @@ import h5py
 import numpy as np
 import pytest
 
-from optodrive.flow import Measurement, Run, Signal
-from optodrive.recording import read_recording, write_recording
+from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.lab.recording import read_recording, write_recording
 from rig import long_train, wait_for
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")

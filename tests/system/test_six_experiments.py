@@ -5,8 +5,8 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from optodrive.board.requirements import Requirements
-from optodrive.config import load_config, pixel_layout
+from optodrive.device.config import load_config, pixel_layout
+from optodrive.link.session.board_requirements import Requirements
 from rig import running
 
 PWM_S = 2e-4

@@ -6,9 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from optodrive.daemon import planner
-from optodrive.flow import FrameSequence, PulseTrain, TactileFrame
-from optodrive.pipeline import prepare
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.daemon.engine import planner
+from optodrive.planning.pipeline import prepare
 from rig import ended, wait_for
 
 

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
-from optodrive.config import load_config
-from optodrive.pipeline import Display
+from optodrive.device.config import load_config
+from optodrive.planning.pipeline import Display
 from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 
 

@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.config import shipped_path
+from optodrive.device.config import shipped_path
 from rig import TOKEN, running
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")

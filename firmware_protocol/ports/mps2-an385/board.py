@@ -23,9 +23,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from optodrive.simulator.board import main
-from optodrive.simulator.limits import BoardSettings
-from optodrive.wire import messages as m
+from optodrive.link.protocol import messages as m
+from optodrive.link.simulator.board_limits import BoardSettings
+from optodrive.link.simulator.board_process import main
 
 IMAGE = Path(__file__).parent / "build" / "board.elf"
 INPUT_BITS = {"interlock": 1, "key": 2, "estop": 4}

@@ -5,7 +5,7 @@ from functools import cache
 from importlib import import_module
 from pkgutil import iter_modules
 
-from optodrive.errors import InputError, nearest
+from optodrive.core.errors import InputError, nearest
 from optodrive.physics.term import Term
 
 

@@ -1,7 +1,7 @@
 """The absorber absorbs less with the light it has had."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import DOSE, Kernels, Most, Term, TermParameter, Values, Warming
 
 

@@ -1,7 +1,7 @@
 """The room moves while its stated temperature does not."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import SESSION, TIME_S, Kernels, Most, Term, TermParameter, Values, Warming
 
 

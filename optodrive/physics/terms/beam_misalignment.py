@@ -1,7 +1,7 @@
 """On one pixel part of the beam misses the absorber and warms its wall instead."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import MINE, PIXEL, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
 
 

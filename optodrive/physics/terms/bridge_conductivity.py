@@ -1,7 +1,7 @@
 """Graphite conducts worse when hot: the bridge's resistance grows with its mean temperature."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import ABSORBER, AMBIENT_K, WALL_K, Kernels, Term, TermParameter, Values, View
 
 

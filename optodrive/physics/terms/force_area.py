@@ -1,6 +1,6 @@
 """Blocked force: gas at constant volume pushes on less than the whole aperture."""
 
-from optodrive.flow import FloatArray
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.pixel import GAS_FRACTION
 from optodrive.physics.term import Term, TermParameter, Values, View
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA

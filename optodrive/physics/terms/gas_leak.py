@@ -1,7 +1,7 @@
 """Gas leaks out of the warm cell and back into the cold one."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import GAS, Kernels, Term, TermParameter
 
 

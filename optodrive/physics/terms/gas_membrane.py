@@ -4,8 +4,8 @@ from math import pi
 
 import numpy as np
 
-from optodrive.flow import FloatArray
-from optodrive.physics.facts import paper_facts
+from optodrive.core.types.arrays import FloatArray
+from optodrive.physics.paper_facts import paper_facts
 from optodrive.physics.pixel import GAS_FRACTION
 from optodrive.physics.term import Term, TermParameter, Values, View
 

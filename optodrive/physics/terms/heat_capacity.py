@@ -1,7 +1,7 @@
 """Graphite stores more heat when hot: its c_p rises 0.71 to 1.12 J/(g K) from 300 to 450 K."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import ABSORBER, Kernels, Most, Term, TermParameter, Values, Warming
 
 

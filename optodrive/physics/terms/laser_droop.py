@@ -1,7 +1,7 @@
 """A diode that warms gives less: power falls within a pulse and recovers between."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import FULL_W, POWER_W, Kernels, Term, TermParameter
 
 

@@ -2,8 +2,8 @@
 
 from math import exp
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import SINCE_S, Kernels, Term, TermParameter
 
 

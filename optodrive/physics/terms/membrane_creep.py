@@ -1,7 +1,7 @@
 """Silicone creeps: the membrane goes on rising under the same pressure."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import GAS, Kernels, Term, TermParameter
 
 SHORTEST_S = 2.5e-3

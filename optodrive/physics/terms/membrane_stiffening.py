@@ -1,7 +1,7 @@
 """A stretched membrane resists more: displacement grows slower than the gas's rise."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import Kernels, Term, TermParameter
 
 

@@ -1,7 +1,7 @@
 """The wall rises with the absorbers beside it."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import NEIGHBOUR, Kernels, Most, Term, TermParameter, Values, Warming
 
 

@@ -1,7 +1,7 @@
 """Power is not proportional to what is commanded: a threshold, or a curve."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import FULL_W, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
 
 

@@ -1,7 +1,7 @@
 """The hot absorber radiates to the room."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import ABSORBER, AMBIENT_K, Kernels, Term, TermParameter
 
 STEFAN_BOLTZMANN = 5.670374e-8

@@ -1,7 +1,7 @@
 """The thermometer's gain is off."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import Kernels, Term, TermParameter
 
 

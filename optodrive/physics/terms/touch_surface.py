@@ -1,6 +1,6 @@
 """The membrane's outer side, where the finger is: it follows the gas below and the wall around it."""
 
-from optodrive.flow import FloatArray
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import Term, TermParameter, Values, View
 
 

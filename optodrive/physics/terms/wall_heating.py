@@ -1,7 +1,7 @@
 """The wall at the bridge's far end is no sink: it warms, and cools to its surroundings more slowly."""
 
-from optodrive.compiled import kernel
-from optodrive.flow import FloatArray
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import FLOW_W, WALL, Flows, Kernels, Term, TermParameter, Values, View
 
 

@@ -15,8 +15,8 @@ from optodrive.cli.doctor_board import check_board
 from optodrive.cli.doctor_finding import ok
 from optodrive.cli.doctor_port import check_port
 from optodrive.cli.main import run
-from optodrive.clock import ManualClock, MonotonicClock
-from optodrive.config import BoardSection, load_config, shipped_path
+from optodrive.core.clock import ManualClock, MonotonicClock
+from optodrive.device.config import BoardSection, load_config, shipped_path
 
 
 @pytest.fixture
@@ -178,8 +178,8 @@ def test_packages_missing_or_too_old_are_named():
     ("cached", "cold", "grade"), [(True, False, "ok"), (True, True, "warning"), (False, True, "warning")]
 )
 def test_the_compiled_kernels(monkeypatch, cached, cold, grade):
-    monkeypatch.setattr("optodrive.compiled.CACHED", cached)
-    monkeypatch.setattr("optodrive.compiled.cold", lambda: cold)
+    monkeypatch.setattr("optodrive.core.kernels.CACHED", cached)
+    monkeypatch.setattr("optodrive.core.kernels.cold", lambda: cold)
     assert host.check_kernels().grade == grade
 
 

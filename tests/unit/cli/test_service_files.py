@@ -4,7 +4,7 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.cli.service_files import CONFIG, INSTALLED, RULES, UNIT, USERS
-from optodrive.config import load_config, shipped_path
+from optodrive.device.config import load_config, shipped_path
 
 PROGRAM = "/opt/optodrive/bin/optodrive"
 USB = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'

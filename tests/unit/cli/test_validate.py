@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from optodrive.cli.validate import cells, validate_table
-from optodrive.physics.paper import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, OUTCOMES, SILENT
+from optodrive.cli.validation_table import cells, validate_table
+from optodrive.lab.validation.paper_outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, OUTCOMES, SILENT
 
 ROWS = {row.fact.id: row for row in validate_table()}
 
@@ -58,7 +58,8 @@ def test_json_is_one_object_in_si_units():
 
 def test_it_loads_nothing_heavy():
     check = (
-        "import sys; import optodrive.cli.validate as v; v.validate(True); assert 'scipy.optimize' not in sys.modules"
+        "import sys; import optodrive.cli.validation_table as v; v.validate(True);"
+        " assert 'scipy.optimize' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=30)
 

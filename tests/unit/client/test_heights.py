@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from displays import DISPLAYS
 from optodrive.client.heights import by_pixel, layout_of, to_bytes, to_json
 from optodrive.client.picture import colour, png
-from optodrive.daemon.resolved import resolved_config
-from optodrive.errors import InputError
-from optodrive.frames.live import parse_live_frame
+from optodrive.core.errors import InputError
+from optodrive.planning.effective_config import resolved_config
+from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 LAYOUT = DISPLAYS["display-437"].layout
 

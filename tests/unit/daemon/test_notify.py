@@ -3,7 +3,7 @@ import socket
 
 import pytest
 
-from optodrive.clock import ManualClock
+from optodrive.core.clock import ManualClock
 from optodrive.daemon.notify import Notifier
 
 

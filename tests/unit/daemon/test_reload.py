@@ -1,8 +1,8 @@
 import pytest
 
-from optodrive.config import load_config
+from optodrive.core.errors import NotReadyError
 from optodrive.daemon.reload import NOT_WHILE, changed, require_dark, sentence, taken
-from optodrive.errors import NotReadyError
+from optodrive.device.config import load_config
 
 
 @pytest.fixture(scope="module")

@@ -4,8 +4,8 @@ from math import pi
 
 import pytest
 
-from optodrive.config import load_config, shipped_path
-from optodrive.errors import InputError
+from optodrive.core.errors import InputError
+from optodrive.device.config import load_config, shipped_path
 from optodrive.physics.parameters import display_pixels, load_parameters
 
 SETS = ["calibrated", "paper_s1_literal"]

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from optodrive.config import DisplaySection
-from optodrive.errors import InputError
-from optodrive.neighbours import Neighbours
+from optodrive.core.errors import InputError
+from optodrive.device.config import DisplaySection
+from optodrive.device.neighbours import Neighbours
 from optodrive.physics import terms
-from optodrive.physics.model import Drive, Model
+from optodrive.physics.numpy_model import Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance
 from optodrive.physics.terms import known_terms

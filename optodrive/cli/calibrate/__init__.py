@@ -1,0 +1,1 @@
+"""`optodrive calibrate`: one module per subcommand."""

@@ -1,0 +1,47 @@
+"""`optodrive config show | check`."""
+
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, print_json
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(help="Show or check a configuration.", no_args_is_help=True)
+    group.command("show")(show)
+    group.command("check")(check)
+    app.add_typer(group, name="config")
+
+
+def show(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Show the resolved configuration, with every pixel and number filled in."""
+    from optodrive.device.config import load_config
+    from optodrive.planning.effective_config import resolved_config
+    from optodrive.planning.pipeline import Display
+
+    document = resolved_config(Display.of(load_config(config)))
+    if json:
+        print_json(document)
+        return
+    pixels = document["display"].pop("pixels")
+    document["display"]["pixels"] = f"{len(pixels)} (listed with --json)"
+    for section, content in document.items():
+        if isinstance(content, dict):
+            print(f"[{section}]")
+            for key, value in content.items():
+                print(f"{key} = {value}")
+            print()
+        else:
+            print(f"{section} = {content}")
+
+
+def check(config: ConfigOption = None, json: JsonOption = False) -> None:
+    """Check a configuration file whole."""
+    from optodrive.device.config import load_config
+    from optodrive.planning.pipeline import Display
+
+    display = Display.of(load_config(config))
+    if json:
+        print_json({"name": display.config.name, "pixels": len(display.layout), "ok": True})
+    else:
+        print(f"{display.config.name}: {len(display.layout)} pixels, configuration in order")

@@ -1,0 +1,120 @@
+"""`optodrive recording convert | show | merge`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optodrive.cli.options import JsonOption, print_json
+
+if TYPE_CHECKING:
+    from optodrive.core.types.measurements import Measurement
+
+TABLE_WIDTH_MAX = 500
+"""The table is as wide as what it says, but no wider than this."""
+RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="An HDF5 file, or a folder of CSV files.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(help="Look into measured data, or turn one form of it into the other.", no_args_is_help=True)
+    group.command("convert")(convert)
+    group.command("show")(show)
+    group.command("merge")(merge)
+    app.add_typer(group, name="recording")
+
+
+def convert(
+    source: Annotated[Path, typer.Argument(metavar="IN", help="An HDF5 file, or a folder of CSV files.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a new folder.")],
+    json: JsonOption = False,
+) -> None:
+    """Turn an HDF5 recording into a folder of CSV files, or the other way; every number stays exactly what it was."""
+    from optodrive.lab.recording import convert_recording
+
+    measurement = convert_recording(source, target)
+    samples = sum(len(signal.t_s) for run in measurement.runs for signal in run.signals.values())
+    if json:
+        print_json({"written": str(target), "runs": len(measurement.runs), "samples": samples})
+    else:
+        print(f"runs             {len(measurement.runs)}")
+        print(f"samples          {samples}")
+        print(f"written          {target}")
+
+
+def show(
+    recording: RecordingArgument,
+    out: Annotated[Path | None, typer.Option("--out", metavar="picture.png", help="Draw every signal.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """Check a recording whole, and show what each run holds."""
+    from optodrive.lab.recording import read_recording
+    from optodrive.lab.recording.summary import summary
+
+    measurement = read_recording(recording)
+    runs = summary(measurement)
+    drawn = None if out is None else _draw(out, measurement)
+    if json:
+        picture = None if out is None else {"file": str(out), "runs": drawn}
+        print_json({"recording": str(recording), "runs": runs, "picture": picture})
+        return
+    _print_table(runs)
+    if out is not None:
+        part = "" if drawn == len(runs) else f", the first {drawn} of {len(runs)} runs"
+        print(f"written          {out}{part}")
+
+
+def merge(
+    session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="As `serve --record-session` writes it.")],
+    measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
+    out: Annotated[Path, typer.Option("--out", metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a folder.")],
+    shift: Annotated[float, typer.Option("--shift", metavar="SECONDS", help="Added to every time measured.")] = 0.0,
+    json: JsonOption = False,
+) -> None:
+    """Join a session's pulses, as executed, with what was measured meanwhile: a recording for `diagnose`."""
+    from optodrive.lab.recording import write_recording
+    from optodrive.lab.recording.merge import merge_session
+
+    measurement = merge_session(session, measured, shift)
+    write_recording(out, measurement)
+    pulses = sum(len(run.pulses) for run in measurement.runs)
+    if json:
+        print_json({"written": str(out), "runs": len(measurement.runs), "pulses": pulses})
+    else:
+        print(f"runs             {len(measurement.runs)}")
+        print(f"pulses           {pulses}")
+        print(f"written          {out}")
+
+
+def _draw(out: Path, measurement: "Measurement") -> int:
+    from optodrive.lab.recording.plot import write_picture
+
+    return write_picture(out, measurement)
+
+
+def _print_table(runs: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for heading in ("run", "group", "pulses", "energy", "signal", "pixel", "samples", "missing", "span"):
+        right = heading in ("pulses", "energy", "pixel", "samples", "missing")
+        table.add_column(heading, justify="right" if right else "left", no_wrap=True)
+    for run in runs:
+        for cells in _rows(run):
+            table.add_row(*(Text(cell) for cell in cells))
+    width = max(Console().width, Console(width=TABLE_WIDTH_MAX).measure(table).maximum)
+    Console(width=width, highlight=False).print(table)
+
+
+def _rows(run: dict[str, Any]) -> list[list[str]]:
+    energy = "" if run["energy_J"] is None else f"{run['energy_J']:.4g} J"
+    first = [run["run"], " ".join((run["group"] or "").split()), str(run["pulses"]), energy]
+    rows = []
+    for name, signal in run["signals"].items():
+        span = f"{signal['start_s']:g} to {signal['end_s']:g} s"
+        pixel = "" if name.startswith("mirror") else str(signal["pixel"])
+        rows.append([*first, name, pixel, str(signal["samples"]), str(signal["missing"]), span])
+        first = ["", "", "", ""]
+    return rows

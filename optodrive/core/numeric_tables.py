@@ -1,0 +1,79 @@
+"""Plain tables of numbers with a head line, read and written a million rows at a time."""
+
+from pathlib import Path
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import written_whole
+from optodrive.core.types.arrays import FloatArray
+
+BLOCK = 50_000
+"""Rows written at a time."""
+
+
+def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
+    """Rows of a CSV file with just this head, [n, columns], all finite; InputError names row, column and value."""
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError:
+        raise InputError(str(path), "not text", "a CSV file, UTF-8") from None
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file") from None
+    head, _, body = text.partition("\n")
+    names = tuple(name.strip() for name in head.strip().split(","))
+    if names != columns:
+        raise InputError(f"{path}: first line", head.strip(), f"'{','.join(columns)}'")
+    body = body.strip().replace("\r", "")
+    rows = body.count("\n") + 1 if body else 0
+    table = _at_once(body, rows, len(columns))
+    if table is None:
+        table = _row_by_row(path, body, columns)
+    bad = np.argwhere(~np.isfinite(table))
+    if len(bad):
+        row, column = bad[0].tolist()
+        raise InputError(f"{path}: row {row + 2}: {columns[column]}", float(table[row, column]), "a finite number")
+    return table
+
+
+def _at_once(body: str, rows: int, columns: int) -> FloatArray | None:
+    """The table, or None where something is not as it should be."""
+    if body.count(",") != rows * (columns - 1):
+        return None
+    try:
+        values = np.array(body.replace("\n", ",").split(","), dtype=np.float64) if rows else np.zeros(0)
+    except ValueError:
+        return None
+    return values.reshape(rows, columns) if len(values) == rows * columns else None
+
+
+def _row_by_row(path: Path, body: str, columns: tuple[str, ...]) -> FloatArray:
+    rows = []
+    for number, line in enumerate(body.split("\n"), start=2):
+        cells = line.split(",")
+        if len(cells) != len(columns):
+            raise InputError(f"{path}: row {number}", line, f"{len(columns)} numbers: {', '.join(columns)}")
+        try:
+            rows.append([float(cell) for cell in cells])
+        except ValueError:
+            at = next(index for index, cell in enumerate(cells) if not _is_number(cell))
+            raise InputError(f"{path}: row {number}: {columns[at]}", cells[at], "a number") from None
+    return np.array(rows).reshape(-1, len(columns))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def write_columns(path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...]) -> None:
+    """Write a table [n, columns], whole or not at all; formats: one a column, as %.3f."""
+    line = ",".join(formats) + "\n"
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(columns) + "\n")
+        for first in range(0, len(table), BLOCK):
+            block = table[first : first + BLOCK]
+            file.write(line * len(block) % tuple(block.ravel().tolist()))

@@ -1,0 +1,1 @@
+"""The types that flow between packages: stimuli, plans, measurements, discrepancies."""

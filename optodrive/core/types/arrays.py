@@ -1,0 +1,23 @@
+"""Array aliases and read-only arrays for the shared types."""
+
+from dataclasses import fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+IntArray = NDArray[np.int64]
+
+BoolArray = NDArray[np.bool_]
+
+StrArray = NDArray[np.str_]
+
+
+def freeze_arrays(instance: object) -> None:
+    """Make every array field of a dataclass instance read-only."""
+    for item in fields(instance):  # type: ignore[arg-type]
+        value: Any = getattr(instance, item.name)
+        if isinstance(value, np.ndarray):
+            value.setflags(write=False)

@@ -1,0 +1,1 @@
+"""The engine: planning, queueing and execution of plans on one board session."""

@@ -1,0 +1,181 @@
+"""A submitted plan through its life: queued, running, then done, failed or cancelled."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
+from optodrive.core.types.plans import BudgetState, ExecutedPulses
+from optodrive.core.units import m_to_um
+from optodrive.daemon.engine.state_waiters import promise
+from optodrive.link.protocol.quantisation import WirePoints
+from optodrive.link.session.timing_error import TimingError
+from optodrive.physics.thermal_state import Heat
+from optodrive.planning.feasibility import Admission
+from optodrive.planning.pipeline import Prepared
+from optodrive.planning.plan_summary import PULSES_LISTED_MAX, pulse_columns, summary
+
+RECORDS_KEPT = 200
+PULSES_KEPT = 1_000_000
+"""Ended plans are forgotten beyond so many plans or pulses."""
+RECENT = 20
+
+Status = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
+
+
+@dataclass
+class PlanRecord:
+    """One plan.
+
+    start_s: board time of its zero; heat_before, budget_before: what it was planned from, on its own time line
+    executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
+    streamed: a newer plan may take the place of what has not left, dropped pulses then
+    arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
+    seen: [p] pixels that a stream's sweep over the display had lit before it
+    ending: done when nothing more will happen to it; told_end: is then called with it, and must neither wait nor raise
+    """
+
+    plan_id: str
+    name: str
+    prepared: Prepared
+    admission: Admission | None
+    points: WirePoints
+    heat_before: Heat
+    budget_before: BudgetState
+    start_s: float
+    arrived_s: float
+    streamed: bool = False
+    status: Status = "planned"
+    error: str | None = None
+    sent: int = 0
+    executed: ExecutedPulses | None = None
+    executed_rows: IntArray | None = None
+    simulated_m: FloatArray | None = None
+    executed_count: int = 0
+    delay_s: float = 0.0
+    timing_error: TimingError | None = None
+    dropped: int = 0
+    planned_after_s: float | None = None
+    first_byte_after_s: float | None = None
+    first_light_after_s: float | None = None
+    seen: BoolArray | None = None
+    ending: "Future[None]" = field(default_factory=promise)
+    told_end: "Callable[[PlanRecord], None]" = field(default=lambda record: None)
+
+    @property
+    def ended(self) -> bool:
+        """Whether nothing more will happen to it."""
+        return self.status in ("done", "superseded", "failed", "cancelled")
+
+    def end(self, status: Status, error: str | None) -> None:
+        """Nothing more will happen to it."""
+        self.status, self.error = status, error
+        self.ending.set_result(None)
+        self.told_end(self)
+
+    def answer(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
+        """The plan as REST answers it; pulses: list them one by one."""
+        answer: dict[str, Any] = {
+            "plan": self.plan_id,
+            "name": self.name,
+            "status": self.status,
+            "error": self.error,
+            "starts_in_s": self.start_s + self.delay_s - board_now_s,
+            "planned": len(self.prepared.plan),
+            "sent": self.sent,
+            "executed": self.executed_count,
+            "dropped": self.dropped,
+            "latency": {
+                "planned_s": self.planned_after_s,
+                "first_byte_s": self.first_byte_after_s,
+                "first_light_s": self.first_light_after_s,
+            },
+            "timing_error": None if self.timing_error is None else asdict(self.timing_error),
+            "summary": summary(self.prepared, self.admission),
+            "pulses": pulse_columns(self.prepared) if pulses else None,
+            "simulated_max_um": None,
+            "tallest_asked": self._tallest_asked(),
+            "executed_pulses": None,
+        }
+        if self.executed is not None:
+            answer["executed_complete"] = self.executed.complete
+            answer["delay_s"] = self.delay_s
+            if self.simulated_m is not None and len(self.simulated_m):
+                answer["simulated_max_um"] = m_to_um(float(self.simulated_m.max()))
+            if pulses and len(self.executed) <= PULSES_LISTED_MAX:
+                answer["executed_pulses"] = self._executed_columns()
+        return answer
+
+    def _tallest_asked(self) -> dict[str, Any] | None:
+        """The pulse asked to be the tallest: asked for, predicted, and simulated from what was executed."""
+        plan = self.prepared.plan
+        asked_m = np.nan_to_num(plan.target_m)
+        if not len(plan) or not asked_m.any():
+            return None
+        row = int(asked_m.argmax())
+        simulated_um = None
+        if self.simulated_m is not None and self.executed_rows is not None and row in self.executed_rows:
+            simulated_um = m_to_um(float(self.simulated_m[self.executed_rows == row][0]))
+        return {
+            "pixel": int(plan.pixel[row]),
+            "asked_um": m_to_um(float(asked_m[row])),
+            "predicted_um": m_to_um(float(self.prepared.predicted_m[row])),
+            "simulated_um": simulated_um,
+        }
+
+    def _executed_columns(self) -> dict[str, list[Any]]:
+        executed = self.executed
+        assert executed is not None  # noqa: S101 - the only caller has just looked
+        return {
+            "start_s": executed.start_s.tolist(),
+            "width_s": executed.width_s.tolist(),
+            "power_w": executed.power_w.tolist(),
+            "pixel": executed.pixel.tolist(),
+            "simulated_um": [] if self.simulated_m is None else m_to_um(self.simulated_m).tolist(),
+        }
+
+
+class PlanBook:
+    """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread.
+
+    on_end: called with each plan when it has ended, by whichever thread ended it; must not wait
+    """
+
+    def __init__(self) -> None:
+        self.on_end: list[Callable[[PlanRecord], None]] = []
+        self._lock = threading.Lock()
+        self._records: dict[str, PlanRecord] = {}
+
+    def add(self, record: PlanRecord) -> None:
+        """Keep a plan."""
+        record.told_end = self._tell_end
+        with self._lock:
+            self._records[record.plan_id] = record
+            pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
+            for plan_id, oldest in list(self._records.items()):
+                if not oldest.ended or (len(self._records) <= RECORDS_KEPT and pulses <= PULSES_KEPT):
+                    break
+                del self._records[plan_id]
+                pulses -= len(oldest.prepared.plan)
+
+    def _tell_end(self, record: PlanRecord) -> None:
+        for told in self.on_end:
+            told(record)
+
+    def find(self, plan_id: str) -> PlanRecord:
+        """A plan by its id; InputError (no_plan) where there is none."""
+        with self._lock:
+            record = self._records.get(plan_id)
+        if record is None:
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
+        return record
+
+    def recent(self) -> list[PlanRecord]:
+        """The latest plans, oldest first."""
+        with self._lock:
+            return list(self._records.values())[-RECENT:]

@@ -1,0 +1,1 @@
+"""The REST, WebSocket and page interface of the daemon, and its access control."""

@@ -1,0 +1,150 @@
+"""The tokens a daemon asks for, one for each role: from a file, or made fresh and written where only its user reads."""
+
+import json
+import os
+import re
+import secrets
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import Field, ValidationError
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import read_toml
+from optodrive.daemon.web.roles import ROLES, Role
+from optodrive.device.config import Section, check_format
+
+VARIABLE = "OPTODRIVE_TOKEN"
+FILE_VARIABLE = "OPTODRIVE_TOKENS"
+ALLOWED = r"^[!-~]{16,200}$"
+SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
+FORMAT = "optodrive-tokens"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Token:
+    """A secret, who has it, what it allows."""
+
+    name: str
+    role: Role
+    secret: str = field(repr=False)
+
+
+class Tokens:
+    """The tokens of a daemon."""
+
+    def __init__(self, tokens: Iterable[Token]) -> None:
+        self.all = tuple(tokens)
+        self._secrets = [(token.secret.encode(), token) for token in self.all]
+
+    def find(self, presented: str) -> Token | None:
+        """The token that was presented, None where it is none of these; takes the same time for each of them."""
+        given = presented.encode()
+        found = None
+        for secret, token in self._secrets:
+            if secrets.compare_digest(given, secret):
+                found = token
+        return found
+
+    @property
+    def strongest(self) -> Token:
+        """The token that allows most."""
+        return max(self.all, key=lambda token: ROLES.index(token.role))
+
+
+class _Entry(Section):
+    name: Annotated[str, Field(pattern=r"^[\w.@ -]{1,40}$")]
+    role: Role
+    secret: Annotated[str, Field(pattern=ALLOWED)]
+
+
+class _File(Section):
+    format: Literal["optodrive-tokens"]
+    version: Literal[1]
+    token: Annotated[tuple[_Entry, ...], Field(min_length=1)]
+
+
+def token_path(port: int) -> Path:
+    """Where the daemon on this TCP port keeps its tokens, unless its configuration says otherwise."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
+    return Path(runtime) / "optodrive" / f"token-{port}"
+
+
+def read_tokens(path: Path) -> Tokens:
+    """The tokens of a file; InputError, which never shows a secret, where it cannot be read or is not in order."""
+    table = read_toml(path)
+    check_format(path, table, FORMAT, VERSION)
+    try:
+        entries = _File.model_validate(table).token
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise InputError(f"{path}: {place}", "what is not shown here", first["msg"]) from None
+    for key in ("name", "secret"):
+        if len({getattr(entry, key) for entry in entries}) < len(entries):
+            raise InputError(f"{path}: token", f"a {key} twice", "each once")
+    return Tokens(Token(entry.name, entry.role, entry.secret) for entry in entries)
+
+
+def private_tokens(path: Path) -> Tokens:
+    """The tokens of a daemon's own file; InputError where others than its owner may read it."""
+    tokens = read_tokens(path)
+    mode = stat.S_IMODE(path.stat().st_mode)
+    if mode & 0o077:
+        raise InputError(str(path), f"mode {mode:04o}", f"0600, for it holds secrets: chmod 600 {path}")
+    return tokens
+
+
+def make_tokens(path: Path, armer: str | None = None) -> Tokens:
+    """A fresh token for each role, in a new file of mode 0600. armer: the armer's, if not a fresh one.
+
+    InputError where that is no token (its text is not shown), or the file cannot be made.
+    """
+    if armer and not re.fullmatch(ALLOWED, armer):
+        raise InputError(VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces")
+    tokens = Tokens(
+        Token(role, role, armer if armer and role == "armer" else secrets.token_urlsafe(32)) for role in ROLES
+    )
+    lines = [f'format = "{FORMAT}"\nversion = {VERSION}\n']
+    lines += [
+        f'\n[[token]]\nname = "{t.name}"\nrole = "{t.role}"\nsecret = {json.dumps(t.secret)}\n' for t in tokens.all
+    ]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        path.unlink(missing_ok=True)
+        path.touch(mode=0o600, exist_ok=False)
+        path.write_text("".join(lines), encoding="utf-8")
+    except OSError as error:
+        raise InputError(str(path), error.strerror, "a place for the daemon's tokens") from None
+    return tokens
+
+
+def daemon_tokens(kept: str, port: int) -> tuple[Tokens, Path]:
+    """A daemon's tokens and their file. kept: a file that outlives it, made where there is none; else fresh ones."""
+    if kept:
+        path = Path(kept)
+        return (private_tokens(path) if path.exists() else make_tokens(path)), path
+    path = token_path(port)
+    return make_tokens(path, os.environ.get(VARIABLE)), path
+
+
+def read_token(port: int | None) -> str:
+    """A token for a daemon on this TCP port, the one that allows most; InputError where there is none to be read.
+
+    port: None for one that is reached otherwise
+    """
+    given = os.environ.get(VARIABLE)
+    if given:
+        return given
+    named = os.environ.get(FILE_VARIABLE)
+    own = [] if port is None else [token_path(port)]
+    places = [Path(named)] if named else [*own, SERVICE_TOKENS]
+    for path in places:
+        if os.access(path, os.R_OK):
+            return read_tokens(path).strongest.secret
+    listed = " or ".join(str(path) for path in places)
+    raise InputError(VARIABLE, None, f"a token: set it, or {listed} to be readable")

@@ -1,0 +1,1 @@
+"""The machine as configured: display layout, scan field, servo and settling times."""

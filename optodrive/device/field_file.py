@@ -1,0 +1,98 @@
+"""field.toml: a field as a file, for people to read and for the planner to load."""
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field as Item
+from pydantic import ValidationError
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import read_toml
+from optodrive.device.calibrated_field import Field
+from optodrive.device.config import Section, check_format, input_error
+from optodrive.device.field_geometry import Geometry
+from optodrive.device.field_surface import ORDER, TERMS, Extent
+
+FORMAT = "optodrive-field"
+VERSION = 1
+
+
+class _Scanner(Section):
+    rad_per_code: Annotated[float, Item(gt=0)]
+    focal_length_m: Annotated[float, Item(gt=0)]
+
+
+class _Extent(Section):
+    x_code: float
+    y_code: float
+    x_half: Annotated[float, Item(gt=0)]
+    y_half: Annotated[float, Item(gt=0)]
+
+
+class _Surface(Section):
+    order: Literal[6]
+    x_m: Annotated[tuple[float, ...], Item(min_length=TERMS, max_length=TERMS)]
+    y_m: Annotated[tuple[float, ...], Item(min_length=TERMS, max_length=TERMS)]
+
+
+class _Uncertainty(Section):
+    sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0)], ...], ...], Item(min_length=2)]
+
+
+class _File(Section):
+    format: str
+    version: int
+    about: dict[str, str | float | int] = Item(default_factory=dict)
+    scanner: _Scanner
+    extent: _Extent
+    geometry: dict[str, float]
+    surface: _Surface
+    uncertainty: _Uncertainty
+
+
+def plain(text: str) -> str:
+    """Text without what would end a string of TOML."""
+    return "".join(letter for letter in text if letter.isprintable() and letter not in '"\\')
+
+
+def field_toml(field: Field, about: dict[str, str | float | int]) -> str:
+    """TOML of format optodrive-field, version 1."""
+    extent = field.extent
+    lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
+    lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
+    lines += ["", "[scanner] # of the configuration it was made for"]
+    lines += [f"rad_per_code = {field.rad_per_code!r}", f"focal_length_m = {field.focal_length_m!r}"]
+    lines += ["", "[extent] # the codes it is made for"]
+    lines += [f"{key} = {float(getattr(extent, key))!r}" for key in ("x_code", "y_code", "x_half", "y_half")]
+    lines += ["", "[geometry]"]
+    lines += [f"{key} = {value!r}" for key, value in field.geometry._asdict().items()]
+    lines += ["", "[surface] # Legendre products of total degree 2 to order, each of mean square 1", f"order = {ORDER}"]
+    lines += [f"{axis}_m = {row.tolist()!r}" for axis, row in zip("xy", field.surface_m, strict=True)]
+    lines += ["", "[uncertainty] # one sigma on an axis, edge to edge, rows by y", "sigma_m = ["]
+    lines += [f"  [{', '.join(f'{value:.4g}' for value in row)}]," for row in field.sigma_grid_m.tolist()]
+    return "\n".join([*lines, "]"]) + "\n"
+
+
+def read_field(path: Path) -> Field:
+    """Read field.toml; InputError with one line for another format or version, or what does not belong there."""
+    table = read_toml(path)
+    check_format(path, table, FORMAT, VERSION)
+    try:
+        content = _File.model_validate(table)
+    except ValidationError as error:
+        raise input_error(error, str(path), _File) from None
+    missing = set(Geometry._fields) ^ set(content.geometry)
+    if missing:
+        raise InputError(f"{path}: geometry", ", ".join(sorted(missing)), f"just {', '.join(Geometry._fields)}")
+    grid = content.uncertainty.sigma_m
+    if any(len(row) != len(grid) for row in grid):
+        raise InputError(f"{path}: uncertainty.sigma_m", [len(row) for row in grid], "as many columns as rows")
+    return Field(
+        geometry=Geometry(**content.geometry),
+        surface_m=np.array([content.surface.x_m, content.surface.y_m]),
+        extent=Extent(**content.extent.model_dump()),
+        rad_per_code=content.scanner.rad_per_code,
+        focal_length_m=content.scanner.focal_length_m,
+        sigma_grid_m=np.array(grid),
+    )

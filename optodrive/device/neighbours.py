@@ -1,0 +1,40 @@
+"""Who lies beside whom on the lattice of pixels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optodrive.core.types.arrays import IntArray, freeze_arrays
+from optodrive.device.config import DisplaySection, pixel_layout
+
+
+@dataclass(frozen=True, eq=False)
+class Neighbours:
+    """Pixels that share an edge. beside: [p, 4] their indices (left, right, below, above), −1 for none.
+
+    frame_edges: [p] edges at the rim of the lattice, which lie against the frame. A missing place inside is neither:
+    no heat crosses there.
+    """
+
+    beside: IntArray
+    frame_edges: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.frame_edges)
+
+    @classmethod
+    def of(cls, display: DisplaySection) -> "Neighbours":
+        """The neighbours on a display's lattice."""
+        layout = pixel_layout(display)
+        index = np.full((display.rows + 2, display.columns + 2), -1, dtype=np.int64)
+        index[layout.row + 1, layout.column + 1] = np.arange(len(layout))
+        row, column = layout.row + 1, layout.column + 1
+        beside = np.stack(
+            [index[row, column - 1], index[row, column + 1], index[row - 1, column], index[row + 1, column]], axis=1
+        )
+        at_rim = [layout.column == 0, layout.column == display.columns - 1]
+        at_rim += [layout.row == 0, layout.row == display.rows - 1]
+        return cls(beside, np.sum(at_rim, axis=0).astype(np.int64))

@@ -1,0 +1,1 @@
+"""Measured data and the board: recordings, diagnosis, validation, calibration, commissioning."""

@@ -1,0 +1,181 @@
+"""pictures.toml: what the pictures of a folder show, and to which codes the beam was sent in each."""
+
+import csv
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import Field as Item
+from pydantic import ValidationError, model_validator
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import read_toml
+from optodrive.device.config import Section, check_format, input_error
+from optodrive.device.field_geometry import CODE_MAX
+
+FORMAT = "optodrive-pictures"
+VERSION = 1
+DESCRIPTION = "pictures.toml"
+COLUMNS = ("file", "x_code", "y_code")
+NAMED = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
+SPOTS = "spots.csv"
+"""What is measured is kept in this file of the folder."""
+VIEWS_LEAST = 3
+"""From fewer pictures of the grid the camera is not told from its place."""
+PITCH_M = (0.2e-3, 0.1)
+"""Distances of a grid that a camera sees as a whole."""
+
+Finite = Annotated[float, Item(allow_inf_nan=False)]
+Pair = tuple[Finite, Finite]
+Name = Annotated[str, Item(min_length=1)]
+
+
+class GridSection(Section):
+    """The grid: rows × columns of inner corners or of dots, pitch_m apart; the first picture has it in the plane."""
+
+    kind: Literal["chessboard", "circles"]
+    rows: Annotated[int, Item(ge=3, le=200)]
+    columns: Annotated[int, Item(ge=3, le=200)]
+    pitch_m: Annotated[float, Item(gt=0)]
+    pictures: Annotated[tuple[Name, ...], Item(min_length=1)]
+
+
+class OriginSection(Section):
+    """How the grid lies on the display, as seen from the front.
+
+    marks_px: in the first picture of the grid about where its first corner is seen, the last of the first row, and the
+    last of the first column; columns and rows of the picture from its upper left
+    first_m: where the first corner lies on the display, from its middle; turn_rad: of the rows, anticlockwise
+    """
+
+    marks_px: tuple[Pair, Pair, Pair]
+    first_m: Pair
+    turn_rad: Annotated[float, Item(ge=-3.2, le=3.2)] = 0.0
+
+
+class SpotsSection(Section):
+    """The pictures of spots: a table file,x_code,y_code, or a pattern of names that end with both codes."""
+
+    table: Name | None = None
+    pictures: Name | None = None
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.table is None) == (self.pictures is None):
+            raise ValueError("either table or pictures, just one of both")
+        if self.table == SPOTS:
+            raise ValueError(f"another name than {SPOTS}, in which what is measured is kept")
+        return self
+
+
+class _File(Section):
+    format: str
+    version: int
+    dark: Name | None = None
+    grid: GridSection
+    origin: OriginSection
+    spots: SpotsSection
+
+
+@dataclass(frozen=True)
+class SpotPicture:
+    """A picture of the beam's spot, and the codes it was sent to."""
+
+    path: Path
+    x_code: float
+    y_code: float
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """A folder as described. dark: the plane without the beam, None where no such picture was taken."""
+
+    path: Path
+    grid: GridSection
+    origin: OriginSection
+    views: tuple[Path, ...]
+    dark: Path | None
+    spots: tuple[SpotPicture, ...]
+
+
+def read_folder(folder: Path) -> Pictures:
+    """Read FOLDER/pictures.toml and what it names; every picture exists. InputError names file, key and value."""
+    path = folder / DESCRIPTION
+    table = read_toml(path)
+    check_format(path, table, FORMAT, VERSION)
+    try:
+        content = _File.model_validate(table)
+    except ValidationError as error:
+        raise input_error(error, str(path), _File) from None
+    _check_pitch(path, content.grid.pitch_m)
+    if 1 < len(content.grid.pictures) < VIEWS_LEAST:
+        expected = f"1, or at least {VIEWS_LEAST} from which the camera is told from its place"
+        raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)
+    views = tuple(_there(folder, name, f"{path}: grid.pictures") for name in content.grid.pictures)
+    dark = None if content.dark is None else _there(folder, content.dark, f"{path}: dark")
+    rows = _by_table(folder, content.spots.table) if content.spots.table else _by_name(folder, path, content.spots)
+    return Pictures(path, content.grid, content.origin, views, dark, rows)
+
+
+def _check_pitch(path: Path, pitch_m: float) -> None:
+    least, most = PITCH_M
+    if not least <= pitch_m <= most:
+        alike = [
+            name for name, unit in (("millimetres", 1e-3), ("micrometres", 1e-6)) if least <= pitch_m * unit <= most
+        ]
+        looks = f"; this looks like {alike[0]}" if pitch_m > most and alike else ""
+        raise InputError(f"{path}: grid.pitch_m", pitch_m, f"{least:g} to {most:g} m{looks}")
+
+
+def _there(folder: Path, name: str, where: str) -> Path:
+    if not (folder / name).is_file():
+        raise InputError(where, name, f"a picture in {folder}")
+    return folder / name
+
+
+def _by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[SpotPicture, ...]:
+    where, pattern = f"{path}: spots.pictures", str(section.pictures)
+    if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
+        raise InputError(where, pattern, "a pattern of names inside the folder, as spot_*.png")
+    out = []
+    for picture in sorted(folder.glob(pattern)):
+        codes = NAMED.search(picture.name)
+        if codes is None:
+            raise InputError(where, picture.name, "a name that ends with both codes, as spot_32768_17404.png")
+        x_code, y_code = (_code(f"{where}: {picture.name}", each) for each in codes.groups())
+        out.append(SpotPicture(picture, x_code, y_code))
+    if not out:
+        raise InputError(where, pattern, f"a pattern that pictures in {folder} have")
+    return tuple(out)
+
+
+def _by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
+    path = folder / name
+    try:
+        with path.open(encoding="utf-8-sig", newline="") as file:
+            rows = [[cell.strip() for cell in row] for row in csv.reader(file)]
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(str(path), str(error), "a readable CSV file") from None
+    if not rows or tuple(rows[0]) != COLUMNS:
+        raise InputError(f"{path}: first line", ",".join(rows[0]) if rows else "", f"'{','.join(COLUMNS)}'")
+    out = []
+    for number, row in enumerate(rows[1:], start=2):
+        where = f"{path}: row {number}"
+        if not row:
+            continue
+        if len(row) != len(COLUMNS):
+            raise InputError(where, ",".join(row), ", ".join(COLUMNS))
+        codes = [_code(f"{where}: {column}", cell) for column, cell in zip(COLUMNS[1:], row[1:], strict=True)]
+        out.append(SpotPicture(_there(folder, row[0], f"{where}: file"), codes[0], codes[1]))
+    return tuple(out)
+
+
+def _code(where: str, text: str) -> float:
+    try:
+        code = float(text)
+    except ValueError:
+        raise InputError(where, text, "a number") from None
+    if not 0.0 <= code <= CODE_MAX:
+        raise InputError(where, text, f"a code, 0 to {CODE_MAX}")
+    return code

@@ -1,0 +1,83 @@
+"""What is known of a field before anything is measured: nominal numbers, and how far a workshop may be off them."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.config import Config, pixel_layout
+from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, Geometry
+from optodrive.device.field_surface import Extent
+
+MARGIN_M = 5e-3
+"""A field is made for so much more than the pixels to every side: uncorrected codes miss by millimetres."""
+LEAST_M = 1e-3
+"""Half of a display that is hardly more than a pixel."""
+NOISE_M = 10e-6
+SURFACE_M = 12e-6
+"""What one expects of a spot's noise and of the surface, rms on an axis; both are fitted where spots suffice."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """What a fit starts from.
+
+    mean, width: of each parameter of the geometry; extent: the codes to make the field for; pixels: those nominally of
+    the display
+    rad_per_code, focal_length_m: of the configuration; noise_m, surface_m: expected rms on an axis
+    field_m2: the area over which a false detection may lie
+    """
+
+    mean: Geometry
+    width: FloatArray
+    rad_per_code: float
+    focal_length_m: float
+    extent: Extent
+    pixels: Extent
+    field_m2: float
+    noise_m: float = NOISE_M
+    surface_m: float = SURFACE_M
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @classmethod
+    def of(cls, config: Config) -> Self:
+        """Nominal numbers of a configuration, with the tolerances of an ordinary laboratory."""
+        scanner, layout = config.scanner, pixel_layout(config.display)
+        focal_m, range_rad = scanner.focal_length_m, scanner.range_rad
+        display_m = [max(LEAST_M, float(np.abs(axis).max())) for axis in (layout.x_m, layout.y_m)]
+        half_m = [half + MARGIN_M for half in display_m]
+        edge_rad = float(np.hypot(half_m[0], half_m[1])) / focal_m
+        code_m = 2.0 * focal_m * scanner.code_rad
+        x_half, y_half = (min(half / code_m, float(CODE_MAX - CENTRE_CODE)) for half in half_m)
+        tolerances = {
+            "gain_x": (1.0, 0.01),
+            "gain_y": (1.0, 0.01),
+            "offset_x_rad": (0.0, 2e-3),
+            "offset_y_rad": (0.0, 2e-3),
+            "cross_x": (0.0, 5e-3),
+            "cross_y": (0.0, 5e-3),
+            "cubic_x_per_rad2": (0.0, 2e-3 / range_rad**2),
+            "cubic_y_per_rad2": (0.0, 2e-3 / range_rad**2),
+            "apart_m": (14e-3, 4e-3),
+            "lens_at_m": (45e-3, 12e-3),
+            "focal_m": (focal_m, 0.005 * focal_m),
+            "bend3_per_rad2": (0.0, 3e-3 / edge_rad**2),
+            "bend5_per_rad4": (0.0, 1e-3 / edge_rad**4),
+            "shift_x_m": (0.0, 2e-3),
+            "shift_y_m": (0.0, 2e-3),
+            "turn_rad": (0.0, 0.03),
+            "tilt_x_rad": (0.0, 0.015),
+            "tilt_y_rad": (0.0, 0.015),
+        }
+        return cls(
+            mean=Geometry(**{name: mean for name, (mean, _) in tolerances.items()}),
+            width=np.array([tolerances[name][1] for name in Geometry._fields]),
+            rad_per_code=scanner.code_rad,
+            focal_length_m=focal_m,
+            extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), x_half, y_half),
+            pixels=Extent(float(CENTRE_CODE), float(CENTRE_CODE), display_m[0] / code_m, display_m[1] / code_m),
+            field_m2=4.0 * half_m[0] * half_m[1],
+        )

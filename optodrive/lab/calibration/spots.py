@@ -1,0 +1,63 @@
+"""Spots: where the beam was sent, and where it was seen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Self
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.numeric_tables import read_columns, write_columns
+from optodrive.core.types.arrays import FloatArray, freeze_arrays
+from optodrive.device.field_geometry import CODE_MAX
+
+COLUMNS = ("x_code", "y_code", "x_m", "y_m")
+
+
+@dataclass(frozen=True, eq=False)
+class Spots:
+    """Codes of the converter, and where the beam landed on the display, m; all [n]."""
+
+    x_code: FloatArray
+    y_code: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    def __len__(self) -> int:
+        return len(self.x_code)
+
+    @classmethod
+    def of(cls, table: FloatArray) -> Self:
+        """From rows of x_code, y_code, x_m, y_m, [n, 4]."""
+        x_code, y_code, x_m, y_m = np.array(table, dtype=np.float64).reshape(-1, 4).T.copy()
+        return cls(x_code, y_code, x_m, y_m)
+
+    def table(self) -> FloatArray:
+        """Rows of x_code, y_code, x_m, y_m, [n, 4]."""
+        return np.column_stack([self.x_code, self.y_code, self.x_m, self.y_m])
+
+
+def read_spots(path: Path) -> Spots:
+    """Read spots.csv; InputError names file, row, column, value and what was expected."""
+    table = read_columns(path, COLUMNS)
+    if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
+        swapped = np.abs(table[:, 2:]).max() > 100.0
+        raise InputError(
+            f"{path}: x_code, y_code",
+            float(table[0, 0]),
+            "codes of the converter, 0 to 65535; these look like metres"
+            + (", with the columns of codes and of metres exchanged" if swapped else ""),
+        )
+    bad = np.argwhere((table[:, :2] < 0) | (table[:, :2] > CODE_MAX))
+    if len(bad):
+        row, column = bad[0].tolist()
+        raise InputError(f"{path}: row {row + 2}: {COLUMNS[column]}", float(table[row, column]), f"0 to {CODE_MAX}")
+    return Spots.of(table)
+
+
+def write_spots(path: Path, spots: Spots) -> None:
+    """Write spots.csv, whole or not at all."""
+    write_columns(path, COLUMNS, spots.table(), ("%.17g", "%.17g", "%.9g", "%.9g"))

@@ -1,0 +1,275 @@
+"""A board held for one task: armed once, points one at a time, and none that the limiter has not passed.
+
+Whoever holds it leaves it through `close`, which tells it to abort; where that is not heard, the closed port and the
+lease end it dark.
+"""
+
+import gc
+import sys
+from dataclasses import fields
+from math import ceil, inf, pi
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+
+from optodrive.core.clock import Clock, claim_processor
+from optodrive.core.errors import (
+    BoardFaultError,
+    InputError,
+    LinkError,
+    LocalProtocolError,
+    NotReadyError,
+    OverBudgetError,
+)
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
+from optodrive.device.config import Config
+from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.fault_hints import hint
+from optodrive.link.session.session import Session
+from optodrive.link.transport.base import Transport
+from optodrive.planning.limiter.limiter import limit, shifted, verify
+from optodrive.planning.pipeline import Display
+
+TURN_S = 0.002
+SWITCH_INTERVAL_S = 2e-4
+"""As the engine's: another thread that computes must not keep the lease waiting."""
+BEYOND_M = 4e-3
+"""Beams are sent so far beyond the outermost pixels: uncorrected they miss by less."""
+SPOT_POWER_MAX_W = 0.05
+"""Most power of a spot: 2 % of what draws a pixel, and steadily on one absorber a few kelvin."""
+SPOT_SHARE_MAX = 0.05
+"""And no more than this share of the laser's power."""
+SPOT_WIDTH_S = 0.02
+START_LEAD_S = 0.03
+SETTLED = 15.0
+"""A move has so many of the servo's time constants to die out."""
+ARM_TIMEOUT_S = 6.0
+POINT_TIMEOUT_S = 3.0
+FAULT_NAMED_S = 0.5
+
+
+class HeldBoard:
+    """A board and its session. Methods raise LinkError, BoardFaultError, NotReadyError for what ends the task."""
+
+    def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
+        self._display, self._clock = display, clock
+        config = display.config
+        code_m = 2.0 * config.scanner.focal_length_m * config.scanner.code_rad
+        self.requirements = Requirements.of(config, ceil(BEYOND_M / code_m))
+        self._limits = self.requirements.limits()
+        self.session = Session(transport, clock, self.requirements)
+        self._state = display.at_rest()[1]
+        self._zero_s: float | None = None
+        self._pixel = weakest_pixel(display)
+        self._settle_s, self._width_s = settle_s(config), spot_width_s(config)
+        self._in_use = self._armed = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def config(self) -> Config:
+        """Of the display before it."""
+        return self._display.config
+
+    def connect(self) -> None:
+        """Open the link and shake hands; kernels are loaded first, for whoever compiles renews no lease."""
+        sys.setswitchinterval(SWITCH_INTERVAL_S)
+        claim_processor()
+        limit(self._plan(0.0, 0.0, self._dark_w), self._state, self._display.budget)
+        gc.collect()
+        gc.freeze()
+        self.session.connect()
+        while self.session.board.temperature_c is None:  # until a STATUS tells of faults and inputs
+            self.session.step(TURN_S, lease=False)
+
+    def close(self) -> None:
+        """Abort, and close the link for good."""
+        self._in_use = self._armed = False
+        self.session.close()
+
+    def step(self) -> None:
+        """Keep the lease and listen, for a moment; raises where the board ended the task by itself."""
+        self.session.step(TURN_S, lease=True)
+        board, refusal = self.session.board, self.session.take_refusal()
+        if board.state == "FAULT" and self._in_use:
+            raise self._fault()
+        if refusal is not None:
+            raise NotReadyError(f"the board refuses: {refusal}")
+        if self._armed and board.state in ("DISARMED", "ARMING"):
+            raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_reason}")
+
+    def _fault(self) -> BoardFaultError:
+        """The fault by its name, which a STATUS tells soon after an ACK told of FAULT."""
+        until_s = self._clock.now_s() + FAULT_NAMED_S
+        while not self.session.board.fault and self._clock.now_s() < until_s:
+            self.session.step(TURN_S, lease=False)
+        fault = self.session.board.fault
+        return BoardFaultError(f"the board went to FAULT {fault}: {hint(fault)}")
+
+    def wait(self, duration_s: float) -> None:
+        """Let time pass, the lease kept."""
+        until_s = self._clock.now_s() + duration_s
+        while self._clock.now_s() < until_s:
+            self.step()
+
+    def arm(self) -> float:
+        """Arm; how long it took from the order to ARMED, s: the board lights its indicator for two seconds first."""
+        began_s = self._clock.now_s()
+        self.session.arm()
+        self._in_use = True
+        while self.session.board.state != "ARMED":
+            self.step()
+            if self._clock.now_s() - began_s > ARM_TIMEOUT_S:
+                raise NotReadyError(f"the board did not arm within {ARM_TIMEOUT_S:g} s: {self.session.board.state}")
+        self._armed = True
+        return self._clock.now_s() - began_s
+
+    def disarm(self) -> None:
+        """To DISARMED, a fault acknowledged, and hear that it is; NotReadyError where the board refuses."""
+        self._in_use = self._armed = False
+        self.session.disarm()
+        until_s = self._clock.now_s() + ARM_TIMEOUT_S
+        while self.session.board.state != "DISARMED":
+            self.session.step(TURN_S, lease=False)
+            refusal = self.session.take_refusal()
+            if refusal is not None:
+                raise NotReadyError(f"the board refuses to disarm: {refusal}")
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"the board does not say that it is disarmed: {self.session.board.state}")
+
+    # --- points -------------------------------------------------------------------------------------------------
+
+    def go(self, x_code: int, y_code: int) -> None:
+        """Send the mirrors somewhere in the dark, and wait until they have settled."""
+        self._show(x_code, y_code, self._dark_w, lit=False)
+
+    def light(self, x_code: int, y_code: int, power_w: float) -> None:
+        """One short pulse at a place, mirrors settled; done when the board has reported it in full."""
+        check_power(self.config, power_w)
+        self._show(x_code, y_code, power_w, lit=True)
+
+    @property
+    def _dark_w(self) -> float:
+        """Rounds to a duty of nothing: the board gets a dark point, while the limiter counts the mirrors' move."""
+        return 0.5 * self.config.laser.max_power_w / DUTY_MAX
+
+    def _plan(self, x_rad: float, y_rad: float, power_w: float) -> PulsePlan:
+        """One pulse. Nobody knows yet which pixel it meets: all count on one, the one that bears least."""
+        columns = {
+            "start_s": self._settle_s,
+            "width_s": self._width_s,
+            "x_rad": x_rad,
+            "y_rad": y_rad,
+            "power_w": power_w,
+            "pixel": self._pixel,
+            "settle_s": self._settle_s,
+            "target_m": np.nan,
+            "nominal_s": self._settle_s,
+            "source": 0,
+        }
+        return PulsePlan(**{item.name: np.array([columns[item.name]]) for item in fields(PulsePlan)})
+
+    def _show(self, x_code: int, y_code: int, power_w: float, lit: bool) -> None:
+        self.check_range(x_code, y_code)
+        if not self._armed:
+            raise NotReadyError(f"the board is not armed: {self.session.board.state}")
+        while not self.session.ready:
+            self.step()
+        scale = self.session.scale
+        x_rad, y_rad = scale.angles(np.array([x_code, y_code]))
+        plan = self._plan(x_rad, y_rad, power_w)
+        limited, before, after, start_s = self._passed(plan)
+        points = quantise(limited, scale)
+        self._prove(points, limited, before, lit)
+        self._state, self._zero_s = after, start_s
+        self._zero_s += self._run(points, limited, start_s, lit)
+
+    def check_range(self, x_code: int, y_code: int) -> None:
+        """InputError for codes beyond the display and a little more."""
+        limits = self._limits
+        for axis, code in (("x", x_code), ("y", y_code)):
+            low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
+            if not low <= code <= high:
+                raise InputError(f"{axis}_code", code, f"{low} to {high}, the display and {BEYOND_M * 1e3:g} mm more")
+
+    def within(self, codes: FloatArray) -> FloatArray:
+        """Codes [k, 2], those too far out drawn in as far as the board goes."""
+        limits = self._limits
+        return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
+
+    def _passed(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
+        """The plan as the limiter lets it pass, the state before and after, and when it begins; waits where it must."""
+        while True:
+            start_s = self.session.board_s() + START_LEAD_S
+            before = shifted(self._state, (start_s if self._zero_s is None else self._zero_s) - start_s)
+            try:
+                limited, after = limit(plan, before, self._display.budget, "refuse")
+            except OverBudgetError as error:
+                if error.earliest_s == inf:
+                    raise
+                self.wait(error.earliest_s)
+                continue
+            return limited, before, after, start_s
+
+    def _prove(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, lit: bool) -> None:
+        """Decode the very bytes that will leave, and hold them against the budget."""
+        decoded = decode(points.payload(), self.session.scale)
+        if len(decoded.index) != int(lit):
+            raise LocalProtocolError(f"{len(decoded.index)} lit points where {int(lit)} is meant")
+        verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
+
+    def _run(self, points: WirePoints, plan: LimitedPlan, start_s: float, lit: bool) -> float:
+        """Stream points and hear them through; by how much they came late, s."""
+        job = self.session.begin(points, start_s)
+        until_s = self._clock.now_s() + POINT_TIMEOUT_S
+        while not job.finished:
+            self.step()
+            if self._clock.now_s() > until_s:
+                raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
+        done = job.executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
+        if lit and not np.allclose(done.width_s, plan.width_s):
+            raise BoardFaultError(f"the board lit a spot for {done.width_s.sum():g} s, asked for {plan.width_s[0]:g} s")
+        ended_s = float(done.start_s[-1] + done.width_s[-1])
+        return max(0.0, ended_s - float(plan.start_s[0] + plan.width_s[0]))
+
+
+def weakest_pixel(display: Display) -> int:
+    """The pixel whose absorber steady light warms most."""
+    heat = display.budget.heat
+    return int(np.argmax(heat.epsilon * heat.r_k_per_w))
+
+
+def settle_s(config: Config) -> float:
+    """Dark time in which any move dies out, s, whole milliseconds."""
+    scanner = config.scanner
+    ramp_s = 2.0 * scanner.range_rad / scanner.slew_rad_per_s
+    constant_s = 1.0 / (2.0 * pi * scanner.bandwidth_hz * scanner.damping)
+    return ceil(1e3 * (scanner.delay_s + ramp_s + SETTLED * constant_s)) * 1e-3
+
+
+def spot_width_s(config: Config) -> float:
+    """Width of a spot's pulse, s: whole PWM periods, no more than a pulse may have."""
+    pwm_hz = config.laser.pwm_hz
+    periods = max(1, int(min(SPOT_WIDTH_S, config.limits.pulse_width_max_s) * pwm_hz * (1 + 1e-9)))
+    return round(periods / pwm_hz * 1e6) * 1e-6
+
+
+def power_max_w(config: Config) -> float:
+    """Most power of a spot, W."""
+    return min(SPOT_POWER_MAX_W, SPOT_SHARE_MAX * config.laser.max_power_w)
+
+
+def check_power(config: Config, power_w: float, option: str = "--spot") -> None:
+    """InputError, naming the option, for a power that no spot may have."""
+    most_w = power_max_w(config)
+    if not 0.0 < power_w <= most_w:
+        raise InputError(option, f"{power_w * 1e3:g} mW", f"more than 0 and at most {most_w * 1e3:g} mW")

@@ -1,0 +1,94 @@
+"""The host's side of a spot sensor: a line asked, a line answered, and nothing that blocks. See SENSOR.md."""
+
+from math import isfinite
+from typing import NamedTuple
+
+from optodrive.core.errors import LinkError
+from optodrive.core.units import um_to_m
+from optodrive.link.transport.base import Transport
+
+LINE_MAX = 64
+
+
+class Sighting(NamedTuple):
+    """Where a spot was seen on the display, and one sigma of either number."""
+
+    x_m: float
+    y_m: float
+    sigma_m: float
+
+
+class SpotSensor:
+    """A sensor on a transport of its own. Methods raise LinkError when the link fails or what is heard is no answer."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self._heard = b""
+
+    @property
+    def port(self) -> str:
+        """The transport's name."""
+        return self._transport.name
+
+    def open(self) -> None:
+        """Open its port; InputError where there is none."""
+        self._transport.open()
+
+    def close(self) -> None:
+        """Close its port."""
+        self._transport.release()
+
+    def ask(self, request: str) -> None:
+        """Say a line; what lay there unheard belongs to no question and is dropped."""
+        self._read()
+        self._heard = b""
+        try:
+            self._transport.write(request.encode("ascii") + b"\n")
+        except LinkError as error:
+            raise LinkError(f"sensor: {error}") from None
+
+    def answer(self) -> str | None:
+        """The line that came, None as long as there is none."""
+        self._heard += self._read()
+        line, end, _ = self._heard.partition(b"\n")
+        if not end:
+            if len(self._heard) > LINE_MAX:
+                raise self._no_answer(self._heard.decode("ascii", "replace"), "a line")
+            return None
+        return line.decode("ascii", "replace").strip()
+
+    def _read(self) -> bytes:
+        try:
+            return self._transport.read(0.0)
+        except LinkError as error:
+            raise LinkError(f"sensor: {error}") from None
+
+    def sighting(self, line: str) -> Sighting | None:
+        """The answer to `spot`; None where it saw nothing."""
+        numbers = self._numbers(line, "spot", 3)
+        if numbers is None:
+            return None
+        x_m, y_m, sigma_m = (um_to_m(number) for number in numbers)
+        return Sighting(x_m, y_m, sigma_m)
+
+    def mirrors_rad(self, line: str) -> tuple[float, float] | None:
+        """The answer to `mirrors`; None where the driver has no position outputs."""
+        numbers = self._numbers(line, "mirrors", 2)
+        return None if numbers is None else (numbers[0], numbers[1])
+
+    def _numbers(self, line: str, request: str, count: int) -> list[float] | None:
+        word, *rest = line.split() or [""]
+        if word == request and rest == ["none"]:
+            return None
+        try:
+            numbers = [float(each) for each in rest]
+        except ValueError:
+            numbers = []
+        if word != request or len(numbers) != count or not all(map(isfinite, numbers)):
+            raise self._no_answer(line, f"'{request}' and {count} numbers, or '{request} none'")
+        return numbers
+
+    def _no_answer(self, heard: str, expected: str) -> LinkError:
+        return LinkError(
+            f"sensor at {self.port}: heard {heard[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
+        )

@@ -1,0 +1,238 @@
+"""Noise of each kind of signal: white, and two coloured parts, on any sample times; what a run shares beside it.
+
+Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt), whitened by a Kalman filter, which takes missing
+samples as they come. Beside it each run has a power jitter, a timing jitter and a baseline per signal. All of it is
+estimated from repeats: contrasts between runs of one group hold no model at all.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import cos, exp, log, pi, sin, sqrt
+
+import numpy as np
+from scipy.optimize import minimize
+
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
+from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
+from optodrive.lab.diagnosis.replicate_contrasts import Contrast, as_contrasts, contrasts
+
+EPS = 1e-12
+
+
+@dataclass(frozen=True)
+class Coloured:
+    """white: σ; two parts: σ and correlation time, s; swing_per_s: angular frequency of the second part."""
+
+    white: float
+    sigma: tuple[float, float]
+    tau_s: tuple[float, float]
+    swing_per_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """coloured: by kind of signal; power: relative; timing: s; baseline: by kind; measured: from repeats.
+
+    uneven: by how many of its own σ the worst pair of repeats differs more than this model has it; unsteady: likewise
+    what repeats differ by as if the power changed within pulses
+    """
+
+    coloured: dict[int, Coloured]
+    power: float
+    timing_s: float
+    baseline: dict[int, float]
+    measured: bool
+    uneven: float = 0.0
+    unsteady: float = 0.0
+
+
+@kernel
+def _whiten(
+    t_s: FloatArray,
+    columns: FloatArray,
+    white: float,
+    sigma_1: float,
+    tau_1: float,
+    sigma_2: float,
+    tau_2: float,
+    swing: float,
+    out: FloatArray,
+) -> float:
+    """Whitened columns [n, k] into out; returns ln |Σ|. States: the first part, the second and its quadrature."""
+    n, k = columns.shape
+    x = np.zeros((k, 3))
+    v1, v2, q = sigma_1 * sigma_1, sigma_2 * sigma_2, white * white
+    p00, p01, p02, p11, p12, p22 = v1, 0.0, 0.0, v2, 0.0, v2
+    a1 = a2 = co = si = total = 0.0
+    known_s = -1.0
+    for row in range(n):
+        if row > 0:
+            dt = t_s[row] - t_s[row - 1]
+            if abs(dt - known_s) > 1e-9 * dt:
+                a1, a2, known_s = exp(-dt / tau_1), exp(-dt / tau_2), dt
+                co, si = a2 * cos(swing * dt), a2 * sin(swing * dt)
+            # P ← F P Fᵀ + Q with F = diag(a1, rotation × a2).
+            n01, n02 = a1 * (co * p01 - si * p02), a1 * (si * p01 + co * p02)
+            r11, r12 = co * p11 - si * p12, co * p12 - si * p22
+            s11, s12 = si * p11 + co * p12, si * p12 + co * p22
+            p00 = a1 * a1 * p00 + v1 * (1.0 - a1 * a1)
+            p11, p12, p22 = (
+                co * r11 - si * r12 + v2 * (1.0 - a2 * a2),
+                si * r11 + co * r12,
+                si * s11 + co * s12 + v2 * (1.0 - a2 * a2),
+            )
+            p01, p02 = n01, n02
+        h0, h1, h2 = p00 + p01, p01 + p11, p02 + p12
+        s = h0 + h1 + q
+        g0, g1, g2, root = h0 / s, h1 / s, h2 / s, 1.0 / sqrt(s)
+        total += log(s)
+        for column in range(k):
+            if row > 0:
+                x0, x1, x2 = a1 * x[column, 0], x[column, 1], x[column, 2]
+                x1, x2 = co * x1 - si * x2, si * x1 + co * x2
+            else:
+                x0 = x1 = x2 = 0.0
+            e = columns[row, column] - x0 - x1
+            out[row, column] = e * root
+            x[column, 0], x[column, 1], x[column, 2] = x0 + g0 * e, x1 + g1 * e, x2 + g2 * e
+        p00, p01, p02 = p00 - g0 * h0, p01 - g0 * h1, p02 - g0 * h2
+        p11, p12, p22 = p11 - g1 * h1, p12 - g1 * h2, p22 - g2 * h2
+    return float(total)
+
+
+def whiten(t_s: FloatArray, columns: FloatArray, noise: Coloured) -> tuple[FloatArray, float]:
+    """Columns [n, k] of one block with unit white noise, and ln |Σ|."""
+    out = np.empty_like(columns, order="C")
+    logdet = _whiten(
+        np.ascontiguousarray(t_s),
+        np.ascontiguousarray(columns),
+        noise.white,
+        noise.sigma[0],
+        noise.tau_s[0],
+        noise.sigma[1],
+        noise.tau_s[1],
+        noise.swing_per_s,
+        out,
+    )
+    return out, logdet
+
+
+def estimate(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
+    """The noise model by maximum likelihood of the contrasts; without repeats, of the residuals themselves.
+
+    power, timing: [m] the prediction's change with the logarithm of the power, and with a delay, per second.
+    """
+    found = contrasts(data, residual, power, timing)
+    coloured: dict[int, Coloured] = {}
+    for kind in data.kinds():
+        own = [item for item in found if item.kind == kind]
+        if not own:
+            own = as_contrasts(data, residual, power, timing, kind)
+        coloured[kind] = _fit_coloured(own)
+    if not found:
+        return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
+    power_sigma, timing_s, baseline = _fit_jitter(found, coloured, data.kinds())
+    model = NoiseModel(coloured, power_sigma, timing_s, baseline, True)
+    return replace(
+        model, uneven=max((_unevenness(item, model) for item in found if item.kind in PIXEL_KINDS), default=0.0)
+    )
+
+
+def _unevenness(contrast: Contrast, model: NoiseModel) -> float:
+    """χ² of a contrast, its jitters allowed for, in σ above what it should be."""
+    size = np.array([model.power, model.timing_s, model.baseline[contrast.kind]])
+    columns = np.column_stack([contrast.value, contrast.jitter * size])
+    whitened, _ = whiten(contrast.t_s, columns, model.coloured[contrast.kind])
+    gram, count = whitened.T @ whitened, len(contrast.value)
+    inner = gram[1:, 1:] + np.eye(len(size))
+    return float((gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:]) - count) / sqrt(2.0 * count))
+
+
+def _minimise(function: Callable[[FloatArray], float], start: FloatArray, step: float, evaluations: int) -> FloatArray:
+    simplex = np.vstack([start, *(start + step * row for row in np.eye(len(start)))])
+    options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.01, "fatol": 0.05}
+    return np.asarray(minimize(function, start, method="Nelder-Mead", options=options).x)
+
+
+def _fit_coloured(contrasts: list[Contrast]) -> Coloured:
+    """One kind's noise, each contrast's jitters projected out."""
+    steps = np.concatenate([np.diff(item.value) for item in contrasts])
+    spread = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
+    white = min(spread, float(1.4826 * np.median(np.abs(steps)) / sqrt(2.0)) + 1e-3 * spread)
+    dt_s = float(np.median(np.concatenate([np.diff(item.t_s) for item in contrasts])))
+    stacked = [(item.t_s, np.column_stack([item.value, _scaled(item.jitter)])) for item in contrasts]
+
+    def read(x: FloatArray) -> Coloured:
+        first, second = dt_s * exp(x[3]), dt_s * exp(x[4])
+        swing = exp(x[5]) if len(x) > 5 else 0.0
+        return Coloured(white * exp(x[0]), (white * exp(x[1]), white * exp(x[2])), (first, second), swing)
+
+    def cost(x: FloatArray) -> float:
+        noise, total = read(x), 0.0
+        for t_s, columns in stacked:
+            whitened, logdet = whiten(t_s, columns, noise)
+            gram = whitened.T @ whitened
+            inner = gram[1:, 1:] + 1e-9 * np.eye(len(gram) - 1) * np.trace(gram)
+            total += logdet + gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:])
+            total += float(np.linalg.slogdet(inner)[1])
+        # Weak priors keep parts that the data does not show from wandering off.
+        return total + 0.02 * float((x[:5] ** 2).sum()) + 1e3 * float(np.maximum(0.0, np.abs(x[:5]) - 8.0).sum())
+
+    plain = np.array([-0.1, -0.7, -1.0, 1.0, 3.0])
+    best = _minimise(cost, plain, 0.7, 220)
+    swinging = np.array([-0.1, -1.5, -0.7, 2.0, 2.5, log(_swing(contrasts, dt_s))])
+    other = _minimise(cost, swinging, 0.4, 260)
+    return read(other) if cost(other) < cost(best) - 6.0 else read(best)
+
+
+def _swing(contrasts: list[Contrast], dt_s: float) -> float:
+    """Angular frequency of the strongest swing: the peak of the mean spectrum over its own smooth course."""
+    count, power = 256, np.zeros(129)
+    for item in contrasts:
+        for start in range(0, len(item.value) - count + 1, count):
+            piece = item.value[start : start + count]
+            power += np.abs(np.fft.rfft((piece - piece.mean()) * np.hanning(count))) ** 2
+    if not power.any():
+        return 0.2 * pi / dt_s
+    smooth = np.convolve(np.log(power[2:] + EPS * power.max()), np.ones(5) / 5, mode="same")
+    return float((2 + int(np.argmax(smooth[2:-2])) + 2) * 2.0 * pi / (count * dt_s))
+
+
+def _scaled(jitter: FloatArray) -> FloatArray:
+    size = np.sqrt((jitter**2).sum(axis=0))
+    return np.asarray(jitter[:, size > 0] / size[size > 0])
+
+
+def _fit_jitter(
+    contrasts: list[Contrast], coloured: dict[int, Coloured], kinds: list[int]
+) -> tuple[float, float, dict[int, float]]:
+    """σ of power (relative), timing (s) and baselines, by the likelihood of what each contrast shows of them."""
+    pairs: dict[int, list[Contrast]] = {}
+    for item in contrasts:
+        pairs.setdefault(item.pair, []).append(item)
+    grams = []
+    for own in pairs.values():
+        size = 2 + len(kinds)
+        gram, right = np.zeros((size, size)), np.zeros(size)
+        for item in own:
+            whitened, _ = whiten(item.t_s, np.column_stack([item.jitter, item.value]), coloured[item.kind])
+            small = whitened.T @ whitened
+            places = [0, 1, 2 + kinds.index(item.kind)]
+            gram[np.ix_(places, places)] += small[:3, :3]
+            right[places] += small[:3, 3]
+        grams.append((gram, right))
+    start = np.log(np.array([0.005, 2e-5, *(coloured[kind].white for kind in kinds)]))
+
+    def cost(x: FloatArray) -> float:
+        variance = np.exp(2.0 * (x + start))
+        total = float((x[:2] ** 2).sum()) + float((x[2:] ** 2).sum()) / 9.0
+        for gram, right in grams:
+            root = np.sqrt(variance)
+            inner = np.eye(len(root)) + root[:, None] * gram * root
+            scaled = root * right
+            total += float(np.linalg.slogdet(inner)[1]) - float(scaled @ np.linalg.solve(inner, scaled))
+        return total
+
+    best = np.exp(_minimise(cost, np.zeros(len(start)), 0.5, 400) + start)
+    return float(best[0]), float(best[1]), {kind: float(best[2 + row]) for row, kind in enumerate(kinds)}

@@ -1,0 +1,93 @@
+"""What repeats differ by: contrasts between runs of one group hold noise and jitters, and no model at all."""
+
+from dataclasses import dataclass
+from math import sqrt
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
+
+ARRIVED_S = 4e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Contrast:
+    """Difference between repeats in one kind of signal: number of its pair; [n] and [n, 3] power, timing, baseline.
+
+    block: number of the last repeat's, in the dataset
+    """
+
+    pair: int
+    kind: int
+    block: int
+    t_s: FloatArray
+    value: FloatArray
+    jitter: FloatArray
+
+
+def contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
+    """Helmert contrasts between the runs of each group, on the samples that all of them have."""
+    found: list[Contrast] = []
+    blocks: dict[tuple[int, int, int], int] = {
+        (block.run, block.kind, block.pixel): number for number, block in enumerate(data.blocks)
+    }
+    pair = 0
+    for runs in data.groups().values():
+        for later in range(1, len(runs)):
+            used = False
+            for number, kind, pixel in list(blocks):
+                if number != runs[later]:
+                    continue
+                places = [blocks.get((run, kind, pixel)) for run in runs[: later + 1]]
+                if any(place is None for place in places):
+                    continue
+                members = [data.blocks[place] for place in places if place is not None]
+                common = _common(members[0].t_s, [member.t_s for member in members[1:]])
+                if common is None:
+                    continue
+                commands = data.runs[number].commands
+                if kind in MIRROR_KINDS and commands is not None:
+                    common = _at_rest(members[0].t_s, common, commands[:, 0])
+                scale = sqrt(later / (later + 1.0))
+                weights = [*([scale / later] * later), -scale]
+                rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
+                value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
+                last, block = rows[-1], blocks[number, kind, pixel]
+                jitter = np.stack([power[last], timing[last], np.ones(len(last))], axis=1)
+                found.append(Contrast(pair, kind, block, members[-1].t_s[common[-1]], value, jitter))
+                used = True
+            pair += used
+    return found
+
+
+def _at_rest(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
+    """Rows at which mirrors have long arrived: what a lag makes of jitter is no noise of the instrument."""
+    times = t_s[common[0]]
+    row = np.searchsorted(steps_s, times, side="right") - 1
+    kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > ARRIVED_S)
+    return [rows[kept] for rows in common] if kept.sum() >= 16 else common
+
+
+def _common(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
+    """Rows of each time axis that all of them share, to 0.1 µs; None for fewer than 16."""
+    keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
+    shared = keys[0]
+    for key in keys[1:]:
+        shared = np.intersect1d(shared, key, assume_unique=True)
+    if len(shared) < 16:
+        return None
+    return [np.searchsorted(key, shared).astype(np.int64) for key in keys]
+
+
+def as_contrasts(
+    data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
+) -> list[Contrast]:
+    """The residuals themselves, where nothing repeats."""
+    found = []
+    for number, block in enumerate(data.blocks):
+        if block.kind == kind:
+            part = block.part
+            jitter = np.stack([power[part], timing[part], np.ones(part.stop - part.start)], axis=1)
+            found.append(Contrast(block.run, kind, number, block.t_s, residual[part], jitter))
+    return found

@@ -1,0 +1,138 @@
+"""The process that writes a session's file: notes in on stdin, a dot out for each that is on disk; ends with stdin.
+
+Before each note room is taken on the disk, and the file is closed after it: a full disk finds it whole.
+"""
+
+import io
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from optodrive.lab.recording.hdf5 import h5py_module
+from optodrive.lab.recording.session_recorder import LENGTH, WRITTEN, Arrays
+from optodrive.lab.recording.storage import FORMAT, PULSES, TABLES, VERSION
+
+SESSION_VERSION = 1
+REST_S = 10.0
+"""A display that was dark for so long begins a new run: its absorbers are cold again, though its walls need minutes."""
+ROOM_BYTES = 1 << 18
+"""More than HDF5 takes for a plan beside its arrays."""
+NOTES = "executed pulses of a session of the driver; signals are merged in afterwards"
+
+
+class SessionFile:
+    """A session's file, open only while it is written."""
+
+    def __init__(self, path: Path, about: dict[str, Any]) -> None:
+        """Begin it; OSError where it cannot be written."""
+        self._path = path
+        self._about = about
+        self._run = 0
+        self._zero_s = self._end_s = 0.0
+        path.touch(exist_ok=False)
+        take_room(path, ROOM_BYTES)
+        with h5py_module().File(path, "w") as file:
+            file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
+            file.attrs["instrument_notes"] = NOTES
+            file.attrs["session_version"] = SESSION_VERSION
+            file.attrs["display"], file.attrs["optodrive"] = about["display"], about["optodrive"]
+            file.create_group("runs")
+            file.create_group("plans").create_dataset("config", data=about["config"])
+
+    def add(self, about: dict[str, Any], arrays: Arrays) -> None:
+        """A plan; OSError where there is no room for it, and then the file is as before."""
+        take_room(self._path, 2 * sum(array.nbytes for array in arrays.values()) + ROOM_BYTES)
+        with h5py_module().File(self._path, "r+") as file:
+            executed = arrays.get("executed")
+            if executed is not None and len(executed):
+                self._choose_run(file, about, executed)
+                about["run"], about["run_zero_s"] = f"run{self._run}", self._zero_s
+            self._write_plan(file["plans"].create_group(about["plan"]), about, arrays)
+
+    def _choose_run(self, file: Any, about: dict[str, Any], executed: np.ndarray[Any, Any]) -> None:
+        """Append pulses to the last run, or to a new one after a rest, or where the board's clock was set anew."""
+        begin_s = float(executed[0, 0])
+        rested = begin_s - self._end_s >= REST_S or begin_s < self._zero_s
+        if self._run == 0 or rested:
+            self._run += 1
+            self._zero_s = begin_s
+            group = file["runs"].create_group(f"run{self._run}")
+            group.attrs["ambient_K"] = self._about["ambient_K"]
+            group.attrs["bridge_width_m"] = self._about["bridge_width_m"]
+            group.attrs["sample"] = self._about["display"]
+            group.attrs["started_at"], group.attrs["started_unix_s"] = about["lit_at"], about["lit_unix_s"]
+            columns = len(TABLES[PULSES])
+            group.create_dataset(
+                PULSES, shape=(0, columns), maxshape=(None, columns), chunks=(256, columns), dtype="f8"
+            )
+        pulses = file[f"runs/run{self._run}/{PULSES}"]
+        pulses.resize(len(pulses) + len(executed), axis=0)
+        pulses[-len(executed) :] = executed - np.array([self._zero_s, 0.0, 0.0, 0.0])
+        self._end_s = float(executed[-1, 0] + executed[-1, 1])
+
+    def _write_plan(self, group: Any, about: dict[str, Any], arrays: Arrays) -> None:
+        for key, value in about.items():
+            if key in ("summary", "trains"):  # longer than an attribute may be
+                group.create_dataset(key, data=value)
+            elif value is not None:
+                group.attrs[key] = value
+        for name, array in arrays.items():
+            group.create_dataset(name, data=array, compression="gzip" if array.size > 1000 else None)
+
+
+def take_room(path: Path, size: int) -> None:
+    """Have the disk keep room beyond the file's end, which closing it gives back; OSError where there is none."""
+    with path.open("r+b") as file:
+        end = file.seek(0, os.SEEK_END)
+        try:
+            os.posix_fallocate(file.fileno(), end, size)
+        except OSError:
+            file.truncate(end)
+            raise
+
+
+def read_note(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
+    """The next note; None at the end, or where it ends in the middle of one."""
+    head = stream.read(LENGTH.size)
+    if len(head) < LENGTH.size:
+        return None
+    (length,) = LENGTH.unpack(head)
+    body = stream.read(length)
+    if len(body) < length:
+        return None
+    with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
+        found = {name: arrays[name] for name in arrays.files}
+    about: dict[str, Any] = json.loads(found.pop("about_").tobytes())
+    return about, found
+
+
+def main() -> int:
+    """Write notes until there are none."""
+    for number in (signal.SIGXFSZ, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends when its pipe does, with what the daemon had to say at the end
+    first = read_note(sys.stdin.buffer)
+    if first is None:
+        return 0
+    try:
+        file = SessionFile(Path(sys.argv[1]), first[0])
+        sys.stdout.buffer.write(WRITTEN)
+        sys.stdout.buffer.flush()
+        while (note := read_note(sys.stdin.buffer)) is not None:
+            file.add(*note)
+            sys.stdout.buffer.write(WRITTEN)
+            sys.stdout.buffer.flush()
+    except BrokenPipeError:
+        return 0  # whoever fed it is gone: what came is written
+    except OSError as error:
+        sys.stderr.write(f"{error.strerror or error}\n")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

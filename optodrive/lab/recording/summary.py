@@ -1,0 +1,52 @@
+"""A recording in figures, one row a run: what `optodrive recording show` prints."""
+
+from typing import Any
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.measurements import Measurement, Run, Signal
+
+
+def summary(measurement: Measurement) -> list[dict[str, Any]]:
+    """Figures of each run, SI units, fit for JSON."""
+    return [_of_run(run) for run in measurement.runs]
+
+
+def _of_run(run: Run) -> dict[str, Any]:
+    group = run.attributes.get("group")
+    return {
+        "run": run.name,
+        "group": None if group is None else str(group),
+        "ambient_K": run.ambient_k,
+        "attributes": {key: _finite(value) for key, value in run.attributes.items()},
+        "pulses": len(run.pulses),
+        "lit": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
+        "energy_J": _finite(_energy_j(run.pulses)),
+        "commands": None if run.commands is None else len(run.commands),
+        "signals": {name: _of_signal(signal) for name, signal in run.signals.items()},
+    }
+
+
+def _energy_j(pulses: FloatArray) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.sum(pulses[:, 1] * pulses[:, 2]))
+
+
+def _of_signal(signal: Signal) -> dict[str, Any]:
+    measured = signal.value[np.isfinite(signal.value)]
+    return {
+        "pixel": signal.pixel,
+        "samples": len(signal.t_s),
+        "missing": len(signal.t_s) - len(measured),
+        "start_s": float(signal.t_s[0]),
+        "end_s": float(signal.t_s[-1]),
+        "least": float(measured.min()),
+        "most": float(measured.max()),
+        "sigma": signal.sigma,
+    }
+
+
+def _finite(value: str | float) -> str | float | None:
+    # JSON has no word for NaN and infinity.
+    return None if isinstance(value, float) and not np.isfinite(value) else value

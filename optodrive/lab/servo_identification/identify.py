@@ -1,0 +1,180 @@
+"""A servo out of its measured steps: least squares from the best of a grid of starts, and how sure the answer is."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
+from optodrive.device.gate_timing import settled_s
+from optodrive.device.servo import Servo
+from optodrive.lab.servo_identification.step_response import angles_rad
+from optodrive.lab.servo_identification.step_trace import AXES, Piece, Trace
+
+NAMES = ("frequency", "damping", "delay", "slowness")
+"""What is fitted: the logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
+LOW = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
+HIGH = np.array([np.log(3e4), 0.999, 0.01, 1.0])
+SCALE = np.array([0.1, 0.1, 1e-5, 1e-3])
+THIN = 3000
+"""Samples that starts are tried on."""
+ALL = 100_000
+STARTS = 4
+SLEW_SEEN = 5.0
+"""1 / slew must lie so many sigma above 0, else the steps were too small to show it."""
+COARSE = 0.4
+"""Samples a period of the servo at least, as its inverse."""
+UNSURE = 0.1
+DRAWS = 60
+SURE = 0.95
+
+FREQUENCIES_HZ = np.geomspace(150.0, 8000.0, 16)
+DAMPINGS = (0.35, 0.6, 0.9)
+SLEWS = (1e6, 1000.0, 400.0, 160.0, 70.0, 30.0, 10.0)
+DELAY_SHARES = (0.0, 0.3, 0.6, 0.9)
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """A mirror's servo. sigma: of frequency (relative), damping, delay (s), 1/slew (s/rad); covariance likewise [4, 4].
+
+    gain, offset_rad: of the measured angle; misfit: rms of what is left, in units of the noise
+    slew_seen: else servo.slew is assumed
+    """
+
+    trace: Trace
+    servo: Servo
+    covariance: FloatArray
+    gain: float
+    offset_rad: float
+    misfit: float
+    slew_seen: bool
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @property
+    def residual_rad(self) -> float:
+        """Rms of what is left of the angles, as weighted by their noise, rad."""
+        return self.misfit * self.trace.noise_rad
+
+    @property
+    def sigma(self) -> FloatArray:
+        """One sigma of each of NAMES, [4]."""
+        found: FloatArray = np.sqrt(np.diag(self.covariance))
+        return found
+
+    def drawn(self) -> list[Servo]:
+        """Servos that the trace does not tell from this one, DRAWS of them."""
+        random = np.random.default_rng(0)
+        drawn = random.multivariate_normal(_packed(self.servo), self.covariance, DRAWS, method="eigh")
+        return [_servo(each) for each in np.clip(drawn, LOW, HIGH)]
+
+    def settled_s(self, step_rad: float, tolerance_rad: float) -> tuple[float, float, float]:
+        """Settle time, as the gate counts it, and its 95 % interval, s."""
+        times_s = [settled_s(servo, step_rad, tolerance_rad) for servo in self.drawn()]
+        best_s = settled_s(self.servo, step_rad, tolerance_rad)
+        low, high = np.quantile(times_s, [0.5 - SURE / 2, 0.5 + SURE / 2]).tolist()
+        return best_s, min(low, best_s), max(high, best_s)
+
+
+def identify(where: str, trace: Trace, assumed_slew_rad_per_s: float) -> Identified:
+    """Fit a servo to a trace; where the slew does not show, the assumed one is kept. InputError names `where`."""
+    thin, whole = _thinned(trace, THIN), _thinned(trace, ALL)
+    free = np.full(4, True)
+    starts = sorted(_starts(trace), key=lambda start: float((_left(thin, start)[0] ** 2).sum()))[:STARTS]
+    rough = min((_fitted(thin, start, free) for start in starts), key=lambda found: found[1])[0]
+    best, _, covariance = _fitted(whole, rough, free)
+    seen = bool(best[3] > SLEW_SEEN * np.sqrt(covariance[3, 3]))
+    if not seen and abs(1.0 / assumed_slew_rad_per_s - best[3]) < 3.0 * np.sqrt(covariance[3, 3]):
+        free[3] = False
+        best[3] = 1.0 / assumed_slew_rad_per_s
+        best, _, covariance = _fitted(whole, best, free)
+    left, gain, offset_rad = _left(whole, best)
+    misfit = float(np.sqrt((left**2).mean()))
+    found = Identified(trace, _servo(best), covariance, gain, offset_rad, misfit, seen)
+    _check(f"{where}: mirror_{AXES[trace.axis]}_rad", found)
+    return found
+
+
+def _check(where: str, found: Identified) -> None:
+    spacing_s, servo = found.trace.spacing_s, found.servo
+    if servo.frequency * spacing_s > COARSE or 2.0 * found.sigma[0] > UNSURE:
+        sampled = f"{1e6 * spacing_s:.3g} µs a sample, {servo.frequency:.3g} Hz ± {2 * found.sigma[0]:.1%}"
+        expected = "finer sampling or more steps: the sampling is too coarse, or the noise too high, for this servo"
+        raise InputError(where, sampled, expected)
+
+
+def _servo(packed: FloatArray) -> Servo:
+    return Servo(float(np.exp(packed[0])), float(packed[1]), float(packed[2]), float(1.0 / packed[3]))
+
+
+def _packed(servo: Servo) -> FloatArray:
+    return np.array([np.log(servo.frequency), servo.damping, servo.delay, 1.0 / servo.slew])
+
+
+def _left(trace: Trace, packed: FloatArray) -> tuple[FloatArray, float, float]:
+    """What a servo leaves of the angles, in units of their noise, with the gain and offset that leave least."""
+    servo = _servo(packed)
+    model = np.concatenate([angles_rad(servo, piece.steps, piece.t_s) for piece in trace.pieces])
+    value = np.concatenate([piece.value_rad for piece in trace.pieces])
+    noise_rad = np.concatenate([np.full(len(piece.t_s), piece.noise_rad) for piece in trace.pieces])
+    weight = noise_rad**-2.0 / (noise_rad**-2.0).sum()
+    model_mean, mean = float(weight @ model), float(weight @ value)
+    around = model - model_mean
+    gain = float((weight * around) @ (value - mean) / max(float((weight * around) @ around), 1e-300))
+    return (value - mean - gain * around) / noise_rad, gain, mean - gain * model_mean
+
+
+def _fitted(trace: Trace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
+    """The best servo near a start, the sum of squares it leaves, and the covariance, 0 for what is not free."""
+
+    def whole(part: FloatArray) -> FloatArray:
+        packed = start.copy()
+        packed[free] = part * SCALE[free]
+        return packed
+
+    left: Callable[[FloatArray], FloatArray] = lambda part: _left(trace, whole(part))[0]  # noqa: E731
+    low, high = LOW[free] / SCALE[free], HIGH[free] / SCALE[free]
+    at = np.clip(start[free] / SCALE[free], low + 1e-9, high - 1e-9)
+    found = least_squares(left, at, bounds=(low, high), jac="3-point", x_scale="jac", max_nfev=80)
+    spare = max(1, len(found.fun) - len(at) - 2)
+    variance = 2.0 * found.cost / spare
+    covariance = np.zeros((4, 4))
+    inverse = np.linalg.pinv(found.jac.T @ found.jac) * variance
+    fitted = np.flatnonzero(free)
+    covariance[np.ix_(fitted, fitted)] = inverse * np.outer(SCALE[free], SCALE[free])
+    return whole(found.x), float(found.cost), covariance
+
+
+def _starts(trace: Trace) -> Iterator[FloatArray]:
+    rise_s = _rise_s(trace)
+    for frequency, damping, slew, share in product(FREQUENCIES_HZ, DAMPINGS, SLEWS, DELAY_SHARES):
+        yield _packed(Servo(frequency, damping, min(share * rise_s, 0.009), slew))
+
+
+def _rise_s(trace: Trace) -> float:
+    """The shortest time after which a mirror has gone a tenth of its step, s: its delay is less."""
+    shortest_s = []
+    for piece in trace.pieces:
+        steps = piece.steps
+        for row in range(1, len(steps.at_s)):
+            way = steps.command_rad[row] - steps.command_rad[row - 1]
+            begin, end = np.searchsorted(piece.t_s, [steps.at_s[row], steps.at_s[row] + 0.01])
+            gone = (piece.value_rad[begin:end] - steps.command_rad[row - 1]) / way
+            there = np.flatnonzero(gone > 0.1)
+            if len(there):
+                shortest_s.append(piece.t_s[begin + there[0]] - steps.at_s[row])
+    return float(np.median(shortest_s)) if shortest_s else 1e-4
+
+
+def _thinned(trace: Trace, most: int) -> Trace:
+    """Samples chosen evenly, about so many at the most."""
+    every = -(-sum(len(piece.t_s) for piece in trace.pieces) // most)
+    pieces = tuple(
+        Piece(each.steps, each.t_s[::every], each.value_rad[::every], each.noise_rad) for each in trace.pieces
+    )
+    return replace(trace, pieces=pieces)

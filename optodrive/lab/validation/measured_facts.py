@@ -1,0 +1,84 @@
+"""Which of the paper's facts are measurements, how well each is known, and why the others are left out."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import sqrt
+
+from optodrive.physics.paper_facts import AMBIENT_C, Fact
+from optodrive.physics.parameters import ParameterSet
+
+READING = 0.05
+"""Relative error of a number read from a figure or rounded in the text, where the paper states none."""
+
+GROUPS = {
+    "temperatures": ("dT_peak_w020", "T_peak_w075"),
+    "displacements": ("z_peak_w020", "z_peak_w075", "z_tp8_w040"),
+    "forces": ("F_peak_w020", "F_peak_w055"),
+    "rates": ("N_50um", "N_400um"),
+    "vibration": ("dpp_200Hz", "dpp_law", "slow_law"),
+}
+"""Measured facts by what was measured."""
+
+MEASURED = tuple(name for group in GROUPS.values() for name in group)
+
+LAW_R2 = {"dpp_law": 0.95, "slow_law": 0.81}
+"""Two facts are a law at one point: its r² (Fig. 3D) leaves √(1 − r²) of the spread, taken as large as the value."""
+
+HEIGHTS_M = {"N_50um": 50e-6, "N_400um": 400e-6}
+"""Rates are compared as the height reached in the time that they leave a pixel: near the plateau a rate says little."""
+
+LEFT_OUT = {
+    "T_peak_w020": "the same reading as dT_peak_w020",
+    "z_repeat_w040": "an upper bound, which every model here meets",
+    "F_linear_in_P": "a statement; no number was read",
+    "dT_air_isometric": "inferred from F_peak_w020, not measured",
+    "dQ_air": "inferred from F_peak_w020, not measured",
+    "eta_stroke": "arithmetic of F_peak_w020 and z_peak_w020",
+    "eta_qt": "arithmetic of dQ_air",
+    "eta_tm": "arithmetic of eta_stroke and eta_qt",
+}
+"""Outcomes that are no measurements of their own."""
+
+
+@dataclass(frozen=True)
+class Datum:
+    """One measured number: value in SI (temperatures as rises, K) and its relative standard errors.
+
+    reading: of the number itself, and its source; scatter: of the sample, which no model of one pixel knows
+    """
+
+    id: str
+    group: str
+    value: float
+    reading: float
+    scatter: float
+    source: str
+
+    @property
+    def sigma(self) -> float:
+        """Of the logarithm."""
+        return sqrt(self.reading**2 + self.scatter**2)
+
+
+def scatter_of(parameters: ParameterSet) -> float:
+    """Relative scatter from sample to sample, which no model of one pixel can know.
+
+    The geometric mean of what Table S3 shows of R w and of C: which of them a fact feels depends on its pulse.
+    """
+    shares = [(item.sigma or 0.0) / item.value for item in (parameters.R_width_product, parameters.C_mean)]
+    return sqrt(shares[0] * shares[1])
+
+
+def recording(facts: Mapping[str, Fact], parameters: ParameterSet) -> tuple[Datum, ...]:
+    """The measured facts, in the order of GROUPS."""
+    scatter = scatter_of(parameters)
+    return tuple(_datum(facts[name], group, scatter) for group, names in GROUPS.items() for name in names)
+
+
+def _datum(fact: Fact, group: str, scatter: float) -> Datum:
+    value = fact.value - (AMBIENT_C if fact.unit == "°C" else 0.0)
+    if fact.id in LAW_R2:
+        return Datum(fact.id, group, value, sqrt(1.0 - LAW_R2[fact.id]), scatter, f"r² = {LAW_R2[fact.id]:g}")
+    if fact.uncertainty is not None:
+        return Datum(fact.id, group, value, fact.uncertainty / value, scatter, "stated")
+    return Datum(fact.id, group, value, READING, scatter, "assumed")

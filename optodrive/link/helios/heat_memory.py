@@ -1,0 +1,70 @@
+"""What a display still holds of earlier plays, kept in a file: each play is a process of its own."""
+
+import os
+import re
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Self
+from zipfile import BadZipFile
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import written_whole
+from optodrive.core.types.plans import BudgetState
+from optodrive.planning.limiter.limiter import shifted
+
+FORMAT = "optodrive-helios-memory"
+VERSION = 1
+WHEN_COLD = "remove it once the display has cooled"
+AHEAD_S = 1.0
+"""Kept before the first light, a plan's zero is put so much later: it counts as warmer, never as colder."""
+
+
+class Memory:
+    """The limiter's budget after the last play on one Helios, by the time of day."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def of(cls, name: str) -> Self:
+        """The memory of the Helios of this name, in the user's folder for what programs keep."""
+        folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "optodrive"
+        return cls(folder / f"{re.sub('[^0-9A-Za-z]+', '-', name)}.npz")
+
+    def keep(self, budget: BudgetState, zero_s: float) -> None:
+        """Remember a budget whose time line begins at zero_s, the time of day; InputError where that fails."""
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        except OSError as error:
+            raise InputError(str(self.path), error.strerror, "a file that can be written") from None
+        columns = {item.name: getattr(budget, item.name) for item in fields(BudgetState)}
+        with written_whole(self.path) as temporary, temporary.open("wb") as file:
+            np.savez(file, format=FORMAT, version=VERSION, zero_s=zero_s, **columns)
+
+    def recall(self, now_s: float, fresh: BudgetState) -> BudgetState:
+        """The budget on a time line that begins now; `fresh` where nothing was ever played.
+
+        at_s above 0: earlier pulses may last so much longer. InputError where the file does not tell what is needed.
+        """
+        if not self.path.exists():
+            return fresh
+        try:
+            with self.path.open("rb") as file, np.load(file) as table:
+                found = {key: table[key] for key in table.files}
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            raise InputError(str(self.path), str(error), f"a file that can be read; {WHEN_COLD}") from None
+        if (str(found.get("format")), int(found.get("version", 0))) != (FORMAT, VERSION):
+            raise InputError(f"{self.path}: version", found.get("version"), f"{FORMAT} {VERSION}; {WHEN_COLD}")
+        kept = {item.name: found[item.name] for item in fields(BudgetState)}
+        columns: dict[str, Any] = {key: float(value) if value.ndim == 0 else value for key, value in kept.items()}
+        budget = BudgetState(**columns)
+        if len(budget.rise_k) != len(fresh.rise_k):
+            expected = f"{len(fresh.rise_k)}, the configured display's; {WHEN_COLD}"
+            raise InputError(f"{self.path}: pixels", len(budget.rise_k), expected)
+        if now_s < float(found["zero_s"]) - AHEAD_S:
+            raise InputError(
+                "the time of day", now_s, f"a time after the last play, as {self.path} has it; {WHEN_COLD}"
+            )
+        return shifted(budget, float(found["zero_s"]) - now_s)

@@ -1,0 +1,101 @@
+"""Frames on the wire: COBS (Cheshire & Baker 1999) with a zero delimiter, CRC-32 (zlib's) at the end.
+
+raw frame: u8 type | u8 seq | u16 session | body | u32 crc over all before it, little-endian, at most RAW_MAX bytes
+"""
+
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+from zlib import crc32
+
+from optodrive.core.errors import LocalProtocolError
+
+RAW_MAX = 252
+HEADER = struct.Struct("<BBH")
+CRC = struct.Struct("<I")
+BODY_MAX = RAW_MAX - HEADER.size - CRC.size
+ENCODED_MAX = RAW_MAX + 1
+"""COBS adds one byte to fewer than 254; the delimiter is not counted."""
+
+
+class Frame(NamedTuple):
+    """One frame whose CRC is right."""
+
+    type: int
+    seq: int
+    session: int
+    body: bytes
+
+
+@dataclass
+class FrameCounters:
+    """What arrived and was no frame."""
+
+    crc_errors: int = 0
+    format_errors: int = 0
+
+
+def cobs_encode(raw: bytes) -> bytes:
+    """COBS without the delimiter, for at most RAW_MAX bytes."""
+    if len(raw) > RAW_MAX:
+        raise LocalProtocolError(f"a frame of {len(raw)} bytes is longer than {RAW_MAX}")
+    return b"".join(bytes((len(run) + 1,)) + run for run in raw.split(b"\0"))
+
+
+def cobs_decode(encoded: bytes) -> bytes | None:
+    """The bytes that were encoded, or None where these are no COBS of at most RAW_MAX bytes."""
+    runs = []
+    at = 0
+    while at < len(encoded):
+        code = encoded[at]
+        if code == 0 or code > ENCODED_MAX or at + code > len(encoded):
+            return None
+        runs.append(encoded[at + 1 : at + code])
+        at += code
+    raw = b"\0".join(runs)
+    return raw if runs and len(raw) <= RAW_MAX else None
+
+
+def encode_frame(frame: Frame) -> bytes:
+    """A frame as it goes over the wire, delimiter included."""
+    raw = HEADER.pack(frame.type, frame.seq, frame.session) + frame.body
+    return cobs_encode(raw + CRC.pack(crc32(raw))) + b"\0"
+
+
+class FrameDecoder:
+    """Bytes in any portions to frames; what is no frame only counts."""
+
+    def __init__(self) -> None:
+        self.counters = FrameCounters()
+        self._pending = b""
+        self._overlong = False
+
+    def feed(self, data: bytes) -> Iterator[Frame]:
+        """Take bytes, give the frames completed by them."""
+        *complete, rest = (self._pending + data).split(b"\0")
+        self._pending = rest
+        for encoded in complete:
+            if self._overlong:
+                self._overlong = False
+            elif encoded:
+                frame = self._frame(encoded)
+                if frame is not None:
+                    yield frame
+        if len(self._pending) > ENCODED_MAX:
+            if not self._overlong:
+                self.counters.format_errors += 1
+            self._overlong = True
+            self._pending = b""
+
+    def _frame(self, encoded: bytes) -> Frame | None:
+        raw = cobs_decode(encoded)
+        if raw is None or len(raw) < HEADER.size + CRC.size:
+            self.counters.format_errors += 1
+            return None
+        content, (crc,) = raw[: -CRC.size], CRC.unpack(raw[-CRC.size :])
+        if crc32(content) != crc:
+            self.counters.crc_errors += 1
+            return None
+        kind, seq, session = HEADER.unpack(content[: HEADER.size])
+        return Frame(kind, seq, session, content[HEADER.size :])

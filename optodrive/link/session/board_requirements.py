@@ -1,0 +1,138 @@
+"""What a configuration asks of a board: limits it is told to tighten to, and what it must be able to do."""
+
+from dataclasses import dataclass
+from math import ceil
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.device.config import Config
+from optodrive.device.field_loader import field_of, moves_of
+from optodrive.device.pixel_map import aimed_layout
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.connection import RTO_S
+from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
+
+PROTOCOL_MAJOR = 1
+TICK_HZ = 1_000_000
+SLACK = 1.05
+"""The board's caps lie this much above the limiter's: it is the second fence, not the first."""
+FIELD_MARGIN_CODES = 64
+FRAME_BYTES = 254
+FLIGHT_S = 0.01
+"""Bytes on their way to the board never take longer than this, so that an ABORT is soon heard, and a lost frame costs
+few others that must be sent again behind it; the protocol allows twice as much."""
+BITS_A_BYTE = 10
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """Derived once from a configuration. margin_codes: so far beyond the outermost pixels the board is let go."""
+
+    config: Config
+    scale: WireScale
+    margin_codes: int = FIELD_MARGIN_CODES
+
+    @classmethod
+    def of(cls, config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> "Requirements":
+        """Derive them; codes span the scanner's whole range."""
+        scale = WireScale(
+            rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
+            full_power_w=config.laser.max_power_w,
+            tick_s=1.0 / TICK_HZ,
+        )
+        return cls(config, scale, margin_codes)
+
+    @property
+    def lease_s(self) -> float:
+        """How long the board stays lit without hearing from the host, s."""
+        return self.config.board.lease_s
+
+    @property
+    def flight_bytes(self) -> int:
+        """Most bytes that may be unacknowledged on the link."""
+        return max(2 * FRAME_BYTES, int(self.config.board.baud / BITS_A_BYTE * FLIGHT_S))
+
+    @property
+    def rto_s(self) -> float:
+        """When a frame without an answer is sent again, s: what is in flight must have had time to pass twice."""
+        return RTO_S + 2 * self.flight_bytes * BITS_A_BYTE / self.config.board.baud
+
+    def limits(self) -> m.Limits:
+        """The limits this host asks the board to tighten to."""
+        limits, layout = self.config.limits, aimed_layout(self.config)
+        settle_us, settle_ns_per_code = self._settling()
+        angles_rad = field_of(self.config).angles_rad(layout.x_m, layout.y_m)
+        x_codes, y_codes = (self.scale.codes(angle_rad) for angle_rad in angles_rad)
+        return m.Limits(
+            max_on_us=ceil(limits.pulse_width_max_s * 1e6),
+            max_duty=65535,
+            mean_duty=65535,
+            spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * SLACK),
+            spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * SLACK),
+            full_power_uw=round(self.config.laser.max_power_w * 1e6),
+            x_min=max(0, int(x_codes.min()) - self.margin_codes),
+            x_max=min(CODE_MAX, int(x_codes.max()) + self.margin_codes),
+            y_min=max(0, int(y_codes.min()) - self.margin_codes),
+            y_max=min(CODE_MAX, int(y_codes.max()) + self.margin_codes),
+            settle_us=settle_us,
+            settle_ns_per_code=settle_ns_per_code,
+            rest_us=round(limits.pulse_rest_min_s * 1e6),
+            lease_ms=round(self.lease_s * 1e3),
+        )
+
+    def _settling(self) -> tuple[int, int]:
+        """settle_us and settle_ns_per_code: the slew, and as much as never comes above the plan's own time of a move.
+
+        Times jump where a longer move begins to overshoot; a steeper line would have to lie lower for the short ones.
+        """
+        moves = moves_of(self.config)
+        ns_per_code = int(self.scale.rad_per_code / self.config.scanner.slew_rad_per_s * 1e9)
+        pitches = np.arange(1, len(moves.calm[0]))
+        # A move may come out a code longer than planned.
+        codes = np.floor(pitches * moves.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
+        times_us = np.minimum(*(np.array(table)[pitches] for table in moves.calm))
+        return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code
+
+    def check(self, peer: m.HelloReply) -> None:
+        """Refuse a board that cannot do what the configuration plans with; InputError names key and value."""
+        config = self.config
+        if peer.major != PROTOCOL_MAJOR:
+            raise InputError("board protocol", f"{peer.major}.{peer.minor}", f"major version {PROTOCOL_MAJOR}", "board")
+        if config.board.uid and peer.uid.hex() != config.board.uid.lower():
+            raise InputError("board.uid", peer.uid.hex(), f"{config.board.uid}, the board configured", "board")
+        if peer.tick_hz != TICK_HZ:
+            raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
+        limits, asked = peer.limits, self.limits()
+        slower = "a slower servo: the board itself keeps the gate closed"
+        if limits.settle_us > asked.settle_us:
+            expected = f"{slower} for {limits.settle_us} µs a move, the plan for {asked.settle_us} µs"
+            raise InputError("scanner.bandwidth_hz", config.scanner.bandwidth_hz, expected, "board")
+        if limits.settle_ns_per_code > asked.settle_ns_per_code:
+            expected = f"{slower} for {limits.settle_ns_per_code} ns a code, the plan for {asked.settle_ns_per_code} ns"
+            raise InputError("scanner.slew_rad_per_s", config.scanner.slew_rad_per_s, expected, "board")
+        if limits.max_on_us < asked.max_on_us:
+            most_s = limits.max_on_us * 1e-6
+            raise InputError(
+                "limits.pulse_width_max_s", config.limits.pulse_width_max_s, f"at most {most_s:g}", "board"
+            )
+        if abs(limits.full_power_uw - asked.full_power_uw) > 0.01 * asked.full_power_uw:
+            board_w = limits.full_power_uw * 1e-6
+            raise InputError(
+                "laser.max_power_w", config.laser.max_power_w, f"{board_w:g}, what the board was set to", "board"
+            )
+        if limits.spot_uj < config.limits.pulse_energy_max_j * 1e6:
+            most_j = limits.spot_uj * 1e-6
+            raise InputError(
+                "limits.pulse_energy_max_j", config.limits.pulse_energy_max_j, f"at most {most_j:g}", "board"
+            )
+        if limits.spot_leak_uw < config.limits.pixel_mean_power_max_w * 1e6:
+            most_w = limits.spot_leak_uw * 1e-6
+            key = "limits.pixel_mean_power_max_w"
+            raise InputError(key, config.limits.pixel_mean_power_max_w, f"at most {most_w:g}", "board")
+        for axis in ("x", "y"):
+            low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
+            if getattr(asked, f"{axis}_min") < low or getattr(asked, f"{axis}_max") > high:
+                raise InputError(
+                    f"display {axis}", "the lattice", f"to lie within the board's codes {low} to {high}", "board"
+                )

@@ -1,0 +1,30 @@
+"""What the host last heard of the board."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from optodrive.link.session.fault_hints import hint
+
+
+@dataclass
+class BoardView:
+    """What the host last heard of the board."""
+
+    state: str = "UNKNOWN"
+    fault: str = ""
+    inputs: int = 0
+    done_index: int = 0
+    queued: int = 0
+    free_points: int = 0
+    underruns: int = 0
+    crc_errors: int = 0
+    format_errors: int = 0
+    seq_errors: int = 0
+    laser_on_s: float = 0.0
+    temperature_c: float | None = None
+    uid: str = ""
+    firmware: int = 0
+
+    def figures(self) -> dict[str, Any]:
+        """As REST answers it, with the fault's likely cause in plain words."""
+        return {**asdict(self), "fault": self.fault or None, "hint": hint(self.fault)}

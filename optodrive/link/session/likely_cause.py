@@ -1,0 +1,128 @@
+"""Why a link went, or a lease lapsed: the likeliest cause in one plain sentence, with what to do."""
+
+from dataclasses import dataclass
+
+from optodrive.link.protocol.describe import reset_cause
+from optodrive.link.transport.port_state import PortState
+
+STALL_SHARE = 0.8
+"""The lease is renewed at a fifth of its length: a stall of the rest lets it lapse."""
+RESTARTS = {
+    "power-up": "its supply was switched off or unplugged; check plug and supply",
+    "reset": "its reset was pressed, or the debugger or USB reset it; arm again when that is over",
+    "brown-out": "its supply sagged; give board and laser a stronger supply, or separate ones",
+    "watchdog": "its firmware hung; update the firmware, and keep the recording of the link (serve --record)",
+}
+NOISE_REMEDY = "check cable, plugs and grounding, keep the cable from the laser's and mirrors' drivers"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What is known when a link fails; counts and stall of the last seconds only.
+
+    bad_here, bad_at_board: frames that arrived damaged; stall_s: the longest gap between turns of the host's loop
+    silent: nothing came for long, rather than an error of the port; planner_stuck: the lease was withheld
+    """
+
+    port: str
+    port_state: PortState
+    silent: bool
+    lease_s: float
+    stall_s: float = 0.0
+    bad_here: int = 0
+    bad_at_board: int = 0
+    sent_again: int = 0
+    naks: int = 0
+    planner_stuck: bool = False
+
+
+def port_cause(port: str, state: PortState) -> str | None:
+    """A cause that the port alone tells; None where it is there and free."""
+    if state.fate == "gone":
+        others = f"; {', '.join(state.others)} there instead, perhaps the same board: " if state.others else "; "
+        return (
+            f"{port} is gone: unplugged, without power, or come back under another name{others}"
+            "check the plug, and name the port by /dev/serial/by-id"
+        )
+    if state.fate == "denied":
+        return f"{port} may not be opened by this user: join its group (often dialout) and log in again"
+    if state.fate == "held":
+        return f"{port} is held by {'; '.join(map(str, state.holders))}: end that program"
+    return None
+
+
+def why_lost(evidence: Evidence) -> str:
+    """Why the link was lost."""
+    found = port_cause(evidence.port, evidence.port_state)
+    if found is not None:
+        return found
+    if not evidence.silent:
+        return why_there_again(evidence.port)
+    return (
+        _stalled(evidence)
+        or _damaged(evidence)
+        or (
+            f"nothing comes from the board though {evidence.port} is open and nothing arrived damaged: "
+            "it hangs, restarts, has no power, or cannot read what reaches it; look at supply, lamps and cable"
+        )
+    )
+
+
+def why_lease_lapsed(evidence: Evidence) -> str:
+    """Why the board heard no lease in time while the link stood."""
+    return (
+        _stalled(evidence)
+        or _planner_stuck(evidence)
+        or _damaged(evidence)
+        or (
+            "the host kept its time and nothing arrived damaged: bytes were held up on the way; "
+            "use a port of its own rather than a hub, and run `optodrive doctor`"
+        )
+    )
+
+
+def _stalled(evidence: Evidence) -> str | None:
+    if evidence.stall_s < STALL_SHARE * evidence.lease_s:
+        return None
+    return (
+        f"this computer stood still for {evidence.stall_s * 1e3:.0f} ms, the lease is {evidence.lease_s * 1e3:.0f} ms: "
+        "suspended, swapping or overloaded; end other work on it, and run `optodrive doctor`"
+    )
+
+
+def _planner_stuck(evidence: Evidence) -> str | None:
+    if not evidence.planner_stuck:
+        return None
+    return "the planner made no progress and the lease was withheld: send smaller plans, or look at the last one"
+
+
+def _damaged(evidence: Evidence) -> str | None:
+    bad = evidence.bad_here + evidence.bad_at_board
+    if bad:
+        return (
+            f"bytes arrive damaged ({evidence.bad_here} bad frames here, {evidence.bad_at_board} at the board in the "
+            f"last seconds): {NOISE_REMEDY}, and compare board.baud"
+        )
+    if evidence.naks or evidence.sent_again:
+        return (
+            f"bytes are lost on the way ({evidence.sent_again} frames sent again, {evidence.naks} refused): "
+            "a hub or a converter cannot keep up; use a port of its own, or a lower board.baud"
+        )
+    return None
+
+
+def why_there_again(port: str) -> str:
+    """A port that failed and can be opened again, on a board that did not restart."""
+    return f"{port} went away and is there again: replugged, or a hub's fault; check the plug, the cable and the hub"
+
+
+def why_deaf(bad_at_board: int) -> str:
+    """What a board says that fell silent, did not restart, and counted damaged frames meanwhile."""
+    return f"what was sent reached the board damaged ({bad_at_board} bad frames there): {NOISE_REMEDY}"
+
+
+def why_restarted(cause_code: int, uptime_s: float) -> str:
+    """What a board says that was started anew while the link was down."""
+    word = reset_cause(cause_code)
+    told = RESTARTS.get(word, "look at its log")
+    return f"the board restarted {uptime_s:.1f} s before it answered again ({word}): {told}"

@@ -1,0 +1,62 @@
+"""How far the board's times lie from the planned ones; the only place that reckons it."""
+
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray
+
+
+@dataclass(frozen=True)
+class TimingError:
+    """Executed start − planned start of a plan's pulses, both from the plan's zero on the board's clock, s.
+
+    start_delay_s: the first pulse's, which shifts the whole plan; median_s; largest_s: the one largest either way
+    drift_ppm: slope of what is left without the delay over the plan's time; 0 where all pulses start at one time
+    """
+
+    pulses: int
+    start_delay_s: float
+    median_s: float
+    largest_s: float
+    drift_ppm: float
+
+
+def timing_error(planned_s: FloatArray, executed_s: FloatArray) -> TimingError | None:
+    """From starts of the same pulses, [n] each; None where there is none."""
+    if not len(planned_s):
+        return None
+    error_s = executed_s - planned_s
+    left_s, since_s = error_s - error_s[0], planned_s - planned_s.mean()
+    spread_s2 = float(since_s @ since_s)
+    return TimingError(
+        pulses=len(error_s),
+        start_delay_s=float(error_s[0]),
+        median_s=float(np.median(error_s)),
+        largest_s=float(error_s[np.abs(error_s).argmax()]),
+        drift_ppm=1e6 * float(since_s @ left_s) / spread_s2 if spread_s2 else 0.0,
+    )
+
+
+class TimingTotals:
+    """Over all plans: pulses, and of each figure the one that was largest either way."""
+
+    def __init__(self) -> None:
+        self._worst: TimingError | None = None
+
+    def add(self, error: TimingError) -> None:
+        """Take a plan's in."""
+        before = self._worst
+        if before is None:
+            self._worst = error
+            return
+        figures = {
+            name: max(value, getattr(before, name), key=abs)
+            for name, value in asdict(error).items()
+            if name != "pulses"
+        }
+        self._worst = TimingError(pulses=before.pulses + error.pulses, **figures)
+
+    def figures(self) -> dict[str, float] | None:
+        """As the state answers it; None before any pulse."""
+        return None if self._worst is None else asdict(self._worst)

@@ -1,0 +1,74 @@
+"""A board's limits: its own, read from a file, and those a host tightened them to."""
+
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from re import fullmatch
+
+from optodrive.core.errors import InputError, nearest
+from optodrive.core.files import read_toml
+from optodrive.link.protocol.messages import POINTS_MAX, Limits
+
+OWN = Limits(
+    max_on_us=50_000,
+    max_duty=65535,
+    mean_duty=65535,
+    spot_uj=150_000,
+    spot_leak_uw=1_400_000,
+    full_power_uw=2_450_000,
+    x_min=0,
+    x_max=65535,
+    y_min=0,
+    y_max=65535,
+    settle_us=200,
+    settle_ns_per_code=50,
+    rest_us=500,
+    lease_ms=100,
+)
+FIELD_MAX = {"H": 0xFFFF, "I": 0xFFFF_FFFF}
+RANGES = {item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)}
+RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
+LOOSENED_BY_MORE = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
+LOOSENED_BY_LESS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
+
+
+def tightened(own: Limits, asked: Limits) -> Limits:
+    """The tighter of both, field by field; the board's power is its own."""
+    tighter = {name: min(getattr(own, name), getattr(asked, name)) for name in LOOSENED_BY_MORE}
+    tighter |= {name: max(getattr(own, name), getattr(asked, name)) for name in LOOSENED_BY_LESS}
+    return replace(own, **tighter)
+
+
+@dataclass(frozen=True)
+class BoardSettings:
+    """What a simulated board is: limits, identity, the grid of cells that its spot guards watch."""
+
+    limits: Limits = OWN
+    uid: str = "73696d756c61746564303031"
+    cell_codes: int = 1300
+    queue_points: int = 4096
+    key_edge: bool = False
+
+
+def load_settings(path: Path) -> BoardSettings:
+    """Settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge."""
+    table = read_toml(path)
+    known = [*RANGES, "uid", "key_edge"]
+    for name, value in table.items():
+        if name not in known:
+            raise InputError(f"{path}", name, f"a known key, {nearest(name, known)}")
+        _check(f"{path}: {name}", name, value)
+    limits = replace(OWN, **{name: value for name, value in table.items() if hasattr(OWN, name)})
+    return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(OWN, name)})
+
+
+def _check(where: str, name: str, value: object) -> None:
+    if name == "uid":
+        if not isinstance(value, str) or not fullmatch("[0-9a-fA-F]{24}", value):
+            raise InputError(where, value, "24 hexadecimal digits")
+    elif name == "key_edge":
+        if not isinstance(value, bool):
+            raise InputError(where, value, "true or false")
+    else:
+        low, high = RANGES[name]
+        if type(value) is not int or not low <= value <= high:
+            raise InputError(where, value, f"a whole number from {low} to {high}")

@@ -1,0 +1,93 @@
+"""What the board watches before it opens the gate: on time, mean power, energy per cell (B4 to B6). Integers only."""
+
+from collections import deque
+
+from optodrive.link.protocol.messages import Limits
+
+WINDOW_US = 1_000_000
+DUTY_FULL = 65535
+
+Cell = tuple[int, int, int]
+"""Which of the four grids, column, row."""
+
+
+class Guards:
+    """The accounts of one board; times in µs."""
+
+    def __init__(self, cell_codes: int) -> None:
+        self._cell_codes = cell_codes
+        self._on: dict[Cell, tuple[int, int]] = {}
+        self._bucket: dict[Cell, tuple[int, int]] = {}
+        self._recent: deque[tuple[int, int, int]] = deque()
+        self._recent_sum = 0
+
+    def cells(self, x: int, y: int) -> list[Cell]:
+        """The cells of a position, one in each of four grids half a cell apart.
+
+        Two positions less than half a cell apart share a cell in at least one grid, so no border hides one from the
+        other; two that are a whole cell apart share none.
+        """
+        size = self._cell_codes
+        half = size // 2
+        return [
+            (grid, (x - 32768 + shift_x) // size, (y - 32768 + shift_y) // size)
+            for grid, (shift_x, shift_y) in enumerate(((half, half), (0, half), (half, 0), (0, 0)))
+        ]
+
+    def refuses(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> str:
+        """The fault that this pulse would be, '' where it may fire."""
+        cells = self.cells(x, y)
+        if max(self.on_time_us(limits, cell, start_us) for cell in cells) + on_us > limits.max_on_us:
+            return "ON_TIME"
+        if self.mean_account(start_us, on_us, duty) > WINDOW_US * limits.mean_duty:
+            return "MEAN_POWER"
+        level_uj = max(self.bucket_uj(limits, cell, start_us) for cell in cells)
+        if level_uj + energy_uj(limits, on_us, duty) > limits.spot_uj:
+            return "SPOT"
+        return ""
+
+    def fire(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> None:
+        """Count a pulse."""
+        energy = energy_uj(limits, on_us, duty)
+        for cell in self.cells(x, y):
+            self._on[cell] = self.on_time_us(limits, cell, start_us) + on_us, start_us + on_us
+            self._bucket[cell] = self.bucket_uj(limits, cell, start_us) + energy, start_us
+        self._recent.append((start_us, on_us, duty))
+        self._recent_sum += on_us * duty
+
+    def on_time_us(self, limits: Limits, cell: Cell, at_us: int) -> int:
+        """Light a cell had without a rest up to at_us."""
+        on_us, ended_us = self._on.get(cell, (0, -WINDOW_US))
+        return 0 if at_us - ended_us >= limits.rest_us else on_us
+
+    def bucket_uj(self, limits: Limits, cell: Cell, at_us: int) -> int:
+        """Level of a cell's leaky bucket."""
+        level_uj, since_us = self._bucket.get(cell, (0, 0))
+        return max(0, level_uj - (at_us - since_us) * limits.spot_leak_uw // 1_000_000)
+
+    def mean_account(self, start_us: int, on_us: int, duty: int) -> int:
+        """Most gate-on time × duty that any second would hold with this pulse, µs × duty code."""
+        while self._recent and sum(self._recent[0][:2]) <= start_us - WINDOW_US:
+            _, gone_us, gone_duty = self._recent.popleft()
+            self._recent_sum -= gone_us * gone_duty
+        # The sum of a second grows until the pulse ends, or a brighter old pulse begins to leave the second.
+        ends = [start_us + on_us]
+        for begun_us, _, _ in self._recent:
+            if begun_us + WINDOW_US >= start_us + on_us:
+                break
+            if begun_us + WINDOW_US > start_us:
+                ends.append(begun_us + WINDOW_US)
+        return max(self._second_before(end_us) + (end_us - start_us) * duty for end_us in ends)
+
+    def _second_before(self, end_us: int) -> int:
+        begin_us, left = end_us - WINDOW_US, 0
+        for start_us, on_us, duty in self._recent:  # oldest first: only the front of the line has left the second
+            if start_us >= begin_us:
+                break
+            left += min(on_us, begin_us - start_us) * duty
+        return self._recent_sum - left
+
+
+def energy_uj(limits: Limits, on_us: int, duty: int) -> int:
+    """Energy of a pulse, µJ, rounded up."""
+    return -(-on_us * duty * limits.full_power_uw // (DUTY_FULL * 1_000_000))

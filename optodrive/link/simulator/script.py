@@ -1,0 +1,83 @@
+"""What happens to a simulated board at given times: inputs change, it is reset, its link breaks down.
+
+[[step]]
+at_s = 1.5
+set = "interlock"      # or "key", "estop"
+value = false
+
+[[step]]
+at_s = 2.0
+do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close"
+rate = 0.01
+
+With from = "light" beside it, at_s counts from the first light. With --sensor also: "stick_x", "stick_y",
+"invert_readback", "blind_sensor", "unplug_sensor".
+"""
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+from optodrive.core.errors import InputError, nearest
+from optodrive.core.files import read_toml
+from optodrive.link.protocol.messages import INPUTS
+
+SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")
+"""What happens to mirrors and spot sensor."""
+ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSOR_ACTIONS)
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that happens. kind: "set" or "do"; name: the input or the action.
+
+    from_light: at_s counts from the first light, else from the start
+    """
+
+    at_s: float
+    kind: str
+    name: str
+    value: bool = False
+    rate: float = 0.0
+    from_light: bool = False
+
+
+def load_script(path: Path, more: Collection[str] = ()) -> list[Step]:
+    """The steps of a script file in order of time; InputError for what it cannot mean. more: actions beside ACTIONS."""
+    table = read_toml(path)
+    entries = table.pop("step", [])
+    for name in table:
+        raise InputError(f"{path}", name, "nothing but [[step]]")
+    if not isinstance(entries, list):
+        raise InputError(f"{path}: step", entries, "[[step]], with two brackets")
+    steps = [_step(f"{path}: step {k}", entry, (*ACTIONS, *more)) for k, entry in enumerate(entries)]
+    return sorted(steps, key=lambda step: step.at_s)
+
+
+def _step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> Step:
+    kind = "set" if "set" in entry else "do"
+    known = INPUTS if kind == "set" else actions
+    name = entry.get(kind)
+    if not isinstance(name, str) or name not in known:
+        raise InputError(f"{where}: {kind}", name, f"a known one, {nearest(str(name), list(known))}")
+    at_s = _number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
+    rate = _number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
+    value = entry.get("value", False)
+    if not isinstance(value, bool):
+        raise InputError(f"{where}: value", value, "true or false")
+    since = entry.get("from", "start")
+    if since not in ("start", "light"):
+        raise InputError(f"{where}: from", since, "start or light")
+    allowed = ["at_s", "from", *(("set", "value") if kind == "set" else ("do", "rate"))]
+    for key in entry:
+        if key not in allowed:
+            raise InputError(where, key, f"a known key, {nearest(key, allowed)}")
+    return Step(at_s, kind, name, value, rate, since == "light")
+
+
+def _number(where: str, value: object, expected: str, most: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
+        raise InputError(where, value, expected)
+    return float(value)

@@ -1,0 +1,63 @@
+"""What each pixel of a simulated display really is: how high it stands, where its absorber lies, and whether it lives.
+
+No calibration sees this. Light that misses the absorber is lost here; in a real display it warms the wall.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
+from optodrive.core.types.plans import ExecutedPulses
+from optodrive.device.config import Config, pixel_layout
+from optodrive.device.pixel_map import map_of
+from optodrive.physics.parameters import PixelArray
+
+GAIN_SPREAD, GAIN_RANGE = 0.15, (0.6, 1.5)
+OFFSET_SPREAD_M, OFFSET_MOST_M = 60e-6, 150e-6
+DEAD_SHARE = 0.04
+DEAD_LIFT = 0.04
+"""What is left of a dead pixel's displacement, at the most."""
+
+
+@dataclass(frozen=True, eq=False)
+class PixelTruth:
+    """All [p]. lift: displacement over the model's; x_m, y_m: the absorber's middle from the pixel's; dead: indices."""
+
+    lift: FloatArray
+    x_m: FloatArray
+    y_m: FloatArray
+    dead: IntArray
+
+    def __post_init__(self) -> None:
+        freeze_arrays(self)
+
+    @classmethod
+    def drawn(cls, seed: int, config: Config) -> Self:
+        """Pixels within a workshop's tolerances, one of 25 dead and one at least; the same for the same seed."""
+        random, count = np.random.default_rng([seed, 0x9135]), len(pixel_layout(config.display))
+        lift = np.clip(np.exp(GAIN_SPREAD * random.standard_normal(count)), *GAIN_RANGE)
+        x_m, y_m = np.clip(OFFSET_SPREAD_M * random.standard_normal((2, count)), -OFFSET_MOST_M, OFFSET_MOST_M)
+        several = min(count - 1, max(1, round(DEAD_SHARE * count)))
+        dead = np.sort(random.choice(count, several, replace=False))
+        lift[dead] = random.uniform(0.0, DEAD_LIFT, several)
+        return cls(lift, x_m, y_m, dead)
+
+    def pixels(self, nominal: PixelArray) -> PixelArray:
+        """The display's pixels as they are."""
+        return replace(nominal, kappa_m_per_k=nominal.kappa_m_per_k * self.lift)
+
+    def hit(self, executed: ExecutedPulses, config: Config) -> ExecutedPulses:
+        """What was executed, with the mean power that falls on each pixel's absorber."""
+        display, laser, known = config.display, config.laser, map_of(config)
+        share = np.ones(len(self.lift))
+        for axis, side in (("x", "width"), ("y", "height")):
+            middle_m = -getattr(self, f"{axis}_m")
+            if known is not None:
+                middle_m = middle_m + getattr(known, f"offset_{axis}_m")
+            focus_m, absorber_m = getattr(laser, f"focus_{side}_m"), getattr(display, f"absorber_{side}_m")
+            low_m = np.maximum(middle_m - 0.5 * focus_m, -0.5 * absorber_m)
+            high_m = np.minimum(middle_m + 0.5 * focus_m, 0.5 * absorber_m)
+            share *= np.maximum(0.0, high_m - low_m) / focus_m
+        return replace(executed, power_w=executed.power_w * share[executed.pixel])

@@ -1,0 +1,43 @@
+"""A plan on the simulated board in virtual time: the real session, the real bytes, the board's own report."""
+
+from collections.abc import Callable
+
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import BoardFaultError
+from optodrive.core.types.plans import ExecutedPulses
+from optodrive.link.protocol.quantisation import quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.planning.pipeline import Display, Prepared
+
+STEP_S = 0.005
+START_LEAD_S = 0.05
+
+
+def execute(display: Display, prepared: Prepared, progress: Callable[[float], None] | None = None) -> ExecutedPulses:
+    """Arm a fresh simulated board, stream the plan, give what the board says it did."""
+    clock = ManualClock(1.0)
+    core = BoardCore(seed=1)
+    session = Session(MemoryLink(core, clock), clock, Requirements.of(display.config))
+    session.connect()
+    session.arm()
+    while session.board.state != "ARMED":
+        _step(session)
+    scale = session.scale
+    points = quantise(prepared.plan, scale)
+    job = session.begin(points, session.board_s() + START_LEAD_S)
+    while len(points) and not job.finished:
+        _step(session)
+        if progress is not None:
+            progress(job.executed_rows / len(prepared.plan))
+    session.close()
+    return job.executed(prepared.plan, scale.full_power_w, scale.tick_s)
+
+
+def _step(session: Session) -> None:
+    session.step(STEP_S, lease=True)
+    board = session.board
+    if board.state in ("FAULT", "DISARMED") and session.last_reason not in ("", "boot", "hello"):
+        raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({session.last_reason})")

@@ -1,0 +1,145 @@
+"""A link's bytes with their times, in a file: append-only, each entry whole or ignored.
+
+file: MAGIC | u32 version | f64 host time | f64 seconds since 1970, both of the beginning
+entry: u8 kind | f64 host time, s | u32 length | bytes | u32 CRC-32 over all before it in the entry; little-endian
+"""
+
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from queue import Full, Queue
+from typing import BinaryIO, NamedTuple
+from zlib import crc32
+
+from optodrive.core.errors import InputError
+
+MAGIC = b"ODWIRE\r\n"
+VERSION = 1
+HEAD = struct.Struct("<8sIdd")
+ENTRY = struct.Struct("<BdI")
+CRC = struct.Struct("<I")
+KINDS = ("to board", "from board", "opened", "closed")
+TO_BOARD, FROM_BOARD, OPENED, CLOSED = KINDS
+DATA_MAX = 1 << 20
+WAITING_MAX = 8192
+"""Entries that may wait for the disk; bytes move in portions of a few hundred."""
+
+
+class Entry(NamedTuple):
+    """What passed. kind: one of KINDS; host_s: monotonic time; data: empty where the link was opened or closed."""
+
+    kind: str
+    host_s: float
+    data: bytes = b""
+
+
+class TapeWriter:
+    """Writes entries in a thread of its own, so that a slow disk stops nobody. say: gets the one line when it ends."""
+
+    def __init__(self, path: Path, host_s: float, say: Callable[[str], None]) -> None:
+        """Begin a new file; InputError where there is one already or it cannot be written."""
+        self.path = path
+        self.recording = True
+        self._say = say
+        self._waiting: Queue[Entry | None] = Queue(WAITING_MAX)
+        try:
+            self._file: BinaryIO = path.open("xb", buffering=0)
+            self._file.write(HEAD.pack(MAGIC, VERSION, host_s, time.time()))
+        except FileExistsError:
+            raise InputError("--record", str(path), "a name that is free: nothing is overwritten") from None
+        except OSError as error:
+            raise InputError("--record", str(path), f"a file that can be written ({error.strerror})") from None
+        self._thread = threading.Thread(target=self._write_all, name="tape", daemon=True)
+        self._thread.start()
+
+    def note(self, entry: Entry) -> None:
+        """Have an entry written; never waits, never raises."""
+        if not self.recording:
+            return
+        try:
+            self._waiting.put_nowait(entry)
+        except Full:
+            self._stop(f"the disk is too slow, {WAITING_MAX} entries wait")
+
+    def close(self) -> None:
+        """Write what waits, and end."""
+        try:
+            self._waiting.put(None, timeout=1.0)
+        except Full:
+            return
+        self._thread.join(timeout=5.0)
+
+    def _stop(self, why: str) -> None:
+        # The loop's thread and the writer's may both come here: one of them may speak.
+        was_recording, self.recording = self.recording, False
+        if was_recording:
+            self._say(f"recording to {self.path} stopped: {why}; the session goes on")
+
+    def _write_all(self) -> None:
+        with self._file:
+            while (entry := self._waiting.get()) is not None:
+                try:
+                    self._write(pack(entry))
+                except OSError as error:
+                    self._stop(error.strerror or str(error))
+                    return
+
+    def _write(self, packed: bytes) -> None:
+        while packed:
+            packed = packed[self._file.write(packed) :]
+
+
+def pack(entry: Entry) -> bytes:
+    """An entry's bytes in the file."""
+    content = ENTRY.pack(KINDS.index(entry.kind), entry.host_s, len(entry.data)) + entry.data
+    return content + CRC.pack(crc32(content))
+
+
+class Tape:
+    """A recorded file, read entry by entry. ignored: bytes at its end that are no whole entry, known after `entries`.
+
+    host_s, unix_s: when it began, monotonic and since 1970
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Look at the head; InputError where it is no recording, or one of another version."""
+        self.path = path
+        self.ignored = 0
+        with self._opened() as file:
+            head = file.read(HEAD.size)
+        if len(head) < HEAD.size or not head.startswith(MAGIC):
+            raise InputError(str(path), head[:8], "a recording of a link, as `serve --record` writes it")
+        _, version, self.host_s, self.unix_s = HEAD.unpack(head)
+        if version != VERSION:
+            raise InputError(f"{path}: version", version, f"{VERSION}, the one this release reads")
+
+    def _opened(self) -> BinaryIO:
+        try:
+            return self.path.open("rb")
+        except OSError as error:
+            raise InputError(str(self.path), error.strerror, "a file that can be read") from None
+
+    def entries(self) -> Iterator[Entry]:
+        """Every whole entry in order; what follows the last whole one is ignored and counted."""
+        with self._opened() as file:
+            file.seek(HEAD.size)
+            good = HEAD.size
+            while (entry := _next(file)) is not None:
+                good = file.tell()
+                yield entry
+            self.ignored = file.seek(0, 2) - good
+
+
+def _next(file: BinaryIO) -> Entry | None:
+    head = file.read(ENTRY.size)
+    if len(head) < ENTRY.size:
+        return None
+    kind, host_s, length = ENTRY.unpack(head)
+    if kind >= len(KINDS) or length > DATA_MAX:
+        return None
+    data, tail = file.read(length), file.read(CRC.size)
+    if len(tail) < CRC.size or CRC.unpack(tail)[0] != crc32(head + data):
+        return None
+    return Entry(KINDS[kind], host_s, data)

@@ -1,0 +1,39 @@
+"""Transports by the name the configuration gives."""
+
+from collections.abc import Callable
+from functools import partial
+
+from optodrive.core.errors import InputError
+from optodrive.device.config import BoardSection
+from optodrive.link.transport.base import Transport
+from optodrive.link.transport.serial_port import SerialPort
+from optodrive.link.transport.simulated import SimulatedBoard
+from optodrive.link.transport.usb_bulk import UsbBulk
+
+TRANSPORTS: dict[str, Callable[[BoardSection], Transport]] = {
+    "serial": lambda board: SerialPort(board.port, board.baud),
+    "simulated": lambda board: SimulatedBoard(board.port, board.baud),
+    "usb": UsbBulk.of,
+}
+
+
+def transport_maker(board: BoardSection) -> Callable[[], Transport]:
+    """What makes the transport, not yet open; InputError for a Helios, which does not speak the board's protocol."""
+    if board.transport not in TRANSPORTS:
+        raise InputError(
+            "board.transport",
+            board.transport,
+            f"one of {', '.join(TRANSPORTS)}: a Helios cannot serve a daemon, see `optodrive helios play`",
+        )
+    return partial(TRANSPORTS[board.transport], board)
+
+
+def make_bench(board: BoardSection, display: str) -> tuple[Transport, str]:
+    """A transport, not yet open, and the port of the spot sensor that comes with it; '' where none does.
+
+    display: the configuration's file or shipped name.
+    """
+    if board.transport == "simulated":
+        simulated = SimulatedBoard(board.port, board.baud, display)
+        return simulated, simulated.sensor_port
+    return transport_maker(board)(), ""

@@ -1,0 +1,60 @@
+"""The paper's numbers, one row a fact, as shipped in configs/paper_facts.csv."""
+
+import csv
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal, cast
+
+from optodrive.device.config import shipped_path
+
+AMBIENT_C = 20.0
+"""Ambient of the paper's single-pixel runs: 527 °C at a rise of 507 K."""
+
+
+@dataclass(frozen=True)
+class Fact:
+    """One number of the paper: relation '=' for a value, '<' for an upper bound; uncertainty None where it gives none.
+
+    Units are SI; temperatures in °C as the paper has them.
+    """
+
+    id: str
+    quantity: str
+    relation: Literal["=", "<"]
+    value: float
+    unit: str
+    uncertainty: float | None
+    conditions: str
+    where: str
+
+    def ratio(self, model: float) -> float | None:
+        """Model over measured, of temperatures by their rises; None for a bound, which has no ratio."""
+        if self.relation == "<":
+            return None
+        zero = AMBIENT_C if self.unit == "°C" else 0.0
+        return (model - zero) / (self.value - zero)
+
+    def missed(self, model: float, tolerance: float) -> bool:
+        """Whether a model lies off by more than tolerance (1 = as much as the fact itself), or above a bound."""
+        ratio = self.ratio(model)
+        return model > self.value if ratio is None else abs(ratio - 1.0) > tolerance
+
+
+@cache
+def paper_facts() -> dict[str, Fact]:
+    """Every fact by its id, in the file's order."""
+    with shipped_path("paper_facts.csv").open(encoding="utf-8", newline="") as file:
+        return {row["id"]: _fact(row) for row in csv.DictReader(file)}
+
+
+def _fact(row: dict[str, str]) -> Fact:
+    return Fact(
+        id=row["id"],
+        quantity=row["quantity"],
+        relation=cast(Literal["=", "<"], row["relation"]),
+        value=float(row["value"]),
+        unit=row["unit"],
+        uncertainty=float(row["uncertainty"]) if row["uncertainty"] else None,
+        conditions=row["conditions"],
+        where=row["where"],
+    )

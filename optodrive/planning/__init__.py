@@ -1,0 +1,1 @@
+"""From requested tactile stimuli to a pulse plan that keeps every limit; no board involved."""

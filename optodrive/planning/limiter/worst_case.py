@@ -1,0 +1,281 @@
+"""From a declared model with its uncertainty to the coefficients of a bound that holds for all of it.
+
+Heat here flows one way in every parameter but the capacities: more power, more resistance, more share, more heat.
+A capacity warms faster when small and remembers longer when large; each node is counted with both (`spread`).
+"""
+
+from dataclasses import dataclass
+from math import e, inf, log
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.planning.limiter.budget import Caps, HeatBound
+
+CHORDS = 8
+STEP_SHARE = 0.07
+"""Walls exchange heat at steps of this share of the quickest wall's own time."""
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Declared relative half-widths; exponent: absolute."""
+
+    absorbed_power: float
+    bridge_resistance: float
+    absorber_capacity: float
+    exponent: float
+    gas_lag: float
+    wall_resistance: float
+    wall_capacity: float
+    side_resistance: float
+    touch_share: float
+    touch_lag: float
+
+
+@dataclass(frozen=True, eq=False)
+class Walls:
+    """A wall node a pixel, K/W and J/K; side, frame: to a neighbour, to the frame, infinite for none."""
+
+    r_k_per_w: float
+    c_j_per_k: float
+    side_k_per_w: float
+    frame_k_per_w: float
+
+
+@dataclass(frozen=True)
+class Touch:
+    """The touch surface: share of the gas's and of the wall's rise, and its lag."""
+
+    gas_share: float
+    wall_share: float
+    lag_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Declared:
+    """The model in use. epsilon, r_k_per_w, c_j_per_k: [p]; exponent: of R = R₀ (T / T₀)ⁿ, T the bridge's mean.
+
+    beside, frame_edges: [p, 4], [p] the lattice; walls, touch: None where the model has none
+    hot_capacity: factor by which a hot absorber may hold more than C; warmer_k: taken off the caps beforehand for what
+    else may warm the display
+    """
+
+    epsilon: FloatArray
+    r_k_per_w: FloatArray
+    c_j_per_k: FloatArray
+    tau_g_s: float
+    ambient_k: float
+    exponent: float
+    beside: IntArray
+    frame_edges: IntArray
+    walls: Walls | None
+    touch: Touch | None
+    hot_capacity: float = 1.0
+    warmer_k: float = 0.0
+
+
+def spread(ratio: float) -> float:
+    """By how much a sum of responses (1/c) e^(−t/rc) may exceed the larger of its values at both ends of c.
+
+    ratio: of the ends.
+
+    With s = 1/c each is s e^(−xs). Between the ends let the weights follow s itself: then e^(−xs) is the geometric
+    mean of its values at the ends, and no mean of the values at the ends exceeds the larger. s itself exceeds the
+    geometric mean of its ends by at most Specht's ratio.
+    """
+    if ratio == 1.0:
+        return 1.0
+    return float((ratio - 1) * ratio ** (1 / (ratio - 1)) / (e * log(ratio)))
+
+
+def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: float) -> HeatBound:
+    """The upper corner; raises InputError where a wall or touch surface is too quick beside the absorber."""
+    epsilon = model.epsilon * (1 + unsure.absorbed_power)
+    r_high = model.r_k_per_w * (1 + unsure.bridge_resistance)
+    c_low = model.c_j_per_k * (1 - unsure.absorber_capacity)
+    c_high = model.c_j_per_k * (1 + unsure.absorber_capacity) * model.hot_capacity
+    knot_k, loss_k = _chords(model, unsure, caps)
+    hottest = float(knot_k[-1] / loss_k[-1])
+    tau_max_s = float((r_high * c_high).max()) * hottest
+    slope_min = float(np.min(np.diff(loss_k) / np.diff(knot_k)))
+    lag_max_s = float((r_high * c_high).max()) / slope_min
+
+    epsilon_max = float(epsilon.max())
+    wall = _wall_bound(model, unsure, epsilon_max, c_high, hottest, tau_max_s, lag_max_s)
+    touch = _touch_bound(model, unsure, epsilon_max, float(r_high.max()) * hottest, tau_max_s, wall)
+    least = _least(model, unsure, caps, c_low, c_high, wall, touch)
+    bound = HeatBound(
+        epsilon=epsilon,
+        r_k_per_w=r_high,
+        c_low_j_per_k=c_low,
+        c_high_j_per_k=c_high,
+        knot_k=knot_k,
+        loss_k=loss_k,
+        absorber_wall=wall.absorber_wall,
+        wall_w_per_k=wall.w_per_k,
+        wall_j_per_k=wall.j_per_k,
+        wall_k_per_j=wall.k_per_j,
+        wall_spread=wall.spread,
+        beside=np.ascontiguousarray(model.beside),
+        side_w_per_k=wall.side_w_per_k,
+        step_s=wall.step_s,
+        touch_lag_s=touch.lag_s,
+        touch_k_per_j=touch.k_per_j,
+        touch_per_wall_k=touch.per_wall_k,
+        touch_spread=touch.spread,
+        least_k_per_w=least.k_per_w,
+        least_rate_per_s=least.rate_per_s,
+        lost_k=least.lost_k,
+        wall_flight=float(c_low.min()) / (wall.still_there * float(wall.j_per_k[1])),
+        touch_flight=float(c_low.min()) * float(touch.k_per_j[1]) / epsilon_max,
+        touch_lost_k=least.touch_lost_k,
+        power_max_w=power_max_w,
+    )
+    for column in bound:
+        if isinstance(column, np.ndarray):
+            column.setflags(write=False)
+    return bound
+
+
+def _chords(model: Declared, unsure: Uncertainty, caps: Caps) -> tuple[FloatArray, FloatArray]:
+    """Chords of the loss u / R(u), times R₀, from 0 to the cap. The loss is concave, so they lie below it."""
+    exponent = model.exponent + unsure.exponent if model.exponent > 0 else 0.0
+    knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
+    wall_k = caps.wall_k if np.isfinite(caps.wall_k) and model.walls is not None else 0.0
+    warmer = (model.ambient_k + model.warmer_k + wall_k + 0.5 * knot_k) / model.ambient_k
+    return knot_k, knot_k * warmer**-exponent
+
+
+@dataclass(frozen=True, eq=False)
+class _WallBound:
+    w_per_k: FloatArray
+    j_per_k: FloatArray
+    k_per_j: FloatArray
+    spread: float
+    side_w_per_k: float
+    step_s: float
+    rate_per_s: float
+    still_there: float
+    absorber_wall: float
+
+
+def _wall_bound(
+    model: Declared,
+    unsure: Uncertainty,
+    epsilon: float,
+    c_absorber_j_per_k: FloatArray,
+    hottest: float,
+    tau_max_s: float,
+    lag_max_s: float,
+) -> _WallBound:
+    pixels = len(model.epsilon)
+    walls = model.walls
+    if walls is None:
+        return _WallBound(np.ones(pixels), np.ones(2), np.zeros(2), 1.0, 0.0, inf, 0.0, 1.0, 1.0)
+    sides = np.count_nonzero(model.beside >= 0, axis=1)
+
+    def leaving(own: float, side: float) -> FloatArray:
+        rim = model.frame_edges / (walls.frame_k_per_w * side)
+        return np.asarray(1 / (walls.r_k_per_w * own) + sides / (walls.side_k_per_w * side) + rim, dtype=np.float64)
+
+    least = leaving(1 + unsure.wall_resistance, 1 + unsure.side_resistance)
+    most = leaving(1 - unsure.wall_resistance, 1 - unsure.side_resistance)
+    c_low = walls.c_j_per_k * (1 - unsure.wall_capacity)
+    # All heat of a pulse is put into the wall at once though it comes over the absorber's time: with 1 / (1 − rate ×
+    # time) more of it, the bound lies above the wall at every later moment.
+    still_there = 1.0 - float(most.max()) / c_low * tau_max_s
+    behind = 1.0 - float(least.max()) / c_low * lag_max_s
+    if min(still_there, behind) < 0.5:
+        raise InputError(
+            "terms.wall_heating",
+            f"a wall that cools in {c_low / float(most.max()):.3g} s",
+            f"more than twice the absorber's {max(tau_max_s, lag_max_s):.3g} s",
+        )
+    # A wall that cools takes its absorber's heat along.
+    carried = float(c_absorber_j_per_k.max()) / still_there
+    capacities = np.array([c_low, walls.c_j_per_k * (1 + unsure.wall_capacity) + carried])
+    # An absorber colder than its wall, because neighbours warm the wall, lags by more than a hot one does.
+    colder = 1 + carried / (c_low + carried) * (hottest - 1)
+    return _WallBound(
+        w_per_k=least,
+        j_per_k=capacities,
+        k_per_j=epsilon / capacities / still_there,
+        spread=spread(capacities[1] / capacities[0]),
+        side_w_per_k=colder / (walls.side_k_per_w * (1 - unsure.side_resistance)),
+        step_s=STEP_SHARE * c_low / float(least.max()),
+        rate_per_s=float(most.max()) / c_low,
+        still_there=still_there,
+        absorber_wall=1.0 / behind,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _TouchBound:
+    lag_s: FloatArray
+    k_per_j: FloatArray
+    per_wall_k: float
+    spread: float
+    gas_s: float
+
+
+def _touch_bound(
+    model: Declared, unsure: Uncertainty, epsilon: float, r_k_per_w: float, tau_max_s: float, wall: _WallBound
+) -> _TouchBound:
+    """A bound on s + c₁ u + c₂ h: touch surface, absorber over its wall, gas over the wall.
+
+    Its rate is no more than (drive − itself) / lag + what the pulse brings, if c₂ = gas share × τ_g / (lag − τ_g) and
+    c₁ = gas share / 2 × τ / lag / ((1 − τ_g / lag) (1 − τ / lag)). A wall that cools leaves both behind: the drive is
+    the wall × (both shares + (c₁ + c₂) lag × the wall's quickest rate).
+    """
+    touch = model.touch
+    if touch is None:
+        return _TouchBound(np.ones(2), np.zeros(2), 0.0, 1.0, 0.0)
+    lags_s = touch.lag_s * np.array([1 - unsure.touch_lag, 1 + unsure.touch_lag])
+    gas_share, wall_share = touch.gas_share * (1 + unsure.touch_share), touch.wall_share * (1 + unsure.touch_share)
+    tau_g_s = model.tau_g_s * (1 + unsure.gas_lag)
+    still_there = (1.0 - tau_max_s / lags_s[0]) * (1.0 - tau_g_s / lags_s[0])
+    if still_there < 0.5 or lags_s[0] < tau_max_s:
+        raise InputError("terms.touch_surface.lag", touch.lag_s, f"well above the absorber's {tau_max_s:.3g} s")
+    gas_s = gas_share * tau_g_s / (1.0 - tau_g_s / float(lags_s[0]))
+    absorber_s = 0.5 * gas_share * tau_max_s / still_there
+    return _TouchBound(
+        lag_s=lags_s,
+        k_per_j=0.5 * gas_share * epsilon * r_k_per_w / lags_s / still_there,
+        per_wall_k=gas_share + wall_share + (absorber_s + gas_s) * wall.rate_per_s,
+        spread=spread(lags_s[1] / lags_s[0]),
+        gas_s=gas_s,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Least:
+    k_per_w: FloatArray
+    rate_per_s: FloatArray
+    lost_k: float
+    touch_lost_k: float
+
+
+def _least(
+    model: Declared,
+    unsure: Uncertainty,
+    caps: Caps,
+    c_low: FloatArray,
+    c_high: FloatArray,
+    wall: _WallBound,
+    touch: _TouchBound,
+) -> _Least:
+    """The lower corner of an absorber over its wall: a wall that nothing warms but the absorber's own heat."""
+    r_low = model.r_k_per_w * (1 - unsure.bridge_resistance)
+    both = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
+    rate_per_s = np.stack([both / (r_low * c_high), both / (r_low * c_low)], axis=1)
+    k_per_w = model.epsilon * (1 - unsure.absorbed_power) * r_low / both
+    if wall.side_w_per_k == 0.0:
+        return _Least(k_per_w, rate_per_s, 0.0, 0.0)
+    warmest_k = min(caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.spread) if touch.per_wall_k > 0.0 else inf)
+    inflow_k_per_s = 4 * wall.side_w_per_k * warmest_k / float(wall.j_per_k[0])
+    lost_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + unsure.gas_lag)
+    gas_lost_k = gas_lag_s * inflow_k_per_s + 0.5 * lost_k
+    touch_lost_k = touch.gas_s / float(touch.lag_s[0]) * gas_lost_k if touch.gas_s > 0.0 else 0.0
+    return _Least(k_per_w, rate_per_s, lost_k, touch_lost_k)

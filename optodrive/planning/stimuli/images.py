@@ -1,0 +1,143 @@
+"""Pictures and animations as frames: brightness becomes height, averaged over the area of each lattice place."""
+
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BytesIO
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config import Config
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.refresh import Beam, hold
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+FORMATS = ("PNG", "JPEG", "GIF")
+SOURCE_PIXELS_MAX = 16_000_000
+ANIMATION_PIXELS_MAX = 200_000_000
+"""Pixels of a picture, and of all pictures of an animation, before they are fitted."""
+
+ANIMATION_FRAMES_MAX = 2_000
+FRAME_MIN_S, FRAME_MAX_S = 0.02, 60.0
+FRAME_DEFAULT_S = 0.1
+"""Shown this long when the file says nothing."""
+
+DARK_BELOW = 0.04
+"""Darker than this is not driven: it could not be felt, and each pulse costs beam time."""
+
+
+def image_frames(
+    config: Config, where: str, file: bytes, height_m: float, seconds: float, invert: bool
+) -> FrameSequence:
+    """A picture (the first of several), white at height_m, kept up for `seconds`; raises InputError for no picture."""
+    lattice = Lattice.of(config)
+    with _opened(file, f"{where}: file") as image:
+        target_m = height_m * lattice_brightness(image, lattice, invert)
+    return FrameSequence(frames=tuple(hold(Beam(config), target_m, seconds, "image")))
+
+
+def animation_frames(
+    config: Config, where: str, file: bytes, height_m: float, rate_hz: float | None, invert: bool
+) -> FrameSequence:
+    """The pictures of an animated GIF or PNG in turn, each shown once; raises InputError for no picture.
+
+    Each lasts 1 / rate_hz; with None as long as the file says, at least 20 ms and the beam time that it needs.
+    """
+    beam, start_s = Beam(config), 0.0
+    frames: list[TactileFrame] = []
+    with _opened(file, f"{where}: file") as image:
+        for position in _positions(image, f"{where}: file"):
+            image.seek(position)
+            target_m = height_m * lattice_brightness(image, beam.lattice, invert)
+            duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.picture_s(target_m))
+            frames.append(TactileFrame(f"animation-{len(frames)}", start_s, duration_s, target_m))
+            start_s += duration_s
+    return FrameSequence(frames=tuple(frames))
+
+
+def lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:
+    """Brightness 0…1 of each pixel [p]: the picture fitted whole into the lattice, centred, nothing around it."""
+    brightness = _brightness(image, invert)
+    rows, columns = lattice.index.shape
+    height, width = brightness.shape
+    scale = max(height / rows, width / columns)
+    down, across = _overlap(rows, height, scale), _overlap(columns, width, scale)
+    fitted = (down @ brightness @ across.T)[::-1]
+    values = np.asarray(fitted[lattice.layout.row, lattice.layout.column], dtype=np.float64)
+    return np.where(values < DARK_BELOW, 0.0, np.minimum(values, 1.0))
+
+
+def _overlap(places: int, source: int, scale: float) -> NDArray[np.float32]:
+    """Share of each lattice place that each source pixel covers, [places, source]; scale: source pixels a place."""
+    low = source / 2 + (np.arange(places)[:, None] - places / 2) * scale
+    pixel = np.arange(source)[None, :]
+    covered = np.clip(np.minimum(low + scale, pixel + 1) - np.maximum(low, pixel), 0.0, None)
+    return np.asarray(covered / scale, dtype=np.float32)
+
+
+def _brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
+    """Brightness 0…1, [rows from the top, columns]; what is transparent is dark, inverted or not."""
+    from PIL import ImageOps
+
+    image = ImageOps.exif_transpose(image)
+    if image.mode.startswith("I"):
+        grey = np.clip(np.asarray(image, dtype=np.float32) / np.float32(65535.0), 0.0, 1.0)
+        return np.asarray(1.0 - grey if invert else grey, dtype=np.float32)
+    rgba = image.convert("RGBA")
+    grey = np.asarray(rgba.convert("RGB").convert("L"), dtype=np.float32) / 255.0
+    alpha = np.asarray(rgba.getchannel("A"), dtype=np.float32) / 255.0
+    return np.asarray((1.0 - grey if invert else grey) * alpha, dtype=np.float32)
+
+
+def _duration_s(image: "Image") -> float:
+    """How long the file wants this picture shown, s; a PNG can carry text under the same name, which is not it."""
+    duration_ms = image.info.get("duration")
+    if not isinstance(duration_ms, int | float) or not 0 < duration_ms < float("inf"):
+        return FRAME_DEFAULT_S
+    return min(max(duration_ms / 1e3, FRAME_MIN_S), FRAME_MAX_S)
+
+
+def _positions(image: "Image", where: str) -> range:
+    """Which pictures of the file belong to the animation; raises InputError for too many."""
+    count = int(getattr(image, "n_frames", 1))
+    if count > ANIMATION_FRAMES_MAX:
+        raise InputError(where, f"{count} pictures", f"at most {ANIMATION_FRAMES_MAX}", code="too_many")
+    if count * image.width * image.height > ANIMATION_PIXELS_MAX:
+        size = f"{count} pictures of {image.width} × {image.height}"
+        raise InputError(where, size, f"at most {ANIMATION_PIXELS_MAX} pixels in all", code="too_many")
+    first = 1 if image.info.get("default_image") and count > 1 else 0
+    return range(first, count)
+
+
+@contextmanager
+def _opened(file: bytes, where: str) -> Iterator["Image"]:
+    """A picture of a known format and a sane size; whatever fails while it is read becomes an InputError."""
+    from PIL import Image, UnidentifiedImageError
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.simplefilter("error", Image.DecompressionBombWarning)
+        try:
+            with Image.open(BytesIO(file), formats=FORMATS) as image:
+                if image.width * image.height > SOURCE_PIXELS_MAX:
+                    raise _too_large(where, f"{image.width} × {image.height}")
+                yield image
+        except (Image.DecompressionBombError, Image.DecompressionBombWarning):
+            raise _too_large(where, "a far larger picture") from None
+        except UnidentifiedImageError:
+            raise InputError(where, file[:16], "a picture: " + ", ".join(FORMATS), code="bad_picture") from None
+        except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, struct.error, zlib.error) as error:
+            raise InputError(where, str(error), "a picture without damage", code="bad_picture") from None
+
+
+def _too_large(where: str, size: str) -> InputError:
+    return InputError(where, size, f"a picture of at most {SOURCE_PIXELS_MAX} pixels", code="too_many")

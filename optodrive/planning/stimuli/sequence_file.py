@@ -1,0 +1,112 @@
+"""FRAMES.json, which is also the body of a plan request: decoded, checked whole, and written back."""
+
+from pathlib import Path
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
+from optodrive.core.units import m_to_um
+from optodrive.device.config import Config, pixel_layout
+from optodrive.planning.stimuli.frame_json import parse_frames
+from optodrive.planning.stimuli.json_values import decode_json, list_at, table_at
+from optodrive.planning.stimuli.train_json import check_trains, checked_train, parse_train, train_to_json
+
+FRAMES_MAX = 10_000
+TRAINS_MAX = 10_000
+TARGETS_MAX = 20_000_000
+"""Frames × pixels of a sequence: 160 MB of targets."""
+
+FILE_MAX_BYTES = 64_000_000
+
+
+def load_sequence(path: str | Path, config: Config) -> FrameSequence:
+    """Read FRAMES.json; raises InputError as `parse_sequence`, or where the file cannot be read."""
+    try:
+        with Path(path).open("rb") as file:
+            body = file.read(FILE_MAX_BYTES + 1)
+    except OSError as error:
+        raise InputError(str(path), error.strerror or str(error), "a readable file", code="no_file") from None
+    if len(body) > FILE_MAX_BYTES:
+        raise InputError(str(path), "a larger file", f"at most {FILE_MAX_BYTES} bytes", code="too_many")
+    return parse_sequence(body, config, Path(path).name)
+
+
+def parse_json(body: bytes | str, where: str) -> object:
+    """JSON text as Python values; raises InputError (bad_json) for what is no JSON, or nests too deep."""
+    try:
+        return decode_json(body, where)
+    except RecursionError:
+        raise InputError(where, body[:20], "JSON that nests less deep", code="bad_json") from None
+
+
+def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
+    """A sequence from JSON text, or from JSON already decoded, for a display; `where` names the source in errors.
+
+    Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
+    bad_time, bad_train, bad_priority, overlapping_trains, too_many.
+    """
+    try:
+        return _sequence(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
+    except RecursionError:  # from showing a value that nests deeper than Python's stack
+        raise InputError(where, "deeper nesting", "objects and lists at most 4 deep", code="bad_json") from None
+
+
+def checked_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
+    """A sequence made by a pattern, held to the same bounds as a file; raises InputError (too_many, bad_train, …)."""
+    most = _frames_max(len(pixel_layout(config.display)))
+    if len(sequence.frames) > most:
+        raise InputError(f"{where}: frames", len(sequence.frames), f"at most {most}", code="too_many")
+    trains = [checked_train(train, f"{where}: trains[{k}]", config) for k, train in enumerate(sequence.trains)]
+    check_trains(trains, f"{where}: trains", config)
+    return FrameSequence(sequence.frames, tuple(trains))
+
+
+def _frames_max(pixel_count: int) -> int:
+    return min(FRAMES_MAX, TARGETS_MAX // pixel_count)
+
+
+def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
+    """A sequence as FRAMES.json has it; heights to 1e-9 µm, so that parsing gives the same numbers back."""
+    return {
+        "frames": [_frame_to_json(frame) for frame in sequence.frames],
+        "trains": [train_to_json(train) | _priority(train) for train in sequence.trains],
+    }
+
+
+def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
+    driven = np.flatnonzero(frame.target_m)
+    together = {"together": True} if frame.together else {}
+    return (
+        together
+        | {
+            "id": frame.frame_id,
+            "show_at_s": frame.show_at_s,
+            "duration_s": frame.duration_s,
+            "target_um": {str(pixel): round(m_to_um(float(frame.target_m[pixel])), 9) for pixel in driven},
+        }
+        | _priority(frame)
+    )
+
+
+def _priority(item: TactileFrame | Train) -> dict[str, object]:
+    return {"priority": item.priority} if item.priority else {}
+
+
+def _sequence(decoded: object, config: Config, where: str) -> FrameSequence:
+    table = table_at(decoded, where, ("frames", "trains"), ())
+    pixel_count = len(pixel_layout(config.display))
+    frame_list = list_at(table.get("frames", []), f"{where}: frames", _frames_max(pixel_count))
+    train_list = list_at(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
+    if not frame_list and not train_list:
+        raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
+    return FrameSequence(
+        frames=parse_frames(frame_list, f"{where}: frames", pixel_count),
+        trains=_trains(train_list, f"{where}: trains", config, pixel_count),
+    )
+
+
+def _trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:
+    trains = tuple(parse_train(entry, f"{where}[{k}]", config, pixel_count) for k, entry in enumerate(entries))
+    check_trains(trains, where, config)
+    return trains

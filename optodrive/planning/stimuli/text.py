@@ -1,0 +1,126 @@
+"""Braille on the lattice: cells of 2 × 3 pixels, lines wrapped by words, pages one after the other."""
+
+from dataclasses import dataclass
+from itertools import groupby
+
+import numpy as np
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.device.config import Config
+from optodrive.planning.stimuli.braille import SPACE, Cell, braille_lines
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+from optodrive.planning.stimuli.refresh import Beam, end_s, hold
+
+DOT_PLACES = {1: (0, 0), 2: (1, 0), 3: (2, 0), 4: (0, 1), 5: (1, 1), 6: (2, 1)}
+"""Dot to (rows down, columns right) from the cell's top left, in dot steps."""
+
+
+@dataclass(frozen=True)
+class Spacing:
+    """In lattice places: between dots of a cell, empty columns between cells, empty rows between lines."""
+
+    dot_step: int
+    cell_gap: int
+    line_gap: int
+
+    @property
+    def cell(self) -> tuple[int, int]:
+        """Rows and columns that a cell covers."""
+        return 2 * self.dot_step + 1, self.dot_step + 1
+
+
+Slot = dict[int, int]
+"""Where a cell can be shown: dot to pixel."""
+
+
+def text_frames(
+    config: Config,
+    where: str,
+    text: str,
+    height_m: float,
+    seconds: float,
+    dot_step: int = 1,
+    cell_gap: int = 1,
+    line_gap: int = 1,
+) -> FrameSequence:
+    """Text in braille from the top left, `seconds` a page (or as long as the beam needs); raises InputError."""
+    lines = braille_lines(text, f"{where}: text")
+    if not any(lines):
+        raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
+    beam, spacing = Beam(config), Spacing(dot_step, cell_gap, line_gap)
+    slots = line_slots(beam.lattice, spacing)
+    if not slots:
+        raise _too_small(config, where, spacing)
+    rows = wrapped(lines, [len(line) for line in slots])
+    frames: list[TactileFrame] = []
+    for first in range(0, len(rows), len(slots)):
+        target_m = _picture(rows[first : first + len(slots)], slots, height_m, len(beam.lattice.layout))
+        frames += hold(
+            beam, target_m, seconds, f"page-{first // len(slots) + 1}", end_s(FrameSequence(tuple(frames[-1:])))
+        )
+    return FrameSequence(frames=tuple(frames))
+
+
+def line_slots(lattice: Lattice, spacing: Spacing) -> list[list[Slot]]:
+    """Lines of cells that fit, top first: of each line the longest run of cells with all six pixels present."""
+    rows, columns = lattice.index.shape
+    cell_rows, cell_columns = spacing.cell
+    down, across = cell_rows + spacing.line_gap, cell_columns + spacing.cell_gap
+    line_count, cell_count = (rows + spacing.line_gap) // down, (columns + spacing.cell_gap) // across
+    top = (rows - (line_count * down - spacing.line_gap)) // 2
+    left = (columns - (cell_count * across - spacing.cell_gap)) // 2
+    lines = []
+    for line in range(line_count):
+        cells = [_slot(lattice, top + line * down, left + k * across, spacing.dot_step) for k in range(cell_count)]
+        runs = [list(run) for whole, run in groupby(cells, key=lambda slot: slot is not None) if whole]
+        if runs:
+            lines.append([slot for slot in max(runs, key=len) if slot is not None])
+    return lines
+
+
+def _slot(lattice: Lattice, from_top: int, from_left: int, dot_step: int) -> Slot | None:
+    slot = {}
+    for dot, (down, right) in DOT_PLACES.items():
+        pixel = lattice.at(lattice.index.shape[0] - 1 - from_top - down * dot_step, from_left + right * dot_step)
+        if pixel is None:
+            return None
+        slot[dot] = pixel
+    return slot
+
+
+def wrapped(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]]:
+    """Words into rows of cells, row k at most widths[k mod n] long; a word longer than its row is cut."""
+    rows: list[list[Cell]] = []
+    for words in lines:
+        rows.append([])
+        for word in words:
+            rest = word
+            gap = [SPACE] if rows[-1] else []
+            if rows[-1] and len(rows[-1]) + 1 + len(rest) > widths[(len(rows) - 1) % len(widths)]:
+                rows.append([])
+                gap = []
+            rows[-1] += gap
+            while len(rows[-1]) + len(rest) > (width := widths[(len(rows) - 1) % len(widths)]):
+                space = width - len(rows[-1])
+                rows[-1] += rest[:space]
+                rest = rest[space:]
+                rows.append([])
+            rows[-1] += rest
+    return rows
+
+
+def _picture(rows: list[list[Cell]], slots: list[list[Slot]], height_m: float, pixel_count: int) -> FloatArray:
+    target_m = np.zeros(pixel_count)
+    for row, line in zip(rows, slots, strict=False):
+        for cell, slot in zip(row, line, strict=False):
+            target_m[[slot[dot] for dot in cell]] = height_m
+    return target_m
+
+
+def _too_small(config: Config, where: str, spacing: Spacing) -> InputError:
+    rows, columns = spacing.cell
+    expected = f"a display with {rows} × {columns} pixels for a cell"
+    found = f"{config.display.rows} × {config.display.columns}"
+    return InputError(f"{where}: {config.name}", found, expected, code="does_not_fit")

@@ -1,0 +1,43 @@
+import copy
+
+import jsonschema_rs
+import pytest
+
+from displays import DISPLAYS
+from optodrive.daemon.web.openapi_bodies import SEQUENCE, SHOWN
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
+
+SCHEMA = jsonschema_rs.validator_for(SEQUENCE)
+
+
+@pytest.mark.parametrize("name", ["showcase", "experiment-1", "experiment-6", "text", "vibration"])
+def test_what_is_played_is_what_the_document_describes(name):
+    config = DISPLAYS["display-437"].config
+    given = {"text": "hello"} if name == "text" else {}
+    SCHEMA.validate(sequence_to_json(build_pattern(name, given, config)))
+
+
+@pytest.mark.parametrize("name", sorted(DISPLAYS))
+def test_the_example_is_right_on_every_display(name):
+    SCHEMA.validate(SHOWN)
+    parse_sequence(copy.deepcopy(SHOWN), DISPLAYS[name].config, "body")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {},
+        {"frames": []},
+        {"frames": [], "trains": []},
+        {"frames": SHOWN["frames"], "train": []},
+        {"frames": [{**SHOWN["frames"][0], "show_at_s": -1.0}]},
+        {"frames": [{**SHOWN["frames"][0], "target_um": {"00": 1}}]},
+        {"trains": [{**SHOWN["trains"][0], "period_s": 0.1}]},
+        {"trains": [{**SHOWN["trains"][0], "pixel": 1.5}]},
+    ],
+)
+def test_what_the_document_refuses_is_refused(wrong):
+    assert not SCHEMA.is_valid(wrong)
+    with pytest.raises(Exception, match="body"):
+        parse_sequence(wrong, DISPLAYS["display-437"].config, "body")

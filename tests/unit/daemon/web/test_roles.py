@@ -1,0 +1,48 @@
+import pytest
+
+from optodrive.daemon.web.roles import ROLES, ROUTES, RouteTable, allows
+from optodrive.daemon.web.static_files import LOGIN
+
+
+def test_each_role_may_do_what_the_lesser_ones_may():
+    for index, role in enumerate(ROLES):
+        assert [allows(role, least) for least in ROLES] == [place <= index for place in range(len(ROLES))]
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "key"),
+    [
+        ("GET", "/v1/plans/p1", "GET /v1/plans/{plan_id}"),
+        ("DELETE", "/v1/plans/p1", "DELETE /v1/plans/{plan_id}"),
+        ("POST", "/v1/patterns/text", "POST /v1/patterns/{name}"),
+        ("WEBSOCKET", "/v1/stream", "WEBSOCKET /v1/stream"),
+    ],
+)
+def test_a_request_is_found_by_its_template(method, path, key):
+    assert RouteTable(ROUTES).find(method, path).key == key
+
+
+@pytest.mark.parametrize(
+    ("method", "path"),
+    [
+        ("HEAD", "/v1/state"),
+        ("GET", "/v1/state/"),
+        ("GET", "/v1/plans/"),
+        ("GET", "/v1/plans/p1/pulses"),
+        ("GET", "/v1/stream"),
+        ("GET", "/V1/STATE"),
+        ("GET", "//v1/health"),
+        ("GET", "/v1/health\n"),
+    ],
+)
+def test_what_is_not_in_the_table_is_not_found(method, path):
+    assert RouteTable(ROUTES).find(method, path) is None
+
+
+def test_stop_asks_for_the_least_role_and_arm_for_the_highest():
+    assert ROUTES["POST /v1/stop"] == ROLES[0]
+    assert ROUTES["POST /v1/arm"] == ROLES[-1]
+    assert [key for key, least in ROUTES.items() if least is None] == [
+        "GET /v1/health",
+        *(f"GET {path}" for path in LOGIN),
+    ]

@@ -1,0 +1,105 @@
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.device.config import load_config, pixel_layout, shipped_configs, shipped_path
+from optodrive.physics.parameters import load_parameters
+from optodrive.planning.effective_config import resolved_config
+from optodrive.planning.pipeline import Display
+
+
+@pytest.mark.parametrize("name", shipped_configs())
+def test_shipped_configurations_have_the_pixels_they_are_named_after(name):
+    layout = pixel_layout(load_config(name).display)
+    assert len(layout) == int(name.removeprefix("display-"))
+    places = np.column_stack([layout.x_m, layout.y_m])
+    assert len(np.unique(places.round(9), axis=0)) == len(layout)
+    assert np.abs(places).max() <= 0.076 + 1e-12
+
+
+def test_pixels_count_by_rows_from_the_lower_left():
+    layout = pixel_layout(load_config("display-16").display)
+    assert layout.x_m[:4] == pytest.approx([-6e-3, -2e-3, 2e-3, 6e-3])
+    assert layout.y_m[::4] == pytest.approx([-6e-3, -2e-3, 2e-3, 6e-3])
+
+
+def test_the_resolved_configuration_carries_what_others_rely_on():
+    resolved = resolved_config(Display.of(load_config()))
+    assert resolved["name"] == "display-437"
+    assert len(resolved["display"]["pixels"]) == 437
+    assert set(resolved["display"]["pixels"][0]) == {"index", "x_m", "y_m", "bridge_width_m"}
+    assert set(resolved["pixel_model"]) >= {"R", "C", "epsilon", "tau_g", "kappa", "phi"}
+    assert set(resolved["laser"]) == {"max_power_w", "pwm_hz", "focus_width_m", "focus_height_m"}
+    assert {"bandwidth_hz", "damping", "delay_s", "slew_rad_per_s", "aim_error_m"} <= set(resolved["scanner"])
+    assert resolved["scanner"]["move_pitch_s"] == pytest.approx(317e-6)
+    assert set(resolved["limits"]) >= {
+        "absorber_max_c",
+        "pulse_energy_max_j",
+        "pulse_width_max_s",
+        "pixel_mean_power_max_w",
+        "display_mean_power_max_w",
+    }
+    assert {"transport", "port"} <= set(resolved["board"])
+    assert resolved["ambient_c"] == 20.0
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "where", "expected"),
+    [
+        ("damping", "dampin", "scanner.dampin", "nearest is 'damping'"),
+        ("[scanner]", "[scaner]", "scaner", "nearest is 'scanner'"),
+        ("baud = 1_000_000", "baud = 10", "board.baud", "9600"),
+        ('transport = "simulated"', 'transport = "serial"', "board", "needs port"),
+        ('transport = "simulated"', 'transport = "usb"', "board", "needs vendor_id and product_id"),
+        ('transport = "simulated"', 'transport = "usb"\nvendor_id = 0x12345', "board.vendor_id", "65535"),
+        ('transport = "simulated"', 'transport = "helios"', "contradict", "codes_a_side 32767 must be 2047"),
+        ("damping = 0.7", "damping = 0.7\ncodes_a_side = 2047", "contradict", "codes_a_side 2047 must be 32767"),
+        ("baud = 1_000_000", "points_per_s = 60_000", "board.points_per_s", "50000"),
+        ("absorber_max_c = 400.0", "absorber_max_c = nan", "absorber_max_c", "finite"),
+        ("pulse_width_max_s = 0.050", "pulse_width_max_s = 0.070", "pulse_width_max_s", "0.065535"),
+        ("pulse_width_max_s = 0.050", "pulse_width_max_s = 0.0001", "contradict", "PWM period"),
+        ("pixel_mean_window_s = 1.0", "pixel_mean_window_s = 0.01", "contradict", "pixel_mean_window_s"),
+        ("[0, 0], ", "[0, 99], ", "display", "outside"),
+        ("[0, 0], ", "[0, 20], ", "display", "twice"),
+        ("version = 3", "version = 2", "version", "expected 3, the one this release reads"),
+        ("damping = 0.7", "damping = 1.0", "scanner.damping", "less than or equal to 0.9"),
+        ("damping = 0.7", "damping = 0.2", "scanner.damping", "greater than or equal to 0.3"),
+        ("focus_width_m = 1.0e-3", "focus_width_m = 1.8e-3", "contradict", "does not fit on display.absorber_width_m"),
+        ("focus_height_m = 0.5e-3", "focus_height_m = 1.3e-3", "contradict", "laser.focus_height_m 0.0013"),
+        ("aim_error_m = 1.0e-4", "aim_error_m = 5.0e-4", "contradict", "scanner.aim_error_m 0.0005"),
+    ],
+)
+def test_wrong_values_are_named_with_place_and_expectation(tmp_path, old, new, where, expected):
+    text = shipped_path("display-437.toml").read_text()
+    assert old in text
+    path = tmp_path / "c.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError) as caught:
+        load_config(path)
+    assert where in str(caught.value)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_parameter_sets_carry_unit_and_source_for_every_value():
+    for name in ("calibrated", "paper_s1_literal"):
+        parameters = load_parameters(name)
+        rows = [parameters.epsilon, parameters.tau_g, parameters.kappa, parameters.phi]
+        rows += [value for bridge in parameters.bridge for value in (bridge.R, bridge.C)]
+        assert all(row.unit and row.source for row in rows)
+        assert parameters.claims.strip()
+
+
+def test_a_bridge_width_between_the_rows_of_table_s3_takes_the_fitted_law():
+    parameters = load_parameters("calibrated")
+    assert parameters.pixel(0.40e-3).r_k_per_w == 184.0
+    assert parameters.pixel(0.30e-3).r_k_per_w == pytest.approx(73.3 / 0.30)
+
+
+def test_an_unknown_parameter_set_is_refused(tmp_path):
+    with pytest.raises(InputError, match="calibrated"):
+        load_parameters("best")
+    path = tmp_path / "p.toml"
+    path.write_text('format = "optodrive-parameters"\nversion = 7\n')
+    with pytest.raises(InputError, match="version"):
+        load_parameters(path)

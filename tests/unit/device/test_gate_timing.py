@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from optodrive.device.gate_timing import outlasting, pole_per_s, settled_s
+from optodrive.device.servo import Servo, follow
+
+SERVO = Servo(frequency=1700.0, damping=0.7, delay=3e-5, slew=100.0)
+servos = st.builds(
+    Servo,
+    frequency=st.floats(200, 5000),
+    damping=st.floats(0.3, 0.9),
+    delay=st.floats(0, 1e-4),
+    slew=st.floats(20, 1000),
+)
+
+
+@settings(max_examples=150)
+@given(servo=servos, move_rad=st.floats(2e-3, 0.3), share=st.floats(0.01, 0.45))
+def test_settled_is_when_the_stepped_servo_last_comes_inside(servo, move_rad, share):
+    """The servo as the diagnosis steps it, which is good to some 2e-4 of a step."""
+    tolerance_rad = share * min(move_rad, 0.02)
+    done_s = settled_s(servo, move_rad, tolerance_rad)
+    t_s = np.linspace(0.0, done_s + 8 / (servo.damping * 2 * np.pi * servo.frequency), 20_001)
+    angle = follow(np.array([-1.0, 0.0]), np.array([0.0, move_rad]), t_s, servo)
+    error_rad = np.abs(angle - move_rad)
+    rough_rad = 2e-3 * min(move_rad, servo.slew / servo.frequency)
+    assert error_rad[t_s >= done_s].max() <= tolerance_rad + rough_rad
+    if done_s > servo.delay + move_rad / servo.slew:
+        assert error_rad[t_s >= done_s - 2 * t_s[1]].max() >= tolerance_rad - rough_rad
+
+
+def test_never_before_the_ramp_is_over():
+    assert settled_s(SERVO, 1e-4, 1e-3) == pytest.approx(3e-5 + 1e-6)
+    assert settled_s(SERVO, 0.1, 0.09) >= 3e-5 + 1e-3
+
+
+def test_the_servo_of_the_shipped_scanners_settles_as_its_class():
+    step_rad = 1e-6  # so small that the slew limit takes no time
+    assert settled_s(SERVO, step_rad, 0.05 * step_rad) - 3e-5 == pytest.approx(0.28e-3, abs=1e-5)
+    assert settled_s(SERVO, step_rad, 0.02 * step_rad) - 3e-5 == pytest.approx(0.55e-3, abs=2e-5)
+
+
+def still_to_come(pole, phases):
+    """[phases] largest |exp(λ t)| from a phase on, sampled."""
+    t_s = np.linspace(0.0, 3 * np.pi / pole.imag, 3001)
+    return np.abs((np.exp(1j * phases[:, None] + pole * t_s)).real).max(axis=1)
+
+
+@pytest.mark.parametrize(
+    "damping", [0.3, *(pytest.param(damping, marks=pytest.mark.slow) for damping in (0.5, 0.7, 0.9))]
+)
+def test_what_outlasts_a_tolerance_is_bounded_over_all_phases_and_tightly(damping):
+    servo = Servo(1000.0, damping, 0.0, 100.0)
+    pole, phases, most = pole_per_s(servo), np.linspace(0, np.pi, 721), 0.0
+    now = still_to_come(pole, phases)
+    for later_s in np.linspace(0.0, np.pi / pole.imag, 91):
+        later = still_to_come(pole, phases + pole.imag * later_s)  # the decay itself is left out
+        most = max(most, (later / now).max())
+    assert most <= outlasting(servo) * (1 + 1e-6)
+    assert most >= 0.99 * outlasting(servo)

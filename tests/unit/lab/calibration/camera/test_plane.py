@@ -1,0 +1,112 @@
+"""From rendered grids to places on the display, by cameras nothing was tuned on."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.lab.calibration.camera.folder import GridSection, OriginSection
+from optodrive.lab.calibration.camera.grid import find_grid, grid_m, turned_to_marks
+from optodrive.lab.calibration.camera.plane import fit_plane
+from rendered import CAMERA, FIRST_M, GRID, SIZE, TILTED, TURN_RAD, Camera, corners_m, grid_light, marks_px, taken
+
+DOTS = GRID | {"kind": "circles"}
+WIDE = Camera(off_m=(0.03, 0.05), away_m=0.21, focal_px=2700.0, middle_px=(790.0, 607.0), k1=-0.2, k2=0.06)
+TURNED = replace(CAMERA, roll_rad=np.pi + 0.1)
+UPRIGHT = replace(CAMERA, roll_rad=0.5 * np.pi, focal_px=4400.0)
+PLACES_M = np.random.default_rng(5).uniform(-36e-3, 36e-3, (500, 2))
+
+
+def section(grid):
+    return GridSection(**grid, pictures=("grid.png",))
+
+
+def origin(camera=CAMERA):
+    marks = tuple((float(x), float(y)) for x, y in marks_px(camera=camera))
+    return OriginSection(marks_px=marks, first_m=FIRST_M, turn_rad=TURN_RAD)
+
+
+def found(camera, grid, seed, noise=2.0):
+    picture = taken(180.0 * grid_light(camera, grid), np.random.default_rng(seed), noise)
+    return find_grid(Path("grid.png"), picture, section(grid))
+
+
+def plane_of(cameras, grid=GRID, noise=2.0):
+    views = [found(camera, grid, seed, noise) for seed, camera in enumerate(cameras)]
+    views[0] = turned_to_marks("it", views[0], origin(cameras[0]))
+    return fit_plane(views, grid_m(section(grid), origin()), grid["pitch_m"], SIZE)
+
+
+def off_m(plane, camera):
+    return np.hypot(*(plane.places_m(camera.pixel(PLACES_M)) - PLACES_M).T)
+
+
+def test_the_grid_lies_where_first_corner_and_turn_say():
+    assert np.allclose(grid_m(section(GRID), origin()), corners_m(), rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("cameras", "grid"),
+    [((CAMERA,), GRID), ((CAMERA,), DOTS), ((WIDE,), GRID), ((TURNED,), GRID), ((UPRIGHT,), GRID)],
+    ids=["chessboard", "dots", "wide lens", "upside down", "upright"],
+)
+def test_one_picture_of_the_grid_is_enough_for_5_um(cameras, grid):
+    plane = plane_of(cameras, grid)
+    off = off_m(plane, cameras[0])
+    assert np.sqrt((off**2).mean()) < 5e-6
+    assert off.max() < 15e-6
+    assert plane.left_px < 0.05
+
+
+@pytest.mark.slow
+def test_several_give_the_camera():
+    plane = plane_of((CAMERA, *TILTED))
+    assert plane.camera is not None
+    matrix, _ = plane.camera
+    assert matrix[0, 0] == pytest.approx(CAMERA.focal_px, rel=0.01)
+    assert np.sqrt((off_m(plane, CAMERA) ** 2).mean()) < 5e-6
+
+
+def test_corners_that_are_off_make_the_plane_less_sure_as_much_as_they_do():
+    """Corners moved at random by a known amount, many times over."""
+    random, exact = np.random.default_rng(3), CAMERA.pixel(corners_m().reshape(-1, 2))
+    off, stated = [], []
+    for _ in range(30):
+        moved = (exact + random.normal(0.0, 0.2, exact.shape)).reshape(*corners_m().shape)
+        plane = fit_plane([moved], corners_m(), GRID["pitch_m"], SIZE)
+        off.append(plane.places_m(CAMERA.pixel(PLACES_M)) - PLACES_M)
+        stated.append(plane.sigma_m(CAMERA.pixel(PLACES_M)))
+        assert 0.17 < plane.left_px < 0.23
+    assert 0.7 < np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(stated))) < 1.4
+
+
+@pytest.mark.slow
+def test_without_the_lens_it_would_miss():
+    """The mutant: a homography alone."""
+    exact = CAMERA.pixel(corners_m().reshape(-1, 2))
+    straight = np.column_stack([exact, np.ones(len(exact))])
+    places = corners_m().reshape(-1, 2)
+    rows = [np.r_[p, 0, 0, 0, -x * p] for p, (x, _) in zip(straight, places, strict=True)]
+    rows += [np.r_[0, 0, 0, p, -y * p] for p, (_, y) in zip(straight, places, strict=True)]
+    matrix = np.linalg.svd(np.array(rows) / [*[1e3, 1e3, 1.0] * 2, 1e3, 1e3, 1.0])[2][-1]
+    matrix = (matrix / [*[1e3, 1e3, 1.0] * 2, 1e3, 1e3, 1.0]).reshape(3, 3)
+    through = np.column_stack([CAMERA.pixel(PLACES_M), np.ones(len(PLACES_M))]) @ matrix.T
+    assert np.hypot(*(through[:, :2] / through[:, 2:] - PLACES_M).T).max() > 50e-6
+
+
+@pytest.mark.parametrize("turn", range(4))
+def test_marks_put_the_grid_right_in_whatever_order_it_was_found(turn):
+    exact = CAMERA.pixel(corners_m().reshape(-1, 2)).reshape(*corners_m().shape)
+    given = exact[:: 1 - 2 * (turn & 1), :: 1 - (turn & 2)]
+    assert np.array_equal(turned_to_marks("it", given, origin()), exact)
+
+
+def test_marks_along_a_column_are_named():
+    exact = CAMERA.pixel(corners_m().reshape(-1, 2)).reshape(*corners_m().shape)
+    first, right, down = marks_px()
+    along_column = (right, right + down - first, first)
+    marks = tuple((float(x), float(y)) for x, y in along_column)
+    with pytest.raises(InputError, match="a first row of 10 and 13 rows"):
+        turned_to_marks("it", exact, origin().model_copy(update={"marks_px": marks}))

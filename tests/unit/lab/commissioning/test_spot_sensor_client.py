@@ -1,0 +1,57 @@
+"""The host's side of the sensor's lines."""
+
+import pytest
+
+from optodrive.core.errors import LinkError
+from optodrive.lab.commissioning.spot_sensor_client import LINE_MAX, SpotSensor
+
+
+class Wire:
+    """A transport that says what a test lets it say, in pieces."""
+
+    name = "a wire"
+
+    def __init__(self, *pieces):
+        self.pieces, self.written = list(pieces), b""
+
+    def read(self, timeout_s):
+        return self.pieces.pop(0) if self.pieces else b""
+
+    def write(self, data):
+        self.written += data
+
+
+def test_a_line_comes_in_pieces_and_what_lay_there_is_dropped():
+    wire = Wire(b"spot 1 2 3\nspo", b"", b"spot 4", b" 5 6\n")
+    sensor = SpotSensor(wire)
+    sensor.ask("spot")
+    assert wire.written == b"spot\n"
+    assert sensor.answer() is None
+    assert sensor.answer() is None
+    line = sensor.answer()
+    assert line == "spot 4 5 6"
+    assert sensor.sighting(line) == pytest.approx((4e-6, 5e-6, 6e-6))
+
+
+def test_none_is_an_answer():
+    sensor = SpotSensor(Wire())
+    assert sensor.sighting("spot none") is None
+    assert sensor.mirrors_rad("mirrors none") is None
+    assert sensor.mirrors_rad("mirrors -0.1 0.2") == (-0.1, 0.2)
+
+
+@pytest.mark.parametrize(
+    "line", ["", "spot", "spot 1 2", "spot 1 2 x", "spot 1 nan 3", "mirrors 1 2", "error no", "\ufffd"]
+)
+def test_what_is_no_answer_is_named(line):
+    with pytest.raises(LinkError, match=r"a wire: heard .*expected 'spot' and 3 numbers"):
+        SpotSensor(Wire()).sighting(line)
+
+
+def test_a_flood_without_a_line_ends():
+    sensor = SpotSensor(Wire(b"", *[b"x" * 50] * 3))
+    sensor.ask("spot")
+    assert sensor.answer() is None
+    with pytest.raises(LinkError, match="expected a line") as caught:
+        sensor.answer()
+    assert len(str(caught.value)) < 2 * LINE_MAX + 100

@@ -1,0 +1,123 @@
+"""From a small recording to the answer: verdicts, words, JSON, model file, what is held out."""
+
+import json
+
+import numpy as np
+import pytest
+
+from labs import lab
+from optodrive.lab.diagnosis.dataset import dataset
+from optodrive.lab.diagnosis.diagnose import diagnose
+from optodrive.lab.diagnosis.held_out_gain import split
+from optodrive.lab.diagnosis.model_file import model_toml
+from optodrive.lab.diagnosis.narrative import answer, quantity, story
+from optodrive.lab.diagnosis.omnibus_test import bins
+from optodrive.lab.diagnosis.report import report
+from optodrive.physics.parameters import load_parameters
+
+DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}
+TWO = {"gas_leak": {"rate": 4.0}, "heat_capacity": {"slope": 2e-3}}
+
+
+@pytest.fixture(scope="module")
+def clean():
+    return diagnose(lab(11, {}))
+
+
+@pytest.fixture(scope="module")
+def droop():
+    return diagnose(lab(12, DROOP))
+
+
+def test_nothing_is_found_where_nothing_is(clean):
+    assert clean.verdict == "none"
+    assert clean.causes == ()
+    assert clean.terms == {}
+    assert story(clean)[0].startswith("Nothing found")
+    assert any("laser_droop: share" in line for line in story(clean))
+
+
+def test_a_hidden_cause_is_named_measured_and_gains(droop):
+    assert (droop.verdict, droop.causes) == ("cause", ("laser_droop",))
+    share = droop.parameters["laser_droop.share"]
+    assert share.low <= 0.08 <= share.high
+    assert droop.gain is not None
+    assert droop.gain.reduction > 0.9
+    assert droop.gain.after["absorber_temperature_K"] < droop.gain.before["absorber_temperature_K"]
+    assert set(droop.held_out).isdisjoint(droop.fitted)
+    text = "\n".join(story(droop))
+    assert "the laser's power falls while it is on" in text
+    assert "Ruled out" in text
+
+
+def test_two_hidden_causes_are_named_together():
+    found = diagnose(lab(13, TWO))
+    assert found.verdict == "cause"
+    assert set(found.causes) == set(TWO)
+
+
+def test_without_repeats_nothing_is_named_for_certain():
+    found = diagnose(lab(14, DROOP, repeats=1))
+    assert found.verdict != "cause"
+    assert any("No run repeats another" in line for line in story(found))
+
+
+def test_the_same_seed_gives_the_same_answer(droop):
+    again = answer(diagnose(lab(12, DROOP)))
+    first = answer(droop)
+    assert {**again, "seconds": 0} == {**first, "seconds": 0}
+
+
+def test_the_answer_is_json_of_the_format(droop):
+    document = json.loads(json.dumps(answer(droop), allow_nan=False))
+    assert document["verdict"] == "cause"
+    assert set(document["parameters"]["R"]) == {"value", "unit", "ci95"}
+    assert set(document["gain"]) == {"heldout_rmse_before", "heldout_rmse_after", "noise_floor", "reduction", "ci95"}
+    assert set(document["runs"]) == {"fitted", "held_out"}
+    for item in document["candidates"]:
+        assert {"cause", "statistic", "p_value", "heldout_gain", "verdict"} <= set(item)
+
+
+def test_the_model_file_loads_as_it_is(droop, tmp_path):
+    path = tmp_path / "model.toml"
+    path.write_text(model_toml(droop, 'odd "name"\n.h5', 0.4e-3))
+    loaded = load_parameters(path)
+    assert loaded.terms["laser_droop"]["share"].value == droop.terms["laser_droop"]["share"]
+    pixel = loaded.pixel(0.4e-3)
+    assert pixel.r_k_per_w == pytest.approx(droop.base["R"])
+    assert loaded.pixel(0.8e-3).r_k_per_w == pytest.approx(droop.base["R"] / 2)
+
+
+def test_the_report_stands_alone_and_escapes(droop, clean):
+    for found in (droop, clean):
+        text = report(found, "<script>.h5")
+        assert "<script>" not in text
+        assert "http" not in text
+        assert text.count("<svg") == text.count("</svg>") > 3
+
+
+def test_whole_groups_are_held_out_never_the_only_one_of_its_kind():
+    data = dataset(lab(15, {}))
+    fitted, held = split(data)
+    assert held
+    groups = {data.runs[run].group for run in held}
+    assert groups.isdisjoint({data.runs[run].group for run in fitted})
+    assert "train" not in groups
+
+
+def test_bins_do_not_mix_groups_or_signals():
+    data = dataset(lab(16, {}))
+    labels = bins(data)
+    owner = {}
+    for block in data.blocks:
+        for label in np.unique(labels[block.part]):
+            key = (data.runs[block.run].group, block.kind)
+            assert owner.setdefault(int(label), key) == key
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [(2e-6, "m", "2 µm"), (0.05, "s", "50 ms"), (0.3, "1", "0.3"), (0.0, "m", "0 m"), (12.5, "K", "12.5 K")],
+)
+def test_quantities_read_as_people_write_them(value, unit, text):
+    assert quantity(value, unit) == text

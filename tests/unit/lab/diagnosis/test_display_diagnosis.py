@@ -1,0 +1,217 @@
+"""Recordings of many pixels: each for itself, on processes that may die, told and mapped."""
+
+import json
+import os
+import signal
+from functools import partial
+
+import numpy as np
+import pytest
+
+from display_lab import display_lab
+from optodrive.cli.main import run
+from optodrive.core.errors import InputError
+from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.device.config import load_config
+from optodrive.lab.diagnosis.dask_workers import crew, done
+from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, diagnose_pixel, warm
+from optodrive.lab.diagnosis.display_narrative import display_answer, display_story, ranges
+from optodrive.lab.diagnosis.display_report import display_report
+from optodrive.lab.recording import DisplayRuns, read_recording, write_recording
+
+DROOP = {"laser_droop": {"share": 0.15, "time": 0.05, "spread": 1.0}}
+HIDDEN = {pixel: DROOP if pixel % 4 == 1 else {} for pixel in range(20, 26)}
+QUICK = {"groups": ("weak", "middle", "strong"), "repeats": 2, "rate": 500.0}
+BAD = 31
+KILLER = 99
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Six good pixels, and one whose samples are all behind the last; mirrors in one run."""
+    path = tmp_path_factory.mktemp("display") / "display.h5"
+    write_recording(path, Measurement((*display_lab(HIDDEN, **QUICK).runs, one_sample_run(), mirror_run())))
+    spoil(path)
+    return path
+
+
+def one_sample_run():
+    t_s = np.linspace(0.0, 0.1, 20)
+    pulses = np.array([[0.02, 0.01, 1.0, float(BAD)]])
+    return Run("pixel31-run", 293.15, pulses, {"displacement_m": Signal(BAD, t_s, np.linspace(0.0, 1e-5, 20))})
+
+
+def mirror_run():
+    t_s = (np.arange(400) + 0.5) * 2e-4
+    moves = np.array([[0.0, 0.0, 0.0], [0.02, 0.01, 0.0], [0.04, -0.02, 0.0]])
+    followed = moves[np.searchsorted(moves[:, 0], t_s, side="right") - 1, 1]
+    noisy = followed + 1e-5 * np.random.default_rng(1).standard_normal(len(t_s))
+    return Run("turning", 293.15, np.zeros((0, 4)), {"mirror_x_rad": Signal(0, t_s, noisy)}, {}, moves)
+
+
+def spoil(path):
+    """A time axis that goes back: only reading the samples shows it."""
+    import h5py
+
+    with h5py.File(path, "r+") as file:
+        file["runs/pixel31-run/displacement_m/t_s"][7] = 0.0
+
+
+def tasks_of(runs):
+    return [PixelTask(item.pixel, item.read) for item in runs.pixels]
+
+
+@pytest.fixture(scope="module")
+def told(recording):
+    """All pixels on two processes, of which one is killed at work, and one more by a task each time it is tried."""
+    warm()
+    runs = DisplayRuns.open([recording])
+    killer = PixelTask(KILLER, partial(signal.raise_signal, signal.SIGKILL))
+    answers = {}
+    with crew(workers=2) as client:
+        before = client.run(os.getpid)
+        assert len(set(before.values())) == 2
+        for task, answer, error in done(client, diagnose_pixel, [*tasks_of(runs), killer]):
+            if not answers:
+                os.kill(next(iter(before.values())), signal.SIGKILL)
+            answers[task.pixel] = (answer, error)
+    return answers
+
+
+@pytest.mark.slow
+def test_every_pixel_has_its_answer_though_workers_were_killed(told):
+    assert sorted(told) == [*HIDDEN, BAD, KILLER]
+    for pixel, terms in HIDDEN.items():
+        answer, error = told[pixel]
+        assert not error
+        assert answer.found.causes == tuple(terms)
+
+
+def test_answers_are_those_of_one_process(told, recording):
+    for task in tasks_of(DisplayRuns.open([recording]))[:2]:
+        alone, there = diagnose_pixel(task).found, told[task.pixel][0].found
+        assert alone.parameters == there.parameters
+        assert alone.candidates == there.candidates
+        assert alone.gain == there.gain
+
+
+def test_bad_data_are_that_pixels_error_alone(told):
+    answer, _ = told[BAD]
+    assert answer.found is None
+    assert "pixel31-run/displacement_m/t_s[7]" in answer.error
+    assert "\n" not in answer.error
+
+
+def test_a_pixel_that_kills_its_workers_is_told_and_takes_no_other_with_it(told):
+    answer, error = told[KILLER]
+    assert answer is None
+    assert "worker died" in error
+
+
+def test_what_is_told_of_a_display(told):
+    pixels = tuple(told[pixel][0] for pixel in [*HIDDEN, BAD])
+    found = DisplayAnswer(pixels, None, 1.0)
+    lines = display_story(found)
+    assert lines[0].startswith("Of 7 pixels, each diagnosed for itself, 2 show that the nominal model is wrong")
+    assert any("2 pixels: the laser's power falls while it is on (laser_droop): 21, 25." in line for line in lines)
+    assert any(line.startswith("  laser_droop.share: median 0.") for line in lines)
+    assert lines[-1] == "Model of the display: medians over 4 of 7 pixels."
+    document = json.loads(json.dumps(display_answer(found)))
+    assert document["summary"]["verdicts"] == {"none": 4, "cause": 2, "ambiguous": 0, "unexplained": 0}
+    assert document["summary"]["errors"] == [BAD]
+    assert document["pixels"]["21"]["causes"] == ["laser_droop"]
+    low, high = document["pixels"]["21"]["parameters"]["laser_droop.share"]["ci95"]
+    assert low < 0.15 < high
+    assert document["pixels"]["31"]["verdict"] is None
+
+
+def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(told):
+    found = DisplayAnswer(tuple(told[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
+    html = display_report(found, "display.h5", load_config("display-437"))
+    assert html.count("<title>pixel ") == 437
+    assert "<title>pixel 21: the laser&#x27;s power falls while it is on (laser_droop); laser_droop.share 0." in html
+    assert "pixel 0: not measured" in html
+    for word in ("<script", "http", "url("):
+        assert word not in html
+    small = display_report(found, "display.h5", load_config("display-16"))
+    assert small.count("<title>pixel ") == 7
+    assert "; display-16 has no pixel 31." in small
+
+
+@pytest.mark.slow
+def test_the_command_writes_report_answer_and_model(tmp_path, capsys):
+    path, out = tmp_path / "five.h5", tmp_path / "answer"
+    out.mkdir()
+    (out / "model.toml").write_text("of an earlier answer")
+    few = display_lab(dict.fromkeys((3, 4, 5), DROOP) | {6: {}}, **QUICK)
+    write_recording(path, Measurement((*few.runs, one_sample_run(), mirror_run())))
+    assert run(["diagnose", str(path), "--workers", "2", "--out", str(out), "--json", "-"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    assert sorted(document["pixels"], key=int) == ["3", "4", "5", "6", "31"]
+    assert document["mirrors"]["verdict"] in ("none", "unexplained", "cause", "ambiguous")
+    assert json.loads((out / "diagnosis.json").read_text()) == document
+    assert "<h2>Map</h2>" in (out / "report.html").read_text()
+    model = out / "model.toml"
+    assert model.exists() == document["summary"]["model"]["written"]
+    assert not model.exists() or "earlier" not in model.read_text()
+
+
+@pytest.mark.parametrize(
+    "address", ["nonsense", "tcp://127.0.0.1", "http://127.0.0.1:8786", "tls://127.0.0.1:9", "tcp://127.0.0.1:9"]
+)
+def test_an_address_where_no_scheduler_is(address, recording, tmp_path, capsys):
+    out = tmp_path / "answer"
+    assert run(["diagnose", str(recording), "--dask", address, "--out", str(out)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "--dask" in error
+    assert address in error
+    assert "\n" not in error
+    assert not out.exists()
+
+
+def test_a_cluster_has_its_own_workers(recording, capsys):
+    assert run(["diagnose", str(recording), "--dask", "tcp://127.0.0.1:9", "--workers", "2"]) == 2
+    assert "--workers" in capsys.readouterr().err
+
+
+def test_a_pixel_reads_its_own_runs_and_signals(recording):
+    runs = DisplayRuns.open([recording])
+    assert [item.pixel for item in runs.pixels] == [*HIDDEN, BAD]
+    own = runs.pixels[3].read()
+    whole = read_recording_of(recording, runs.pixels[3].parts[0].names)
+    assert [item.name for item in own.runs] == [item.name for item in whole]
+    assert all(signal.pixel == 23 for item in own.runs for signal in item.signals.values())
+    assert [item.name for item in runs.mirrors.read().runs] == ["turning"]
+
+
+def read_recording_of(path, names):
+    from optodrive.lab.recording import read_runs
+
+    return read_runs(path, list(names)).runs
+
+
+def test_a_file_that_changes_meanwhile_is_refused(tmp_path):
+    path = tmp_path / "display.h5"
+    write_recording(path, display_lab({3: {}}, groups=("weak",), repeats=2))
+    task = tasks_of(DisplayRuns.open([path]))[0]
+    write_recording(path, display_lab({3: {}}, groups=("weak", "strong"), repeats=2))
+    assert "when the diagnosis began" in diagnose_pixel(task).error
+    with pytest.raises(InputError, match="when the diagnosis began"):
+        task.read()
+
+
+def test_folders_are_read_by_pixel_too(tmp_path):
+    measurement = display_lab({3: {}, 8: {}}, groups=("weak",), repeats=2)
+    write_recording(tmp_path / "one", measurement)
+    write_recording(tmp_path / "two.h5", measurement)
+    runs = DisplayRuns.open([tmp_path / "one", tmp_path / "two.h5"])
+    names = [item.name for item in runs.pixels[1].read().runs]
+    assert names == ["one/pixel8-run000", "one/pixel8-run001", "two/pixel8-run000", "two/pixel8-run001"]
+    values = [item.signals["displacement_m"].value for item in read_recording(tmp_path / "two.h5").runs[2:]]
+    for item, value in zip(runs.pixels[1].read().runs, [*values, *values], strict=True):
+        np.testing.assert_array_equal(item.signals["displacement_m"].value, value)
+
+
+def test_pixels_in_words():
+    assert ranges([3, 7, 8, 12, 13, 14, 15]) == "3, 7, 8, 12 to 15"
+    assert ranges([4]) == "4"

@@ -1,0 +1,163 @@
+"""A session's file and its writer, a process of its own, without a board."""
+
+import os
+import resource
+import signal
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.measurements import Measurement, Run, Signal
+from optodrive.lab.recording import read_recording, write_recording
+from optodrive.lab.recording.merge import merge_session
+from optodrive.lab.recording.session_recorder import WAITING_MAX, SessionRecorder
+from optodrive.lab.recording.session_writer import REST_S
+
+ABOUT = {"display": "d", "optodrive": "0", "ambient_K": 293.15, "bridge_width_m": 4e-4, "config": "{}"}
+
+
+def note(plan, start_s, pulses=3, padding=0):
+    about = {"plan": plan, "name": "n", "status": "done", "error": None, "summary": "{}", "trains": "[]"}
+    about |= {"lit_unix_s": 1e9 + start_s, "lit_at": "2001-09-09T01:46:40+00:00"}
+    begin_s = start_s + 0.02 * np.arange(pulses)
+    columns = [begin_s, np.full(pulses, 0.01), np.full(pulses, 2.0), np.full(pulses, 17.0)]
+    executed = np.column_stack(columns)
+    random = np.random.default_rng(1).random(padding)
+    return about, {"executed": executed, "planned": executed, "simulated_m": np.full(pulses, 1e-5), "padding": random}
+
+
+def recorded(path, notes, said):
+    recorder = SessionRecorder(path, ABOUT, said.append)
+    for each in notes:
+        recorder.note(lambda each=each: each)
+    recorder.close()
+    return recorder
+
+
+def until(condition):
+    end_s = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
+def test_plans_are_kept_and_a_rest_begins_a_new_run(tmp_path):
+    path, said = tmp_path / "a.h5", []
+    after = 1.0 + REST_S + 0.1
+    empty = ({**note("p3", 0.0)[0], "status": "cancelled", "error": "why"}, {"planned": np.zeros((0, 5))})
+    recorded(path, [note("p1", 0.5), note("p2", 0.7), empty, note("p4", after), note("p5", 0.2)], said)
+    assert said == []
+    with h5py.File(path) as file:
+        assert list(file["runs"]) == ["run1", "run2", "run3"]
+        np.testing.assert_allclose(file["runs/run1/pulses"][:, 0], [0, 0.02, 0.04, 0.2, 0.22, 0.24], atol=1e-9)
+        np.testing.assert_allclose(file["runs/run2/pulses"][:, 0], [0, 0.02, 0.04], atol=1e-9)
+        assert file["runs/run1"].attrs["started_unix_s"] == 1e9 + 0.5
+        assert sorted(file["plans"]) == ["config", "p1", "p2", "p3", "p4", "p5"]
+        assert file["plans/p2"].attrs["run"] == "run1"
+        assert file["plans/p4"].attrs["run"] == "run2"
+        assert file["plans/p5"].attrs["run"] == "run3"  # the board's clock was set anew
+        assert (file["plans/p3"].attrs["status"], file["plans/p3"].attrs["error"]) == ("cancelled", "why")
+        assert "run" not in file["plans/p3"].attrs
+        np.testing.assert_allclose(file["plans/p1/simulated_m"], 1e-5)
+
+
+def test_a_full_disk_is_told_in_one_line_and_what_was_written_stays(tmp_path):
+    path, said = tmp_path / "a.h5", []
+    recorder = SessionRecorder(path, ABOUT, said.append)
+    resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))
+    for k in range(30):
+        recorder.note(lambda k=k: note(f"p{k}", 0.1 * k, padding=10_000))
+    until(lambda: not recorder.recording)
+    recorder.note(lambda: pytest.fail("nothing is made for a recording that has ended"))
+    recorder.close()
+    assert len(said) == 1
+    assert "File too large" in said[0]
+    assert "the display goes on" in said[0]
+    with h5py.File(path) as file:
+        plans = len(file["plans"]) - 1
+        assert 3 < plans < 30
+        assert len(file["runs/run1/pulses"]) == 3 * plans
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_writer_that_ends_or_hangs_holds_nobody_up(tmp_path, number):
+    said = []
+    recorder = SessionRecorder(tmp_path / "a.h5", ABOUT, said.append)
+    os.kill(recorder._writer.pid, number)
+    began_s = time.monotonic()
+    for k in range(2 * WAITING_MAX):
+        recorder.note(lambda k=k: note(f"p{k}", 0.1 * k))
+    assert time.monotonic() - began_s < 5.0
+    until(lambda: said)
+    recorder._writer.kill()
+    until(lambda: not recorder._thread.is_alive())
+    assert len(said) == 1
+    assert "stopped" in said[0]
+
+
+def test_its_feeder_ending_ends_the_writer_with_all_that_came(tmp_path):
+    """As after kill -9 of the daemon: the pipe closes in the middle of a note."""
+    said = []
+    recorder = SessionRecorder(tmp_path / "a.h5", ABOUT, said.append)
+    recorder.note(lambda: note("p1", 0.0))
+    until(lambda: (tmp_path / "a.h5").stat().st_size and recorder._waiting.empty())
+    recorder.close()
+    assert recorder._writer.returncode == 0
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert "p1" in file["plans"]
+
+
+def test_a_note_that_cannot_be_made_is_told(tmp_path):
+    said = []
+    recorder = recorded(tmp_path / "a.h5", [], said)
+    recorder = SessionRecorder(tmp_path / "b.h5", ABOUT, said.append)
+    recorder.note(lambda: 1 / 0)
+    until(lambda: said)
+    recorder.close()
+    assert "ZeroDivisionError" in said[0]
+
+
+def test_nothing_is_overwritten_and_a_bad_path_is_one_line(tmp_path):
+    (tmp_path / "a.h5").write_text("dear")
+    with pytest.raises(InputError, match="name that is free"):
+        SessionRecorder(tmp_path / "a.h5", ABOUT, print)
+    with pytest.raises(InputError, match="No such file"):
+        SessionRecorder(tmp_path / "no" / "a.h5", ABOUT, print)
+
+
+def measured(path, names, pulses=()):
+    t_s = np.linspace(0.0, 0.5, 50)
+    drive = np.array(pulses, dtype=float).reshape(-1, 4)
+    runs = [
+        Run(name, 290.0, drive, {"displacement_m": Signal(17, t_s, np.sin(t_s), 1e-7)}, {"camera": "c"})
+        for name in names
+    ]
+    write_recording(path, Measurement(tuple(runs)))
+
+
+def test_measured_signals_join_the_runs_of_their_name(tmp_path):
+    session, lab, out = tmp_path / "a.h5", tmp_path / "lab", tmp_path / "b.h5"
+    recorded(session, [note("p1", 0.0), note("p2", 60.0)], [])
+    measured(lab, ["run2"])
+    write_recording(out, merge_session(session, lab, shift_s=0.25))
+    (run,) = read_recording(out).runs
+    assert (run.name, run.ambient_k, run.attributes["camera"]) == ("run2", 290.0, "c")
+    assert run.attributes["sample"] == "d"
+    np.testing.assert_allclose(run.pulses[:, 0], [0.0, 0.02, 0.04], atol=1e-9)
+    assert run.signals["displacement_m"].t_s[0] == 0.25
+
+
+def test_what_does_not_belong_together_is_refused_by_name(tmp_path):
+    session = tmp_path / "a.h5"
+    recorded(session, [note("p1", 0.0)], [])
+    measured(tmp_path / "x", ["run7"])
+    with pytest.raises(InputError, match="run7"):
+        merge_session(session, tmp_path / "x")
+    measured(tmp_path / "y", ["run1"], pulses=[[0.0, 0.01, 1.0, 17.0]])
+    with pytest.raises(InputError, match="1 pulses, expected none"):
+        merge_session(session, tmp_path / "y")
+    with pytest.raises(InputError, match="without signals"):
+        read_recording(session)

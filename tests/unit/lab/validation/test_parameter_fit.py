@@ -1,0 +1,40 @@
+"""The scripts that made the shipped files make them again, byte for byte."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[4]
+
+
+def made(script, out):
+    command = [sys.executable, ROOT / "scripts" / script, "--out", out]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_calibrated_set_is_what_the_fit_gives(tmp_path):
+    printed = made("calibrate_parameters.py", tmp_path / "calibrated.toml")
+    assert (tmp_path / "calibrated.toml").read_text() == (ROOT / "configs/parameters/calibrated.toml").read_text()
+    for parameter in ("kappa", "tau_g", "phi"):
+        assert f"\n{parameter}" in "\n" + printed
+
+
+def test_the_validation_page_is_current(tmp_path):
+    made("validation_doc.py", tmp_path / "page.md")
+    page = ROOT / "docs" / "validation.md"
+    if (tmp_path / "page.md").read_text(encoding="utf-8") != page.read_text(encoding="utf-8"):
+        pytest.fail("docs/validation.md is not current: run scripts/validation-doc")
+
+
+def test_every_row_of_the_page_has_the_columns_of_its_heading():
+    columns = None
+    for line in (ROOT / "docs" / "validation.md").read_text(encoding="utf-8").splitlines():
+        if not line.startswith("| "):
+            columns = None
+            continue
+        columns = columns or line.count(" |")
+        assert line.count(" |") == columns, line

@@ -1,0 +1,242 @@
+"""What the user is told when the link goes: produced for real on the simulated board, in virtual time."""
+
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from test_session import CONFIG, Rig, plan
+
+from optodrive.core.errors import InputError, LinkError
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.likely_cause import (
+    STALL_SHARE,
+    Evidence,
+    port_cause,
+    why_lease_lapsed,
+    why_lost,
+    why_restarted,
+)
+from optodrive.link.session.link_watch import RECENT_S, Counts, LinkWatch
+from optodrive.link.session.session import Session
+from optodrive.link.simulator.faulty_link import FaultyLink
+from optodrive.link.transport.port_state import Holder, PortState
+
+LEASE_S = CONFIG.board.lease_s
+QUIET = Evidence("/dev/ttyACM0", PortState("there"), silent=True, lease_s=LEASE_S)
+
+
+class Damaged(Rig):
+    """A line that flips bits both ways."""
+
+    def __init__(self):
+        super().__init__()
+        self.faults = FaultyLink(seed=1)
+        self.link.write = lambda data: self.core.receive(self.faults.carry(data), round(self.clock.now_s() * 1e6))
+        read = super(type(self.link), self.link).read
+        self.link.read = lambda timeout_s: self.faults.carry(read(timeout_s))
+
+
+def cause(rig):
+    return rig.session.link_figures()["likely_cause"]
+
+
+def lost(rig, lease=True):
+    """Run until the link is given up; what is told."""
+    with pytest.raises(LinkError) as caught:
+        rig.run(30.0, lease)
+    told = rig.session.lost(caught.value)
+    assert told.endswith(cause(rig))
+    return told
+
+
+def test_a_link_that_stands_has_no_cause_and_counts_its_turns():
+    rig = Rig().connect().arm()
+    rig.run(1.0)
+    figures = rig.session.link_figures()
+    assert figures["likely_cause"] is None
+    assert figures["likely_cause_ago_s"] is None
+    assert 1.9 < figures["longest_stall_ms"] < 3.0
+
+
+def test_a_host_that_stood_still_is_told_so():
+    rig = Rig().connect().arm()
+    rig.play(plan(500))
+    rig.run(0.3)
+    rig.clock.sleep(0.35)
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    assert "this computer stood still for 35" in cause(rig)
+    assert f"the lease is {LEASE_S * 1e3:.0f} ms" in cause(rig)
+    assert rig.session.link_figures()["longest_stall_ms"] == pytest.approx(350, abs=5)
+
+
+def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
+    rig = Rig().connect().arm()
+    rig.run(0.3)
+    read = rig.link.read
+
+    def stopped(timeout_s):
+        rig.clock.sleep(0.35)
+        rig.link.read = read
+        return read(timeout_s)
+
+    rig.link.read = stopped
+    rig.session.step(0.002, lease=True)
+    assert rig.session.board.fault == "LINK"
+    assert "this computer stood still for 35" in cause(rig)
+
+
+def test_a_stall_of_long_ago_explains_nothing():
+    rig = Rig().connect()
+    rig.clock.sleep(0.5)
+    rig.run(RECENT_S + 1.0)
+    rig.arm()
+    rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
+    assert "stood still" not in cause(rig)
+
+
+def test_a_planner_that_hangs_is_told_so():
+    rig = Rig().connect().arm()
+    rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
+    assert "planner made no progress" in cause(rig)
+
+
+def test_a_board_that_was_reset_is_silent_at_first_and_then_tells():
+    for code, word in enumerate(("power-up", "reset", "brown-out", "watchdog")):
+        rig = Rig().connect().arm()
+        rig.core.reset(round(rig.clock.now_s() * 1e6), code)
+        assert "hangs, restarts, has no power" in lost(rig)
+        rig.connect()
+        assert "restarted 2." in cause(rig)
+        assert f"({word})" in cause(rig)
+
+
+def test_a_link_that_comes_back_to_the_same_board_does_not_blame_a_restart():
+    rig = Rig().connect().arm()
+    rig.link.cut = True
+    assert "hangs, restarts, has no power" in lost(rig)
+    rig.link.cut = False
+    rig.connect()
+    assert "restarted" not in cause(rig)
+    assert rig.session.link_figures()["likely_cause_ago_s"] > 0
+
+
+def test_damage_of_what_the_board_sends_is_told_at_once():
+    rig = Damaged().connect()
+    rig.link.write = lambda data: super(type(rig.link), rig.link).write(data)
+    rig.faults.break_down("flip_bits", 0.3)
+    told = lost(rig)
+    assert "bytes arrive damaged" in told
+    assert "cable" in told
+
+
+def test_damage_of_what_the_board_hears_is_told_when_it_answers_again():
+    rig = Damaged().connect()
+    rig.faults.break_down("flip_bits", 0.3)
+    assert "cannot read what reaches it" in lost(rig)
+    rig.faults.repair()
+    rig.connect()
+    assert "reached the board damaged" in cause(rig)
+
+
+def test_a_board_that_hears_only_damage_lets_the_lease_lapse():
+    rig = Damaged().connect().arm()
+    rig.faults.break_down("flip_bits", 0.04)
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    assert rig.session.board.fault == "LINK"
+    assert "bytes arrive damaged" in cause(rig)
+
+
+def test_lost_frames_without_damage_are_told_as_lost_bytes():
+    evidence = replace(QUIET, naks=3, sent_again=9)
+    assert "bytes are lost on the way (9 frames sent again, 3 refused)" in why_lost(evidence)
+    assert why_lease_lapsed(evidence) == why_lost(evidence)
+    assert "kept its time" in why_lease_lapsed(QUIET)
+
+
+def test_the_port_tells_first():
+    gone = PortState("gone", others=("/dev/ttyACM1",))
+    evidence = replace(QUIET, port_state=gone, bad_here=5, stall_s=9.0)
+    assert why_lost(evidence).startswith("/dev/ttyACM0 is gone")
+    assert "/dev/ttyACM1 there instead" in why_lost(evidence)
+    assert "dialout" in port_cause("/dev/ttyACM0", PortState("denied"))
+    held = PortState("held", (Holder(12, "ModemManager"),))
+    assert "held by ModemManager, process 12" in why_lost(replace(QUIET, port_state=held))
+    assert port_cause("/dev/ttyACM0", PortState("there")) is None
+    assert "is there again: replugged" in why_lost(replace(QUIET, silent=False))
+
+
+def test_a_stall_counts_from_where_it_costs_the_lease():
+    enough_s = STALL_SHARE * LEASE_S
+    assert "stood still" in why_lease_lapsed(replace(QUIET, stall_s=enough_s))
+    assert "stood still" not in why_lease_lapsed(replace(QUIET, stall_s=0.99 * enough_s))
+
+
+def test_an_unknown_reset_cause_is_said_as_it_is():
+    assert "(unknown cause 9)" in why_restarted(9, 1.0)
+
+
+def test_counters_of_an_earlier_link_do_not_count():
+    watch = LinkWatch("/dev/none", LEASE_S)
+    watch.turn(1.0, True, Counts(bad_here=50))
+    watch.opened()
+    watch.turn(2.0, True, Counts())
+    watch.heard("LINK", 2.01, Counts())
+    assert "kept its time" in watch.cause.sentence
+    before = watch.cause
+    watch.heard("LINK", 2.2, Counts(bad_here=9))
+    assert watch.cause is before, "told once a fault"
+
+
+def test_a_board_found_in_a_fault_of_another_time_is_not_explained():
+    rig = Rig().connect().arm()
+    rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
+    rig.session.close()
+    other = Session(rig.link, rig.clock, Requirements.of(CONFIG))
+    other.connect()
+    assert other.board.fault == "LINK"
+    other.step(0.002, lease=True)
+    assert other.likely_cause is None
+
+
+def test_a_board_that_does_not_fit_is_no_failure_of_the_link():
+    rig = Rig().connect()
+    told = rig.session.lost(InputError("board.uid", "1", "2", "board"))
+    assert "likely cause" not in told
+    assert cause(rig) is None
+
+
+def test_a_pty_that_is_taken_away_is_gone(tmp_path):
+    master, slave = os.openpty()
+    name = tmp_path / "tty"
+    name.symlink_to(os.ttyname(slave))
+    watch = LinkWatch(str(name), LEASE_S)
+    os.close(slave)
+    watch.not_back(1.0)
+    assert watch.cause is None
+    device = Path(name).readlink()
+    os.close(master)
+    assert not device.exists()
+    watch.not_back(2.0)
+    assert watch.cause.sentence.startswith(f"{name} is gone")
+    first = watch.cause
+    watch.not_back(3.0)
+    assert watch.cause is first
+    watch.back(4.0, 0, 100.0, Counts())
+    assert "is there again: replugged" in watch.cause.sentence
+
+
+def test_a_port_that_another_program_took_names_it(tmp_path):
+    master, slave = os.openpty()
+    watch = LinkWatch(os.ttyname(slave), LEASE_S)
+    os.close(slave)
+    code = "import os, sys; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(flush=True); sys.stdin.read()"
+    command = [sys.executable, "-c", code, watch._port]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        watch.not_back(1.0)
+        process.stdin.close()
+    os.close(master)
+    assert f"process {process.pid}: end that program" in watch.cause.sentence

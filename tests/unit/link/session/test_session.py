@@ -1,0 +1,525 @@
+"""The session against the simulated board, both real, over a link in memory and a clock moved by hand."""
+
+import sys
+import threading
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import InputError, LinkError, NotReadyError
+from optodrive.core.types.plans import EMPTY_PLAN, LimitedPlan
+from optodrive.device.config import Config
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import FrameDecoder, encode_frame
+from optodrive.link.protocol.quantisation import quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
+from optodrive.link.session.fault_hints import HINTS, hint
+from optodrive.link.session.session import CONNECT_TIMEOUT_S, SILENCE_S, Session
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.memory_link import MemoryLink
+
+CONFIG = DISPLAYS["display-16"].config
+STEP_S = 0.002
+
+
+class Wire(MemoryLink):
+    """The link in memory, where messages can be kept from arriving."""
+
+    def __init__(self, core, clock):
+        super().__init__(core, clock)
+        self.cut = False
+        self.keep_back = lambda frame: False
+        self.sent = []
+        self._up, self._down = FrameDecoder(), FrameDecoder()
+
+    def write(self, data):
+        frames = list(self._up.feed(data))
+        self.sent += frames
+        if not self.cut:
+            super().write(b"".join(encode_frame(frame) for frame in frames if not self.keep_back(frame)))
+
+    def read(self, timeout_s):
+        data = super().read(timeout_s)
+        if self.cut:
+            return b""
+        return b"".join(encode_frame(frame) for frame in self._down.feed(data) if not self.keep_back(frame))
+
+
+class Rig:
+    def __init__(self, settings=None, config=CONFIG, start_s=5.0):
+        self.log = []
+        self.clock = ManualClock(start_s)
+        self.core = BoardCore(settings, self.log.append, seed=2)
+        self.link = Wire(self.core, self.clock)
+        self.session = Session(self.link, self.clock, Requirements.of(config))
+
+    def connect(self):
+        self.session.connect()
+        return self
+
+    def run(self, duration_s, lease=True):
+        until_s = self.clock.now_s() + duration_s
+        while self.clock.now_s() < until_s:
+            self.session.step(STEP_S, lease)
+
+    def until(self, condition, patience_s=20.0, lease=True):
+        give_up_s = self.clock.now_s() + patience_s
+        while not condition():
+            assert self.clock.now_s() < give_up_s, f"in vain: {self.session.board}"
+            self.session.step(STEP_S, lease)
+
+    def arm(self):
+        self.session.arm()
+        self.until(lambda: self.session.ready)
+        return self
+
+    def play(self, plan):
+        return self.session.begin(quantise(plan, self.session.scale), self.session.board_s() + 0.05)
+
+    def pulses(self):
+        return [entry for entry in self.log if entry["event"] == "pulse"]
+
+    def states(self):
+        return [entry["state"] for entry in self.log if entry["event"] == "state"]
+
+
+def plan(n=100, width_s=0.002, period_s=0.004, power_w=0.5):
+    """A limited plan: n pulses on four places in turn."""
+    pixel = np.arange(n) % 4
+    ones = np.ones(n)
+    columns = {
+        "start_s": 0.003 + period_s * np.arange(n),
+        "width_s": width_s * ones,
+        "x_rad": 0.006 * (pixel - 1.5),
+        "y_rad": 0.002 * (pixel - 1.5),
+        "power_w": power_w * (1 + pixel) / 4,
+        "pixel": pixel,
+    }
+    rest = {"energy_j": ones, "trimmed_j": 0 * ones, "reason": np.full(n, ""), "headroom_k": ones}
+    return LimitedPlan(**{**vars(EMPTY_PLAN), **columns, **rest})
+
+
+@pytest.fixture
+def rig():
+    return Rig().connect()
+
+
+# --- connecting -----------------------------------------------------------------------------------------------------
+
+
+def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
+    session = rig.session
+    assert session.connected
+    assert session.quiet
+    assert session.board.state == "DISARMED"
+    assert session.board.uid == BoardSettings().uid
+    assert rig.core._limits.spot_uj == session._requirements.limits().spot_uj < OWN.spot_uj
+    assert session.board_s() == pytest.approx(rig.clock.now_s(), abs=0.003)
+    assert session.link_figures()["round_trip_ms"] > 0
+
+
+def test_hello_is_repeated_until_the_board_hears():
+    rig = Rig()
+    rig.link.keep_back = lambda frame: frame.type == m.Hello.TYPE and rig.clock.now_s() < 6.3
+    rig.connect()
+    hellos = [frame for frame in rig.link.sent if frame.type == m.Hello.TYPE]
+    assert 5 <= len(hellos) <= 8
+    assert len({frame.body for frame in hellos}) == len(hellos), "each with a nonce of its own"
+
+
+@pytest.mark.parametrize(
+    ("kinds", "says"),
+    [(range(256), "is open, but no board answers"), ((0x90, 0x98, 0x83), "greets, but does not answer further")],
+)
+def test_no_answer_is_a_link_error_in_its_time(kinds, says):
+    rig = Rig()
+    rig.link.keep_back = lambda frame: frame.type in kinds
+    with pytest.raises(LinkError, match=says):
+        rig.connect()
+    assert rig.clock.now_s() < 5.0 + CONNECT_TIMEOUT_S + 0.1
+    assert not rig.session.connected
+
+
+def changed(section, **values):
+    table = CONFIG.model_dump()
+    table[section] |= values
+    return Config.model_validate(table)
+
+
+@pytest.mark.parametrize(
+    ("settings", "config", "says"),
+    [
+        (BoardSettings(uid="00" * 12), changed("board", uid="11" * 12), "board.uid: got '0000"),
+        (BoardSettings(replace(OWN, settle_us=228)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
+        (BoardSettings(replace(OWN, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
+        (BoardSettings(replace(OWN, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
+        (BoardSettings(replace(OWN, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),
+        (BoardSettings(replace(OWN, spot_uj=100_000)), CONFIG, "limits.pulse_energy_max_j: got 0.125"),
+        (BoardSettings(replace(OWN, spot_leak_uw=1_000_000)), CONFIG, "limits.pixel_mean_power_max_w: got 1.3"),
+        (BoardSettings(replace(OWN, x_min=31_000)), CONFIG, "display x"),
+        (BoardSettings(replace(OWN, y_max=33_000)), CONFIG, "display y"),
+    ],
+)
+def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config, says):
+    rig = Rig(settings, config)
+    with pytest.raises(InputError, match=says) as caught:
+        rig.connect()
+    assert "\n" not in str(caught.value)
+    assert not rig.session.connected
+
+
+@pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
+def test_another_protocol_or_clock_is_refused(field, value):
+    requirements = Requirements.of(CONFIG)
+    fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
+    fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=OWN)
+    requirements.check(m.HelloReply(**fits))
+    with pytest.raises(InputError, match=f"{value}"):
+        requirements.check(m.HelloReply(**{**fits, field: value}))
+
+
+@pytest.mark.parametrize("name", sorted(DISPLAYS))
+def test_the_simulated_board_fits_every_display(name):
+    Rig(config=DISPLAYS[name].config).connect().arm()
+
+
+def test_limits_hold_also_where_the_session_found_a_fault(rig):
+    rig.core.set_input("estop", True, round(rig.clock.now_s() * 1e6))
+    rig.session.close()
+    rig.core.set_input("estop", False, round(rig.clock.now_s() * 1e6))
+    rig.connect()
+    assert rig.session.board.state == "FAULT"
+    rig.session.disarm()
+    rig.until(lambda: rig.session.board.state == "DISARMED")
+    rig.arm()
+    assert rig.core._limits.spot_uj < OWN.spot_uj
+
+
+# --- arming and playing ---------------------------------------------------------------------------------------------
+
+
+def test_arm_takes_the_board_s_two_seconds(rig):
+    began_s = rig.clock.now_s()
+    rig.arm()
+    assert 2.0 < rig.clock.now_s() - began_s < 2.1
+    with pytest.raises(NotReadyError, match="the board is ARMED"):
+        rig.session.arm()
+
+
+def test_what_is_executed_is_what_was_planned(rig):
+    rig.arm()
+    asked = plan(500)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    done = job.executed(asked, 2.45, 1e-6)
+    assert done.complete
+    assert done.pixel.tolist() == asked.pixel.tolist()
+    assert np.abs(done.start_s - asked.start_s).max() < 1e-12
+    assert np.abs(done.width_s - asked.width_s).max() < 1e-12
+    assert np.abs(done.power_w - asked.power_w).max() < 2.45 / 65535
+    log = rig.pulses()
+    assert [entry["on_us"] for entry in log] == done.on_tick.tolist()
+    assert [entry["off_us"] - entry["on_us"] for entry in log] == done.width_ticks.tolist()
+    assert rig.states()[-2:] == ["RUNNING", "ARMED"]
+    assert (rig.session.board.underruns, rig.session.link_figures()["retransmitted"]) == (0, 0)
+
+
+def test_more_points_than_the_queue_holds():
+    rig = Rig(BoardSettings(queue_points=60)).connect().arm()
+    asked = plan(400)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert job.executed(asked, 2.45, 1e-6).complete
+    assert rig.session.link_figures()["naks"] == 0, "credits kept the host from asking for room that is not there"
+    assert rig.session.board.underruns == 0
+
+
+def test_one_job_after_another(rig):
+    rig.arm()
+    for n in (1, 30, 7):
+        rig.until(lambda: rig.session.ready)
+        asked = plan(n)
+        job = rig.play(asked)
+        rig.until(lambda job=job: job.finished)
+        assert job.executed(asked, 2.45, 1e-6).complete
+    assert len(rig.pulses()) == 38
+
+
+def test_lost_reports_are_asked_for_again(rig):
+    rig.arm()
+    lost = []
+    rig.link.keep_back = lambda frame: frame.type == m.Executed.TYPE and len(lost) < 30 and not lost.append(frame)
+    asked = plan(200)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert len(lost) == 30
+    assert job.executed(asked, 2.45, 1e-6).complete
+    assert job.executed(asked, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
+    assert m.GetExecuted.TYPE in {frame.type for frame in rig.link.sent}
+
+
+def test_a_lossy_link_slows_but_does_not_change_what_is_done(rig):
+    rig.arm()
+    rng = np.random.default_rng(1)
+    rig.link.keep_back = lambda frame: rng.random() < 0.1
+    asked = plan(300)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert job.executed(asked, 2.45, 1e-6).complete
+    assert rig.session.link_figures()["retransmitted"] > 0
+
+
+# --- lease, silence, faults -----------------------------------------------------------------------------------------
+
+
+def test_the_lease_is_renewed_by_step_alone(rig):
+    rig.arm()
+    rig.run(3.0)
+    assert rig.session.board.state == "ARMED"
+    rig.clock.sleep(0.2)  # the loop stands still, and nothing else renews
+    rig.session.step(STEP_S, lease=True)
+    assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
+
+
+def test_without_proof_of_the_planner_the_board_ends_within_its_lease(rig):
+    rig.arm()
+    rig.play(plan(500))
+    rig.run(0.3)
+    stopped_us = round(rig.clock.now_s() * 1e6)
+    rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
+    (fault,) = [entry for entry in rig.log if entry["event"] == "fault"]
+    assert fault["fault"] == "LINK"
+    assert fault["t_us"] - stopped_us <= 100_000
+    assert not rig.core.gate
+    assert rig.session.board.figures()["hint"] == HINTS["LINK"]
+    lit = len(rig.pulses())
+    rig.run(1.0)
+    assert len(rig.pulses()) == lit, "a lease alone brings nothing back"
+
+
+def test_silence_is_a_link_error_that_says_what_was_counted(rig):
+    rig.link.cut = True
+    began_s = rig.clock.now_s()
+    with pytest.raises(LinkError, match=r"fell silent for 2 s; 0 bad frames here"):
+        rig.run(10.0)
+    assert SILENCE_S < rig.clock.now_s() - began_s < SILENCE_S + 0.1
+
+
+def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
+    rig.arm()
+    rig.core.reset(round(rig.clock.now_s() * 1e6))
+    with pytest.raises(LinkError):
+        rig.run(10.0)
+    rig.session.drop()
+    rig.connect()
+    assert rig.session.board.state == "DISARMED"
+    assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
+
+
+@pytest.mark.parametrize("kind", [m.HelloReply.TYPE, m.ClockReply.TYPE])
+def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
+    """Heat is kept in the board's time: it would move by all the time that the board has run."""
+    rig.run(3.0)
+    rig.session.drop()
+    rig.link.keep_back = lambda frame: frame.type == kind
+    with pytest.raises(LinkError):
+        rig.connect()
+    assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
+    rig.link.keep_back = lambda frame: False
+    before_s = rig.session.board_s()
+    rig.connect()
+    assert rig.session.board_s() - before_s < CONNECT_TIMEOUT_S
+
+
+def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
+    rig.arm()
+    asked = plan(100)
+    job = rig.play(asked)
+    rig.until(lambda: rig.core.gate and len(rig.pulses()) > 20)
+    rig.core.set_input("interlock", False, round(rig.clock.now_s() * 1e6))
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    rig.run(0.1)
+    done = job.executed(asked, 2.45, 1e-6)
+    assert len(done) == len(rig.pulses())
+    assert not done.complete
+    assert done.width_s[-1] < asked.width_s[0]
+    assert rig.session.board.fault == "INTERLOCK"
+    with pytest.raises(NotReadyError, match="FAULT INTERLOCK"):
+        rig.session.arm()
+    rig.session.disarm()
+    rig.run(0.05)
+    assert rig.session.take_refusal() == "INPUT"
+    assert rig.session.take_refusal() is None
+    assert hint("INTERLOCK") == rig.session.board.figures()["hint"]
+
+
+def test_nothing_more_of_a_job_is_sent_after_a_fault():
+    rig = Rig(BoardSettings(queue_points=60)).connect().arm()
+    rig.play(plan(400))
+    rig.until(lambda: len(rig.pulses()) > 20)
+    rig.core.set_input("estop", True, round(rig.clock.now_s() * 1e6))
+    rig.until(lambda: rig.session.board.state == "FAULT")
+    rig.link.sent.clear()
+    rig.run(0.5)
+    assert m.Data.TYPE not in {frame.type for frame in rig.link.sent}
+
+
+def test_every_fault_of_the_board_has_a_hint_but_those_of_its_own_electronics():
+    assert set(m.FAULTS) - set(HINTS) == {"", "TICK", "READBACK"}
+    assert "no likely cause" in hint("TICK")
+
+
+# --- breaking off ---------------------------------------------------------------------------------------------------
+
+
+def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
+    rig.arm()
+    rig.play(plan(500))
+    rig.run(0.3)
+    lit = len(rig.pulses())
+    rig.session.abort()
+    rig.session.step(STEP_S, lease=True)
+    assert not rig.core.gate
+    assert rig.core.state == "DISARMED"
+    rig.until(lambda: rig.session.quiet and rig.session.board.state == "DISARMED")
+    rig.run(0.5)
+    assert len(rig.pulses()) <= lit + 1
+    assert rig.core._limits.spot_uj < OWN.spot_uj, "the new session tightens again"
+    rig.arm()
+    asked = plan(50)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert job.executed(asked, 2.45, 1e-6).complete
+
+
+def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_limits_first(rig):
+    rig.arm()
+    rig.play(plan(500))
+    rig.run(0.3)
+    hellos, rig.link.sent = [], []
+
+    def keep_back(frame):
+        hellos.extend([frame] if frame.type == m.Hello.TYPE else [])
+        return frame.type == m.Hello.TYPE and len(hellos) == 1
+
+    rig.link.keep_back = keep_back
+    rig.session.abort()
+    assert not rig.session.aborted
+    rig.until(lambda: rig.session.aborted)
+    assert rig.core.state == rig.session.board.state == "DISARMED"
+    assert not rig.session.quiet
+    rig.arm()
+    assert len(hellos) == 2
+    told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
+    assert told == [m.Limits.TYPE, m.ArmReq.TYPE]
+    assert rig.core._limits.spot_uj < OWN.spot_uj
+
+
+def test_flush_in_mid_job_stays_armed_for_the_next(rig):
+    rig.arm()
+    cut = rig.play(plan(500))
+    rig.run(0.3)
+    rig.session.flush()
+    rig.until(lambda: rig.session.ready)
+    assert not cut.finished
+    asked = plan(50)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert job.executed(asked, 2.45, 1e-6).complete
+
+
+def test_a_board_that_gave_a_hold_up_can_be_armed_again(rig):
+    rig.arm()
+    rig.link.keep_back = lambda frame: frame.type in (m.Data.TYPE, m.End.TYPE) and frame.seq >= 8
+    rig.play(plan(500))
+    rig.until(lambda: rig.session.board.state == "DISARMED")
+    assert rig.session.last_reason == "hold too long"
+    rig.link.keep_back = lambda frame: False
+    rig.run(0.2)
+    rig.arm()
+    asked = plan(50)
+    job = rig.play(asked)
+    rig.until(lambda: job.finished)
+    assert job.executed(asked, 2.45, 1e-6).complete
+
+
+def test_a_rejected_start_is_told(rig):
+    rig.arm()
+    job = rig.play(plan(5))
+    job.first_index += 1  # START will name a point that is not the first queued
+    rig.run(0.1)
+    assert rig.session.take_refusal() == "INDEX"
+    assert rig.core.state == "ARMED"
+    assert rig.pulses() == []
+    rig.session.flush()
+    rig.until(lambda: rig.session.ready)
+
+
+def test_close_says_abort_and_a_reconnect_does_not_arm(rig):
+    rig.arm()
+    rig.play(plan(500))
+    rig.run(0.2)
+    rig.session.close()
+    assert rig.link.sent[-1].type == m.Abort.TYPE
+    assert rig.core.state == "DISARMED"
+    assert not rig.core.gate
+    rig.connect()
+    rig.run(1.0)
+    assert rig.session.board.state == "DISARMED"
+    assert rig.states()[-1] == "DISARMED"
+
+
+# --- clock ----------------------------------------------------------------------------------------------------------
+
+
+def test_clock_goes_by_the_narrowest_bracket():
+    sync = ClockSync()
+    assert sync.board_s(5.0) == 0.0
+    assert not sync.known
+    assert sync.round_trip_s is None
+    sync.add(10.000, 10.010, 110.009)  # wide, and off by 4 ms
+    sync.add(10.020, 10.021, 110.0205)  # narrow, and right
+    sync.add(10.030, 10.050, 110.031)
+    assert sync.board_s(10.1) == pytest.approx(110.1, abs=1e-9)
+    assert sync.round_trip_s == pytest.approx(0.001)
+
+
+def test_clock_lets_an_old_narrow_bracket_go():
+    sync = ClockSync()
+    sync.add(0.0, 0.001, 100.0005)
+    late_s = 0.002 / DRIFT_MAX
+    sync.add(late_s, late_s + 0.002, 100.0 + late_s + 0.001 + 0.001)
+    assert sync.board_s(late_s) == pytest.approx(100.0 + late_s + 0.001)
+
+
+def test_another_thread_may_always_ask():
+    """What REST asks while the link comes and goes is answered, whatever the loop is doing to it."""
+    rig, errors, over = Rig(), [], threading.Event()
+
+    def ask():
+        try:
+            while not over.is_set():
+                rig.session.link_figures()
+                rig.session.board_s()
+                rig.session.board.figures()
+        except Exception as error:
+            errors.append(error)
+
+    interval_s = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    asker = threading.Thread(target=ask)
+    asker.start()
+    try:
+        for _ in range(300):
+            rig.connect()
+            rig.session.drop()
+    finally:
+        over.set()
+        asker.join()
+        sys.setswitchinterval(interval_s)
+    assert not errors

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA, measure
+from optodrive.link.simulator.traces import trace
+from optodrive.link.simulator.virtual_run import execute
+from optodrive.planning.pipeline import prepare
+
+
+def sequence(display, count=30, height_m=50e-6):
+    target = np.zeros(len(display.layout))
+    target[:count] = height_m
+    return FrameSequence((TactileFrame("a", 0.0, 0.5, target), TactileFrame("b", 0.9, 0.5, target * 1.2)))
+
+
+def test_what_is_planned_is_executed_on_every_display(any_display):
+    prepared = prepare(any_display, sequence(any_display), *any_display.at_rest())
+    executed = execute(any_display, prepared)
+    plan = prepared.plan
+    assert executed.complete
+    assert executed.start_s == pytest.approx(plan.start_s, abs=1e-9)
+    assert executed.width_s == pytest.approx(plan.width_s, abs=1e-12)
+    assert executed.power_w == pytest.approx(plan.power_w, rel=1e-3)
+    assert executed.pixel.tolist() == plan.pixel.tolist()
+
+
+@pytest.mark.parametrize(
+    ("width_s", "gap_s"), [(0.05, 0.0), (0.04, 0.01), (0.025, 0.025), (0.001, 0.001), (0.0002, 0.05)]
+)
+def test_what_the_limiter_passes_is_no_fault_on_the_board(any_display, width_s, gap_s):
+    train = PulseTrain(0, 0.0, 1.5, width_s, gap_s, any_display.config.laser.max_power_w)
+    prepared = prepare(any_display, FrameSequence((), (train,)), *any_display.at_rest())
+    assert execute(any_display, prepared).complete
+
+
+def test_instruments_read_the_trace_with_their_stated_noise(display):
+    prepared = prepare(display, sequence(display, 3), *display.at_rest())
+    executed = execute(display, prepared)
+    traced = trace(display.heat_at_rest(), executed, [0, 2], 1e-3)
+    pulses = np.zeros((1, 4))
+    exact = measure(traced, pulses, 293.15, 4e-4, 0.0, 0)
+    assert [run.name for run in exact.runs] == ["pixel-0", "pixel-2"]
+    displacement = exact.runs[0].signals["displacement_m"]
+    assert displacement.sigma is None
+    assert displacement.value.max() == pytest.approx(60e-6, rel=0.01)
+    noisy = measure(traced, pulses, 293.15, 4e-4, 2.0, 0).runs[0].signals["displacement_m"]
+    assert noisy.sigma == 2 * INSTRUMENT_SIGMA["displacement_m"]
+    assert np.std(noisy.value - displacement.value) == pytest.approx(noisy.sigma, rel=0.15)
+    again = measure(traced, pulses, 293.15, 4e-4, 2.0, 0).runs[0].signals["displacement_m"]
+    assert np.array_equal(noisy.value, again.value)

@@ -1,0 +1,149 @@
+import os
+import stat
+import subprocess
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import InputError
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.framing import Frame, encode_frame
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.transport.link_capture import (
+    CLOSED,
+    CRC,
+    ENTRY,
+    FROM_BOARD,
+    HEAD,
+    KINDS,
+    MAGIC,
+    OPENED,
+    TO_BOARD,
+    VERSION,
+    WAITING_MAX,
+    Entry,
+    Tape,
+    TapeWriter,
+    pack,
+)
+from optodrive.link.transport.recorded import RecordedTransport
+
+ENTRIES = st.lists(
+    st.builds(Entry, st.sampled_from(KINDS), st.floats(0, 1e9, allow_nan=False), st.binary(max_size=300)), max_size=12
+)
+
+
+def written(path, entries, said=None):
+    writer = TapeWriter(path, 3.5, (said if said is not None else []).append)
+    for entry in entries:
+        writer.note(entry)
+    writer.close()
+    return Tape(path)
+
+
+def test_what_passes_is_on_the_tape_with_its_time_and_the_link_does_not_notice(tmp_path):
+    clock = ManualClock(5.0)
+    writer = TapeWriter(tmp_path / "a", clock.now_s(), pytest.fail)
+    link = RecordedTransport(MemoryLink(BoardCore(seed=3), clock), writer, clock)
+    link.open()
+    hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 7).body()))
+    link.write(hello)
+    reply = link.read(0.01)
+    assert link.read(0.01) == b""
+    link.close()
+    link.release()
+    tape = Tape(tmp_path / "a")
+    assert list(tape.entries()) == [
+        Entry(OPENED, 5.0),
+        Entry(TO_BOARD, 5.0, hello),
+        Entry(FROM_BOARD, 5.0 + 1e-4, reply),
+        Entry(CLOSED, pytest.approx(5.0 + 1e-4 + 0.01)),
+    ]
+    assert (tape.host_s, tape.ignored) == (5.0, 0)
+
+
+@given(ENTRIES, st.data())
+def test_a_tape_cut_or_damaged_anywhere_gives_the_whole_entries_before_that(tmp_path_factory, entries, data):
+    path = tmp_path_factory.mktemp("tape") / "a"
+    written(path, entries)
+    whole = path.read_bytes()
+    cut = data.draw(st.integers(HEAD.size, len(whole)))
+    ends = [HEAD.size]
+    for entry in entries:
+        ends.append(ends[-1] + len(pack(entry)))
+    kept = max(k for k, end in enumerate(ends) if end <= cut)
+    path.write_bytes(whole[:cut])
+    tape = Tape(path)
+    assert list(tape.entries()) == entries[:kept]
+    assert tape.ignored == cut - ends[kept]
+    if cut < len(whole):
+        damaged = bytearray(whole)
+        damaged[cut] ^= 1 << data.draw(st.integers(0, 7))
+        path.write_bytes(damaged)
+        assert list(Tape(path).entries()) == entries[:kept]
+
+
+def test_nothing_is_overwritten_and_other_files_are_refused_by_name(tmp_path):
+    path = tmp_path / "a"
+    written(path, [])
+    with pytest.raises(InputError, match=r"--record.*name that is free"):
+        TapeWriter(path, 0.0, print)
+    with pytest.raises(InputError, match="can be written"):
+        TapeWriter(tmp_path / "no" / "b", 0.0, print)
+    with pytest.raises(InputError, match="can be read"):
+        Tape(tmp_path / "c")
+    path.write_bytes(b"some text that is none of ours, and long enough")
+    with pytest.raises(InputError, match="recording of a link"):
+        Tape(path)
+    path.write_bytes(HEAD.pack(MAGIC, VERSION + 1, 0.0, 0.0))
+    with pytest.raises(InputError, match=f"version.*{VERSION}, the one"):
+        Tape(path)
+
+
+FULL = """
+import resource, signal, sys
+from pathlib import Path
+from optodrive.link.transport.link_capture import Entry, TapeWriter
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
+said = []
+writer = TapeWriter(Path(sys.argv[1]), 0.0, said.append)
+for k in range(200):
+    writer.note(Entry("to board", float(k), bytes(100)))
+writer.close()
+writer.note(Entry("to board", 1e3, b"afterwards"))
+writer.close()
+assert not writer.recording
+assert len(said) == 1 and "stopped" in said[0] and "the session goes on" in said[0], said
+"""
+
+
+def test_a_full_disk_is_said_once_and_what_was_written_can_be_read(tmp_path):
+    path = tmp_path / "a"
+    subprocess.run([sys.executable, "-c", FULL, path], check=True)
+    entries = list(Tape(path).entries())
+    assert len(entries) == (2000 - HEAD.size) // (ENTRY.size + 100 + CRC.size)
+    assert [entry.host_s for entry in entries] == list(range(len(entries)))
+
+
+def test_a_disk_that_does_not_answer_costs_bounded_memory_and_no_time(tmp_path):
+    """A pipe that nobody reads stands for the disk: its writer hangs, whoever notes goes on."""
+    said = []
+    writer = TapeWriter(tmp_path / "a", 0.0, said.append)
+    reading, writing = os.pipe()
+    os.dup2(writing, writer._file.fileno())
+    assert stat.S_ISFIFO(os.fstat(writer._file.fileno()).st_mode)
+    entry = Entry(TO_BOARD, 0.0, bytes(200))
+    for _ in range(2 * WAITING_MAX):
+        writer.note(entry)
+    assert len(said) == 1
+    assert "too slow" in said[0]
+    assert writer._waiting.qsize() <= WAITING_MAX
+    os.close(writing)
+    os.close(reading)  # the writer's thread gets an error and ends
+    writer._thread.join(10)
+    assert not writer._thread.is_alive()

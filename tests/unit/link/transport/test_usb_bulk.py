@@ -1,0 +1,161 @@
+"""The session over USB: the real pyusb, bulk endpoints, and the simulated board's core behind them."""
+
+import errno
+
+import pytest
+import usb.core
+from usb_bridge import UsbBridge
+
+from displays import DISPLAYS
+from optodrive.core.clock import ManualClock
+from optodrive.core.errors import InputError, LinkError
+from optodrive.device.config import BoardSection
+from optodrive.link.protocol.quantisation import quantise
+from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.session import Session
+from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.transport.registry import TRANSPORTS, transport_maker
+from optodrive.link.transport.usb_bulk import UsbBulk
+from optodrive.planning.pipeline import prepare
+
+STEP_S = 0.005
+DISPLAY = DISPLAYS["display-16"]
+
+
+class Rig:
+    def __init__(self, serial_number="", **bridge):
+        self.clock, self.log = ManualClock(5.0), []
+        self.core = BoardCore(sink=self.log.append, seed=2)
+        self.usb = UsbBridge(self.core, self.clock, **bridge)
+        self.link = UsbBulk(0x1209, 0x0001, serial_number, self.usb)
+        self.session = Session(self.link, self.clock, Requirements.of(DISPLAY.config))
+
+    def until(self, condition, patience_s=20.0, lease=True):
+        give_up_s = self.clock.now_s() + patience_s
+        while not condition():
+            assert self.clock.now_s() < give_up_s, f"in vain: {self.session.board}"
+            self.session.step(STEP_S, lease)
+
+    def streaming(self):
+        """Connected, armed, and in the middle of a plan."""
+        from optodrive.core.types.stimuli import FrameSequence, PulseTrain
+
+        sequence = FrameSequence(trains=(PulseTrain(5, 0.0, 1.0, 0.004, 0.02, 1.0),))
+        self.plan = prepare(DISPLAY, sequence, *DISPLAY.at_rest()).plan
+        self.session.connect()
+        self.session.arm()
+        self.until(lambda: self.session.ready)
+        points = quantise(self.plan, self.session.scale)
+        self.job = self.session.begin(points, self.session.board_s() + 0.05)
+        self.until(lambda: len(self.pulses()) > 5)
+        return self
+
+    def pulses(self):
+        return [entry for entry in self.log if entry["event"] == "pulse"]
+
+
+def test_a_plan_is_armed_streamed_and_reported_over_usb():
+    rig = Rig().streaming()
+    rig.until(lambda: rig.job.finished)
+    scale = rig.session.scale
+    executed = rig.job.executed(rig.plan, scale.full_power_w, scale.tick_s)
+    assert executed.complete
+    assert executed.start_s == pytest.approx(rig.plan.start_s)
+    rig.session.close()
+    assert rig.core.state == "DISARMED"
+    assert not rig.usb.claimed
+
+
+def test_unplugged_in_mid_plan_the_board_goes_dark_and_it_is_told():
+    rig = Rig().streaming()
+    rig.usb.unplug()
+    with pytest.raises(LinkError, match=r"link to usb 1209:0001 lost: .*unplugged, or without power"):
+        rig.session.step(STEP_S, lease=True)
+    rig.session.drop()
+    assert not rig.core.gate
+    assert rig.core.state == "DISARMED"
+    with pytest.raises(InputError, match="a USB device that is plugged in"):
+        rig.session.connect()
+    rig.usb.plugged = True
+    rig.session.connect()
+    assert rig.session.board.state == "DISARMED"
+
+
+def test_a_host_that_only_lets_go_is_ended_by_the_boards_lease():
+    rig = Rig().streaming()
+    rig.link.close()
+    rig.clock.sleep(DISPLAY.config.board.lease_s + 1e-3)
+    rig.core.advance(round(rig.clock.now_s() * 1e6))
+    assert not rig.core.gate
+    assert rig.core.fault == "LINK"
+
+
+def test_what_a_session_before_left_is_not_read():
+    rig = Rig()
+    rig.usb.waiting = b"old" * 5000
+    rig.link.open()
+    assert rig.link.read(0.01) == b""
+
+
+def test_a_board_that_takes_nothing_more_is_a_lost_link():
+    rig = Rig()
+    rig.link.open()
+    rig.usb.stalled = True
+    began_s = rig.clock.now_s()
+    with pytest.raises(LinkError, match="timed out"):
+        rig.link.write(b"x")
+    assert rig.clock.now_s() - began_s == pytest.approx(0.5)
+
+
+def test_a_board_that_takes_a_part_is_a_lost_link():
+    rig = Rig()
+    rig.link.open()
+    rig.usb.bulk_write = lambda *transfer: 1
+    with pytest.raises(LinkError, match="took 1 of 3 bytes"):
+        rig.link.write(b"abc")
+
+
+def test_of_several_boards_the_serial_number_tells_which():
+    with pytest.raises(InputError, match="2 times 1209:0001', expected one such USB device, or its serial_number"):
+        Rig(serials=("A1", "B2")).link.open()
+    rig = Rig("B2", serials=("A1", "B2"))
+    rig.link.open()
+    assert rig.usb.claimed == {(1, 1)}
+    assert rig.link.name == "usb 1209:0001 B2"
+    with pytest.raises(InputError, match="got '1209:0001 C3'"):
+        Rig("C3", serials=("A1", "B2")).link.open()
+
+
+def test_what_keeps_it_from_being_opened_is_told():
+    rig = Rig()
+    rig.usb.open_errno = errno.EACCES
+    with pytest.raises(InputError, match="udev rule"):
+        rig.link.open()
+    rig = Rig()
+    rig.usb.claim_errno = errno.EBUSY
+    with pytest.raises(LinkError, match="does another program hold it"):
+        rig.link.open()
+    rig = Rig(one_way=True)
+    with pytest.raises(InputError, match="a bulk endpoint each way"):
+        rig.link.open()
+    with pytest.raises(LinkError, match="not open"):
+        rig.link.read(0.0)
+    rig.link.close()
+
+
+def test_without_libusb_it_says_so(monkeypatch):
+    def none(**_):
+        raise usb.core.NoBackendError("No backend available")
+
+    monkeypatch.setattr(usb.core, "find", none)
+    with pytest.raises(InputError, match=r"libusb-1\.0-0"):
+        UsbBulk(1, 2).open()
+
+
+def test_the_registry_makes_what_the_configuration_names():
+    board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
+    assert transport_maker(board)().name == "usb 1209:0001 A1"
+    assert transport_maker(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
+    assert set(TRANSPORTS) == {"serial", "simulated", "usb"}
+    with pytest.raises(InputError, match="a Helios cannot serve a daemon"):
+        transport_maker(BoardSection(transport="helios"))

@@ -1,0 +1,89 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from optodrive.physics.pixel import Pixel, advance
+from optodrive.physics.pulse_for_height import DriveRange, pulse_peak, reach_m, shortest
+
+PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
+DRIVE = DriveRange.of(2.45, 5000.0, 0.050)
+
+
+def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, least_periods=1, from_s=0.0):
+    goal_k = target_m / pixel.kappa_m_per_k
+    span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+    periods, duty = shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
+    return (periods, duty) if periods else None
+
+
+def test_range_counts_whole_periods():
+    assert DRIVE.max_periods == 250
+    assert DriveRange.of(2.45, 5000.0, 0.0301).max_periods == 150
+
+
+@given(
+    share=st.floats(1e-3, 1.0),
+    theta=st.floats(0.0, 200.0),
+    gas_share=st.floats(0.0, 1.0),
+)
+def test_the_pulse_reaches_its_target_from_any_heat(share, theta, gas_share):
+    gamma = 0.5 * theta * gas_share
+    target = share * reach_m(PIXEL, DRIVE)
+    pulse = pulse_for_peak(PIXEL, theta, gamma, target, DRIVE)
+    dark_peak = pulse_peak(PIXEL, theta, gamma, 0.0, 1e-9)[0] * PIXEL.kappa_m_per_k
+    if pulse is None:
+        assert dark_peak >= target * (1 - 1e-9)
+        return
+    periods, duty = pulse
+    assert 1 <= periods <= DRIVE.max_periods
+    assert 0 < duty <= 1
+    t = np.linspace(0, 0.1, 4001)
+    width = periods * DRIVE.period_s
+    gas = [
+        advance(PIXEL, theta, gamma, duty * 2.45, s)[1]
+        if s <= width
+        else advance(PIXEL, *advance(PIXEL, theta, gamma, duty * 2.45, width), 0.0, s - width)[1]
+        for s in t
+    ]
+    assert max(gas) * PIXEL.kappa_m_per_k == pytest.approx(target, rel=1e-4)
+
+
+def test_it_is_the_shortest_width_that_can():
+    periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, 100e-6, DRIVE)
+    shorter = pulse_peak(PIXEL, 0.0, 0.0, 2.45, (periods - 1) * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
+    assert shorter < 100e-6
+    assert duty > 0.9 * (periods - 1) / periods
+
+
+def test_no_pulse_where_the_heat_is_enough():
+    assert pulse_for_peak(PIXEL, 100.0, 50.0, 150e-6, DRIVE) is None
+
+
+def test_a_target_out_of_reach_gets_the_longest_pulse():
+    assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * reach_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
+
+
+@given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), least=st.integers(1, 300))
+def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, least):
+    target = share * reach_m(PIXEL, DRIVE)
+    narrow, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
+    if narrow is None:
+        assert wide is None
+        return
+    assert wide[0] == max(narrow[0], min(least, DRIVE.max_periods))
+    peak = pulse_peak(PIXEL, theta, 0.0, wide[1] * 2.45, wide[0] * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
+    assert peak == pytest.approx(target, rel=1e-6)
+
+
+@given(share=st.floats(0.01, 0.5), least=st.integers(1, 40), from_s=st.floats(0.01, 0.04))
+def test_a_peak_may_count_only_from_a_time_on(share, least, from_s):
+    target = share * reach_m(PIXEL, DRIVE)
+    periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, target, DRIVE, least, from_s)
+    width = periods * DRIVE.period_s
+    lit = advance(PIXEL, 0.0, 0.0, duty * 2.45, width)
+    gas = [advance(PIXEL, *lit, 0.0, s)[1] for s in max(0.0, from_s - width) + np.linspace(0, 0.05, 2001)]
+    assert periods >= least
+    assert (duty == 1.0 and periods == DRIVE.max_periods) or max(gas) * PIXEL.kappa_m_per_k == pytest.approx(
+        target, rel=1e-4
+    )

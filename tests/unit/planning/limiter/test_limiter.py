@@ -1,0 +1,262 @@
+"""Each cap has a test that its removal breaks: `test_a_cap_taken_away_is_noticed` proves it."""
+
+from dataclasses import replace
+from math import inf
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
+from optodrive.core.types.plans import PulsePlan
+from optodrive.planning.limiter.budget import Budget, Mirrors
+from optodrive.planning.limiter.energy_windows import Chains, Pulses, allowed_w, append
+from optodrive.planning.limiter.limiter import fired, fresh_state, limit, shifted, verify, wait_s
+from optodrive.planning.limiter.worst_case import Declared, Touch, Uncertainty, Walls, heat_bound, spread
+from warmth import NO_CAPS
+
+CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
+MODEL = Declared(
+    epsilon=np.full(3, 0.66),
+    r_k_per_w=np.full(3, 120.0 / 0.66),
+    c_j_per_k=np.full(3, 0.023 / 120.0 * 0.66),
+    tau_g_s=3e-3,
+    ambient_k=293.15,
+    exponent=0.0,
+    beside=np.array([[-1, 1, -1, -1], [0, 2, -1, -1], [1, -1, -1, -1]]),
+    frame_edges=np.zeros(3, dtype=np.int64),
+    walls=Walls(20.0, 0.06, 430.0, 430.0),
+    touch=Touch(0.3, 0.4, 1.2),
+)
+SERVO = Mirrors(
+    omega_per_s=1e4, damping=0.7, delay_s=3e-5, slew_rad_per_s=100.0, lead_s=1e-3, mean_s=1.0, code_rad=0.0, early_s=0.0
+)
+
+
+def roomy(**caps):
+    """No cap binds but those given."""
+    caps = NO_CAPS._replace(**caps)
+    return Budget(caps, heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
+
+
+ROOMY = roomy()
+
+
+def pulses(*rows):
+    """Rows of (pixel, start_s, width_s, power_w); a pixel's number is also where it lies, in units of 10 mrad."""
+    pixel, start, width, power = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
+    zero = np.zeros(len(rows))
+    return PulsePlan(
+        start_s=start,
+        width_s=width,
+        x_rad=0.01 * pixel,
+        y_rad=zero,
+        power_w=power,
+        pixel=pixel.astype(np.int64),
+        settle_s=zero,
+        target_m=np.full(len(rows), np.nan),
+        nominal_s=start,
+        source=np.zeros(len(rows), dtype=np.int64),
+    )
+
+
+def run(budget, *rows, policy="trim"):
+    return limit(pulses(*rows), fresh_state(3), budget, policy)[0]
+
+
+CASES = {
+    "absorber_temperature": (dict(absorber_k=150.0), [(0, 0.0, 0.050, 2.45)]),
+    "pulse_energy": (dict(pulse_energy_j=0.050), [(0, 0.0, 0.040, 2.45)]),
+    "spot_energy": (
+        dict(pulse_energy_j=0.125, pixel_mean_w=1.3),
+        [(0, 0.0, 0.040, 2.45), (0, 0.05, 0.040, 2.45)],
+    ),
+    "pixel_mean_power": (
+        dict(pixel_mean_w=0.2),
+        [(0, 0.0, 0.040, 2.45), (0, 0.1, 0.040, 2.45), (0, 0.2, 0.040, 2.45)],
+    ),
+    "display_mean_power": (
+        dict(display_mean_w=0.1),
+        [(0, 0.0, 0.040, 2.45), (1, 0.1, 0.040, 2.45), (2, 0.2, 0.040, 2.45)],
+    ),
+    "wall_temperature": (dict(wall_k=3.0), [(1, 0.06 * k, 0.050, 2.45) for k in range(3)]),
+    "touch_temperature": (dict(touch_k=2.0), [(1, 0.06 * k, 0.050, 2.45) for k in range(2)]),
+    "galvo_acceleration": (dict(galvo_rad2_per_s4=1e7), [(0, 0.0, 0.001, 1.0), (2, 0.002, 0.001, 1.0)]),
+    "pulse_width": ({}, [(0, 0.0, 0.030, 1.0), (0, 0.0302, 0.030, 1.0)]),
+}
+
+
+@pytest.mark.parametrize("cause", CASES)
+def test_each_cap_trims_the_last_pulse_and_gives_its_reason(cause):
+    caps, rows = CASES[cause]
+    limited = run(roomy(**caps), *rows)
+    assert limited.reason[-1] == cause
+    assert limited.trimmed_j[-1] > 0
+    assert limited.energy_j[-1] + limited.trimmed_j[-1] == pytest.approx(rows[-1][2] * rows[-1][3])
+    assert set(limited.reason[:-1]) <= {""}
+
+
+@pytest.mark.parametrize("cause", CASES)
+def test_a_cap_taken_away_is_noticed(cause):
+    rows = CASES[cause][1]
+    if cause == "pulse_width":
+        assert run(roomy(pulse_rest_s=1e-6), *rows).reason[-1] == ""
+    else:
+        assert run(ROOMY, *rows).reason[-1] == ""
+
+
+@pytest.mark.parametrize("cause", CASES)
+def test_refuse_names_pixel_and_cap(cause):
+    caps, rows = CASES[cause]
+    with pytest.raises(OverBudgetError, match=rf"pulse {len(rows) - 1} on pixel {rows[-1][0]} .*cap|bucket") as caught:
+        run(roomy(**caps), *rows, policy="refuse")
+    refusal = caught.value
+    assert (refusal.pixel, refusal.cap) == (rows[-1][0], cause)
+    assert 0 < refusal.margin_j <= rows[-1][2] * rows[-1][3]
+
+
+def test_refuse_says_when_the_whole_would_fit():
+    budget = roomy(touch_k=2.0)
+    _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), fresh_state(3), budget)
+    again = pulses((1, 0.1, 0.05, 2.45))
+    later_s = wait_s(again, warm, budget)
+    assert 0.01 < later_s < 10.0
+    with pytest.raises(OverBudgetError, match=f"the whole fits {later_s:.3f} s later"):
+        limit(again, warm, budget, "refuse")
+    limit(pulses((1, 0.1 + later_s, 0.05, 2.45)), warm, budget, "refuse")
+    with pytest.raises(OverBudgetError):
+        limit(pulses((1, 0.1 + later_s - 0.002, 0.05, 2.45)), warm, budget, "refuse")
+
+
+def test_what_no_rest_makes_fit_is_said_to_fit_never():
+    with pytest.raises(OverBudgetError, match="does not fit at any later time") as caught:
+        run(roomy(absorber_k=100.0), (0, 0.0, 0.05, 2.45), policy="refuse")
+    assert caught.value.earliest_s == inf
+
+
+def test_nothing_is_trimmed_inside_the_caps():
+    limited = run(ROOMY, (0, 0.0, 0.02, 2.45), (1, 0.03, 0.02, 2.45))
+    assert limited.trimmed_j.sum() == 0
+    assert limited.reason.tolist() == ["", ""]
+
+
+def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
+    budget = roomy(absorber_k=150.0)
+    limited = run(budget, (1, 0.0, 0.050, 2.45))
+    own_k = 120.0 * limited.power_w[0] * (1 - np.exp(-0.050 / 0.023))
+    wall_k = budget.heat.wall_k_per_j[0] * limited.energy_j[0] * budget.heat.absorber_wall
+    assert 149.95 < own_k + wall_k < 150.0  # the rest is what neighbours may send
+    assert limited.headroom_k == pytest.approx([150.0, 0.0, 150.0], abs=1e-6)
+
+
+def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
+    caps = NO_CAPS._replace(absorber_k=150.0)
+    bare = replace(MODEL, walls=None, touch=None)
+    budget = Budget(caps, heat_bound(bare, CERTAIN, caps, 2.45), SERVO)
+    gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
+    assert gentle.trimmed_j.sum() == 0
+    limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))
+    rise = 120.0 * limited.power_w * (1 - np.exp(-0.050 / 0.023))
+    assert rise == pytest.approx([150.0, 150.0], rel=1e-9)
+
+
+def test_a_pulse_wider_than_the_cap_is_refused_under_any_policy():
+    with pytest.raises(RefusedError, match=r"60\.000 ms wide, the cap is 50\.000 ms"):
+        run(ROOMY, (0, 0.0, 0.060, 1.0))
+
+
+def test_state_goes_on_over_plans_and_pauses():
+    budget = roomy(absorber_k=200.0, display_mean_w=0.5)
+    rows = [(k % 3, 0.06 * k + (0.3 if k > 5 else 0.0), 0.05, 2.45) for k in range(12)]
+    whole = run(budget, *rows)
+    state, power = fresh_state(3), []
+    for row in rows:
+        piece, state = limit(pulses(row), state, budget)
+        power += piece.power_w.tolist()
+    assert power == pytest.approx(whole.power_w.tolist(), rel=1e-12, abs=1e-12)
+
+
+def test_a_state_moved_in_time_limits_the_same():
+    budget = roomy(absorber_k=150.0, pixel_mean_w=0.6)
+    _, state = limit(pulses((0, 0.0, 0.05, 2.45)), fresh_state(3), budget)
+    here, _ = limit(pulses((0, 0.07, 0.05, 2.45)), state, budget)
+    there, _ = limit(pulses((0, 5.07, 0.05, 2.45)), shifted(state, 5.0), budget)
+    assert there.power_w == pytest.approx(here.power_w)
+
+
+def test_a_plan_may_not_start_in_the_past_of_the_budget():
+    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), fresh_state(3), ROOMY)
+    with pytest.raises(RefusedError, match="before the budget's time"):
+        limit(pulses((1, 0.5, 0.05, 1.0)), state, ROOMY)
+
+
+def beam(plan, power_w):
+    columns = {name: getattr(plan, name) for name in ("start_s", "width_s", "x_rad", "y_rad")}
+    return SimpleNamespace(**columns, power_w=power_w)
+
+
+def test_proof_before_emission_passes_what_was_limited_and_catches_what_was_not():
+    budget = roomy(absorber_k=150.0)
+    plan = run(budget, (0, 0.0, 0.05, 2.45), (1, 0.06, 0.05, 2.45))
+    verify(plan, np.arange(2), beam(plan, plan.power_w), fresh_state(3), budget)
+    with pytest.raises(LocalProtocolError, match="encoded pulse 1 on pixel 1 passes a cap"):
+        verify(plan, np.arange(2), beam(plan, plan.power_w * [1.0, 1.001]), fresh_state(3), budget)
+
+
+def test_pulses_that_were_not_fired_are_forgotten_and_the_others_count():
+    budget = roomy(touch_k=5.0)
+    plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), fresh_state(3), budget)
+    first_only = fired(plan, 0.1, fresh_state(3), budget)
+    assert first_only.touch_k[0].max() > 0.5
+    assert first_only.touch_k[1].max() == 0.0
+    assert after.touch_k[1].max() > 0.5
+
+
+def test_state_stays_as_large_however_many_pulses_went_by():
+    budget, state = roomy(pixel_mean_w=1.3, touch_k=20.0), fresh_state(3)
+    sizes = []
+    for k in range(30):
+        train = pulses(*[(n % 3, 100.0 * k + 0.01 * n, 0.005, 2.45) for n in range(1000)])
+        state = limit(train, state, budget)[1]
+        sizes.append(sum(column.nbytes for column in vars(state).values() if isinstance(column, np.ndarray)))
+    assert max(sizes[1:]) == min(sizes[1:])
+
+
+def test_a_sum_of_decays_never_exceeds_its_ends_by_more_than_the_spread():
+    rng = np.random.default_rng(3)
+    for half in (0.05, 0.3, 0.5):
+        capacities = np.linspace(1 - half, 1 + half, 201)
+        for _ in range(50):
+            ages, energies = rng.uniform(0, 6, 8), rng.uniform(0, 1, 8)
+            rise = (energies / capacities[:, None] * np.exp(-ages / capacities[:, None])).sum(axis=1)
+            assert rise.max() <= spread((1 + half) / (1 - half)) * max(rise[0], rise[-1])
+
+
+def brute_allowed(window_s, cap_j, rows, start, width):
+    """Largest power found by trying every window end on a fine grid."""
+    ends = np.linspace(start, start + width, 4001)[1:]
+    best = np.inf
+    for end in ends:
+        used = sum(p * max(0.0, min(end, s + w) - max(end - window_s, s)) for s, w, p in rows)
+        best = min(best, (cap_j - used) / (end - start))
+    return best
+
+
+def test_energy_window_agrees_with_trying_every_window():
+    rng = np.random.default_rng(5)
+    for _ in range(15):
+        fired_pulses = Pulses(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        chain = Chains(np.full(1, -1), np.full(1, -1), np.zeros(1), np.full(12, -1), np.zeros(12))
+        time, rows = 0.0, []
+        for row in range(12):
+            time += rng.uniform(0.0, 0.1)
+            width, power = rng.uniform(0.001, 0.05), rng.uniform(0.0, 4.0)
+            exact = allowed_w(chain, 0, fired_pulses, time, width, 0.5, 1.0)
+            tried = brute_allowed(0.5, 0.5, rows, time, width)
+            assert exact <= tried * (1 + 1e-9) + 1e-9
+            assert exact == pytest.approx(tried, rel=2e-2, abs=2e-2)
+            power = max(0.0, min(power, exact))
+            fired_pulses.start_s[row], fired_pulses.width_s[row], fired_pulses.power_w[row] = time, width, power
+            append(chain, 0, fired_pulses, row)
+            rows.append((time, width, power))
+            time += width

@@ -1,0 +1,97 @@
+"""The visiting order: every pixel once, never longer than row by row, and near the shortest there is."""
+
+from itertools import pairwise, permutations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from displays import DISPLAYS
+from optodrive.planning.scheduler import visiting_path
+from optodrive.planning.scheduler.visiting_path import path_rad, serpentine, visiting_order, warm
+
+DISPLAY = DISPLAYS["display-437"]
+LAYOUT, FIELD = DISPLAY.layout, DISPLAY.machine.field
+X_RAD, Y_RAD = FIELD.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
+PITCH_RAD = float(np.diff(np.unique(X_RAD)).min())
+COUNT = len(LAYOUT)
+
+
+def ordered(active, origin=None):
+    return visiting_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column, X_RAD, Y_RAD, origin)
+
+
+def length(tour, origin=None):
+    """Of a path in pitches, by plain Python."""
+    whole = ([] if origin is None else [origin]) + list(tour)
+    moves = (max(abs(X_RAD[a] - X_RAD[b]), abs(Y_RAD[a] - Y_RAD[b])) for a, b in pairwise(whole))
+    return sum(moves) / PITCH_RAD
+
+
+@given(
+    active=st.sets(st.integers(0, COUNT - 1), min_size=1, max_size=80),
+    origin=st.none() | st.integers(0, COUNT - 1),
+)
+def test_every_pixel_once_and_never_longer_than_row_by_row(active, origin):
+    tour = ordered(active, origin)
+    assert sorted(tour.tolist()) == sorted(active)
+    rows = serpentine(np.array(sorted(active)), LAYOUT.row, LAYOUT.column)
+    # Two pixels have nothing to choose but which comes first, which no frame says.
+    if len(active) > 2:
+        assert length(tour, origin) <= length(rows, origin) + 1e-9
+    begin = -1 if origin is None else origin
+    assert path_rad(tour, X_RAD, Y_RAD, begin) / PITCH_RAD == pytest.approx(length(tour, origin))
+
+
+@settings(max_examples=60)
+@given(
+    active=st.sets(st.integers(0, COUNT - 1), min_size=3, max_size=7),
+    origin=st.none() | st.integers(0, COUNT - 1),
+)
+def test_small_sets_against_every_order(active, origin):
+    shortest = min(length(tour, origin) for tour in permutations(active))
+    assert length(ordered(active, origin), origin) <= 1.35 * shortest + 1e-9
+
+
+def test_small_sets_are_near_the_shortest_on_the_whole():
+    generator = np.random.default_rng(4)
+    ours = best = 0.0
+    for _ in range(60):
+        active = generator.choice(COUNT, 7, replace=False).tolist()
+        ours += length(ordered(active))
+        best += min(length(tour) for tour in permutations(active))
+    assert ours <= 1.03 * best
+
+
+def test_full_lattices_diagonals_and_columns_are_single_steps():
+    every = range(COUNT)
+    diagonal = [pixel for pixel in every if LAYOUT.row[pixel] == LAYOUT.column[pixel]]
+    column = [pixel for pixel in every if LAYOUT.column[pixel] == 3]
+    for active in (every, diagonal, column):
+        assert length(ordered(active)) <= 1.02 * (len(active) - 1)
+
+
+def test_clusters_are_left_once():
+    """Two clusters far apart: one long move between them."""
+    here = [p for p in range(COUNT) if LAYOUT.row[p] < 4 and 2 <= LAYOUT.column[p] < 6]
+    there = [p for p in range(COUNT) if LAYOUT.row[p] >= 16 and 14 <= LAYOUT.column[p] < 18]
+    tour = ordered([*here, *there])
+    jumps = [a for a, b in pairwise(tour.tolist()) if (a in here) != (b in here)]
+    assert len(jumps) == 1
+
+
+def test_the_path_begins_where_the_mirrors_stand():
+    active = [0, 10, 18, 200, 210, 420, 436]
+    for origin in (0, 436):
+        assert ordered(active, origin)[0] == origin
+
+
+def test_after_warming_up_nothing_is_left_to_compile():
+    """A planner that compiles shows no progress, and would cost the lease."""
+    warm()
+    compiled = (visiting_path.path_rad, visiting_path._near, visiting_path._improve)  # those that Python calls
+    before = [len(kernel.signatures) for kernel in compiled]
+    assert min(before) > 0
+    ordered(np.random.default_rng(1).choice(COUNT, 60, replace=False).tolist(), 7)
+    assert [len(kernel.signatures) for kernel in compiled] == before

@@ -1,0 +1,254 @@
+import subprocess
+import sys
+from io import BytesIO
+
+import numpy as np
+import pytest
+from PIL import Image, ImageDraw, PngImagePlugin
+
+from optodrive.core.errors import InputError
+from optodrive.device.config import load_config
+from optodrive.planning.stimuli import images
+from optodrive.planning.stimuli.images import animation_frames, image_frames, lattice_brightness
+from optodrive.planning.stimuli.pixel_lattice import Lattice
+
+CONFIG = load_config("display-437")
+LATTICE = Lattice.of(CONFIG)
+
+
+def encoded(*pictures, kind="PNG", **options):
+    buffer = BytesIO()
+    extra = {"save_all": True, "append_images": pictures[1:]} if len(pictures) > 1 else {}
+    pictures[0].save(buffer, kind, **extra, **options)
+    return buffer.getvalue()
+
+
+def grey(array):
+    return Image.fromarray(np.asarray(array, dtype=np.uint8))
+
+
+def shown(file, invert=False):
+    """Brightness at every place, [rows from the top, columns], NaN in the corners."""
+    target = image_frames(CONFIG, "t", file, 1.0, 0.0, invert).frames[0].target_m
+    return np.where(LATTICE.index >= 0, target[LATTICE.index], np.nan)[::-1]
+
+
+def test_a_picture_of_the_lattice_is_taken_pixel_by_pixel():
+    values = np.random.default_rng(1).integers(20, 256, (21, 21))
+    found = shown(encoded(grey(values)))
+    assert np.count_nonzero(np.isnan(found)) == 4
+    assert np.nanmax(np.abs(found - values / 255)) < 1e-6
+
+
+def test_left_is_left_and_top_is_top():
+    values = np.zeros((21, 21))
+    values[1, 5] = 255
+    place = np.argwhere(shown(encoded(grey(values))) > 0)
+    assert place.tolist() == [[1, 5]]
+    (pixel,) = np.flatnonzero(image_frames(CONFIG, "t", encoded(grey(values)), 1.0, 0.0, False).frames[0].target_m)
+    assert LATTICE.layout.x_m[pixel] == pytest.approx(-5 * 3.6e-3)
+    assert LATTICE.layout.y_m[pixel] == pytest.approx(9 * 3.6e-3)
+
+
+def test_places_average_over_their_area():
+    fine = np.random.default_rng(2).integers(50, 256, (63, 63))
+    expected = fine.reshape(21, 3, 21, 3).mean(axis=(1, 3)) / 255
+    found = shown(encoded(grey(fine)))
+    assert np.nanmax(np.abs(found - expected)) < 1e-5
+
+
+def test_area_is_kept_when_sizes_do_not_divide():
+    one = np.zeros((50, 50))
+    one[20:30, 22:29] = 255
+    found = shown(encoded(grey(one)))
+    assert np.nansum(found) == pytest.approx(70 * (21 / 50) ** 2, rel=1e-2)
+
+
+@pytest.mark.parametrize(("size", "rows", "columns"), [((42, 14), 7, 21), ((14, 42), 21, 7), ((1, 1), 21, 21)])
+def test_the_aspect_is_kept_and_the_picture_centred(size, rows, columns):
+    bright = np.nan_to_num(shown(encoded(Image.new("L", size, 255))), nan=1.0) > 0.5
+    found_rows, found_columns = np.flatnonzero(bright[:, 10]), np.flatnonzero(bright[10])
+    assert (len(found_rows), len(found_columns)) == (rows, columns)
+    assert found_rows.mean() == found_columns.mean() == 10
+
+
+def test_invert_raises_what_is_dark_but_not_what_lies_outside():
+    picture = Image.new("L", (42, 14), 0)
+    assert not np.nan_to_num(shown(encoded(picture))).any()
+    assert np.nansum(shown(encoded(picture), invert=True)) == pytest.approx(7 * 21, rel=1e-6)
+
+
+def test_what_is_transparent_is_dark_inverted_or_not():
+    picture = Image.new("RGBA", (21, 21), (255, 255, 255, 0))
+    picture.paste((255, 255, 255, 128), (0, 0, 21, 10))
+    found = shown(encoded(picture))
+    assert found[5, 5] == pytest.approx(128 / 255, abs=1e-5)
+    assert found[15, 5] == 0
+    picture.paste((0, 0, 0, 255), (0, 0, 5, 21))
+    assert shown(encoded(picture), invert=True)[15, 2] == 1.0
+    assert shown(encoded(picture), invert=True)[15, 10] == 0
+
+
+@pytest.mark.parametrize(
+    ("picture", "value"),
+    [
+        (Image.new("RGB", (9, 9), (255, 0, 0)), 76 / 255),
+        (Image.new("1", (9, 9), 1), 1.0),
+        (Image.new("P", (9, 9), 0), 0.0),
+        (Image.new("LA", (9, 9), (200, 255)), 200 / 255),
+        (Image.fromarray(np.full((9, 9), 32768, dtype=np.uint16)), 0.5),
+    ],
+)
+def test_every_mode_is_read(picture, value):
+    assert shown(encoded(picture))[10, 10] == pytest.approx(value, abs=1e-4)
+
+
+def test_jpeg_is_read_upright():
+    picture = Image.new("L", (40, 40), 0)
+    picture.paste(255, (0, 0, 40, 20))
+    exif = Image.Exif()
+    exif[0x0112] = 3  # the camera was held upside down
+    assert shown(encoded(picture, kind="JPEG"))[3, 10] == pytest.approx(1.0, abs=0.01)
+    turned = shown(encoded(picture, kind="JPEG", exif=exif))
+    assert turned[3, 10] == 0
+    assert turned[17, 10] == pytest.approx(1.0, abs=0.01)
+
+
+def test_nearly_black_is_not_driven():
+    assert not image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 9)), 1.0, 0.0, False).frames[0].target_m.any()
+    assert image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 12)), 1.0, 0.0, False).frames[0].target_m.all()
+
+
+def test_white_is_the_height_asked_for():
+    frame = image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 255)), 50e-6, 0.0, False).frames[0]
+    assert frame.target_m == pytest.approx(50e-6)
+    assert frame.duration_s > 437 * 3e-3
+
+
+def dots(count):
+    pictures = [Image.new("L", (21, 21), 0) for _ in range(count)]
+    for k, picture in enumerate(pictures):
+        picture.putpixel((5 + k, 10), 255)
+    return pictures
+
+
+@pytest.mark.parametrize("kind", ["GIF", "PNG"])
+def test_an_animation_moves_at_the_pace_of_its_file(kind):
+    file = encoded(*dots(4), kind=kind, duration=[50, 120, 10, 80], **({"disposal": 2} if kind == "GIF" else {}))
+    frames = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    assert [frame.duration_s for frame in frames] == pytest.approx([0.05, 0.12, 0.02, 0.08])
+    assert [frame.show_at_s for frame in frames] == pytest.approx([0.0, 0.05, 0.17, 0.19])
+    assert [np.flatnonzero(frame.target_m).tolist() for frame in frames] == [
+        [int(LATTICE.index[10, 5 + k])] for k in range(4)
+    ]
+
+
+def test_a_picture_that_takes_the_beam_longer_is_given_the_time_unless_a_rate_is_asked_for():
+    file = encoded(Image.new("L", (21, 21), 255), *dots(1), kind="GIF", duration=50)
+    slow = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    assert slow[0].duration_s > 437 * 3e-3
+    assert slow[1].duration_s == pytest.approx(0.05)
+    assert slow[1].show_at_s == slow[0].duration_s
+    fast = animation_frames(CONFIG, "t", file, 50e-6, 25.0, False).frames
+    assert [frame.show_at_s for frame in fast] == pytest.approx([0.0, 0.04])
+
+
+def test_the_first_picture_of_an_animation_is_its_picture():
+    frame = image_frames(CONFIG, "t", encoded(*dots(3), kind="GIF", duration=50), 50e-6, 0.0, False).frames[0]
+    assert np.flatnonzero(frame.target_m).tolist() == [int(LATTICE.index[10, 5])]
+
+
+def test_a_still_picture_is_an_animation_of_one():
+    (frame,) = animation_frames(CONFIG, "t", encoded(*dots(1)), 50e-6, None, False).frames
+    assert frame.duration_s == pytest.approx(0.1)
+
+
+def test_the_poster_of_a_png_is_no_part_of_its_animation():
+    poster, *moving = dots(4)
+    file = encoded(poster, *moving, default_image=True, duration=100)
+    frames = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    assert [np.flatnonzero(frame.target_m).tolist() for frame in frames] == [
+        [int(LATTICE.index[10, 5 + k])] for k in (1, 2, 3)
+    ]
+
+
+@pytest.mark.parametrize("text", ["nan", "abc", "1e999", "-5"])
+def test_a_note_called_duration_is_not_a_duration(text):
+    notes = PngImagePlugin.PngInfo()
+    notes.add_text("duration", text)
+    (frame,) = animation_frames(CONFIG, "t", encoded(*dots(1), pnginfo=notes), 50e-6, None, False).frames
+    assert frame.duration_s == pytest.approx(0.1)
+
+
+def refusal(file, build=image_frames):
+    with pytest.raises(InputError) as caught:
+        build(CONFIG, "image", file, 50e-6, 1.0, False)
+    assert "\n" not in str(caught.value)
+    return caught.value.code, str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "file",
+    [b"", b"no picture", b"%PDF-1.4", b"\x89PNG\r\n\x1a\n", b"GIF89a", encoded(Image.new("L", (9, 9)), kind="BMP")],
+)
+@pytest.mark.parametrize("build", [image_frames, animation_frames])
+def test_a_picture_that_is_no_picture_is_refused(file, build):
+    code, message = refusal(file, build)
+    assert code == "bad_picture"
+    assert message.startswith("image: file: got ")
+
+
+@pytest.mark.parametrize("kind", ["PNG", "JPEG", "GIF"])
+def test_a_picture_cut_short_is_refused(kind):
+    noise = grey(np.random.default_rng(3).integers(0, 256, (64, 64)))
+    file = encoded(noise, kind=kind)
+    assert shown(file).shape == (21, 21)
+    for share in (0.2, 0.5, 0.8):
+        code, message = refusal(file[: int(len(file) * share)])
+        assert code == "bad_picture"
+        assert message.startswith("image: file: got ")
+
+
+def test_an_animation_cut_short_is_refused():
+    noise = [grey(np.random.default_rng(k).integers(0, 256, (64, 64))) for k in range(4)]
+    file = encoded(*noise, kind="GIF", duration=50)
+    assert refusal(file[: len(file) // 2], animation_frames)[0] == "bad_picture"
+
+
+def test_large_pictures_are_refused_before_they_are_unpacked(monkeypatch):
+    code, message = refusal(encoded(Image.new("1", (5000, 4000))))
+    assert code == "too_many"
+    assert message == "image: file: got '5000 × 4000', expected a picture of at most 16000000 pixels"
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 1000)
+    for side in (40, 100):  # Pillow only warns up to twice its bound
+        assert refusal(encoded(Image.new("1", (side, side))))[0] == "too_many"
+
+
+def test_long_animations_are_refused(monkeypatch):
+    file = encoded(*dots(5), kind="GIF", duration=50)
+    monkeypatch.setattr(images, "ANIMATION_FRAMES_MAX", 4)
+    assert refusal(file, animation_frames) == ("too_many", "image: file: got '5 pictures', expected at most 4")
+    monkeypatch.setattr(images, "ANIMATION_FRAMES_MAX", 5)
+    assert len(animation_frames(CONFIG, "t", file, 50e-6, None, False).frames) == 5
+    monkeypatch.setattr(images, "ANIMATION_PIXELS_MAX", 5 * 21 * 21 - 1)
+    assert refusal(file, animation_frames)[0] == "too_many"
+
+
+def test_a_drawing_keeps_its_shape_on_every_display():
+    picture = Image.new("L", (300, 300), 0)
+    ImageDraw.Draw(picture).ellipse((30, 30, 270, 270), fill=255)
+    for name in ("display-16", "display-357", "display-1511"):
+        lattice = Lattice.of(load_config(name))
+        bright = lattice_brightness(picture, lattice, False)
+        radius = np.hypot(lattice.layout.x_m, lattice.layout.y_m) / 4e-3
+        half = lattice.index.shape[0] / 2
+        assert bright[radius < 0.8 * half - 1].min(initial=1.0) > 1 - 1e-5
+        assert bright[radius > 0.8 * half + 1].max(initial=0.0) == 0.0
+
+
+def test_pillow_is_loaded_only_for_pictures():
+    code = (
+        "import sys, optodrive.planning.stimuli.pattern_registry as p; p.describe_patterns();"
+        " sys.exit('PIL' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

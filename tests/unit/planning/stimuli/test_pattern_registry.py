@@ -1,0 +1,202 @@
+import json
+from base64 import b64encode
+from io import BytesIO
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from optodrive.core.errors import InputError
+from optodrive.device.config import load_config
+from optodrive.planning.stimuli.pattern_registry import PATTERNS, build_pattern, describe_patterns, find_pattern
+from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
+
+CONFIG = load_config("display-437")
+
+
+def picture():
+    buffer = BytesIO()
+    Image.new("L", (7, 7), 255).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+NEEDED = {"text": {"text": "hello"}, "image": {"file": picture()}, "animation": {"file": picture()}}
+
+
+def refusal(name, given, config=CONFIG):
+    with pytest.raises(InputError) as caught:
+        build_pattern(name, given, config)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 400
+    return caught.value.code, message
+
+
+@pytest.mark.parametrize("name", list(PATTERNS))
+def test_every_pattern_plays_with_its_defaults(name):
+    sequence = build_pattern(name, NEEDED.get(name, {}), CONFIG)
+    assert sequence.frames or sequence.trains
+    assert any(frame.target_m.any() for frame in sequence.frames) or sequence.trains
+    assert all(a.show_at_s + a.duration_s <= b.show_at_s + 1e-9 for a, b in pairwise(sequence.frames))
+    again = parse_sequence(json.dumps(sequence_to_json(sequence)), CONFIG, "again")
+    assert again.trains == sequence.trains
+    for one, two in zip(again.frames, sequence.frames, strict=True):
+        assert (one.frame_id, one.show_at_s, one.duration_s) == (two.frame_id, two.show_at_s, two.duration_s)
+        assert one.target_m == pytest.approx(two.target_m, rel=1e-12, abs=1e-15)
+
+
+def test_the_six_experiments_are_there():
+    assert [name for name in PATTERNS if name.startswith("experiment")] == [f"experiment-{k}" for k in range(1, 7)]
+
+
+def test_the_description_is_json():
+    described = json.loads(json.dumps(describe_patterns(), allow_nan=False))
+    assert [item["name"] for item in described] == list(PATTERNS)
+    for item in described:
+        assert item["summary"]
+        for parameter in item["parameters"]:
+            assert parameter["meaning"]
+            assert parameter["required"] == (parameter["default"] is None and parameter["name"] in ("text", "file"))
+
+
+@pytest.mark.parametrize("name", list(PATTERNS))
+def test_defaults_lie_within_their_own_bounds(name):
+    pattern = find_pattern(name)
+    given = {p.name: p.default for p in pattern.parameters if p.default is not None}
+    pattern.arguments({**given, **NEEDED.get(name, {})}, CONFIG)
+
+
+def test_text_from_a_command_line_and_numbers_mean_the_same():
+    typed = build_pattern("all", {"height_um": "75.5", "seconds": "0"}, CONFIG)
+    given = build_pattern("all", {"height_um": 75.5, "seconds": 0}, CONFIG)
+    assert typed.frames[0].target_m == pytest.approx(75.5e-6)
+    assert np.array_equal(typed.frames[0].target_m, given.frames[0].target_m)
+    one = build_pattern("experiment-2", {"speed": "32", "direction": "ccw", "centre": "100"}, CONFIG)
+    assert one == build_pattern("experiment-2", {"speed": 32, "direction": "ccw", "centre": 100}, CONFIG)
+
+
+def test_millimetres_become_metres():
+    sequence = build_pattern("square", {"side_mm": 43.2, "seconds": 0}, CONFIG)
+    assert np.count_nonzero(sequence.frames[0].target_m) == 48
+
+
+def test_a_file_is_bytes_or_base64():
+    raw = build_pattern("image", {"file": picture()}, CONFIG)
+    text = build_pattern("image", {"file": b64encode(picture()).decode()}, CONFIG)
+    assert np.array_equal(raw.frames[0].target_m, text.frames[0].target_m)
+
+
+def test_flags_are_true_or_false():
+    for false in ("false", False):
+        assert build_pattern("image", {"file": picture(), "invert": false}, CONFIG).frames[0].target_m.any()
+    for true in ("true", True):
+        assert not build_pattern("image", {"file": picture(), "invert": true}, CONFIG).frames[0].target_m.any()
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "code", "says"),
+    [
+        (
+            "experiment-7",
+            {},
+            "unknown_pattern",
+            "pattern: got 'experiment-7', expected a known pattern, nearest is 'experiment-",
+        ),
+        ("x" * 5000, {}, "unknown_pattern", "one of experiment-1"),
+        (
+            "all",
+            {"heigth_um": 5},
+            "unknown_parameter",
+            "pattern all: got 'heigth_um', expected a known parameter, nearest is 'height_um'",
+        ),
+        ("showcase", {"seconds": 5}, "unknown_parameter", "expected no parameter"),
+        ("all", [1], "bad_parameter", "got [1], expected an object"),
+        ("text", {}, "missing_parameter", "pattern text: text: got None"),
+        ("image", {}, "missing_parameter", "pattern image: file: got None"),
+        (
+            "all",
+            {"height_um": -5},
+            "bad_parameter",
+            "pattern all: height_um: got -5, expected a number from 0.1 to 1000 µm",
+        ),
+        ("all", {"height_um": 1001}, "bad_parameter", "got 1001"),
+        ("all", {"height_um": "tall"}, "bad_parameter", "got 'tall'"),
+        ("all", {"height_um": "nan"}, "bad_parameter", "got 'nan'"),
+        ("all", {"height_um": float("inf")}, "bad_parameter", "got inf"),
+        ("all", {"height_um": True}, "bad_parameter", "got True"),
+        ("all", {"height_um": None}, "bad_parameter", "got None"),
+        ("all", {"height_um": [50]}, "bad_parameter", "got [50]"),
+        ("all", {"height_um": 10**400}, "bad_parameter", "expected a number"),
+        ("all", {"seconds": -1}, "bad_parameter", "from 0 to 600 s"),
+        ("pixel", {"pixel": 437}, "unknown_pixel", "pattern pixel: pixel: got 437, expected a whole number, 0…436"),
+        ("pixel", {"pixel": "-1"}, "unknown_pixel", "got '-1'"),
+        ("pixel", {"pixel": 1.5}, "unknown_pixel", "got 1.5"),
+        ("pixel", {"pixel": "9" * 5000}, "unknown_pixel", "0…436"),
+        ("experiment-3", {"target": 0}, "bad_parameter", "target: got 0, expected a whole number, 1…9"),
+        ("experiment-3", {"target": 10}, "bad_parameter", "got 10"),
+        ("experiment-3", {"target": True}, "bad_parameter", "got True"),
+        ("experiment-4", {"level": "²"}, "bad_parameter", "got '²'"),
+        ("experiment-1", {"direction": "north"}, "bad_parameter", "got 'north', expected one of left, right, up, down"),
+        ("experiment-2", {"speed": 20}, "bad_parameter", "got 20, expected one of 16, 32, 64"),
+        ("experiment-1", {"centre": 0}, "does_not_fit", "pattern experiment-1: centre: got 0, expected a pixel with"),
+        ("image", {"file": picture(), "invert": "maybe"}, "bad_parameter", "got 'maybe', expected true or false"),
+        ("image", {"file": picture(), "invert": 1}, "bad_parameter", "got 1, expected true or false"),
+        ("image", {"file": "no base64!"}, "bad_parameter", "the bytes of a file"),
+        ("image", {"file": "ünïcode"}, "bad_parameter", "the bytes of a file"),
+        ("image", {"file": 7}, "bad_parameter", "got 7"),
+        ("image", {"file": b"no picture"}, "bad_picture", "pattern image: file: got b'no picture', expected a picture"),
+        ("animation", {"file": picture(), "rate_hz": 0}, "bad_parameter", "from 0.01 to 50 Hz"),
+        ("text", {"text": ""}, "bad_parameter", "1 to 2000 characters"),
+        ("text", {"text": "a" * 2001}, "bad_parameter", "1 to 2000 characters"),
+        ("text", {"text": ["a"]}, "bad_parameter", "got ['a']"),
+        ("text", {"text": "é"}, "bad_text", "LATIN SMALL LETTER E WITH ACUTE"),
+        ("text", {"text": "ab " * 600, "seconds": 600}, "too_many", "at most 10000"),
+        ("circle", {"radius_mm": 500}, "does_not_fit", "radius_mm: got 500.0"),
+    ],
+)
+def test_wrong_requests_are_refused_in_one_line(name, given, code, says):
+    found, message = refusal(name, given)
+    assert found == code
+    assert says in message
+
+
+def test_a_number_may_be_written_as_text():
+    assert build_pattern("text", {"text": 42}, CONFIG).frames[0].target_m.any()
+
+
+def test_patterns_keep_the_limits_of_the_display():
+    limits = CONFIG.limits.model_copy(update={"pulse_width_max_s": 0.02})
+    tight = CONFIG.model_copy(update={"limits": limits})
+    assert build_pattern("experiment-1", {}, tight).trains
+    code, message = refusal("experiment-3", {}, tight)
+    assert code == "bad_train"
+    assert "pattern experiment-3: trains[0].pulse_width_s: got 0.025" in message
+    weak = CONFIG.model_copy(update={"laser": CONFIG.laser.model_copy(update={"max_power_w": 1.0})})
+    assert build_pattern("experiment-4", {"level": 9}, weak).trains[0].power_w == 1.0
+
+
+def test_a_frame_every_display_can_draw_in_its_time():
+    for name in ("display-16", "display-357", "display-1511"):
+        config = load_config(name)
+        for frame in build_pattern("all", {}, config).frames:
+            assert frame.duration_s >= len(frame.target_m) * 2.8e-3
+
+
+DOC = (Path(__file__).parents[4] / "docs" / "patterns.md").read_text(encoding="utf-8")
+
+
+def test_the_documented_example_is_read():
+    example = DOC.partition("```json")[2].partition("```")[0]
+    sequence = parse_sequence(example, CONFIG, "docs")
+    assert (len(sequence.frames), len(sequence.trains)) == (2, 2)
+
+
+def test_the_document_names_every_pattern_and_its_parameters():
+    table = DOC.partition("## Patterns")[2]
+    for pattern in PATTERNS.values():
+        if not pattern.name.startswith("experiment"):
+            assert f"`{pattern.name}`" in table
+        for parameter in pattern.parameters:
+            assert f"`{parameter.name}`" in table

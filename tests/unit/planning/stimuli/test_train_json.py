@@ -1,0 +1,189 @@
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from optodrive.core.errors import InputError
+from optodrive.core.types.stimuli import HeightTrain, PulseTrain
+from optodrive.device.config import load_config
+from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
+from optodrive.planning.stimuli.train_json import check_trains, checked_train, pulse_count
+
+CONFIG = load_config("display-437")
+TRAIN = {"pixel": 17, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.020, "gap_s": 0.060, "power_w": 2.45}
+
+
+def parse(*changes):
+    return parse_sequence({"trains": [{**TRAIN, **change} for change in changes]}, CONFIG, "frames.json").trains
+
+
+def refusal(*changes):
+    with pytest.raises(InputError) as caught:
+        parse(*changes)
+    message = str(caught.value)
+    assert "\n" not in message
+    return caught.value.code, message
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "says"),
+    [
+        ({"pixel": 437}, "unknown_pixel", "frames.json: trains[0].pixel: got 437, expected a pixel, 0…436"),
+        ({"pixel": -1}, "unknown_pixel", "got -1"),
+        ({"pixel": 1.0}, "unknown_pixel", "got 1.0"),
+        ({"pixel": True}, "unknown_pixel", "got True"),
+        ({"pixel": "17"}, "unknown_pixel", "got '17'"),
+        ({"start_s": -1e-6}, "bad_time", "start_s: got -1e-06"),
+        ({"start_s": None}, "bad_time", "start_s: got None"),
+        ({"duration_s": 0}, "bad_time", "duration_s: got 0"),
+        ({"duration_s": float("nan")}, "bad_time", "duration_s: got nan"),
+        ({"gap_s": -0.001}, "bad_train", "gap_s: got -0.001"),
+        ({"gap_s": True}, "bad_train", "gap_s: got True"),
+        ({"pulse_width_s": 0}, "bad_train", "pulse_width_s: got 0"),
+        ({"pulse_width_s": -0.01}, "bad_train", "pulse_width_s: got -0.01"),
+        ({"pulse_width_s": 0.0502}, "bad_train", "at most limits.pulse_width_max_s = 0.05 s"),
+        ({"pulse_width_s": 0.0201}, "bad_train", "got 0.0201, expected whole PWM periods of 0.0002 s, nearest is 0.02"),
+        ({"pulse_width_s": 0.00001}, "bad_train", "nearest is 0.0002"),
+        ({"power_w": 0}, "bad_train", "power_w: got 0"),
+        ({"power_w": -1}, "bad_train", "power_w: got -1"),
+        (
+            {"power_w": 2.5},
+            "bad_train",
+            "power_w: got 2.5, expected a power above 0, at most laser.max_power_w = 2.45 W",
+        ),
+        ({"power_w": "2"}, "bad_train", "power_w: got '2'"),
+        ({"pulse_width": 1}, "unknown_key", "got 'pulse_width', expected a known key, nearest is 'pulse_width_s'"),
+    ],
+)
+def test_a_wrong_train_is_refused(change, code, says):
+    found, message = refusal(change)
+    assert found == code
+    assert says in message
+
+
+HEIGHTS = {"pixel": 17, "start_s": 0.0, "duration_s": 1.0, "period_s": 0.04, "target_um": 300, "peak_to_peak_um": 120}
+
+
+def test_a_train_by_height_is_told_by_its_keys():
+    (train,) = parse_sequence({"trains": [HEIGHTS]}, CONFIG, "f").trains
+    assert train == HeightTrain(17, 0.0, 1.0, 0.04, pytest.approx(300e-6), pytest.approx(120e-6))
+    assert len(train.pulse_starts_s()) == pulse_count(train) == 25
+    (free,) = parse_sequence({"trains": [{**HEIGHTS, "peak_to_peak_um": None}]}, CONFIG, "f").trains
+    assert free.peak_to_peak_m is None
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "says"),
+    [
+        ({"pixel": 437}, "unknown_pixel", "frames.json: trains[0].pixel: got 437"),
+        ({"period_s": 0.0006}, "bad_train", "trains[0].period_s: got 0.0006, expected at least 0.0007 s"),
+        ({"period_s": 0}, "bad_train", "period_s: got 0"),
+        ({"target_um": 0}, "bad_target", "target_um: got 0.0, expected a height > 0 in µm"),
+        ({"target_um": "300"}, "bad_target", "target_um: got '300'"),
+        ({"peak_to_peak_um": 301}, "bad_train", "peak_to_peak_um: got 301.0, expected a height above 0, at most"),
+        ({"peak_to_peak_um": -1}, "bad_train", "peak_to_peak_um: got -1.0"),
+        ({"power_w": 2}, "unknown_key", "got 'power_w', expected a known key"),
+        ({"duration_s": 1001, "period_s": 0.01}, "too_many", "got 100100, expected at most 100000 pulses in all"),
+    ],
+)
+def test_a_wrong_train_by_height_is_refused(change, code, says):
+    with pytest.raises(InputError) as caught:
+        parse_sequence({"trains": [{**HEIGHTS, **change}]}, CONFIG, "frames.json")
+    assert caught.value.code == code
+    assert says in str(caught.value)
+
+
+def test_a_train_by_height_needs_its_keys_and_its_share_of_the_beam():
+    for key in ("target_um", "period_s", "pixel"):
+        with pytest.raises(InputError) as caught:
+            parse_sequence({"trains": [{k: v for k, v in HEIGHTS.items() if k != key}]}, CONFIG, "f")
+        assert caught.value.code == "missing_key"
+    for other in ({**HEIGHTS, "start_s": 0.0001}, {**TRAIN, "start_s": 0.03}, TRAIN):
+        with pytest.raises(InputError) as caught:
+            parse_sequence({"trains": [HEIGHTS, other]}, CONFIG, "f")
+        assert caught.value.code == "overlapping_trains"
+    assert parse_sequence({"trains": [{**HEIGHTS, "start_s": 0.025}, {**TRAIN, "gap_s": 0.02}]}, CONFIG, "f").trains
+
+
+def test_a_train_by_height_is_written_as_it_was_read():
+    once = parse_sequence({"trains": [HEIGHTS, {**HEIGHTS, "start_s": 0.01, "peak_to_peak_um": None}]}, CONFIG, "f")
+    assert parse_sequence(sequence_to_json(once), CONFIG, "f").trains == once.trains
+
+
+def test_the_limits_themselves_are_allowed():
+    parse({"pulse_width_s": 0.05, "gap_s": 0.0, "power_w": 2.45})
+    parse({"pulse_width_s": 0.0002, "duration_s": 1e-9})
+
+
+def test_a_width_near_whole_periods_is_played_as_them():
+    (train,) = parse({"pulse_width_s": 0.020001})
+    assert train.pulse_width_s == pytest.approx(0.02, abs=1e-15)
+    assert refusal({"pulse_width_s": 0.020003})[0] == "bad_train"
+
+
+def test_pulses_of_two_trains_at_once_are_refused():
+    code, message = refusal({}, {"pixel": 18, "start_s": 0.03}, {"pixel": 19, "start_s": 0.165})
+    assert code == "overlapping_trains"
+    assert message == (
+        "frames.json: trains[2]: got 0.165, expected a pulse after 0.18 s: until then the one beam is on for "
+        "trains[0], from 0.16 s"
+    )
+
+
+def test_pulses_of_the_same_pixel_overlap_too():
+    assert refusal({}, {"start_s": 0.01})[0] == "overlapping_trains"
+    assert refusal({}, {})[0] == "overlapping_trains"
+
+
+def test_order_in_the_file_does_not_matter():
+    assert refusal({"start_s": 0.49}, {"start_s": 0.0, "duration_s": 1.0})[0] == "overlapping_trains"
+
+
+def test_interleaved_and_abutting_pulses_are_fine():
+    assert len(parse(*({"pixel": 10 + k, "start_s": 0.02 * k} for k in range(4)))) == 4
+
+
+def test_one_nanosecond_is_the_tolerance():
+    assert parse({}, {"pixel": 18, "start_s": 0.02 - 0.9e-9})
+    assert refusal({}, {"pixel": 18, "start_s": 0.02 - 1.2e-9})[0] == "overlapping_trains"
+
+
+def test_a_long_pulse_reaches_over_a_short_train_between():
+    code, message = refusal(
+        {"pulse_width_s": 0.05, "duration_s": 0.01}, {"pixel": 3, "start_s": 0.04, "pulse_width_s": 0.001}
+    )
+    assert code == "overlapping_trains"
+    assert "trains[1]: got 0.04" in message
+
+
+def test_too_many_pulses_are_refused_before_they_are_made():
+    code, message = refusal({"duration_s": 86_400, "pulse_width_s": 0.0002, "gap_s": 0.0002})
+    assert code == "too_many"
+    assert "got 216000000, expected at most 2000000 pulses" in message
+
+
+def test_pulses_are_counted_as_they_are_made():
+    for duration_s in (0.001, 0.08, 0.0800001, 0.3, 1.0):
+        train = PulseTrain(0, 0.0, duration_s, 0.02, 0.06, 1.0)
+        assert pulse_count(train) == len(train.pulse_starts_s())
+
+
+def test_a_hundred_thousand_pulses_are_checked_quickly():
+    train = PulseTrain(0, 0.0, 1000.0, 0.0002, 0.0018, 1.0)
+    many = [replace(train, pixel=k, start_s=0.0005 * k, duration_s=50.0) for k in range(4)]
+    start_s = time.process_time()
+    check_trains(many, "trains", CONFIG)
+    assert time.process_time() - start_s < 0.5
+    assert sum(map(pulse_count, many)) == 100_000
+    late = replace(train, pixel=9, start_s=49.9996, duration_s=0.001)
+    with pytest.raises(InputError, match="one beam"):
+        check_trains([*many, late], "trains", CONFIG)
+
+
+def test_another_laser_has_other_periods():
+    config = CONFIG.model_copy(update={"laser": CONFIG.laser.model_copy(update={"pwm_hz": 1000.0})})
+    train = PulseTrain(0, 0.0, 1.0, 0.0152, 0.1, 1.0)
+    with pytest.raises(InputError, match=r"whole PWM periods of 0.001 s, nearest is 0.015"):
+        checked_train(train, "t", config)
+    assert np.isclose(checked_train(train, "t", CONFIG).pulse_width_s, 0.0152)

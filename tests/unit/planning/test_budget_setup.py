@@ -1,0 +1,139 @@
+"""Terms and the limiter: what a set's terms may warm is counted, or the set is refused by name."""
+
+import numpy as np
+import pytest
+
+from displays import DISPLAYS
+from optodrive.core.errors import InputError
+from optodrive.core.types.plans import PulsePlan
+from optodrive.core.units import ZERO_CELSIUS_K
+from optodrive.physics.parameters import Parameter, load_parameters
+from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.term import Warming
+from optodrive.physics.terms import known_terms
+from optodrive.planning import budget_setup
+from optodrive.planning.budget_setup import BOUNDED, budget_of, warming_of
+from optodrive.planning.limiter.limiter import fresh_state, limit
+
+DISPLAY = DISPLAYS["display-16"]
+CONFIG = DISPLAY.config
+LARGE = {
+    "heat_capacity": {"slope": 3e-3},
+    "neighbour_crosstalk": {"share": 0.02, "lag": 0.02},
+    "power_nonlinearity": {"threshold": 0.0, "curvature": 0.25},
+    "absorber_ageing": {"share": 0.1},
+    "beam_misalignment": {"share": 0.2, "pixel": 5.0, "resistance": 20.0, "time": 0.3},
+    "ambient_drift": {"offset": 3.0, "ramp": -1.0, "bend": 0.5, "rate": 0.0},
+}
+
+
+def with_term(key, base="surroundings", **values):
+    term = known_terms()[key]
+    own = {
+        item.name: Parameter(value=values.get(item.name, max(item.default, item.low)), unit=item.unit, source="here")
+        for item in term.parameters
+    }
+    below = load_parameters(base)
+    return below.model_copy(update={"terms": {**below.terms, key: own}, "planner_terms": (key,)})
+
+
+def budget_with(key, base="surroundings"):
+    return budget_of(CONFIG, with_term(key, base, **LARGE.get(key, {})), DISPLAY.pixels)
+
+
+@pytest.mark.parametrize("key", sorted(known_terms()))
+def test_every_term_has_a_bound_but_crosstalk_that_touch_surfaces_would_not_bear(key):
+    if key == "neighbour_crosstalk":
+        with pytest.raises(InputError, match=r"limits\.touch_max_c: got 43\.0, expected more than .* may warm it"):
+            budget_of(CONFIG, with_term(key, share=0.15), DISPLAY.pixels)
+    budget_with(key)
+
+
+def test_light_absorbed_better_and_better_has_no_bound():
+    with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter's bound holds for"):
+        budget_of(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
+
+
+def test_terms_that_never_warm_change_no_bound():
+    plain = budget_of(CONFIG, load_parameters("surroundings"), DISPLAY.pixels)
+    for key, term in known_terms().items():
+        if term.never_warmer and key not in BOUNDED:
+            with_it = budget_with(key)
+            assert with_it.caps == plain.caps
+            for ours, theirs in zip(with_it.heat, plain.heat, strict=True):
+                assert np.array_equal(ours, theirs), key
+
+
+def hostile(power_w, seed):
+    """The beam on one pixel and those beside it, all it takes, at this power."""
+    generator = np.random.default_rng(seed)
+    count = 120
+    width_s = generator.integers(25, 250, count) * 2e-4
+    rest_s = generator.choice([5e-4, 5e-3, 0.03], count)
+    start_s = 0.01 + np.cumsum(np.concatenate([[0.0], (width_s + rest_s)[:-1]]))
+    pixel = generator.choice([5, 5, 5, 4, 6], count)
+    angles_rad = DISPLAY.machine.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
+    x_rad, y_rad = (angle_rad[pixel] for angle_rad in angles_rad)
+    zero, nothing = np.zeros(count), np.full(count, np.nan)
+    return PulsePlan(
+        start_s, width_s, x_rad, y_rad, np.full(count, power_w), pixel, zero, nothing, start_s, pixel.astype(np.int64)
+    )
+
+
+def hottest_share(key, budget, plan):
+    """How near the pixel's absorber comes to its cap, by the pixel with that term alone; 1 is the cap."""
+    limited, _ = limit(plan, fresh_state(len(DISPLAY.pixels)), budget)
+    pulses = np.column_stack([limited.start_s, limited.width_s, limited.power_w, limited.pixel])
+    t_s = np.arange(0.0, float(plan.start_s[-1]) + 0.3, 1e-4)
+    ambient_k = CONFIG.ambient_c + ZERO_CELSIUS_K
+    dose = 0.0 if key == "absorber_ageing" else 1.0
+    scene = Scene(pulses, 5, ambient_k, (t_s, t_s[:0], t_s[:0]), dose_before=dose)
+    values = {key: LARGE[key]} if key != "ambient_drift" else {}
+    rise_k = observe(scene, DISPLAY.pixels.each[5], Active.of(values))[0].max()
+    drift_k = 4.5 if key == "ambient_drift" else 0.0
+    return (rise_k + drift_k) / (CONFIG.limits.absorber_max_c - CONFIG.ambient_c)
+
+
+@pytest.mark.parametrize("key", sorted(LARGE))
+@pytest.mark.parametrize("power_w", [2.45, 1.2])
+def test_no_term_takes_an_absorber_above_its_cap(key, power_w):
+    budget = budget_with(key, base="calibrated")
+    for seed in range(3):
+        assert hottest_share(key, budget, hostile(power_w, seed)) <= 1.0
+
+
+@pytest.mark.parametrize("key", ["power_nonlinearity", "ambient_drift"])
+def test_a_limiter_that_forgot_the_term_would_be_caught(key, monkeypatch):
+    """Without what the term adds, and with nothing else declared unsure, the cap is passed."""
+    sure = dict.fromkeys(CONFIG.limits.uncertainty.model_dump(), 0.0)
+    limits = CONFIG.limits.model_copy(update={"uncertainty": CONFIG.limits.uncertainty.model_copy(update=sure)})
+    # A wide energy bucket, so that the absorber's own cap is what stops the beam.
+    limits = limits.model_copy(update={"pixel_mean_power_max_w": 2.45, "display_mean_power_max_w": 2.45})
+    config = CONFIG.model_copy(update={"limits": limits.model_copy(update={"absorber_max_c": 160.0})})
+    parameters = with_term(key, "calibrated", **LARGE[key])
+
+    def share(budget):
+        scale = (CONFIG.limits.absorber_max_c - CONFIG.ambient_c) / (160.0 - CONFIG.ambient_c)
+        return max(hottest_share(key, budget, hostile(1.2, seed)) for seed in range(3)) * scale
+
+    assert share(budget_of(config, parameters, DISPLAY.pixels)) <= 1.0
+    monkeypatch.setattr(budget_setup, "warming_of", lambda *_: Warming())
+    assert share(budget_of(config, parameters, DISPLAY.pixels)) > 1.0
+
+
+def test_hot_graphite_that_stores_more_cools_more_slowly_in_the_bound():
+    plain = budget_of(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
+    hot = budget_with("heat_capacity", "calibrated").heat
+    cap_k = CONFIG.limits.absorber_max_c - CONFIG.ambient_c
+    assert hot.c_low_j_per_k.tolist() == plain.c_low_j_per_k.tolist()
+    assert hot.c_high_j_per_k == pytest.approx(plain.c_high_j_per_k * (1 + 3e-3 * cap_k))
+
+
+def test_what_warms_everything_is_taken_off_every_cap_with_what_walls_and_touch_surfaces_pass_on():
+    parameters = with_term("ambient_drift", **LARGE["ambient_drift"])
+    warming = warming_of(parameters, DISPLAY.pixels, CONFIG)
+    assert 4.5 < warming.everywhere_k < 4.7
+    plain = budget_of(CONFIG, load_parameters("surroundings"), DISPLAY.pixels).caps
+    caps = budget_of(CONFIG, parameters, DISPLAY.pixels).caps
+    for name in ("absorber_k", "wall_k", "touch_k"):
+        assert getattr(plain, name) - getattr(caps, name) == pytest.approx(warming.everywhere_k, rel=0.01)
