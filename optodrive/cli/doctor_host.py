@@ -115,12 +115,12 @@ def check_room(folder: Path, free_bytes: int) -> Finding:
 
 def check_kernels() -> Finding:
     """Whether machine code is there already."""
-    from optodrive.core.kernels import CACHED, cold
+    from optodrive.core.kernels import CACHED, is_cold
 
     if not CACHED:
         return warning(
             "kernels", "machine code cannot be kept", "make ~/.cache/optodrive writable, or set NUMBA_CACHE_DIR"
         )
-    if cold():
+    if is_cold():
         return warning("kernels", "not compiled yet", "the first start takes half a minute: run `optodrive serve` once")
     return ok("kernels", "compiled")

@@ -88,9 +88,9 @@ def print_json(document: dict[str, Any]) -> None:
 
 def announce_compilation() -> None:
     """Say on stderr why the first run after an install or upgrade takes so long."""
-    from optodrive.core.kernels import cold
+    from optodrive.core.kernels import is_cold
 
-    if cold():
+    if is_cold():
         print("optodrive: compiling kernels, half a minute, once", file=sys.stderr)
 
 

@@ -1,36 +1,34 @@
-"""Kernels: plain Python functions on numbers and arrays, compiled by numba on first use and kept in its cache."""
+"""Numba kernels: plain Python functions on numbers and arrays, compiled on first use and cached on disk.
+
+The cache key of a kernel is its bytecode together with everything that the bytecode refers to: called kernels, global
+constants and the fields of the named tuples in its signature. A comment, a docstring or an edit elsewhere in the file
+therefore does not invalidate machine code, and a changed callee or constant in another file does.
+"""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
-from typing import ParamSpec, TypeVar
+from types import CodeType, FunctionType, ModuleType
+from typing import Any, ParamSpec, TypeVar
 
 import numba
+import numpy as np
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 
 def _cache_dir() -> Path:
-    """Where machine code is kept: apart for each state of the sources.
-
-    Numba looks only at the file of the kernel itself; one that calls a kernel of another file would stay as it was
-    when that file changes.
-    """
-    package = Path(__file__).parents[1]
-    digest = sha256()
-    for source in sorted(
-        [*package.glob("physics/**/*.py"), *package.glob("planning/**/*.py"), *package.glob("device/*.py")]
-    ):
-        digest.update(source.read_bytes())
-    base = os.environ.get("NUMBA_CACHE_DIR") or Path(
-        os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "optodrive", "kernels"
+    return Path(
+        os.environ.get("NUMBA_CACHE_DIR")
+        or Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "optodrive", "kernels")
     )
-    return Path(base, digest.hexdigest()[:16])
 
 
-def _writable(folder: Path) -> bool:
+def _is_writable(folder: Path) -> bool:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
@@ -39,32 +37,157 @@ def _writable(folder: Path) -> bool:
 
 
 _FOLDER = _cache_dir()
-CACHED = _writable(_FOLDER)
-"""Without a folder to keep it in, machine code is made anew by every process."""
-numba.config.CACHE_DIR = str(_FOLDER)  # type: ignore[attr-defined]
+CACHED = _is_writable(_FOLDER)
+"""False where the cache folder is not writable: every process then compiles its kernels anew."""
 
 
 def code_folder() -> Path | None:
-    """Where generated code may be kept beside its machine code, for this state of the sources."""
+    """Return the folder for generated source files and machine code; None where it is not writable."""
     return _FOLDER if CACHED else None
 
 
-def cold() -> bool:
-    """Whether no machine code is kept yet for this state of the sources: the next use of kernels takes seconds."""
-    return not CACHED or not any(_FOLDER.glob("*/*.nbi"))
+def code_stamp(function: FunctionType) -> str:
+    """Return the digest of a function's bytecode and of everything that the bytecode refers to, as hexadecimal."""
+    parts: list[str] = []
+    _collect_function(function, parts, set())
+    return sha256("\n".join(parts).encode()).hexdigest()
+
+
+def _collect_function(function: FunctionType, parts: list[str], visited: set[int]) -> None:
+    if id(function) in visited:
+        return
+    visited.add(id(function))
+    names: list[str] = []
+    _collect_code(function.__code__, function.__doc__, parts, names)
+    parts.append(repr((function.__defaults__, function.__kwdefaults__)))
+    referenced = [function.__globals__[name] for name in dict.fromkeys(names) if name in function.__globals__]
+    for value in [*referenced, *function.__annotations__.values(), *(cell.cell_contents for cell in _cells(function))]:
+        _collect_value(value, names, parts, visited)
+
+
+def _cells(function: FunctionType) -> Iterable[Any]:
+    return function.__closure__ or ()
+
+
+def _collect_code(code: CodeType, docstring: str | None, parts: list[str], names: list[str]) -> None:
+    parts += [code.co_name, code.co_code.hex(), repr((code.co_names, code.co_varnames, code.co_argcount))]
+    names += code.co_names
+    for position, constant in enumerate(code.co_consts):
+        if isinstance(constant, CodeType):
+            _collect_code(constant, None, parts, names)
+        elif position > 0 or constant != docstring:
+            parts.append(repr(constant))
+
+
+def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[int]) -> None:
+    callee = getattr(value, "py_func", value)
+    if isinstance(callee, FunctionType):
+        _collect_function(callee, parts, visited)
+    elif isinstance(value, np.ndarray):
+        parts.append(f"{value.dtype} {value.shape} {sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}")
+    elif isinstance(value, ModuleType):
+        parts.append(value.__name__)
+        if value.__name__.split(".")[0] == __name__.split(".")[0]:
+            for name in sorted(set(names) & set(vars(value))):
+                _collect_value(vars(value)[name], names, parts, visited)
+    elif isinstance(value, type) and hasattr(value, "_fields"):
+        if id(value) not in visited:
+            visited.add(id(value))
+            parts.append(f"{value.__qualname__} {value._fields}")
+            for annotation in value.__annotations__.values():
+                _collect_value(annotation, names, parts, visited)
+    elif isinstance(value, tuple):
+        for item in value:
+            _collect_value(item, names, parts, visited)
+    else:
+        parts.append(getattr(value, "__qualname__", None) or repr(value))
+
+
+class _KernelLocator:
+    """Places the machine code of every kernel in one folder; the stamp in `_KernelCache` tells its versions apart."""
+
+    def __init__(self, function: FunctionType) -> None:
+        self._module = function.__module__
+
+    def ensure_cache_path(self) -> None:
+        _FOLDER.mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return str(_FOLDER)
+
+    def get_source_stamp(self) -> str:
+        return ""
+
+    def get_disambiguator(self) -> str:
+        return self._module
+
+    @classmethod
+    def from_function(cls, py_func: FunctionType, py_file: str) -> "_KernelLocator":
+        return cls(py_func)
+
+
+class _KernelCacheImpl(CompileResultCacheImpl):
+    _locator_classes: Any = (_KernelLocator,)
+
+
+_open_index: Callable[[str, str, str], Any] = IndexDataCacheFile  # numba has no types
+
+
+class _KernelCache(FunctionCache):
+    """Numba's cache of one function, keyed on `code_stamp`.
+
+    The stamp is computed at the first look-up: a kernel may call one that its module defines later.
+    """
+
+    _impl_class = _KernelCacheImpl
+
+    @cached_property
+    def file_base(self) -> str:
+        """Name of the kernel's cache files without their suffixes."""
+        return f"{self._impl.filename_base}-{code_stamp(self._py_func)[:24]}"
+
+    def is_empty(self) -> bool:
+        """Return whether no machine code of the kernel is cached."""
+        return not Path(self.cache_path, f"{self.file_base}.nbi").exists()
+
+    def _load_overload(self, sig: Any, target_context: Any) -> Any:
+        self._open()
+        return super()._load_overload(sig, target_context)  # type: ignore[no-untyped-call]
+
+    def _save_overload(self, sig: Any, data: Any) -> None:
+        self._open()
+        super()._save_overload(sig, data)  # type: ignore[no-untyped-call]
+
+    def _open(self) -> None:
+        self._cache_file: Any = _open_index(self.cache_path, self.file_base, self.file_base)
+
+
+_new_cache: Callable[[Any], _KernelCache] = _KernelCache  # numba has no types
+_caches: list[_KernelCache] = []
+
+
+def is_cold() -> bool:
+    """Return whether most imported kernels have no machine code yet, so that their first use takes seconds."""
+    return 2 * sum(cache.is_empty() for cache in _caches) > len(_caches) if CACHED else True
 
 
 def kernel(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a function on its first use; the machine code is kept, so only the first run after a change pays."""
-    compiled: Callable[P, T] = numba.njit(cache=CACHED, nogil=True, error_model="numpy")(function)
-    return compiled
+    """Compile a function on its first use and cache the machine code on disk."""
+    return _compile(function)
 
 
 def vector_kernel(function: Callable[P, T]) -> Callable[P, T]:
-    """As `kernel`, and sums may be taken in any order: only so does the processor add several terms at once.
+    """Compile as `kernel` and allow sums in any order, so that the processor's vector units apply.
 
     The last digits of a result then depend on the processor.
     """
-    free = {"reassoc", "contract", "arcp"}
-    compiled: Callable[P, T] = numba.njit(cache=CACHED, nogil=True, error_model="numpy", fastmath=free)(function)
-    return compiled
+    return _compile(function, fastmath={"reassoc", "contract", "arcp"})
+
+
+def _compile(function: Callable[P, T], **options: Any) -> Callable[P, T]:
+    compiled: Any = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    if CACHED:
+        compiled._cache = _new_cache(function)
+        _caches.append(compiled._cache)
+    result: Callable[P, T] = compiled
+    return result

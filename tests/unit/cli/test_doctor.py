@@ -179,7 +179,7 @@ def test_packages_missing_or_too_old_are_named():
 )
 def test_the_compiled_kernels(monkeypatch, cached, cold, grade):
     monkeypatch.setattr("optodrive.core.kernels.CACHED", cached)
-    monkeypatch.setattr("optodrive.core.kernels.cold", lambda: cold)
+    monkeypatch.setattr("optodrive.core.kernels.is_cold", lambda: cold)
     assert host.check_kernels().grade == grade
 
 
