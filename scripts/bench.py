@@ -22,19 +22,19 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import load_config
 from optodrive.device.neighbours import Neighbours
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.simulator.virtual_run import execute
-from optodrive.physics.nominal_display import DisplayHeat
+from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import load_parameters
-from optodrive.physics.wall_coupling import LatticeHeat, Modes, Walls, conductances_w_per_k
-from optodrive.planning.limiter.limiter import limit, shifted, verify
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.physics.wall_coupling import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
+from optodrive.planning.limiter.limiter import limit, shift_state, verify
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 from optodrive.planning.scheduler.scheduler import Scheduler
 
 RUNS = 7
 
 
-def median_s(work) -> float:
+def measure_median_s(work) -> float:
     """Median CPU seconds of a call."""
     times = []
     for _ in range(RUNS):
@@ -44,104 +44,110 @@ def median_s(work) -> float:
     return statistics.median(times)
 
 
-def full_frame(name="display-1511", height_m=50e-6):
-    display = Display.of(load_config(name))
+def build_full_frame(name="display-1511", height_m=50e-6):
+    display = DisplayModel.from_config(load_config(name))
     count = len(display.layout)
     return display, FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(count, height_m)),))
 
 
-def child_cpu_s(arguments) -> float:
-    def used():
+def measure_child_cpu_s(arguments) -> float:
+    def read_cpu_s():
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         return usage.ru_utime + usage.ru_stime
 
-    before_s = used()
+    before_s = read_cpu_s()
     subprocess.run(arguments, check=True, stdout=subprocess.DEVNULL)
-    return used() - before_s
+    return read_cpu_s() - before_s
 
 
-def plan_rows(height_um):
-    display, sequence = full_frame(height_m=height_um * 1e-6)
-    heat, budget = display.at_rest()
-    prepared = prepare(display, sequence, heat, budget)
-    piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat.copy())))
-    count = len(prepared.plan)
-    schedule_s = median_s(lambda: list(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat.copy())))
-    limit_s = median_s(lambda: limit(piece, budget, display.budget))
-    whole_s = median_s(lambda: prepare(display, sequence, heat, budget))
+def measure_plan_rows(height_um):
+    display, sequence = build_full_frame(height_m=height_um * 1e-6)
+    heat, budget = display.build_cold_state()
+    planned_sequence = plan_sequence(display, sequence, heat, budget)
+    batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat.copy())))
+    count = len(planned_sequence.plan)
+    schedule_s = measure_median_s(
+        lambda: list(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat.copy()))
+    )
+    limit_s = measure_median_s(lambda: limit(batch, budget, display.budget))
+    total_s = measure_median_s(lambda: plan_sequence(display, sequence, heat, budget))
     return [
         (f"{height_um} µm: pulses planned a second", count / schedule_s, "1/s"),
         (f"{height_um} µm: pulses limited a second", count / limit_s, "1/s"),
-        (f"{height_um} µm: planned, limited and predicted a second", count / whole_s, "1/s"),
-        (f"{height_um} µm: beam-on share of the plan", prepared.plan.width_s.sum() / prepared.duration_s, "1"),
-        (f"{height_um} µm: pixels shown a second of the plan", count / prepared.duration_s, "1/s"),
+        (f"{height_um} µm: planned, limited and predicted a second", count / total_s, "1/s"),
+        (
+            f"{height_um} µm: beam-on share of the plan",
+            planned_sequence.plan.width_s.sum() / planned_sequence.duration_s,
+            "1",
+        ),
+        (f"{height_um} µm: pixels shown a second of the plan", count / planned_sequence.duration_s, "1/s"),
     ]
 
 
 def bench_plan():
     """A full 1,511-pixel frame: planned, limited, predicted; and the whole command from the shell."""
-    rows = [row for height_um in (50, 100, 400) for row in plan_rows(height_um)]
+    rows = [row for height_um in (50, 100, 400) for row in measure_plan_rows(height_um)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames.json"
         path.write_text(json.dumps({"frames": [{"show_at_s": 0, "duration_s": 10, "target_um": [50.0] * 1511}]}))
         command = [Path(sys.executable).with_name("optodrive"), "plan", path, "--config", "display-1511"]
-        cpu_s = statistics.median(child_cpu_s(command) for _ in range(RUNS))
+        cpu_s = statistics.median(measure_child_cpu_s(command) for _ in range(RUNS))
     return [*rows, ("optodrive plan, 1,511 pixels at 50 µm, the whole command", cpu_s, "s CPU")]
 
 
 def bench_wire():
     """From limited plan to bytes, and the proof that reads them back."""
-    display, sequence = full_frame()
-    heat, budget = display.at_rest()
-    plan = prepare(display, sequence, heat, budget).plan
-    scale = Requirements.of(display.config).scale
+    display, sequence = build_full_frame()
+    heat, budget = display.build_cold_state()
+    plan = plan_sequence(display, sequence, heat, budget).plan
+    scale = BoardRequirements.from_config(display.config).scale
     points = quantise(plan, scale)
-    payload = points.payload()
+    payload = points.encode_payload()
 
-    def prove():
+    def run_verification():
         decoded = decode(payload, scale)
         verify(plan, points.row[decoded.index], decoded, budget, display.budget)
 
     return [
-        ("pulses quantised a second", len(plan) / median_s(lambda: quantise(plan, scale)), "1/s"),
-        ("pulses decoded and proven a second", len(plan) / median_s(prove), "1/s"),
+        ("pulses quantised a second", len(plan) / measure_median_s(lambda: quantise(plan, scale)), "1/s"),
+        ("pulses decoded and proven a second", len(plan) / measure_median_s(run_verification), "1/s"),
         ("bytes of points a pulse", len(payload) / len(plan), "B"),
     ]
 
 
 def bench_board():
     """The real session and the simulated board in virtual time."""
-    display, sequence = full_frame()
-    prepared = prepare(display, sequence, *display.at_rest())
-    seconds = median_s(lambda: execute(display, prepared))
+    display, sequence = build_full_frame()
+    planned_sequence = plan_sequence(display, sequence, *display.build_cold_state())
+    seconds = measure_median_s(lambda: execute(display, planned_sequence))
     return [
-        ("pulses through session and simulated board a second", len(prepared.plan) / seconds, "1/s"),
-        ("times real time", prepared.duration_s / seconds, "×"),
+        ("pulses through session and simulated board a second", len(planned_sequence.plan) / seconds, "1/s"),
+        ("times real time", planned_sequence.duration_s / seconds, "×"),
     ]
 
 
 HOUR_S = 3600.0
-INTEGRATED = 300
+INTEGRATED_PULSES = 300
 """Pulses that the general integrator is given; it takes the same time for each."""
 
 
-def hour_of_frames():
+def build_hour_of_frames():
     """Columns of pulses: full frames at 50 µm as the planner makes them, one after the other for an hour."""
-    display, sequence = full_frame()
-    prepared = prepare(display, sequence, *display.at_rest())
-    plan, frames = prepared.plan, int(HOUR_S / prepared.duration_s)
-    begin_s = np.repeat(np.arange(frames) * prepared.duration_s, len(plan))
+    display, sequence = build_full_frame()
+    planned_sequence = plan_sequence(display, sequence, *display.build_cold_state())
+    plan, frames = planned_sequence.plan, int(HOUR_S / planned_sequence.duration_s)
+    begin_s = np.repeat(np.arange(frames) * planned_sequence.duration_s, len(plan))
     start_s = np.tile(plan.start_s, frames) + begin_s
     return display, (np.tile(plan.pixel, frames), start_s, np.tile(plan.width_s, frames), np.tile(plan.power_w, frames))
 
 
-def seconds(work):
+def measure_once_s(work):
     begin_s = time.process_time()
     result = work()
     return time.process_time() - begin_s, result
 
 
-def integrated(slope, count, columns):
+def integrate_pulses(slope, count, columns):
     """The state [variables × pixels] after the pulses, by solve_ivp from edge to edge; slope(light_w) makes dy/dt."""
     state, now_s = np.zeros(count), 0.0
     for pixel, start_s, width_s, power_w in zip(*columns, strict=True):
@@ -152,8 +158,8 @@ def integrated(slope, count, columns):
     return state
 
 
-def nominal_slope(pixel, count):
-    def of(index, light_w):
+def make_nominal_slope(pixel, count):
+    def make_slope(index, light_w):
         def slope(_, state):
             theta, gas = state[:count], state[count:]
             heating = -theta / pixel.tau_s
@@ -162,13 +168,13 @@ def nominal_slope(pixel, count):
 
         return slope
 
-    return of
+    return make_slope
 
 
-def wall_slope(pixel, walls, neighbours):
-    count, leak = len(neighbours), csr_array(conductances_w_per_k(walls, neighbours))
+def make_wall_slope(pixel, walls, neighbours):
+    count, leak = len(neighbours), csr_array(build_conductances_w_per_k(walls, neighbours))
 
-    def of(index, light_w):
+    def make_slope(index, light_w):
         def slope(_, state):
             theta, wall, gas = state[:count], state[count : 2 * count], state[2 * count :]
             flow_w = (theta - wall) / pixel.r_k_per_w
@@ -179,60 +185,62 @@ def wall_slope(pixel, walls, neighbours):
 
         return slope
 
-    return of
+    return make_slope
 
 
-def hour_rows(name, make, columns, slope):
+def measure_hour_rows(name, make_heat, columns, make_slope):
     """One simulator against the clock, and a general integrator on the first pulses of the same list."""
-    first = [column[:INTEGRATED] for column in columns]
-    checked = make()
-    checked.pulses(*first)
-    heat = make()
-    ours_s, _ = seconds(lambda: heat.pulses(*columns))
-    rises_k = np.concatenate(rises_at_end(checked, first))
-    theirs_s, state = seconds(lambda: integrated(slope, len(rises_k), first))
-    ours_ms, theirs_ms = 1e3 * ours_s / len(columns[0]), 1e3 * theirs_s / INTEGRATED
-    apart_k = np.abs(rises_k - state).max()
+    first = [column[:INTEGRATED_PULSES] for column in columns]
+    reference = make_heat()
+    reference.pulses(*first)
+    heat = make_heat()
+    kernel_s, _ = measure_once_s(lambda: heat.pulses(*columns))
+    rises_k = np.concatenate(read_rises_at_end(reference, first))
+    solver_s, state = measure_once_s(lambda: integrate_pulses(make_slope, len(rises_k), first))
+    kernel_ms, solver_ms = 1e3 * kernel_s / len(columns[0]), 1e3 * solver_s / INTEGRATED_PULSES
+    difference_k = np.abs(rises_k - state).max()
     return [
-        (f"{name}: one hour, every pulse's peaks", ours_s, "s CPU"),
-        (f"{name}: times real time", HOUR_S / ours_s, "×"),
-        (f"{name}: a pulse", ours_ms, "ms"),
-        (f"{name}: a pulse by solve_ivp, rtol 1e-8", theirs_ms, "ms"),
-        (f"{name}: solve_ivp takes longer", theirs_ms / ours_ms, "×"),
-        (f"{name}: largest difference to solve_ivp after {INTEGRATED} pulses", apart_k, "K"),
+        (f"{name}: one hour, every pulse's peaks", kernel_s, "s CPU"),
+        (f"{name}: times real time", HOUR_S / kernel_s, "×"),
+        (f"{name}: a pulse", kernel_ms, "ms"),
+        (f"{name}: a pulse by solve_ivp, rtol 1e-8", solver_ms, "ms"),
+        (f"{name}: solve_ivp takes longer", solver_ms / kernel_ms, "×"),
+        (f"{name}: largest difference to solve_ivp after {INTEGRATED_PULSES} pulses", difference_k, "K"),
     ]
 
 
-def rises_at_end(heat, columns):
+def read_rises_at_end(heat, columns):
     """The rises [p] of each kind at the last pulse's end."""
     end_s = float(columns[1][-1] + columns[2][-1])
-    if isinstance(heat, LatticeHeat):
-        return heat.rises(end_s)
-    each = [heat.rises(pixel, end_s) for pixel in range(len(heat.pixels))]
-    return tuple(np.array(each).T)
+    if isinstance(heat, CoupledDisplay):
+        return heat.rises_k(end_s)
+    per_pixel = [heat.rises(pixel, end_s) for pixel in range(len(heat.pixels))]
+    return tuple(np.array(per_pixel).T)
 
 
 def bench_hour():
     """An hour of full frames on 1,511 pixels, each pulse simulated: the nominal pixel, and with walls. One run each."""
-    display, columns = hour_of_frames()
-    pixel, neighbours = display.pixels.each[0], Neighbours.of(display.config.display)
-    walls = Walls.of(load_parameters("surroundings"))
-    modes_s, modes = seconds(lambda: Modes.of(pixel, walls, neighbours))
+    display, columns = build_hour_of_frames()
+    pixel, neighbours = display.pixels.elements[0], Neighbours.from_display(display.config.display)
+    walls = WallParameters.from_parameters(load_parameters("surroundings"))
+    modes_s, modes = measure_once_s(lambda: Modes.diagonalise(pixel, walls, neighbours))
     count = len(display.pixels)
     return [
         ("pulses", len(columns[0]), "1"),
-        *hour_rows("nominal", lambda: DisplayHeat(display.pixels), columns, nominal_slope(pixel, count)),
+        *measure_hour_rows(
+            "nominal", lambda: NominalThermalState(display.pixels), columns, make_nominal_slope(pixel, count)
+        ),
         ("walls and neighbours: the modes, once a display", modes_s, "s CPU"),
-        *hour_rows(
+        *measure_hour_rows(
             "walls and neighbours",
-            lambda: LatticeHeat(modes),
+            lambda: CoupledDisplay(modes),
             columns,
-            wall_slope(pixel, walls, neighbours),
+            make_wall_slope(pixel, walls, neighbours),
         ),
     ]
 
 
-def resident_mib():
+def read_resident_mib():
     """Memory the process holds now, MiB."""
     fields = Path("/proc/self/statm").read_text().split()
     return int(fields[1]) * resource.getpagesize() / 2**20
@@ -242,28 +250,28 @@ def bench_limit():
     """The limiter alone: a full frame, and a million pulses in pieces with the state carried on."""
     rows = []
     for height_um in (50, 400):
-        display, sequence = full_frame(height_m=height_um * 1e-6)
-        heat, state = display.at_rest()
-        piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat)))
-        limit_s = median_s(lambda piece=piece, state=state, budget=display.budget: limit(piece, state, budget))
+        display, sequence = build_full_frame(height_m=height_um * 1e-6)
+        heat, state = display.build_cold_state()
+        batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat)))
+        limit_s = measure_median_s(lambda piece=batch, state=state, budget=display.budget: limit(piece, state, budget))
         rows.append((f"{height_um} µm: a full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
-    display, sequence = full_frame()
-    heat, state = display.at_rest()
-    piece = next(iter(Scheduler(display.machine, sequence, display.heat_at_rest).pieces(heat)))
-    period_s = float(piece.start_s[-1] + piece.width_s[-1]) + 1e-3
-    held_mib, count, begin_s = [], 0, time.process_time()
+    display, sequence = build_full_frame()
+    heat, state = display.build_cold_state()
+    batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat)))
+    period_s = float(batch.start_s[-1] + batch.width_s[-1]) + 1e-3
+    samples_mib, count, begin_s = [], 0, time.process_time()
     while count < 1_000_000:
-        state = shifted(limit(piece, state, display.budget)[1], -period_s)
-        count += len(piece)
-        held_mib.append(resident_mib())
+        state = shift_state(limit(batch, state, display.budget)[1], -period_s)
+        count += len(batch)
+        samples_mib.append(read_resident_mib())
     rows.append(("a million pulses, frame after frame", time.process_time() - begin_s, "s"))
-    rows.append(("memory after 10,000 of them", held_mib[7], "MiB"))
-    rows.append(("memory after all of them", held_mib[-1], "MiB"))
+    rows.append(("memory after 10,000 of them", samples_mib[7], "MiB"))
+    rows.append(("memory after all of them", samples_mib[-1], "MiB"))
     return rows
 
 
 DISPLAY_PIXELS, DISPLAY_WORKERS = 100, 2
-HIDDEN = (
+HIDDEN_TERMS = (
     {"laser_droop": {"share": 0.1, "time": 0.05, "spread": 1.0}},
     {"bridge_conductivity": {"exponent": 0.4}},
     {"gas_leak": {"rate": 4.0}},
@@ -276,27 +284,29 @@ def bench_display():
     """A recording of 100 pixels, 15 runs each, diagnosed pixel by pixel on two worker processes. One run."""
     sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
     from display_lab import display_lab
-    from optodrive.lab.diagnosis.dask_workers import crew, done
-    from optodrive.lab.diagnosis.display_diagnosis import PixelTask, diagnose_pixel, warm
+    from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
+    from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel
     from optodrive.lab.recording import DisplayRuns, write_recording
 
-    hidden = {pixel: HIDDEN[pixel % 10] if pixel % 10 < len(HIDDEN) else {} for pixel in range(DISPLAY_PIXELS)}
+    hidden = {
+        pixel: HIDDEN_TERMS[pixel % 10] if pixel % 10 < len(HIDDEN_TERMS) else {} for pixel in range(DISPLAY_PIXELS)
+    }
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "display.h5"
         write_recording(path, display_lab(hidden, seed=4000))
         file_mib = path.stat().st_size / 2**20
-        warm()
+        compile_kernels()
         begin_s = time.monotonic()
         runs = DisplayRuns.open([path])
         opened_s = time.monotonic()
         tasks = [PixelTask(item.pixel, item.read) for item in runs.pixels]
-        with crew(workers=DISPLAY_WORKERS) as client:
+        with open_client(workers=DISPLAY_WORKERS) as client:
             ready_s = time.monotonic()
-            answers = {task.pixel: answer for task, answer, _ in done(client, diagnose_pixel, tasks)}
+            answers = {task.pixel: answer for task, answer, _ in run_tasks(client, diagnose_pixel, tasks)}
             end_s = time.monotonic()
-            largest_mib = max(client.run(peak_mib).values())
-    named = [answers[pixel].found.causes == tuple(terms) for pixel, terms in hidden.items()]
-    busy_s = sum(answer.found.seconds for answer in answers.values())
+            largest_mib = max(client.run(read_peak_mib).values())
+    named = [answers[pixel].discrepancy.causes == tuple(terms) for pixel, terms in hidden.items()]
+    busy_s = sum(answer.discrepancy.elapsed_s for answer in answers.values())
     return [
         ("pixels, 15 runs each", len(answers), "1"),
         ("size of the recording", file_mib, "MiB"),
@@ -311,7 +321,7 @@ def bench_display():
     ]
 
 
-def peak_mib():
+def read_peak_mib():
     """The most memory this process ever held, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 

@@ -16,9 +16,9 @@ from rich.table import Table
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 from optodrive.planning.scheduler import scheduler
-from optodrive.planning.scheduler.periodic_pulses import at_target, with_room
+from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from pixel_ode import height_um
@@ -26,124 +26,132 @@ from pixel_ode import height_um
 PIXELS = (200, 201, 222, 221)
 SECONDS, CYCLES = 0.6, 12
 """A train lasts so long, and so many cycles at least."""
-STEADY = 5
+STEADY_CYCLES = 5
 """Cycles at the end that are looked at."""
 FRAMES = 300
-SWING = 0.5
+PEAK_TO_PEAK_SHARE = 0.5
 """Swing asked for, between the least (0) and the most (1) that a height and a rate allow."""
 
 
-def last_cycles(display, result, train, period_s):
+def measure_last_cycles(display, result, train, period_s):
     """Peak and swing, µm, mean of the last cycles of a train, and its energy a cycle there, J."""
     plan = result.plan
     rows = np.flatnonzero(plan.pixel == train.pixel)
-    starts_s = train.pulse_starts_s()[-STEADY - 1 : -1] + result.lead_s
-    t_s = np.linspace(starts_s[0], starts_s[0] + STEADY * period_s, 200 * STEADY + 1)
+    starts_s = train.pulse_starts_s()[-STEADY_CYCLES - 1 : -1] + result.lead_s
+    t_s = np.linspace(starts_s[0], starts_s[0] + STEADY_CYCLES * period_s, 200 * STEADY_CYCLES + 1)
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w])[rows]
-    each = height_um(display.pixels.each[train.pixel], pulses, t_s)[:-1].reshape(STEADY, 200)
-    lit = rows[(plan.start_s[rows] > starts_s[0] - 1e-6) & (plan.start_s[rows] < t_s[-1] - 1e-6)]
-    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[lit].sum() / STEADY
+    each = height_um(display.pixels.each[train.pixel], pulses, t_s)[:-1].reshape(STEADY_CYCLES, 200)
+    row_numbers = rows[(plan.start_s[rows] > starts_s[0] - 1e-6) & (plan.start_s[rows] < t_s[-1] - 1e-6)]
+    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[row_numbers].sum() / STEADY_CYCLES
 
 
-def room_us(display, count, period_s):
+def compute_beam_time_us(display, count, period_s):
     """Beam time of a pulse of one of so many trains that share a period."""
     machine = display.machine
-    own_us = round((period_s - machine.rest_s) * 1e6)
+    period_share_us = round((period_s - machine.pulse_rest_s) * 1e6)
     if count == 1:
-        return own_us
+        return period_share_us
     x_rad, _ = machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
-    return min(own_us, int(1e6 * period_s / count) - machine.moves.time_us(x_rad[201] - x_rad[200], 0.0))
+    return min(period_share_us, int(1e6 * period_s / count) - machine.moves.time_us(x_rad[201] - x_rad[200], 0.0))
 
 
-def train_rows(display, count, rate_hz, target_um):
+def measure_train(display, count, rate_hz, target_um):
     """One row of the table of cycles."""
     period_s = 1.0 / rate_hz
-    at_rest, drive = display.heat_at_rest(), with_room(display.machine.drive, room_us(display, count, period_s))
-    lasts_s = max(SECONDS, CYCLES * period_s)
-    first = HeightTrain(PIXELS[0], 0.0, lasts_s, period_s, target_um * 1e-6)
-    head = (str(count), f"{rate_hz:g}", f"{target_um:g}")
-    fewest = next(
+    display_model, drive = (
+        display.build_cold_heat(),
+        limit_pulse_width(display.machine.drive, compute_beam_time_us(display, count, period_s)),
+    )
+    duration_s = max(SECONDS, CYCLES * period_s)
+    first = HeightTrain(PIXELS[0], 0.0, duration_s, period_s, target_um * 1e-6)
+    row_start = (str(count), f"{rate_hz:g}", f"{target_um:g}")
+    min_periods = next(
         (
             n
             for n in range(1, drive.max_periods + 1)
-            if at_target(first, at_rest, drive, n).peak_m > 0.9999e-6 * target_um
+            if solve_steady_state(first, display_model, drive, n).peak_m > 0.9999e-6 * target_um
         ),
         None,
     )
-    if fewest is None:
-        return (*head, f"out of reach: {1e6 * at_target(first, at_rest, drive, drive.max_periods).peak_m:.0f} at most")
-    most_m, least_m = (at_target(first, at_rest, drive, n).peak_to_peak_m for n in (fewest, drive.max_periods))
-    swing_m = least_m + SWING * (most_m - least_m)
+    if min_periods is None:
+        return (
+            *row_start,
+            f"out of reach: {1e6 * solve_steady_state(first, display_model, drive, drive.max_periods).peak_m:.0f} at most",
+        )
+    peak_to_peak_max_m, peak_to_peak_min_m = (
+        solve_steady_state(first, display_model, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
+    )
+    peak_to_peak_m = peak_to_peak_min_m + PEAK_TO_PEAK_SHARE * (peak_to_peak_max_m - peak_to_peak_min_m)
     trains = tuple(
-        replace(first, pixel=PIXELS[k], start_s=round(k * period_s / count, 6), peak_to_peak_m=swing_m)
+        replace(first, pixel=PIXELS[k], start_s=round(k * period_s / count, 6), peak_to_peak_m=peak_to_peak_m)
         for k in range(count)
     )
-    result = prepare(display, FrameSequence(trains=trains), *display.at_rest())
-    peak_um, felt_um, warm_j = last_cycles(display, result, trains[0], period_s)
+    result = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
+    peak_um, simulated_peak_to_peak_um, train_j = measure_last_cycles(display, result, trains[0], period_s)
     width_s = result.plan.width_s[result.plan.pixel == PIXELS[0]][-1]
-    periods, duty = at_rest.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
+    periods, duty = display_model.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
     cold = tuple(
         PulseTrain(
-            item.pixel, item.start_s, lasts_s, periods * drive.period_s,
+            item.pixel, item.start_s, duration_s, periods * drive.period_s,
             period_s - periods * drive.period_s, duty * drive.max_power_w,
         )
         for item in trains
     )  # fmt: skip
-    from_rest = prepare(display, FrameSequence(trains=cold), *display.at_rest())
-    cold_um, _, cold_j = last_cycles(display, from_rest, trains[0], period_s)
-    trimmed = "" if not from_rest.plan.trimmed_j.any() else ", trimmed"
+    cold_result = plan_sequence(display, FrameSequence(trains=cold), *display.build_cold_state())
+    cold_um, _, cold_j = measure_last_cycles(display, cold_result, trains[0], period_s)
+    trimmed = "" if not cold_result.plan.trimmed_j.any() else ", trimmed"
     return (
-        *head,
+        *row_start,
         f"{peak_um:.1f} ({100 * (peak_um / target_um - 1):+.2f} %)",
-        f"{1e6 * swing_m:.1f}",
-        f"{felt_um:.1f} ({100 * (felt_um / swing_m / 1e6 - 1):+.1f} %)",
-        f"{1e3 * warm_j:.2f}",
+        f"{1e6 * peak_to_peak_m:.1f}",
+        f"{simulated_peak_to_peak_um:.1f} ({100 * (simulated_peak_to_peak_um / peak_to_peak_m / 1e6 - 1):+.1f} %)",
+        f"{1e3 * train_j:.2f}",
         f"{1e3 * cold_j:.2f}",
-        f"{100 * (1 - warm_j / cold_j):.0f} %",
+        f"{100 * (1 - train_j / cold_j):.0f} %",
         f"{cold_um:.0f}{trimmed}",
     )
 
 
-def cycles_table(display):
+def build_cycles_table(display):
     """Trains by height against pulses planned as if from rest."""
     table = Table("pixels", "Hz", "peak µm", "simulated", "swing µm", "simulated", "mJ a cycle", "from rest", "less",
                   "peak from rest", title="trains by height")  # fmt: skip
     for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
         try:
-            table.add_row(*train_rows(display, count, rate_hz, target_um))
+            table.add_row(*measure_train(display, count, rate_hz, target_um))
         except InputError as error:
             table.add_row(str(count), f"{rate_hz:g}", f"{target_um:g}", str(error))
     return table
 
 
 @contextmanager
-def overheard():
+def record_candidates():
     """Every list of rehearsals that the scheduler chooses from meanwhile."""
-    choose, heard = scheduler.best, []
-    scheduler.best = lambda items, due_s: (heard.append(items), choose(items, due_s))[1]
+    original, recorded = scheduler.select_schedule, []
+    scheduler.select_schedule = lambda items, due_s: (recorded.append(items), original(items, due_s))[1]
     try:
-        yield heard
+        yield recorded
     finally:
-        scheduler.best = choose
+        scheduler.select_schedule = original
 
 
-def shown(display, heights_um):
+def plan_frame(display, heights_um):
     """A frame of heights by pixel, as prepared, with time enough for any number of rounds."""
     target_m = np.zeros(len(display.layout))
     target_m[list(heights_um)] = np.array(list(heights_um.values())) * 1e-6
-    frame = TactileFrame("f", 0.0, 20.0, target_m, together=True)
-    return prepare(display, FrameSequence((frame,)), *display.at_rest())
+    frame = TactileFrame("f", 0.0, 20.0, target_m, simultaneous=True)
+    return plan_sequence(display, FrameSequence((frame,)), *display.build_cold_state())
 
 
-def together_table(display):
+def build_simultaneous_table(display):
     """Squares of pixels in rounds: simultaneity, and how long the whole takes."""
     table = Table("pixels", "µm", "rounds", "simultaneity", "ends ms", "longer by ms", "", title="frames together")
     for side, target_um in ((2, 100), (2, 300), (3, 50), (3, 100), (3, 200), (6, 50)):
         square = [200 + 21 * row + column for row in range(side) for column in range(side)]
-        with overheard() as heard:
-            (told,) = shown(display, dict.fromkeys(square, target_um)).together
-        for item in heard[0]:
-            longer_ms = 1e3 * (item.end_s - heard[0][0].end_s)
+        with record_candidates() as recorded:
+            (report,) = plan_frame(display, dict.fromkeys(square, target_um)).simultaneous
+        for item in recorded[0]:
+            longer_ms = 1e3 * (item.end_s - recorded[0][0].end_s)
             table.add_row(
                 f"{side * side}",
                 f"{target_um}",
@@ -151,19 +159,19 @@ def together_table(display):
                 f"{item.simultaneity:.3f}",
                 f"{1e3 * item.end_s:.1f}",
                 f"{longer_ms:+.1f}",
-                "chosen" if item.rounds == told.rounds else "",
+                "chosen" if item.rounds == report.interleaved_rounds else "",
             )
     return table
 
 
-def shortening(display):
+def measure_shortening(display):
     """Whether more rounds ever shorten a frame: random pixels and heights, one line."""
     generator = np.random.default_rng(1)
-    with overheard() as heard:
+    with record_candidates() as recorded:
         for _ in range(FRAMES):
-            chosen = generator.choice(len(display.layout), generator.integers(2, 30), replace=False)
-            shown(display, dict(zip(chosen.tolist(), generator.uniform(5.0, 400.0, len(chosen)), strict=True)))
-    longer_s = np.array([item.end_s - items[0].end_s for items in heard for item in items[1:]])
+            pixels = generator.choice(len(display.layout), generator.integers(2, 30), replace=False)
+            plan_frame(display, dict(zip(pixels.tolist(), generator.uniform(5.0, 400.0, len(pixels)), strict=True)))
+    longer_s = np.array([item.end_s - items[0].end_s for items in recorded for item in items[1:]])
     return (
         f"{FRAMES} random frames, split in {len(longer_s)} ways: {np.count_nonzero(longer_s < 0)} end earlier than "
         f"unsplit, the least later by {1e3 * longer_s.min():.1f} ms"
@@ -171,10 +179,10 @@ def shortening(display):
 
 
 def main() -> int:
-    display, console = Display.of(load_config("display-437")), Console(width=150)
-    console.print(cycles_table(display))
-    console.print(together_table(display))
-    console.print(shortening(display))
+    display, console = DisplayModel.from_config(load_config("display-437")), Console(width=150)
+    console.print(build_cycles_table(display))
+    console.print(build_simultaneous_table(display))
+    console.print(measure_shortening(display))
     return 0
 
 

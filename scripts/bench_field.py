@@ -9,54 +9,54 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.numeric_tables import write_columns
-from optodrive.device.config import load_config, pixel_layout
+from optodrive.device.config import build_pixel_layout, load_config
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.field_prior import Prior
+from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.field_writer import write_field
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
 
 GEOMETRIES, POINTS, RUNS = 10, 1_000_000, 7
-NOISE_M, FALSE = 10e-6, 0.02
+NOISE_M, OUTLIER_SHARE = 10e-6, 0.02
 
 
-class Lab:
+class HiddenGeometryLab:
     """Hidden geometries of the default display."""
 
     def __init__(self):
         self.config = load_config()
-        self.prior = Prior.of(self.config)
-        self.half_m = float(np.abs(pixel_layout(self.config.display).x_m).max())
-        self.code_m = 2.0 * self.config.scanner.focal_length_m * self.config.scanner.code_rad
+        self.prior = FieldPrior.from_config(self.config)
+        self.half_m = float(np.abs(build_pixel_layout(self.config.display).x_m).max())
+        self.code_m = 2.0 * self.config.scanner.focal_length_m * self.config.scanner.rad_per_code
 
-    def fit(self, seed, side):
+    def fit_spots(self, seed, side):
         """A grid of spots with noise and false detections, fitted."""
         truth, random = Truth.drawn(seed, self.config), np.random.default_rng([seed, side])
-        at = np.rint(CENTRE_CODE + np.linspace(-self.half_m, self.half_m, side) / self.code_m)
-        codes = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
-        places = np.column_stack(truth.position_m(*codes.T)) + NOISE_M * random.standard_normal(codes.shape)
-        false = random.random(len(codes)) < FALSE
-        places[false] = random.uniform(-self.half_m, self.half_m, (int(false.sum()), 2))
-        return truth, fit_field(Spots.of(np.column_stack([codes, places])), self.prior)
+        axis_codes = np.rint(CENTRE_CODE + np.linspace(-self.half_m, self.half_m, side) / self.code_m)
+        codes = np.stack(np.meshgrid(axis_codes, axis_codes), axis=-1).reshape(-1, 2)
+        positions = np.column_stack(truth.position_m(*codes.T)) + NOISE_M * random.standard_normal(codes.shape)
+        is_outlier = random.random(len(codes)) < OUTLIER_SHARE
+        positions[is_outlier] = random.uniform(-self.half_m, self.half_m, (int(is_outlier.sum()), 2))
+        return truth, fit_field(MeasuredSpots.from_table(np.column_stack([codes, positions])), self.prior)
 
-    def anywhere(self, count):
+    def sample_positions(self, count):
         """Places on the display's square, [2, count]."""
         return np.random.default_rng(5).uniform(-self.half_m, self.half_m, (2, count))
 
-    def errors(self, side):
+    def measure_errors(self, side):
         """Of each geometry: rms and largest length of the miss, µm; and the share within two stated sigmas, by axis."""
-        out, wanted = [], self.anywhere(3000)
+        out, targets = [], self.sample_positions(3000)
         for seed in range(GEOMETRIES):
-            truth, fit = self.fit(seed, side)
-            codes = fit.field.codes(*wanted)
-            miss = np.array(truth.position_m(*codes)) - wanted
+            truth, fit = self.fit_spots(seed, side)
+            codes = fit.field.codes(*targets)
+            miss = np.array(truth.position_m(*codes)) - targets
             covered = float((np.abs(miss) <= 2.0 * fit.field.sigma_m(*codes)).mean())
             length_um = 1e6 * np.hypot(*miss)
             out.append((float(np.sqrt((length_um**2).mean())), float(length_um.max()), covered))
         return np.array(out)
 
 
-def median_cpu_s(work):
+def measure_median_cpu_s(work):
     times = []
     for _ in range(RUNS):
         begin_s = time.process_time()
@@ -65,36 +65,36 @@ def median_cpu_s(work):
     return statistics.median(times)
 
 
-def command_s(*arguments):
+def measure_command_s(*arguments):
     begin_s = time.perf_counter()
     subprocess.run(["optodrive", *arguments], check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - begin_s
 
 
 def bench_field():
-    lab, rows = Lab(), []
+    lab, rows = HiddenGeometryLab(), []
     for side in (17, 5, 3):
-        rms_um, most_um, covered = lab.errors(side).T
+        rms_um, max_um, covered = lab.measure_errors(side).T
         rows.append(
             (f"{side**2} spots: miss, rms length, median of {GEOMETRIES} hidden geometries", np.median(rms_um), "µm")
         )
         rows.append((f"{side**2} spots: the same, the worst geometry", rms_um.max(), "µm"))
-        rows.append((f"{side**2} spots: the largest miss of all", most_um.max(), "µm"))
+        rows.append((f"{side**2} spots: the largest miss of all", max_um.max(), "µm"))
         rows.append((f"{side**2} spots: within two stated sigmas", covered.mean(), "1"))
-    _, fit = lab.fit(0, 17)
-    field, wanted = fit.field, lab.anywhere(POINTS)
-    codes = field.codes(*wanted)
-    rows.append(("a million places to codes", median_cpu_s(lambda: field.codes(*wanted)), "s CPU"))
-    rows.append(("a million codes to places", median_cpu_s(lambda: field.position_m(*codes)), "s CPU"))
-    back = np.abs(np.subtract(field.codes(*field.position_m(*codes)), codes)).max()
-    rows.append(("to metres and back, the most", float(back), "codes"))
+    _, fit = lab.fit_spots(0, 17)
+    field, targets = fit.field, lab.sample_positions(POINTS)
+    codes = field.codes(*targets)
+    rows.append(("a million places to codes", measure_median_cpu_s(lambda: field.codes(*targets)), "s CPU"))
+    rows.append(("a million codes to places", measure_median_cpu_s(lambda: field.position_m(*codes)), "s CPU"))
+    round_trip = np.abs(np.subtract(field.codes(*field.position_m(*codes)), codes)).max()
+    rows.append(("to metres and back, the most", float(round_trip), "codes"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_field(folder / "field.toml", fit)
-        write_columns(folder / "points.csv", ("x_m", "y_m"), wanted.T, ("%.9f", "%.9f"))
+        write_columns(folder / "points.csv", ("x_m", "y_m"), targets.T, ("%.9f", "%.9f"))
         common = ["field", "--calibration", f"{folder}/field.toml", "--points"]
-        there_s = command_s(*common, f"{folder}/points.csv", "--out", f"{folder}/codes.csv")
-        back_s = command_s(*common, f"{folder}/codes.csv", "--inverse", "--out", f"{folder}/back.csv")
+        there_s = measure_command_s(*common, f"{folder}/points.csv", "--out", f"{folder}/codes.csv")
+        back_s = measure_command_s(*common, f"{folder}/codes.csv", "--inverse", "--out", f"{folder}/back.csv")
     rows.append(("optodrive field, a million lines to codes, the whole command", there_s, "s"))
     rows.append(("optodrive field --inverse, a million lines, the whole command", back_s, "s"))
     return rows

@@ -13,63 +13,63 @@ import numpy as np
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import Display, prepare
-from optodrive.planning.scheduler.visiting_path import visiting_order
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 NAIVE_SETTLE_S = 4e-4
 LKH_RUNS = 10
-CALM_US = 1_000_000
+LONG_DWELL_US = 1_000_000
 """A stay after which every move is calm."""
 EXPERIMENTS = tuple(f"experiment-{k}" for k in range(1, 7))
 
 
-class Bench:
+class OrderBenchmark:
     """A display at rest, its mirrors, and the times its moves take."""
 
     def __init__(self, name):
-        self.display = Display.of(load_config(name))
-        machine = self.display.machine
-        self.layout, self.moves, self.drive = machine.layout, machine.moves, machine.drive
+        self.display = DisplayModel.from_config(load_config(name))
+        machine = self.display.scan_head
+        self.layout, self.moves, self.drive = machine.layout, machine.settling, machine.drive
         self.x_rad, self.y_rad = machine.field.angles_rad(self.layout.x_m, self.layout.y_m)
 
-    def move_us(self, origin, pixel, lit_us=CALM_US):
+    def compute_move_us(self, origin, pixel, dwell_us=LONG_DWELL_US):
         if origin is None:
-            return self.moves.lead_us
-        return self.moves.time_us(
-            self.x_rad[pixel] - self.x_rad[origin], self.y_rad[pixel] - self.y_rad[origin], lit_us
+            return self.moves.lead_in_us
+        return self.moves.settling_us(
+            self.x_rad[pixel] - self.x_rad[origin], self.y_rad[pixel] - self.y_rad[origin], dwell_us
         )
 
-    def naive_us(self, origin, pixel, _lit_us=0):
+    def compute_naive_move_us(self, origin, pixel, _dwell_us=0):
         if origin is None:
-            return self.moves.lead_us
-        way = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))
-        return 1e6 * (NAIVE_SETTLE_S + way / self.display.config.scanner.slew_rad_per_s)
+            return self.moves.lead_in_us
+        distance_rad = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))
+        return 1e6 * (NAIVE_SETTLE_S + distance_rad / self.display.config.scanner.slew_rad_per_s)
 
     # --- orders -------------------------------------------------------------------------------------------------
 
-    def rows(self, active, _origin):
+    def order_by_row(self, active, _origin):
         return active
 
-    def ours(self, active, origin):
-        return visiting_order(active, self.layout.row, self.layout.column, self.x_rad, self.y_rad, origin)
+    def order_by_scheduler(self, active, origin):
+        return compute_visiting_order(active, self.layout.row, self.layout.column, self.x_rad, self.y_rad, origin)
 
-    def solver(self, active, origin):
+    def order_by_solver(self, active, origin):
         """LKH's shortest open path, by the times of our moves; from the origin if there is one."""
         if len(active) < 3:
             return active
         nodes = active if origin is None else np.concatenate([[origin], active])
-        times = [[self.move_us(a, b) for b in nodes.tolist()] for a in nodes.tolist()]
+        durations = [[self.compute_move_us(a, b) for b in nodes.tolist()] for a in nodes.tolist()]
         # A place that costs nothing to go to joins the ends; with an origin, nothing but that may follow it.
-        far = 10 * max(map(max, times)) * len(nodes)
+        forbidden = 10 * max(map(max, durations)) * len(nodes)
         matrix = [[0] * (len(nodes) + 1)]
-        for k, row in enumerate(times):
-            matrix.append([0 if origin is None or k else far, *row])
+        for k, row in enumerate(durations):
+            matrix.append([0 if origin is None or k else forbidden, *row])
         if origin is not None:
-            matrix[0][2:] = [far] * (len(nodes) - 1)
+            matrix[0][2:] = [forbidden] * (len(nodes) - 1)
             for row in matrix[2:]:
                 row[0] = 0
-            matrix[1][0] = far
+            matrix[1][0] = forbidden
         tour = elkai.DistanceMatrix(matrix).solve_tsp(runs=LKH_RUNS)[:-1]
         begin = tour.index(0)
         path = nodes[np.array(tour[begin + 1 :] + tour[:begin]) - 1]
@@ -77,103 +77,111 @@ class Bench:
 
     # --- drawing ------------------------------------------------------------------------------------------------
 
-    def drawn(self, frames, order_of, move_us):
+    def plan_order(self, frames, order_of, move_us):
         """Total time, light, moves (s), pulses, and the light that rounding to PWM periods added."""
-        heat = self.display.heat_at_rest()
-        now_us, standing, lit_us = 0, None, CALM_US
+        heat = self.display.build_cold_heat()
+        now_us, pixel_before, dwell_us = 0, None, LONG_DWELL_US
         light_us, exact_us, moves_us, count = 0, 0.0, 0, 0
         for target_m in frames:
-            for pixel in order_of(np.flatnonzero(target_m > 0), standing).tolist():
-                move = move_us(standing, pixel, lit_us)
-                pulse = heat.pulse_for_peak(pixel, (now_us + move) * 1e-6, float(target_m[pixel]), self.drive)
+            for pixel in order_of(np.flatnonzero(target_m > 0), pixel_before).tolist():
+                move = move_us(pixel_before, pixel, dwell_us)
+                pulse = heat.solve_pulse(pixel, (now_us + move) * 1e-6, float(target_m[pixel]), self.drive)
                 if pulse is None:
                     continue
                 width_us = round(pulse[0] * self.drive.period_s * 1e6)
                 power_w = pulse[1] * self.drive.max_power_w
                 start_s = np.array([(now_us + move) * 1e-6])
-                heat.pulses(np.array([pixel]), start_s, np.array([width_us * 1e-6]), np.array([power_w]))
+                heat.apply_pulses(np.array([pixel]), start_s, np.array([width_us * 1e-6]), np.array([power_w]))
                 now_us += move + width_us
                 moves_us, light_us, count = moves_us + move, light_us + width_us, count + 1
                 exact_us += (pulse[0] - 1 + pulse[1]) * self.drive.period_s * 1e6
-                standing, lit_us = pixel, width_us
+                pixel_before, dwell_us = pixel, width_us
         return {"total_s": now_us * 1e-6, "light_s": light_us * 1e-6, "exact_s": exact_us * 1e-6, "count": count}
 
 
-def cases(bench):
+def build_cases(bench):
     """Name to frames, each [p] metres, drawn one after the other."""
     layout, count = bench.layout, len(bench.layout)
     rng = np.random.default_rng(11)
 
-    def some(pixels, height_m=50e-6):
+    def build_target(pixels, height_m=50e-6):
         target_m = np.zeros(count)
         target_m[pixels] = height_m
         return target_m
 
     yield from ((f"full, {height} µm", [np.full(count, height * 1e-6)]) for height in (50, 100, 400))
-    yield from ((f"{n} at random, 50 µm", [some(rng.choice(count, n, replace=False))]) for n in (10, 50, 200))
-    yield "diagonal band, 50 µm", [some(np.flatnonzero(np.abs(layout.row - layout.column) < 2))]
+    yield from ((f"{n} at random, 50 µm", [build_target(rng.choice(count, n, replace=False))]) for n in (10, 50, 200))
+    yield "diagonal band, 50 µm", [build_target(np.flatnonzero(np.abs(layout.row - layout.column) < 2))]
     corners = [(5, 5), (8, 30), (30, 12), (33, 33), (20, 20)]
     near = [(np.abs(layout.row - r) < 3) & (np.abs(layout.column - c) < 3) for r, c in corners]
-    yield "five clusters, 50 µm", [some(np.flatnonzero(np.any(near, axis=0)))]
+    yield "five clusters, 50 µm", [build_target(np.flatnonzero(np.any(near, axis=0)))]
     for name, pattern, given in (("moving edge", "edge", {}), ("braille, optodrive", "text", {"text": "optodrive"})):
         sequence = build_pattern(pattern, given, bench.display.config)
         yield name, [frame.target_m for frame in sequence.frames]
 
 
-def case_rows(bench, name, frames):
-    naive = bench.drawn(frames, bench.rows, bench.naive_us)
+def measure_case(bench, name, frames):
+    naive = bench.drawn(frames, bench.rows, bench.compute_naive_move_us)
     begin_s = time.process_time()
-    strong = bench.drawn(frames, bench.solver, bench.move_us)
-    strong_s = time.process_time() - begin_s
-    ours = bench.drawn(frames, bench.ours, bench.move_us)
-    floor = bench.drawn(frames, bench.ours, lambda *_: 0)["exact_s"]
-    over_s = ours["total_s"] - floor
-    moves, rounding = ours["total_s"] - ours["light_s"], ours["light_s"] - ours["exact_s"]
-    yield f"{name}: pixels shown", ours["count"], "1"
+    solver_result = bench.drawn(frames, bench.order_by_solver, bench.compute_move_us)
+    solver_s = time.process_time() - begin_s
+    scheduler_result = bench.drawn(frames, bench.order_by_scheduler, bench.compute_move_us)
+    floor = bench.drawn(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
+    excess_s = scheduler_result["total_s"] - floor
+    moves, rounding = (
+        scheduler_result["total_s"] - scheduler_result["light_s"],
+        scheduler_result["light_s"] - scheduler_result["exact_s"],
+    )
+    yield f"{name}: pixels shown", scheduler_result["count"], "1"
     yield f"{name}: pixels a second, naive", naive["count"] / naive["total_s"], "1/s"
-    yield f"{name}: pixels a second, ours", ours["count"] / ours["total_s"], "1/s"
+    yield f"{name}: pixels a second, ours", scheduler_result["count"] / scheduler_result["total_s"], "1/s"
     yield f"{name}: beam-on share, naive", naive["light_s"] / naive["total_s"], "1"
-    yield f"{name}: beam-on share, solver's order", strong["light_s"] / strong["total_s"], "1"
-    yield f"{name}: beam-on share, ours", ours["light_s"] / ours["total_s"], "1"
+    yield f"{name}: beam-on share, solver's order", solver_result["light_s"] / solver_result["total_s"], "1"
+    yield f"{name}: beam-on share, ours", scheduler_result["light_s"] / scheduler_result["total_s"], "1"
     yield f"{name}: time over the floor, naive", naive["total_s"] / floor, "×"
-    yield f"{name}: time over the floor, solver's order", strong["total_s"] / floor, "×"
-    yield f"{name}: time over the floor, ours", ours["total_s"] / floor, "×"
-    yield f"{name}: ours over the solver's", ours["total_s"] / strong["total_s"], "×"
-    yield f"{name}: of what is over the floor, moves", moves / over_s, "1"
-    yield f"{name}: of what is over the floor, whole PWM periods", rounding / over_s, "1"
-    yield f"{name}: of what is over the floor, heat that left meanwhile", (ours["exact_s"] - floor) / over_s, "1"
-    yield f"{name}: the solver's time", strong_s, "s CPU"
+    yield f"{name}: time over the floor, solver's order", solver_result["total_s"] / floor, "×"
+    yield f"{name}: time over the floor, ours", scheduler_result["total_s"] / floor, "×"
+    yield f"{name}: ours over the solver's", scheduler_result["total_s"] / solver_result["total_s"], "×"
+    yield f"{name}: of what is over the floor, moves", moves / excess_s, "1"
+    yield f"{name}: of what is over the floor, whole PWM periods", rounding / excess_s, "1"
+    yield (
+        f"{name}: of what is over the floor, heat that left meanwhile",
+        (scheduler_result["exact_s"] - floor) / excess_s,
+        "1",
+    )
+    yield f"{name}: the solver's time", solver_s, "s CPU"
     if len(frames) == 1:
         sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, frames[0]),))
-        prepared = prepare(bench.display, sequence, *bench.display.at_rest())
-        assert abs(prepared.duration_s - ours["total_s"]) < 1e-6 or prepared.shortfall is not None, (
-            "not what is planned"
-        )
+        planned_sequence = plan_sequence(bench.display, sequence, *bench.display.build_cold_state())
+        assert (
+            abs(planned_sequence.duration_s - scheduler_result["total_s"]) < 1e-6
+            or planned_sequence.shortfall is not None
+        ), "not what is planned"
 
 
-def experiment_rows(bench, name):
+def measure_experiment(bench, name):
     """A stimulus says when its pulses come, so there is one order; what differs is how late the moves make them."""
     sequence = build_pattern(name, {}, bench.display.config)
-    prepared = prepare(bench.display, sequence, *bench.display.at_rest())
-    plan = prepared.plan
+    planned_sequence = plan_sequence(bench.display, sequence, *bench.display.build_cold_state())
+    plan = planned_sequence.plan
     light_s = float(plan.width_s.sum())
-    free_us, standing, late_us = 0.0, None, 0.0
-    for pixel, nominal_s, width_s in zip(plan.pixel.tolist(), plan.nominal_s, plan.width_s, strict=True):
-        move_us = 0.0 if pixel == standing else bench.naive_us(standing, pixel)
+    free_us, pixel_before, late_us = 0.0, None, 0.0
+    for pixel, nominal_s, width_s in zip(plan.pixel.tolist(), plan.requested_start_s, plan.width_s, strict=True):
+        move_us = 0.0 if pixel == pixel_before else bench.compute_naive_move_us(pixel_before, pixel)
         start_us = max(1e6 * nominal_s, free_us + move_us)
         late_us = max(late_us, start_us - 1e6 * nominal_s)
-        free_us, standing = start_us + 1e6 * width_s, pixel
-    yield f"{name}: pulses a second", len(plan) / prepared.duration_s, "1/s"
-    yield f"{name}: beam-on share, in its own order", light_s / prepared.duration_s, "1"
+        free_us, pixel_before = start_us + 1e6 * width_s, pixel
+    yield f"{name}: pulses a second", len(plan) / planned_sequence.duration_s, "1/s"
+    yield f"{name}: beam-on share, in its own order", light_s / planned_sequence.duration_s, "1"
     yield f"{name}: time over the light, naive", 1e-6 * free_us / light_s, "×"
-    yield f"{name}: time over the light, ours", prepared.duration_s / light_s, "×"
+    yield f"{name}: time over the light, ours", planned_sequence.duration_s / light_s, "×"
     yield f"{name}: the latest pulse is late by, naive", 1e-3 * late_us, "ms"
-    yield f"{name}: the latest pulse is late by, ours", 1e3 * prepared.train_late_s, "ms"
+    yield f"{name}: the latest pulse is late by, ours", 1e3 * planned_sequence.train_lateness_max_s, "ms"
 
 
 def bench_order():
     """Rows of the table."""
-    bench = Bench("display-1511")
-    rows = [row for name, frames in cases(bench) for row in case_rows(bench, name, frames)]
-    perceived = Bench("display-437")
-    return [*rows, *(row for name in EXPERIMENTS for row in experiment_rows(perceived, name))]
+    bench = OrderBenchmark("display-1511")
+    rows = [row for name, frames in build_cases(bench) for row in measure_case(bench, name, frames)]
+    perceived = OrderBenchmark("display-437")
+    return [*rows, *(row for name in EXPERIMENTS for row in measure_experiment(perceived, name))]

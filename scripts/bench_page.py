@@ -10,36 +10,39 @@ from statistics import median
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("system", "browser")]
 
-SECONDS, LOOKS = 12, 300
+SECONDS, SNAPSHOTS = 12, 300
 PERIODS_S = 20.0
 
 
-def look_rows():
+def measure_snapshots():
     """Wall time of one look at heat and of one at the budget, half of the display lit."""
     import numpy as np
 
-    from optodrive.daemon.engine.display_snapshot import Executed, LiveHeat
+    from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
     from optodrive.device.config import load_config
-    from optodrive.planning.pipeline import Display, warm_up
+    from optodrive.planning.pipeline import DisplayModel, warm_up
 
-    display = Display.of(load_config("display-1511"))
+    display = DisplayModel.from_config(load_config("display-1511"))
     warm_up(display)
-    live, pixel = LiveHeat(display), np.arange(0, 1511, 2)
+    live, pixel = LiveThermalState(display), np.arange(0, 1511, 2)
     count, none = len(pixel), np.zeros(len(pixel))
     start_s = 5e-3 * np.arange(count)
-    live.take(Executed(None, pixel, pixel, start_s, np.full(count, 4e-3), np.full(count, 2.0), none, none))
+    live.apply(ExecutedBatch(None, pixel, pixel, start_s, np.full(count, 4e-3), np.full(count, 2.0), none, none))
     rows = []
-    for what, look in (("a look at all heights", live.at), ("a look at the budget", live.usage)):
+    for what, compute_snapshot in (
+        ("a look at all heights", live.state_at),
+        ("a look at the budget", live.compute_usage),
+    ):
         taken_s = []
-        for k in range(LOOKS):
+        for k in range(SNAPSHOTS):
             begin_s = time.perf_counter()
-            look(5e-3 * count + 0.033 * k)
+            compute_snapshot(5e-3 * count + 0.033 * k)
             taken_s.append(time.perf_counter() - begin_s)
         rows.append((what, 1e3 * median(taken_s), "ms"))
     return rows
 
 
-def page_rows():
+def measure_page():
     """Frames that the page painted in each second, and what the daemon's loop bore of it."""
     from rig import Board, Daemon
     from window import Visit, chromium
@@ -54,10 +57,10 @@ def page_rows():
                 daemon.arm()
                 daemon.call("POST", "/v1/patterns/all", json={"height_um": 30, "seconds": PERIODS_S})
                 daemon.call("POST", "/v1/patterns/all", json={"height_um": 30, "seconds": PERIODS_S})
-                counted = [(time.monotonic(), _frames(page))]
+                counted = [(time.monotonic(), _read_frame_count(page))]
                 for _ in range(SECONDS):
                     time.sleep(1.0)
-                    counted.append((time.monotonic(), _frames(page)))
+                    counted.append((time.monotonic(), _read_frame_count(page)))
                 state = daemon.state()
         finally:
             if daemon is not None:
@@ -73,10 +76,10 @@ def page_rows():
     ]
 
 
-def _frames(page):
+def _read_frame_count(page):
     return int(page.locator("#display").get_attribute("data-frames"))
 
 
 def bench_page():
     """Looks, then the page itself."""
-    return look_rows() + page_rows()
+    return measure_snapshots() + measure_page()

@@ -20,13 +20,13 @@ import numpy as np
 
 RUNS = 50
 MINUTE_S, FULL_HZ = 60.0, 16.0
-PIXELS, ACTIVE, RATE_HZ, SECONDS, CALLERS = 1511, 200, 20.0, 15.0, 4
+PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
 TOKEN = "a-token-for-a-benchmark"
 CONFIG = Path(__file__).parents[1] / "configs" / "display-1511.toml"
-UNBOUNDED = "\n[daemon]\nrequests_per_s = 100000\nrequests_burst = 100000\n"
+UNLIMITED_RATES = "\n[daemon]\nrequests_per_s = 100000\nrequests_burst = 100000\n"
 """The load is the daemon's to carry, not its doorkeeper's to turn away."""
 
-BARE = """
+BARE_SERVER = """
 import sys
 import uvicorn
 from fastapi import FastAPI, Request
@@ -45,24 +45,24 @@ uvicorn.run(app, port=int(sys.argv[1]), log_level="warning", access_log=False)
 """
 
 
-def random_frame(rng):
+def build_random_frame(rng):
     pixels = rng.choice(PIXELS, ACTIVE, replace=False)
     return {str(pixel): 60.0 for pixel in pixels.tolist()}
 
 
-def planning_rows():
+def measure_planning():
     """CPU time of everything between a frame and its proven bytes: plan, limit, predict, quantise, decode, verify."""
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.device.config import load_config
     from optodrive.link.protocol.quantisation import decode, quantise
-    from optodrive.link.session.board_requirements import Requirements
+    from optodrive.link.session.board_requirements import BoardRequirements
     from optodrive.planning.limiter.limiter import verify
-    from optodrive.planning.pipeline import Display, prepare
+    from optodrive.planning.pipeline import DisplayModel, plan_sequence
 
-    display = Display.of(load_config("display-1511"))
-    scale = Requirements.of(display.config).scale
+    display = DisplayModel.from_config(load_config("display-1511"))
+    scale = BoardRequirements.from_config(display.config).scale
     rng = np.random.default_rng(5)
-    heat, budget = display.at_rest()
+    heat, budget = display.build_cold_state()
     rows, times = [], []
     for active in (10, 50, ACTIVE, PIXELS):
         times.clear()
@@ -71,9 +71,9 @@ def planning_rows():
             target[rng.choice(PIXELS, active, replace=False)] = 60e-6
             sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
             begin_s = time.process_time()
-            prepared = prepare(display, sequence, heat, budget, standing_on=7)
+            prepared = plan_sequence(display, sequence, heat, budget, initial_pixel=7)
             points = quantise(prepared.plan, scale)
-            decoded = decode(points.payload(), scale)
+            decoded = decode(points.encode_payload(), scale)
             verify(prepared.plan, points.row[decoded.index], decoded, budget, display.budget)
             times.append(time.process_time() - begin_s)
         rows.append(
@@ -82,20 +82,20 @@ def planning_rows():
     return rows
 
 
-class Load:
+class RequestLoad:
     """Callers that ask for the state as fast as they are answered."""
 
     def __init__(self, url):
         self._url = url
         self._stop = threading.Event()
-        self._threads = [threading.Thread(target=self._ask, daemon=True) for _ in range(CALLERS)]
-        self.asked = 0
+        self._threads = [threading.Thread(target=self._send_requests, daemon=True) for _ in range(CLIENTS)]
+        self.answered = 0
 
-    def _ask(self):
+    def _send_requests(self):
         with httpx.Client(base_url=self._url, headers={"Authorization": f"Bearer {TOKEN}"}) as client:
             while not self._stop.is_set():
                 client.get("/v1/state")
-                self.asked += 1
+                self.answered += 1
 
     def __enter__(self):
         for thread in self._threads:
@@ -108,14 +108,14 @@ class Load:
             thread.join()
 
 
-def pushed(url):
+def push_frames(url):
     """Round trips of frames pushed at the rate, s, and the daemon's own answers."""
     rng = np.random.default_rng(7)
     trips, answers = [], []
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:
         next_s = time.monotonic()
         for _ in range(int(RATE_HZ * SECONDS)):
-            body = json.dumps({"frames": [{"show_at_s": 0, "duration_s": 60, "target_um": random_frame(rng)}]})
+            body = json.dumps({"frames": [{"show_at_s": 0, "duration_s": 60, "target_um": build_random_frame(rng)}]})
             begin_s = time.monotonic()
             response = client.post("/v1/plans", params={"newest": True}, content=body)
             trips.append(time.monotonic() - begin_s)
@@ -134,32 +134,32 @@ def pushed(url):
         )
 
 
-def a_minute():
+def measure_full_frames():
     """Full frames that ripple over the display, as fast as 16 a second, without other callers; from rest to the end."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.daemon.engine.engine import Engine
     from optodrive.device.config import load_config
     from optodrive.link.transport.simulated import SimulatedBoard
-    from optodrive.planning.pipeline import Display
+    from optodrive.planning.pipeline import DisplayModel
 
-    display = Display.of(load_config("display-1511"))
+    display = DisplayModel.from_config(load_config("display-1511"))
     board = SimulatedBoard("", 1_000_000)
     engine = Engine(display, board, MonotonicClock())
     engine.start()
     engine.arm().result(10)
-    plans, misses, lights, open_plans = [], [], [], []
+    plans, errors, first_light_s, open_plans = [], [], [], []
 
-    def take(plan):
-        engine.ending(plan).result(20)
-        record = engine.plan(plan)
+    def collect(plan):
+        engine.get_end_future(plan).result(20)
+        record = engine.get_plan(plan)
         if record["executed"]:
             asked_um = dict(zip(record["pulses"]["pixel"], record["pulses"]["target_um"], strict=True))
             done = record["executed_pulses"]
-            misses.extend(
+            errors.extend(
                 um / asked_um[pixel] - 1 for pixel, um in zip(done["pixel"], done["simulated_um"], strict=True)
             )
-            lights.append(record["latency"]["first_light_s"])
+            first_light_s.append(record["latency"]["first_light_s"])
             plans.append(set(done["pixel"]))
 
     try:
@@ -170,32 +170,32 @@ def a_minute():
             sequence = FrameSequence((TactileFrame(str(k), 0.0, 3600.0, target),))
             open_plans.append(engine.submit(lambda s=sequence: s, "frame", streamed=True).result(20)["plan"])
             if len(open_plans) > 5:
-                take(open_plans.pop(0))
+                collect(open_plans.pop(0))
             time.sleep(max(0.0, begin_s + (k + 1) / FULL_HZ - time.monotonic()))
         engine.end_stream().result(10)
         time.sleep(1.0)
         for plan in open_plans:
-            take(plan)
+            collect(plan)
         underruns = engine.snapshot()["board"]["underruns"]
     finally:
         engine.close()
         board.release()
     name = f"full frames, {FULL_HZ:g} a second for {MINUTE_S:g} s, no other callers"
     return [
-        (f"{name}: arrival to first light, median", 1e3 * statistics.median(lights), "ms"),
-        (f"{name}: the same, largest", 1e3 * max(lights), "ms"),
+        (f"{name}: arrival to first light, median", 1e3 * statistics.median(first_light_s), "ms"),
+        (f"{name}: the same, largest", 1e3 * max(first_light_s), "ms"),
         (f"{name}: pixels lit", len(set().union(*plans)), "1"),
-        (f"{name}: largest error of a height", float(np.abs(misses).max()), "1"),
+        (f"{name}: largest error of a height", float(np.abs(errors).max()), "1"),
         (f"{name}: times the board ran out of points", underruns, "1"),
     ]
 
 
-def in_a_process(arguments, environment, ready):
+def start_process(arguments, environment, ready):
     process = subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
     return process, ready(process)
 
 
-def wait_for_bare(port):
+def make_bare_url_reader(port):
     def ready(_):
         while True:
             try:
@@ -207,11 +207,11 @@ def wait_for_bare(port):
     return ready
 
 
-def of_daemon(process):
+def read_daemon_url(process):
     return process.stdout.readline().split(" on ")[1].split(",")[0]
 
 
-def percentiles(name, values, unit="ms"):
+def format_percentiles(name, values, unit="ms"):
     return [
         (f"{name}, {label}", 1e3 * float(np.percentile(values, at)), unit)
         for label, at in (("median", 50), ("p99", 99))
@@ -220,42 +220,42 @@ def percentiles(name, values, unit="ms"):
 
 def bench_stream():
     """Rows of the table."""
-    rows = planning_rows()
+    rows = measure_planning()
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": folder}
         script = Path(folder) / "bare.py"
-        script.write_text(BARE)
-        bare, url = in_a_process([sys.executable, script, "8459"], environment, wait_for_bare(8459))
+        script.write_text(BARE_SERVER)
+        bare_server, url = start_process([sys.executable, script, "8459"], environment, make_bare_url_reader(8459))
         try:
-            with Load(url):
-                bare_trips, *_ = pushed(url)
+            with RequestLoad(url):
+                bare_trips, *_ = push_frames(url)
         finally:
-            bare.terminate()
+            bare_server.terminate()
         optodrive = Path(sys.executable).with_name("optodrive")
         config = Path(folder) / "config.toml"
-        config.write_text(CONFIG.read_text() + UNBOUNDED)
+        config.write_text(CONFIG.read_text() + UNLIMITED_RATES)
         command = [optodrive, "serve", "--config", config, "--port", "0"]
-        daemon, url = in_a_process(command, environment, of_daemon)
+        daemon, url = start_process(command, environment, read_daemon_url)
         try:
             httpx.post(f"{url}/v1/arm", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=10).raise_for_status()
-            with Load(url) as load:
-                trips, _, state, plans = pushed(url)
+            with RequestLoad(url) as load:
+                trips, _, state, plans = push_frames(url)
         finally:
             daemon.terminate()
-    ended = [plan for plan in plans if plan["latency"]["first_light_s"] is not None]
-    rows += [("callers besides, questions answered a second", load.asked / SECONDS, "1/s")]
-    rows += percentiles("a frame's round trip over REST", trips)
-    rows += percentiles("the same to a bare FastAPI", bare_trips)
+    finished = [plan for plan in plans if plan["latency"]["first_light_s"] is not None]
+    rows += [("callers besides, questions answered a second", load.answered / SECONDS, "1/s")]
+    rows += format_percentiles("a frame's round trip over REST", trips)
+    rows += format_percentiles("the same to a bare FastAPI", bare_trips)
     for key, name in (
         ("planned_s", "arrival to plan taken on"),
         ("first_byte_s", "arrival to first byte to the board"),
         ("first_light_s", "arrival to first light"),
     ):
-        rows += percentiles(name, [plan["latency"][key] for plan in ended])
+        rows += format_percentiles(name, [plan["latency"][key] for plan in finished])
     rows += [
         (
             "share of the p99 to the first byte that a bare FastAPI takes too",
-            float(np.percentile(bare_trips, 99) / np.percentile([p["latency"]["first_byte_s"] for p in ended], 99)),
+            float(np.percentile(bare_trips, 99) / np.percentile([p["latency"]["first_byte_s"] for p in finished], 99)),
             "1",
         ),
         (
@@ -265,4 +265,4 @@ def bench_stream():
         ),
         ("times the board ran out of points", state["board"]["underruns"], "1"),
     ]
-    return rows + a_minute()
+    return rows + measure_full_frames()

@@ -17,13 +17,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "blind"))
 
-FIRST = {"dev": 9_000_000, "report": 3_000_000}
+FIRST_SEEDS = {"dev": 9_000_000, "report": 3_000_000}
 SAMPLES = 30_000
-KEPT = 2
+THINNED_GROUPS = 2
 """Groups of runs in a thinned recording."""
 
 
-def examine(task: tuple[str, int]) -> dict[str, Any]:
+def run_case(task: tuple[str, int]) -> dict[str, Any]:
     """One case: drawn, diagnosed, and once more after the experiment that the answer asks for."""
     from blind_lab import draw
     from blind_score import score
@@ -33,20 +33,26 @@ def examine(task: tuple[str, int]) -> dict[str, Any]:
         try:
             case = draw("single" if block == "thin" else block, seed, folder)
             if block == "thin":
-                thin(case.path, seed)
+                thin_recording(case.path, seed)
         except RuntimeError as error:  # some seeds hide nothing that could be seen
             return {"block": block, "seed": seed, "skipped": str(error)}
-        told = answered(case.path)
-        after, ask = None, told["next_experiment"]
-        if told["verdict"] == "ambiguous" and ask is not None:
-            after = answered(
-                case.measure(ask["pulses"], ask["signals"], folder, pixel=ask["pixel"], repeats=ask["repeats"])
+        answer = diagnose_recording(case.path)
+        repeated_answer, experiment = None, answer["next_experiment"]
+        if answer["verdict"] == "ambiguous" and experiment is not None:
+            repeated_answer = diagnose_recording(
+                case.measure(
+                    experiment["pulses"],
+                    experiment["signals"],
+                    folder,
+                    pixel=experiment["pixel"],
+                    repeats=experiment["repeats"],
+                )
             )
-        marked = replace(score(case, told, after=after), block=block)
-    return {"score": marked, "baselines": baselines(told), "answer": told}
+        scored = replace(score(case, answer, after=repeated_answer), block=block)
+    return {"score": scored, "baselines": name_baseline_causes(answer), "answer": answer}
 
 
-def thin(path: Path, seed: int) -> None:
+def thin_recording(path: Path, seed: int) -> None:
     """Leave a few groups of a recording: what a lab in a hurry measures, and what makes causes look alike."""
     import h5py
     import numpy as np
@@ -54,41 +60,43 @@ def thin(path: Path, seed: int) -> None:
     with h5py.File(path, "a") as file:
         runs = file["runs"]
         groups = sorted({run.attrs["group"] for run in runs.values()})
-        kept = set(np.random.default_rng([seed, 5]).choice(groups, min(KEPT, len(groups)), replace=False).tolist())
-        for name in [name for name, run in runs.items() if run.attrs["group"] not in kept]:
+        kept_groups = set(
+            np.random.default_rng([seed, 5]).choice(groups, min(THINNED_GROUPS, len(groups)), replace=False).tolist()
+        )
+        for name in [name for name, run in runs.items() if run.attrs["group"] not in kept_groups]:
             del runs[name]
 
 
-def answered(path: Path) -> dict[str, Any]:
+def diagnose_recording(path: Path) -> dict[str, Any]:
     """The answer as the command line gives it."""
     from optodrive.lab.diagnosis.diagnose import diagnose
-    from optodrive.lab.diagnosis.narrative import answer
-    from optodrive.lab.diagnosis.priors import prior_of
+    from optodrive.lab.diagnosis.narrative import build_answer
+    from optodrive.lab.diagnosis.priors import build_prior
     from optodrive.lab.recording import read_recording
 
     measurement = read_recording(path)
-    prior, epsilon, _ = prior_of(measurement, None)
-    return json.loads(json.dumps(answer(diagnose(measurement, 0, prior, epsilon))))
+    prior, epsilon, _ = build_prior(measurement, None)
+    return json.loads(json.dumps(build_answer(diagnose(measurement, 0, prior, epsilon))))
 
 
-def baselines(told: dict[str, Any]) -> dict[str, str]:
+def name_baseline_causes(answer: dict[str, Any]) -> dict[str, str]:
     """What simpler rules would have named, from the same likelihood ratios; "" for nothing."""
     from math import log
 
-    from optodrive.physics.terms import known_terms
+    from optodrive.physics.terms import discover_terms
 
     def best(price: float) -> str:
-        worth = {
-            item["cause"]: item["statistic"] - price * len(known_terms()[item["cause"]].parameters) for item in rows
+        criterion = {
+            item["cause"]: item["statistic"] - price * len(discover_terms()[item["cause"]].parameters) for item in rows
         }
-        name = max(worth, key=worth.__getitem__)
-        return name if worth[name] > 0 else ""
+        name = max(criterion, key=criterion.__getitem__)
+        return name if criterion[name] > 0 else ""
 
-    rows = told["candidates"]
+    rows = answer["candidates"]
     return {"largest R²": best(0.0), "AIC": best(2.0), "BIC": best(log(SAMPLES))}
 
 
-def compared(done: list[dict[str, Any]]) -> str:
+def format_comparison(done: list[dict[str, Any]]) -> str:
     """Simple rules beside the verdicts: they always name one."""
     from blind_score import wilson
 
@@ -127,34 +135,34 @@ def main() -> None:
     from blind_score import table
 
     parser = argparse.ArgumentParser(prog="scripts/bench blind")
-    parser.add_argument("--seeds", choices=tuple(FIRST), default="dev")
+    parser.add_argument("--seeds", choices=tuple(FIRST_SEEDS), default="dev")
     parser.add_argument("--nulls", type=int, default=24)
     parser.add_argument("--cases", type=int, default=18, help="of each other block")
     parser.add_argument("--thin", type=int, help="instead: so many cases of one cause, two groups of runs each")
     parser.add_argument("--skip", type=int, default=0, help="so many seeds of each block")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--keep", type=Path, help="folder for the answers")
-    chosen = parser.parse_args()
-    first = FIRST[chosen.seeds] + chosen.skip
-    counts = {"none": chosen.nulls, "single": chosen.cases, "unknown": chosen.cases, "pair": chosen.cases}
-    if chosen.thin:
-        counts = {"thin": chosen.thin}
+    options = parser.parse_args()
+    first = FIRST_SEEDS[options.seeds] + options.skip
+    counts = {"none": options.nulls, "single": options.cases, "unknown": options.cases, "pair": options.cases}
+    if options.thin:
+        counts = {"thin": options.thin}
     tasks = [(block, first + row) for block, count in counts.items() for row in range(count)]
-    with ProcessPoolExecutor(chosen.workers) as pool:
+    with ProcessPoolExecutor(options.workers) as pool:
         done = list(
-            track(pool.map(examine, tasks), total=len(tasks), console=Console(stderr=True), description="blind")
+            track(pool.map(run_case, tasks), total=len(tasks), console=Console(stderr=True), description="blind")
         )
-    if chosen.keep is not None:
-        chosen.keep.mkdir(parents=True, exist_ok=True)
+    if options.save is not None:
+        options.save.mkdir(parents=True, exist_ok=True)
         for (block, seed), item in zip(tasks, done, strict=True):
             if "answer" in item:
-                (chosen.keep / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
+                (options.save / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
     for item in done:
         if "skipped" in item:
             print(f"not drawn: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
-    told = [item for item in done if "score" in item]
-    print(table(item["score"] for item in told))
-    print(compared(told))
+    scored = [item for item in done if "score" in item]
+    print(table(item["score"] for item in scored))
+    print(format_comparison(scored))
 
 
 if __name__ == "__main__":

@@ -11,16 +11,16 @@ import sys
 import numpy as np
 from scipy.optimize import least_squares
 
-from optodrive.lab.validation.extended_outcomes import outcomes
-from optodrive.physics.paper_facts import paper_facts
+from optodrive.lab.validation.extended_outcomes import simulate_outcomes
+from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import Parameter, load_parameters
 
 HALVES = {
     "first": ("dT_peak_w020", "z_peak_w020", "dpp_200Hz", "F_peak_w020"),
     "second": ("T_peak_w075", "z_peak_w075", "z_tp8_w040", "F_peak_w055"),
 }
-JUDGED = ("dT_peak_w020", "T_peak_w075", "z_peak_w020", "z_peak_w075", "z_tp8_w040", "F_peak_w020", "F_peak_w055")
-JUDGED += ("N_50um", "N_400um", "dpp_200Hz", "dpp_law", "slow_law")
+JUDGED_FACTS = ("dT_peak_w020", "T_peak_w075", "z_peak_w020", "z_peak_w075", "z_tp8_w040", "F_peak_w020", "F_peak_w055")
+JUDGED_FACTS += ("N_50um", "N_400um", "dpp_200Hz", "dpp_law", "slow_law")
 MODELS = {
     "nominal": (),
     "bridge_conductivity": ("bridge_conductivity",),
@@ -29,74 +29,79 @@ MODELS = {
     "wall_heating": ("wall_heating",),
     "all": ("bridge_conductivity", "gas_membrane", "force_area", "wall_heating", "lateral_conduction", "touch_surface"),
 }
-FREE = {"n": (0.05, 0.0, 1.3), "share": (0.3, 0.1, 0.5), "tau_g": (3.0, 0.3, 30.0), "area": (1.0, 0.1, 7.07)}
-FREE |= {"kappa": (4.0, 0.5, 20.0), "phi": (0.23, 0.02, 2.0)}
+FREE_PARAMETERS = {"n": (0.05, 0.0, 1.3), "share": (0.3, 0.1, 0.5), "tau_g": (3.0, 0.3, 30.0), "area": (1.0, 0.1, 7.07)}
+FREE_PARAMETERS |= {"kappa": (4.0, 0.5, 20.0), "phi": (0.23, 0.02, 2.0)}
 UNITS = {"n": "1", "share": "1", "tau_g": "s", "area": "m^2", "kappa": "m/K", "phi": "N/K"}
-SCALE = {"tau_g": 1e-3, "area": 1e-6, "kappa": 1e-6, "phi": 1e-3}
+UNIT_SCALES = {"tau_g": 1e-3, "area": 1e-6, "kappa": 1e-6, "phi": 1e-3}
 
 
-def free_of(terms):
+def list_free_parameters(terms):
     """What a model has to be fitted: a quantity that a term takes over is the term's."""
     names = ["share" if "gas_membrane" in terms else "kappa", "tau_g", "area" if "force_area" in terms else "phi"]
     return names + (["n"] if "bridge_conductivity" in terms else [])
 
 
-def made(base, terms, values):
+def build_parameters(base, terms, values):
     """The parameter set of a model with these values, in FREE's units."""
 
-    def one(name):
-        return Parameter(value=values[name] * SCALE.get(name, 1.0), unit=UNITS[name], source="fitted")
+    def build_parameter(name):
+        return Parameter(value=values[name] * UNIT_SCALES.get(name, 1.0), unit=UNITS[name], source="fitted")
 
-    share = one("share") if "share" in values else Parameter(value=0.3, unit="1", source="assumed")
-    chosen = {key: base.terms[key] for key in terms}
-    if "bridge_conductivity" in chosen:
-        chosen["bridge_conductivity"] = {"exponent": one("n")}
-    if "gas_membrane" in chosen:
-        chosen["gas_membrane"] = chosen["gas_membrane"] | {"share": share}
-    if "force_area" in chosen:
-        chosen["force_area"] = {"area": one("area"), "share": share}
-    own = {name: one(name) for name in ("kappa", "tau_g", "phi") if name in values}
-    return base.model_copy(update={"terms": chosen, **own})
+    share = build_parameter("share") if "share" in values else Parameter(value=0.3, unit="1", source="assumed")
+    chosen_terms = {key: base.terms[key] for key in terms}
+    if "bridge_conductivity" in chosen_terms:
+        chosen_terms["bridge_conductivity"] = {"exponent": build_parameter("n")}
+    if "gas_membrane" in chosen_terms:
+        chosen_terms["gas_membrane"] = chosen_terms["gas_membrane"] | {"share": share}
+    if "force_area" in chosen_terms:
+        chosen_terms["force_area"] = {"area": build_parameter("area"), "share": share}
+    base_parameters = {name: build_parameter(name) for name in ("kappa", "tau_g", "phi") if name in values}
+    return base.model_copy(update={"terms": chosen_terms, **base_parameters})
 
 
-def fitted(base, terms, half):
+def fit_terms(base, terms, half):
     """Values that meet a half's facts best, in the logarithm of model over measured."""
-    facts, names = paper_facts(), free_of(terms)
+    facts, names = load_paper_facts(), list_free_parameters(terms)
     shown = [fact for fact in HALVES[half] if "n" in names or "T_peak" not in fact]
 
-    def misses(x):
-        said = outcomes(made(base, terms, dict(zip(names, x, strict=True))))
-        return [np.log(facts[fact].ratio(said[fact])) for fact in shown]
+    def compute_residuals(x):
+        predicted = simulate_outcomes(build_parameters(base, terms, dict(zip(names, x, strict=True))))
+        return [np.log(facts[fact].ratio(predicted[fact])) for fact in shown]
 
-    start, low, high = (np.array([FREE[name][k] for name in names]) for k in range(3))
-    best = least_squares(misses, start, bounds=(low, high), x_scale=start, diff_step=1e-3, xtol=1e-7, ftol=1e-9)
+    start, low, high = (np.array([FREE_PARAMETERS[name][k] for name in names]) for k in range(3))
+    best = least_squares(
+        compute_residuals, start, bounds=(low, high), x_scale=start, diff_step=1e-3, xtol=1e-7, ftol=1e-9
+    )
     return dict(zip(names, best.x.tolist(), strict=True)), shown
 
 
-def gains():
+def measure_gains():
     """Model → half → values, ratios, and the error on what it was not shown."""
-    base, facts = load_parameters("extended"), paper_facts()
-    told = {}
+    base, facts = load_parameters("extended"), load_paper_facts()
+    results = {}
     for model, terms in MODELS.items():
         for half in HALVES:
-            values, shown = fitted(base, terms, half)
-            said = outcomes(made(base, terms, values))
-            ratios = {fact: facts[fact].ratio(said[fact]) for fact in JUDGED}
-            unseen = [fact for fact in JUDGED if fact not in HALVES[half] and fact != "N_50um"]
+            values, shown = fit_terms(base, terms, half)
+            predicted = simulate_outcomes(build_parameters(base, terms, values))
+            ratios = {fact: facts[fact].ratio(predicted[fact]) for fact in JUDGED_FACTS}
+            unseen = [fact for fact in JUDGED_FACTS if fact not in HALVES[half] and fact != "N_50um"]
             error = float(np.sqrt(np.mean([np.log(ratios[fact]) ** 2 for fact in unseen])))
-            told[f"{model}, {half} half"] = {"values": values, "ratios": ratios, "shown": shown, "error": error}
+            results[f"{model}, {half} half"] = {"values": values, "ratios": ratios, "shown": shown, "error": error}
             print(model, half, values, f"{100 * error:.1f} %", file=sys.stderr)
-    return told
+    return results
 
 
-def table(told):
+def format_table(results):
     """Markdown: ratios by model; bold where the fact was shown to the fit."""
-    lines = ["| model | half shown | " + " | ".join(JUDGED) + " | error unseen |", "| --- " * (len(JUDGED) + 3) + "|"]
-    for name, row in told.items():
+    lines = [
+        "| model | half shown | " + " | ".join(JUDGED_FACTS) + " | error unseen |",
+        "| --- " * (len(JUDGED_FACTS) + 3) + "|",
+    ]
+    for name, row in results.items():
         model, half = name.removesuffix(" half").split(", ")
         cells = [
             f"**{row['ratios'][fact]:.2f}**" if fact in row["shown"] else f"{row['ratios'][fact]:.2f}"
-            for fact in JUDGED
+            for fact in JUDGED_FACTS
         ]
         lines.append(f"| {model} | {half} | " + " | ".join(cells) + f" | {100 * row['error']:.0f} % |")
     return "\n".join(lines)
@@ -105,8 +110,8 @@ def table(told):
 def main():
     parser = argparse.ArgumentParser(prog="scripts/calibrate-extended", description=__doc__)
     parser.add_argument("--json", action="store_true")
-    told = gains()
-    print(json.dumps(told, indent=2) if parser.parse_args().json else table(told))
+    results = measure_gains()
+    print(json.dumps(results, indent=2) if parser.parse_args().json else format_table(results))
 
 
 if __name__ == "__main__":

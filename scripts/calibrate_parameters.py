@@ -7,9 +7,9 @@ from statistics import stdev
 
 from scipy.optimize import brentq
 
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from optodrive.lab.validation.paper_outcomes import FITTED_ON, OUTCOMES
-from optodrive.physics.paper_facts import paper_facts
+from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import Parameter, ParameterSet, load_parameters
 
 BRACKETS = {"kappa": (1e-7, 1e-4), "tau_g": (2e-4, 5e-2), "phi": (1e-6, 1e-1)}
@@ -21,7 +21,7 @@ SCATTER = {
 }
 """Facts whose scatter, each taken alone with the other parameters held, is a parameter's sigma."""
 
-LEFT_OUT = {"tau_g": ("N_50um",)}
+EXCLUDED_FACTS = {"tau_g": ("N_50um",)}
 """What contradicts the facts of SCATTER at every width of Table S3; its width is not given either."""
 
 CLAIMS = """\
@@ -34,59 +34,63 @@ tau_g takes its ripple to be at full power, which the paper does not say: a tent
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=shipped_path("parameters", "calibrated.toml"))
+    parser.add_argument("--out", type=Path, default=locate_shipped("parameters", "calibrated.toml"))
     out = parser.parse_args().out
-    fitted = fit(load_parameters("paper_s1_literal"))
-    alone = {name: {fact: solve(fitted, name, fact) for fact in facts} for name, facts in SCATTER.items()}
-    sigmas = {name: stdev(values.values()) for name, values in alone.items()}
+    fitted = fit_parameters(load_parameters("paper_s1_literal"))
+    single_fact_values = {
+        name: {fact: solve_for_fact(fitted, name, fact) for fact in facts} for name, facts in SCATTER.items()
+    }
+    sigmas = {name: stdev(values.values()) for name, values in single_fact_values.items()}
     for name, fact in FITTED_ON.items():
         value = getattr(fitted, name).value
         print(f"{name:6} {value:.4g} ± {sigmas[name]:.2g} {UNITS[name]}, fitted on {fact}")
-        for other, implied in alone[name].items():
+        for other, implied in single_fact_values[name].items():
             print(f"         {other:12} alone asks for {implied:.4g}")
-        for other in LEFT_OUT.get(name, ()):
-            print(f"         {other:12} alone asks for {solve(fitted, name, other):.4g} (left out: met at no width)")
-    out.write_text(as_toml(fitted, sigmas), encoding="utf-8")
+        for other in EXCLUDED_FACTS.get(name, ()):
+            print(
+                f"         {other:12} alone asks for {solve_for_fact(fitted, name, other):.4g} (left out: met at no width)"
+            )
+    out.write_text(format_toml(fitted, sigmas), encoding="utf-8")
     print(f"written {out}")
 
 
-def fit(start: ParameterSet) -> ParameterSet:
+def fit_parameters(start: ParameterSet) -> ParameterSet:
     """Solves the parameters' facts in turn until nothing moves: kappa and tau_g act on both of theirs."""
     current = start
     while True:
         previous = current
         for name, fact in FITTED_ON.items():
-            current = with_value(current, name, solve(current, name, fact))
+            current = replace_value(current, name, solve_for_fact(current, name, fact))
         if all(abs(getattr(current, n).value / getattr(previous, n).value - 1) < 1e-9 for n in FITTED_ON):
             return current
 
 
-def solve(parameters: ParameterSet, name: str, fact: str) -> float:
+def solve_for_fact(parameters: ParameterSet, name: str, fact: str) -> float:
     """The value of one parameter at which one fact is met, the others held."""
     low, high = BRACKETS[name]
-    measured = paper_facts()[fact].value
-    miss = OUTCOMES[fact]
-    return float(brentq(lambda v: miss(with_value(parameters, name, v)) / measured - 1.0, low, high, rtol=1e-12))
+    measured = load_paper_facts()[fact].value
+    outcome = OUTCOMES[fact]
+    return float(brentq(lambda v: outcome(replace_value(parameters, name, v)) / measured - 1.0, low, high, rtol=1e-12))
 
 
-def with_value(parameters: ParameterSet, name: str, value: float) -> ParameterSet:
+def replace_value(parameters: ParameterSet, name: str, value: float) -> ParameterSet:
     """The set with one parameter replaced."""
     parameter = Parameter(value=value, unit=UNITS[name], source=f"fitted on {FITTED_ON[name]}")
     return parameters.model_copy(update={name: parameter})
 
 
-def as_toml(fitted: ParameterSet, sigmas: dict[str, float]) -> str:
+def format_toml(fitted: ParameterSet, sigmas: dict[str, float]) -> str:
     """The calibrated set as a file; what is the paper's own is copied from the literal set's file."""
-    own = shipped_path("parameters", "paper_s1_literal.toml").read_text(encoding="utf-8")
+    own = locate_shipped("parameters", "paper_s1_literal.toml").read_text(encoding="utf-8")
     epsilon = re.search(r"\[epsilon\].*?(?=\n\[)", own, re.DOTALL).group()
     absorber = own[own.index("[R_width_product]") :]
     head = f'format = "optodrive-parameters"\nversion = 1\nname = "calibrated"\nclaims = """\n{CLAIMS}"""\n'
     return "\n".join(
-        [head, epsilon, *(_block(fitted, name, sigmas[name]) for name in ("tau_g", "kappa", "phi")), absorber]
+        [head, epsilon, *(_format_block(fitted, name, sigmas[name]) for name in ("tau_g", "kappa", "phi")), absorber]
     )
 
 
-def _block(fitted: ParameterSet, name: str, sigma: float) -> str:
+def _format_block(fitted: ParameterSet, name: str, sigma: float) -> str:
     source = f"fitted on {FITTED_ON[name]}; sigma: scatter of what {', '.join(SCATTER[name])} ask for alone"
     value = getattr(fitted, name).value
     return f'[{name}]\nvalue = {value:.4g}\nunit = "{UNITS[name]}"\nsigma = {sigma:.2g}\nsource = "{source}"\n'

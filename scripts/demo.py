@@ -11,23 +11,23 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from optodrive.client.http import Remote
+from optodrive.client.http import DaemonClient
 from optodrive.core.errors import LinkError, OptodriveError, RefusedError
-from optodrive.daemon.web.tokens import token_path
+from optodrive.daemon.web.tokens import build_tokens_path
 
-PROGRAMME = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
+PATTERNS = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
 START_TIMEOUT_S = 30.0
 COLUMNS = ("pattern", "planned", "sent", "executed", "asked µm", "got µm")
 
 
-def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], Remote]:
-    token_path(port).unlink(missing_ok=True)
+def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
+    build_tokens_path(port).unlink(missing_ok=True)
     optodrive = Path(sys.executable).with_name("optodrive")
     daemon = subprocess.Popen([optodrive, "serve", "--port", str(port)])
-    give_up_s = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < give_up_s and daemon.poll() is None:
-        if token_path(port).exists():
-            remote = Remote(f"http://127.0.0.1:{port}")
+    deadline_s = time.monotonic() + START_TIMEOUT_S
+    while time.monotonic() < deadline_s and daemon.poll() is None:
+        if build_tokens_path(port).exists():
+            remote = DaemonClient(f"http://127.0.0.1:{port}")
             try:
                 remote.call("GET", "/v1/state")
             except LinkError:
@@ -39,7 +39,7 @@ def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], Remote]:
     raise RefusedError("the daemon did not start; its own line above says why")
 
 
-def show(remote: Remote, pattern: str) -> dict:
+def play_pattern(remote: DaemonClient, pattern: str) -> dict:
     """Play a pattern to its end; what came of it."""
     answer = remote.call("POST", f"/v1/patterns/{pattern}")
     with Progress(
@@ -56,7 +56,7 @@ def show(remote: Remote, pattern: str) -> dict:
     return answer
 
 
-def row(name: str, answer: dict) -> list[str]:
+def format_row(name: str, answer: dict) -> list[str]:
     asked = answer["tallest_asked"]
     heights = (
         [f"{asked['asked_um']:.1f}", f"{asked['simulated_um']:.1f}"]
@@ -66,18 +66,18 @@ def row(name: str, answer: dict) -> list[str]:
     return [name, *(str(answer[key]) for key in ("planned", "sent", "executed")), *heights]
 
 
-def report(shown: list[tuple[str, dict]]) -> bool:
+def print_report(shown: list[tuple[str, dict]]) -> bool:
     """Print what came of it; whether every pulse planned was sent and executed."""
     done = [(name, answer) for name, answer in shown if answer["status"] == "done"]
     table = Table(*COLUMNS)
     for name, answer in done:
-        table.add_row(*row(name, answer))
+        table.add_row(*format_row(name, answer))
     Console().print(table)
     planned, sent, executed = (sum(answer[key] for _, answer in shown) for key in ("planned", "sent", "executed"))
     print(f"pulses planned {planned}, sent {sent}, executed {executed}")
-    asked = [answer["tallest_asked"] for _, answer in done if answer["tallest_asked"]]
-    if asked:
-        tallest = max(asked, key=lambda item: item["asked_um"])
+    with_target = [answer["tallest_asked"] for _, answer in done if answer["tallest_asked"]]
+    if with_target:
+        tallest = max(with_target, key=lambda item: item["asked_um"])
         print(
             f"tallest membrane displacement {tallest['simulated_um']:.1f} µm, computed from the executed pulses; "
             f"{tallest['asked_um']:.1f} µm asked for"
@@ -97,10 +97,10 @@ def main() -> int:
         print("arming: the board's indicator is lit for two seconds first", flush=True)
         remote.call("POST", "/v1/arm")
         started_s = time.monotonic()
-        for pattern in itertools.cycle(PROGRAMME):
+        for pattern in itertools.cycle(PATTERNS):
             if options.seconds is not None and shown and time.monotonic() - started_s >= options.seconds:
                 break
-            shown.append((pattern, show(remote, pattern)))
+            shown.append((pattern, play_pattern(remote, pattern)))
         remote.call("POST", "/v1/stop")
     except KeyboardInterrupt:
         print("\nending")
@@ -111,7 +111,7 @@ def main() -> int:
         if daemon is not None:
             daemon.terminate()
             daemon.wait(timeout=10)
-    return 0 if shown and report(shown) else 1
+    return 0 if shown and print_report(shown) else 1
 
 
 if __name__ == "__main__":

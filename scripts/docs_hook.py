@@ -4,11 +4,11 @@ import re
 from pathlib import Path
 
 from mkdocs.structure.files import File
-from rest_reference import rest_reference
+from rest_reference import build_rest_reference
 
 ROOT = Path(__file__).resolve().parent.parent
-BESIDE = "firmware_protocol"
-PAGES = ("PROTOCOL.md", "SENSOR.md")
+PROTOCOL_FOLDER = "firmware_protocol"
+PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
 
 
 def on_config(config):
@@ -22,14 +22,18 @@ def on_config(config):
 
 def on_files(files, config):
     """Pages that are no files of docs/."""
-    files.append(File.generated(config, "rest.md", content=rest_reference()))
-    for name in PAGES:
-        files.append(File.generated(config, name, content=(ROOT / BESIDE / name).read_text(encoding="utf-8")))
+    files.append(File.generated(config, "rest.md", content=build_rest_reference()))
+    for name in PROTOCOL_PAGES:
+        files.append(File.generated(config, name, content=(ROOT / PROTOCOL_FOLDER / name).read_text(encoding="utf-8")))
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
     """The protocols are pages here; what they link to beside docs/ is named, not linked."""
-    if page.file.src_uri in PAGES:
+    if page.file.src_uri in PROTOCOL_PAGES:
         return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
-    return re.sub(rf"\]\((?:\.\./)+{BESIDE}/({'|'.join(map(re.escape, PAGES))})(#[^)]*)?\)", r"](\1\2)", markdown)
+    return re.sub(
+        rf"\]\((?:\.\./)+{PROTOCOL_FOLDER}/({'|'.join(map(re.escape, PROTOCOL_PAGES))})(#[^)]*)?\)",
+        r"](\1\2)",
+        markdown,
+    )

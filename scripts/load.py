@@ -29,7 +29,7 @@ GROWTH_MAX_MB = 30.0
 STOP_P99_MAX_S = 0.05
 
 
-WITNESS = """
+SLEEPER = """
 import json, signal, time
 late_s, on = [], True
 def leave(*_):
@@ -45,11 +45,11 @@ print(json.dumps(late_s[:: max(1, len(late_s) // 100_000)] + [max(late_s)]))
 """A process that only sleeps: how late it wakes is the computer's doing, and no program's on it."""
 
 
-class Rig:
+class LoadRig:
     """Board and daemon, both processes of their own."""
 
     def __init__(self, folder, config):
-        from optodrive.device.config import shipped_path
+        from optodrive.device.config import locate_shipped
 
         self.log = folder / "board.jsonl"
         port = folder / "tty"
@@ -58,7 +58,7 @@ class Rig:
         )
         while not port.exists():
             time.sleep(0.01)
-        text = shipped_path(f"{config}.toml").read_text()
+        text = locate_shipped(f"{config}.toml").read_text()
         path = folder / "config.toml"
         path.write_text(re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text))
         self.daemon = subprocess.Popen(
@@ -71,20 +71,20 @@ class Rig:
         if "http" not in line:
             raise SystemExit("scripts/load: the daemon did not start; its own line above says why")
         self.url = re.search(r"http://[\d.:]+", line)[0]
-        self._read_to = 0
+        self._read_bytes = 0
 
-    def memory_mb(self):
+    def read_memory_mb(self):
         """What the daemon holds in memory."""
         status = Path(f"/proc/{self.daemon.pid}/status").read_text()
         return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
 
-    def new_events(self):
+    def read_new_events(self):
         """What the board has logged since the last call, whole lines only."""
         with self.log.open() as file:
-            file.seek(self._read_to)
+            file.seek(self._read_bytes)
             text = file.read()
         whole = text[: text.rfind("\n") + 1]
-        self._read_to += len(whole.encode())
+        self._read_bytes += len(whole.encode())
         return [json.loads(line) for line in whole.splitlines()]
 
     def close(self):
@@ -94,14 +94,14 @@ class Rig:
         self.daemon.stdout.close()
 
 
-class Caller:
+class HttpClient:
     """One connection of plain HTTP, so that callers cost this computer little beside the daemon they load."""
 
     def __init__(self, url):
         self._host, self._port = url.removeprefix("http://").split(":")
         self._reader = self._writer = None
 
-    async def ask(self, method, path, body=b""):
+    async def request(self, method, path, body=b""):
         """The answer's status; its body is read and left."""
         if self._writer is None:
             self._reader, self._writer = await asyncio.open_connection(self._host, int(self._port))
@@ -113,7 +113,7 @@ class Caller:
             await self._reader.readexactly(int(length[1]))
         return int(answer.split()[1])
 
-    async def read_on(self):
+    async def read_more(self):
         """More of an answer that does not end."""
         return await self._reader.read(65536)
 
@@ -122,7 +122,7 @@ class Caller:
             self._writer.close()
 
 
-class Crowd:
+class ClientPool:
     """Callers in a process of their own: who push and who watch, for as long as was said."""
 
     def __init__(self, options):
@@ -136,25 +136,25 @@ class Crowd:
         watchers = range(self._options.watchers)
         listening = [k for k in watchers if k % 2 and "/v1/telemetry" in paths]
         await asyncio.gather(
-            *(self._push(k) for k in range(self._options.clients)),
-            *(self._listen() if k in listening else self._watch() for k in watchers),
+            *(self._push_frames(k) for k in range(self._options.clients)),
+            *(self._read_telemetry() if k in listening else self._poll_state() for k in watchers),
         )
         print(json.dumps({"answers": self.answers, "trips": self.trips}))
 
-    def _over(self):
+    def _is_over(self):
         return time.monotonic() >= self._end_s
 
-    async def _paced(self, period_s, what, ask):
-        caller = Caller(self._options.crowd)
+    async def _repeat(self, period_s, kind, send):
+        caller = HttpClient(self._options.crowd)
         await asyncio.sleep(random.random() * period_s)
-        while not self._over():
+        while not self._is_over():
             begin_s = time.monotonic()
-            self.answers[await ask(caller)] += 1
-            self.trips[what].append(time.monotonic() - begin_s)
+            self.answers[await send(caller)] += 1
+            self.trips[kind].append(time.monotonic() - begin_s)
             await asyncio.sleep(max(0.0, begin_s + period_s - time.monotonic()))
         caller.close()
 
-    async def _push(self, number):
+    async def _push_frames(self, number):
         rng = random.Random(number)
         dry = number % 2 == 0
         path = f"/v1/plans?{'dry_run' if dry else 'newest'}=true"
@@ -164,32 +164,32 @@ class Crowd:
             frame = {"show_at_s": 0, "duration_s": 60, "target_um": targets}
             return caller.ask("POST", path, json.dumps({"frames": [frame]}).encode())
 
-        await self._paced(self._options.push_s, "dry run" if dry else "push", ask)
+        await self._repeat(self._options.push_s, "dry run" if dry else "push", ask)
 
-    async def _watch(self):
-        await self._paced(self._options.watch_s, "state", lambda caller: caller.ask("GET", "/v1/state"))
+    async def _poll_state(self):
+        await self._repeat(self._options.watch_s, "state", lambda caller: caller.ask("GET", "/v1/state"))
 
-    async def _listen(self):
-        caller = Caller(self._options.crowd)
-        self.answers[await caller.ask("GET", "/v1/telemetry")] += 1
-        while not self._over() and await caller.read_on():
+    async def _read_telemetry(self):
+        caller = HttpClient(self._options.crowd)
+        self.answers[await caller.request("GET", "/v1/telemetry")] += 1
+        while not self._is_over() and await caller.read_more():
             pass
         caller.close()
 
 
-class Load:
+class StopTest:
     """Who stops, in this process and with nothing else to do; what is counted."""
 
     def __init__(self, rig, options):
         self._rig = rig
         self._end_s = time.monotonic() + 60 * options.minutes
         self._client = httpx.Client(base_url=rig.url, headers=HEADERS, timeout=30)
-        self.stops, self.gates, self.memory, self.late = [], [], [], []
+        self.stop_s, self.gate_off_s, self.memory_mb, self.wake_delays_s = [], [], [], []
         self.underruns = self.faults = self.stall_ms = 0
         arguments = [f"--{name.replace('_', '-')}={value}" for name, value in vars(options).items() if name != "crowd"]
         self._client.post("/v1/arm").raise_for_status()
-        self._witness = subprocess.Popen([sys.executable, "-c", WITNESS], stdout=subprocess.PIPE, text=True)
-        self._crowd = subprocess.Popen(
+        self._sleeper = subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True)
+        self._client_process = subprocess.Popen(
             [sys.executable, __file__, *arguments, f"--crowd={rig.url}"], stdout=subprocess.PIPE, text=True
         )
 
@@ -200,7 +200,7 @@ class Load:
             self._client.post("/v1/plans", json={"trains": [train]})
             time.sleep(random.uniform(0.1, 1.0) * STOP_EVERY_S)
             self._stop()
-            self.memory.append(self._rig.memory_mb())
+            self.memory_mb.append(self._rig.memory_mb())
             state = self._client.get("/v1/state").json()
             self.underruns = state["board"]["underruns"]
             self.stall_ms = state["link"]["longest_stall_ms"]
@@ -208,29 +208,29 @@ class Load:
                 self.faults += 1
                 self._client.post("/v1/disarm")
             self._client.post("/v1/arm")
-        self._witness.terminate()
-        self.late = json.loads(self._witness.communicate(timeout=60)[0])
-        told, _ = self._crowd.communicate(timeout=60)
+        self._sleeper.terminate()
+        self.wake_delays_s = json.loads(self._sleeper.communicate(timeout=60)[0])
+        told, _ = self._client_process.communicate(timeout=60)
         crowd = json.loads(told)
         self.answers, self.trips = Counter(crowd["answers"]), crowd["trips"]
 
     def _stop(self):
-        sent_us, begin_s = self._lit_us(), time.monotonic()
+        sent_us, begin_s = self._wait_for_gate_edge_us(), time.monotonic()
         response = self._client.post("/v1/stop")
-        self.stops.append(time.monotonic() - begin_s)
+        self.stop_s.append(time.monotonic() - begin_s)
         response.raise_for_status()
-        edges = [event for event in self._rig.new_events() if event["event"] == "gate"]
+        edges = [event for event in self._rig.read_new_events() if event["event"] == "gate"]
         if edges and edges[-1]["on"]:
             raise SystemExit("scripts/load: STOP was answered, and the gate is on")
         if edges and sent_us is not None:
-            self.gates.append(max(0.0, 1e-6 * (edges[-1]["t_us"] - sent_us)))
+            self.gate_off_s.append(max(0.0, 1e-6 * (edges[-1]["t_us"] - sent_us)))
 
-    def _lit_us(self):
+    def _wait_for_gate_edge_us(self):
         """The board's clock now, from the newest line of its log; None where it stays dark."""
-        self._rig.new_events()
+        self._rig.read_new_events()
         end_s = time.monotonic() + 0.3
         while time.monotonic() < end_s:
-            edges = [event for event in self._rig.new_events() if event["event"] == "gate"]
+            edges = [event for event in self._rig.read_new_events() if event["event"] == "gate"]
             if edges:
                 return edges[-1]["t_us"]
             time.sleep(0.0005)
@@ -238,45 +238,49 @@ class Load:
 
     def close(self):
         self._client.close()
-        for process in (self._crowd, self._witness):
+        for process in (self._client_process, self._sleeper):
             if process.poll() is None:
                 process.terminate()
             process.wait(timeout=15)
             process.stdout.close()
 
 
-def percentile_ms(values, share):
+def compute_percentile_ms(values, share):
     ordered = sorted(values)
     return 1e3 * ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("nan")
 
 
-def spread(values):
-    return f"{len(values)} times, p50 {percentile_ms(values, 0.5):.1f} ms, p99 {percentile_ms(values, 0.99):.1f} ms"
+def format_percentiles(values):
+    return f"{len(values)} times, p50 {compute_percentile_ms(values, 0.5):.1f} ms, p99 {compute_percentile_ms(values, 0.99):.1f} ms"
 
 
-def report(load, seconds):
+def print_report(stop_test, seconds):
     """Print the figures; what was wrong in them."""
-    for what, trips in load.trips.items():
+    for what, trips in stop_test.trips.items():
         if trips:
-            print(f"{what:10} answered {spread(trips)}")
-    print(f"answers    {sum(load.answers.values()) / seconds:.0f} a second, by status {dict(load.answers)}")
-    print(f"STOP       answered {spread(load.stops)}")
-    print(f"gate off   by the board's log, while lit: {spread(load.gates)}")
-    third = max(1, len(load.memory) // 3)
-    first, last = statistics.median(load.memory[:third]), statistics.median(load.memory[-third:])
-    print(f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, most {max(load.memory):.1f} MB")
-    print(f"underruns  {load.underruns}; faults seen at a stop: {load.faults}")
-    print(f"engine     longest turn of its loop {load.stall_ms:.0f} ms")
-    print(f"asleep     a process that only sleeps woke late {spread(load.late)}, most {1e3 * max(load.late):.0f} ms")
+            print(f"{what:10} answered {format_percentiles(trips)}")
+    print(f"answers    {sum(stop_test.answers.values()) / seconds:.0f} a second, by status {dict(stop_test.answers)}")
+    print(f"STOP       answered {format_percentiles(stop_test.stop_s)}")
+    print(f"gate off   by the board's log, while lit: {format_percentiles(stop_test.gate_off_s)}")
+    third = max(1, len(stop_test.memory) // 3)
+    first, last = statistics.median(stop_test.memory[:third]), statistics.median(stop_test.memory[-third:])
+    print(
+        f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, most {max(stop_test.memory):.1f} MB"
+    )
+    print(f"underruns  {stop_test.underruns}; faults seen at a stop: {stop_test.faults}")
+    print(f"engine     longest turn of its loop {stop_test.stall_ms:.0f} ms")
+    print(
+        f"asleep     a process that only sleeps woke late {format_percentiles(stop_test.late)}, most {1e3 * max(stop_test.late):.0f} ms"
+    )
     print(f"computer   load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, these callers among it")
-    wrong = []
-    if load.underruns:
-        wrong.append(f"{load.underruns} underruns")
+    failures = []
+    if stop_test.underruns:
+        failures.append(f"{stop_test.underruns} underruns")
     if last - first > GROWTH_MAX_MB:
-        wrong.append(f"memory grew by {last - first:.0f} MB")
-    if any(int(status) >= 500 for status in load.answers):
-        wrong.append("answers of status 500 and above")
-    return wrong
+        failures.append(f"memory grew by {last - first:.0f} MB")
+    if any(int(status) >= 500 for status in stop_test.answers):
+        failures.append("answers of status 500 and above")
+    return failures
 
 
 def main():
@@ -291,25 +295,25 @@ def main():
     parser.add_argument("--crowd", metavar="URL", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.crowd:
-        asyncio.run(Crowd(options).run())
+        asyncio.run(ClientPool(options).run())
         return 0
     with tempfile.TemporaryDirectory() as folder:
-        rig = Rig(Path(folder), options.config)
+        rig = LoadRig(Path(folder), options.config)
         try:
-            load = Load(rig, options)
+            stop_test = StopTest(rig, options)
             try:
-                load.run()
+                stop_test.run()
             finally:
-                load.close()
-            wrong = report(load, 60 * options.minutes)
+                stop_test.close()
+            failures = print_report(stop_test, 60 * options.minutes)
         finally:
             rig.close()
-    p99_s = percentile_ms(load.stops, 0.99) * 1e-3
+    p99_s = compute_percentile_ms(stop_test.stop_s, 0.99) * 1e-3
     if p99_s >= STOP_P99_MAX_S:
         print(f"slow       STOP answered p99 {1e3 * p99_s:.0f} ms, wished below {1e3 * STOP_P99_MAX_S:.0f} ms")
-    if wrong:
-        print(f"scripts/load: {'; '.join(wrong)}", file=sys.stderr)
-    return 1 if wrong else 0
+    if failures:
+        print(f"scripts/load: {'; '.join(failures)}", file=sys.stderr)
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":

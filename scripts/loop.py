@@ -12,9 +12,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT / "tests" / "blind"))
 
-FIRST = 7_000_000
+FIRST_SEED = 7_000_000
 """Seeds of this benchmark alone."""
-SHOWS = 0.005
+ERROR_MIN = 0.005
 """An error below this is no error of heights: the effect sits in instruments or mirrors."""
 
 
@@ -34,7 +34,7 @@ def main() -> None:
     for number, cause in enumerate(options.causes or CATALOGUE):
         for case in range(options.cases):
             with TemporaryDirectory() as folder:
-                drawn = draw("single", FIRST + 100 * number + case, folder, cause=cause)
+                drawn = draw("single", FIRST_SEED + 100 * number + case, folder, cause=cause)
                 row: dict[str, object] = {"cause": cause, "seed": drawn.seed}
                 try:
                     loop = close_loop(drawn, Path(folder))
@@ -43,23 +43,25 @@ def main() -> None:
                     row |= {"refused": str(error)}
             rows.append(row)
             if not options.json:
-                print(line(row), flush=True)
-    seen = [row for row in rows if float(str(row.get("nominal", 0.0))) > SHOWS]
-    mended = sum(float(str(row["cut"])) >= 0.8 for row in seen)
+                print(format_row(row), flush=True)
+    affected = [row for row in rows if float(str(row.get("nominal", 0.0))) > ERROR_MIN]
+    corrected = sum(float(str(row["cut"])) >= 0.8 for row in affected)
     if options.json:
-        print(json.dumps({"rows": rows, "shown": len(seen), "mended": mended}, indent=2))
+        print(json.dumps({"rows": rows, "shown": len(affected), "mended": corrected}, indent=2))
     else:
-        print(f"{mended} of {len(seen)} heights wrong by more than {SHOWS:.1%} lost four fifths of their error")
+        print(
+            f"{corrected} of {len(affected)} heights wrong by more than {ERROR_MIN:.1%} lost four fifths of their error"
+        )
 
 
-def line(row: dict[str, object]) -> str:
+def format_row(row: dict[str, object]) -> str:
     """A row as text."""
     head = f"{row['cause']!s:22} {row['seed']}"
     if "refused" in row:
         return f"{head}  refused: {row['refused']}"
-    said = "+".join(row["said"]) if isinstance(row["said"], tuple) and row["said"] else str(row["verdict"])
+    diagnosed = "+".join(row["said"]) if isinstance(row["said"], tuple) and row["said"] else str(row["verdict"])
     return (
-        f"{head}  {said:40} nominal {float(str(row['nominal'])):7.2%}  diagnosed {float(str(row['extended'])):7.2%}"
+        f"{head}  {diagnosed:40} nominal {float(str(row['nominal'])):7.2%}  diagnosed {float(str(row['extended'])):7.2%}"
         f"  cut {float(str(row['cut'])):8.1%}  trimmed {row['trimmed']}"
     )
 

@@ -15,7 +15,7 @@ HEART = ("..##.##..", ".#######.", ".#######.", "..#####..", "...###...", "....#
 PULSES_IN = 200
 
 
-def draw(page):
+def draw_heart(page):
     """A heart in the middle of 21 x 21 pixels, stroke by stroke."""
     page.locator("#display").scroll_into_view_if_needed()
     box = page.locator("#display").bounding_box()
@@ -27,10 +27,10 @@ def draw(page):
                 )
 
 
-def take(browser, daemon, name, viewport, scheme):
+def take_screenshot(browser, daemon, name, viewport, scheme):
     window = Visit(browser, daemon.url, viewport=viewport, color_scheme=scheme, device_scale_factor=1)
     page = window.open()
-    draw(page)
+    draw_heart(page)
     page.locator("#rate").fill("6")
     page.locator("#seconds").fill("4")
     page.locator("#preview").click()
@@ -58,7 +58,7 @@ def main():
                 with chromium() as browser:
                     for name, viewport in (("desk", WIDE), ("phone", PHONE)):
                         for scheme in ("light", "dark"):
-                            take(browser, daemon, name, viewport, scheme)
+                            take_screenshot(browser, daemon, name, viewport, scheme)
             finally:
                 daemon.stop()
         finally:

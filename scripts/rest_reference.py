@@ -2,10 +2,10 @@
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.web.api import make_app
+from optodrive.daemon.web.api import build_app
 from optodrive.device.config import load_config
-from optodrive.link.transport.registry import transport_maker
-from optodrive.planning.pipeline import Display
+from optodrive.link.transport.registry import find_transport_factory
+from optodrive.planning.pipeline import DisplayModel
 
 HEAD = """# REST
 
@@ -15,30 +15,30 @@ Generated from the daemon's OpenAPI, which it answers itself at `/openapi.json`.
 """
 
 
-def openapi():
+def build_openapi():
     """The application's OpenAPI; nothing is connected for it."""
     config = load_config()
-    engine = Engine(Display.of(config), transport_maker(config.board)(), MonotonicClock())
+    engine = Engine(DisplayModel.from_config(config), find_transport_factory(config.board)(), MonotonicClock())
     try:
-        return make_app(engine, "unused").openapi()
+        return build_app(engine, "unused").openapi()
     finally:
         engine.close()
 
 
-def rest_reference():
+def build_rest_reference():
     """Markdown, a section a route."""
     sections = [HEAD]
-    for path, methods in openapi()["paths"].items():
+    for path, methods in build_openapi()["paths"].items():
         for method, route in methods.items():
-            sections.append(section(f"{method.upper()} {path}", route))
+            sections.append(format_section(f"{method.upper()} {path}", route))
     return "\n".join(sections)
 
 
-def section(title, route):
+def format_section(title, route):
     """One route: what it does, what it takes, what it answers."""
     lines = [f"## {title}", "", route.get("description", ""), ""]
     rows = [
-        f"| `{item['name']}` | {item['in']} | {kind(item['schema'])} | {cell(item.get('description', ''))} |"
+        f"| `{item['name']}` | {item['in']} | {format_type(item['schema'])} | {escape_cell(item.get('description', ''))} |"
         for item in route.get("parameters", ())
     ]
     if rows:
@@ -49,18 +49,18 @@ def section(title, route):
     return "\n".join([*lines, "Answers: " + "; ".join(answers) + ".", ""])
 
 
-def kind(schema):
+def format_type(schema):
     """A parameter's type in words."""
-    told = schema.get("type", "any")
+    text = schema.get("type", "any")
     if "enum" in schema:
-        told = ", ".join(f"`{value}`" for value in schema["enum"])
-    return cell(told + (f", {schema['default']} if left out" if "default" in schema else ""))
+        text = ", ".join(f"`{value}`" for value in schema["enum"])
+    return escape_cell(text + (f", {schema['default']} if left out" if "default" in schema else ""))
 
 
-def cell(text):
+def escape_cell(text):
     """Text that does not end a table's cell."""
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 
 if __name__ == "__main__":
-    print(rest_reference())
+    print(build_rest_reference())

@@ -3,12 +3,12 @@
 import argparse
 from pathlib import Path
 
-from optodrive.cli.validation_table import HEADINGS, cells, validate_table
+from optodrive.cli.validation_table import HEADINGS, build_validation_rows, format_cells
 from optodrive.lab.validation import narrative
-from optodrive.lab.validation.measured_facts import LEFT_OUT
-from optodrive.lab.validation.paper_outcomes import SILENT
-from optodrive.lab.validation.study import study
-from optodrive.physics.paper_facts import paper_facts
+from optodrive.lab.validation.measured_facts import EXCLUDED
+from optodrive.lab.validation.paper_outcomes import NOT_MODELLED
+from optodrive.lab.validation.study import run_study
+from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import load_parameters
 
 INTRODUCTION = """\
@@ -35,7 +35,7 @@ same pixel; [extended-model.md](extended-model.md) says what each term gains.
 - That the gas settles at half the absorber's rise is Text S1's; displacements fix only its product with κ.
 """
 
-LITERAL = """\
+LITERAL_SECTION = """\
 ## What the literal set tells
 
 Its gas lags by 64 ms. That takes the displacement of a 50 ms pulse to a half, of an 8 ms pulse to a quarter, and the
@@ -47,7 +47,7 @@ The two laws of Fig. 3D belong to opposite ends. In a linear pixel without lag t
 pulses much longer than τ, and the mean follows τ/t_g for pulses much shorter; at t_p = t_g = τ it gives 0.73 and 0.79.
 """
 
-DIAGNOSED = """\
+DIAGNOSIS_SECTION = """\
 ## What `optodrive validate --diagnose` makes of it
 
 It takes the twelve measured outcomes for a recording and the literal set for the model, chooses among the causes of
@@ -56,7 +56,7 @@ group. It
 prints:
 """
 
-DISCUSSED = """\
+DISCUSSION_SECTION = """\
 What to make of that:
 
 - The lag is beyond doubt: displacements and vibration each predict the other, with causes found without them.
@@ -77,7 +77,7 @@ A rate is compared as the height in the time that it leaves a pixel: near the pl
 Not data:
 """
 
-KEYS = """\
+JSON_KEYS = """\
 `--diagnose --json` prints one object, SI units, temperatures as rises in K:
 
 - `nominal`: the parameter set that is diagnosed
@@ -99,60 +99,62 @@ Verdicts of candidates: `alike` (would do in the place of a cause), `as good` (a
 """
 
 
-def document():
+def build_page():
     """The page, whole."""
-    rows = validate_table()
+    rows = build_validation_rows()
     parts = [
         INTRODUCTION,
         "## Outcomes\n",
-        table(row for row in rows if row.role != "input"),
+        format_table(row for row in rows if row.role != "input"),
         "## Where the calibrated set misses by more than 15 %\n",
-        bullets((row.fact.id, row.remark) for row in rows if row.remark),
-        LITERAL,
-        diagnosed(),
+        format_bullets((row.fact.id, row.remark) for row in rows if row.remark),
+        LITERAL_SECTION,
+        build_diagnosis_section(),
         "## Inputs\n\nTaken from the paper, or followed from what was by arithmetic alone.\n",
-        table(row for row in rows if row.role == "input"),
+        format_table(row for row in rows if row.role == "input"),
         "## What each row is\n",
-        bullets((row.fact.id, described(row.fact)) for row in rows),
+        format_bullets((row.fact.id, describe_fact(row.fact)) for row in rows),
         "## Facts that no set speaks to\n",
-        bullets(SILENT.items()),
+        format_bullets(NOT_MODELLED.items()),
     ]
     return "\n".join(parts)
 
 
-def diagnosed():
+def build_diagnosis_section():
     """The story of the paper's facts, with its table."""
-    found = study(paper_facts(), load_parameters("paper_s1_literal"))
-    lines = [narrative.HEADINGS, ("---",) * len(narrative.HEADINGS), *narrative.rows(found)]
+    study_result = run_study(load_paper_facts(), load_parameters("paper_s1_literal"))
+    lines = [narrative.HEADINGS, ("---",) * len(narrative.HEADINGS), *narrative.build_rows(study_result)]
     parts = [
-        DIAGNOSED,
-        quoted(narrative.before_table(found)),
+        DIAGNOSIS_SECTION,
+        format_quote(narrative.describe_findings(study_result)),
         "".join("| " + " | ".join(line) + " |\n" for line in lines),
-        quoted([*narrative.after_table(found), "", *narrative.assumptions(found)]),
-        DISCUSSED,
-        bullets(LEFT_OUT.items()),
-        KEYS,
+        format_quote(
+            [*narrative.describe_predictions(study_result), "", *narrative.describe_assumptions(study_result)]
+        ),
+        DISCUSSION_SECTION,
+        format_bullets(EXCLUDED.items()),
+        JSON_KEYS,
     ]
     return "\n".join(parts)
 
 
-def quoted(lines):
+def format_quote(lines):
     """As printed."""
     return "".join(f"> {line}".rstrip() + "\n" for line in lines)
 
 
-def table(rows):
+def format_table(rows):
     """Rows under their headings."""
-    lines = [HEADINGS, ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:", "--:", "---"), *map(cells, rows)]
+    lines = [HEADINGS, ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:", "--:", "---"), *map(format_cells, rows)]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
-def bullets(items):
+def format_bullets(items):
     """Named remarks, one a line."""
     return "".join(f"- `{name}`: {text}\n" for name, text in items)
 
 
-def described(fact):
+def describe_fact(fact):
     """Quantity, conditions and place."""
     conditions = f" ({fact.conditions})" if fact.conditions else ""
     return f"{fact.quantity}{conditions}. {fact.where}"
@@ -161,4 +163,4 @@ def described(fact):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=Path("docs/validation.md"))
-    parser.parse_args().out.write_text(document(), encoding="utf-8")
+    parser.parse_args().out.write_text(build_page(), encoding="utf-8")

@@ -18,14 +18,14 @@ TOKEN = "a-token-for-a-wheel"
 PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 
 
-def build(folder):
+def build_wheel(folder):
     """The wheel, built in isolation."""
     subprocess.run([*PIP, "wheel", "-q", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
     (wheel,) = folder.glob("optodrive-*.whl")
     return wheel
 
 
-def install(wheel, folder, quick):
+def install_wheel(wheel, folder, quick):
     """An environment with nothing but the wheel and what it asks for; quick: what it asks for is lent by this one."""
     venv.create(folder, with_pip=False)
     python = folder / "bin" / "python"
@@ -38,23 +38,23 @@ def install(wheel, folder, quick):
     return folder / "bin" / "optodrive"
 
 
-def tried(optodrive, outside):
+def try_installation(optodrive, outside):
     """What was found: the daemon from the wheel, asked by HTTP; the shipped configurations, read."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment |= {"OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(outside)}
 
-    def told(*arguments):
+    def run_python(*arguments):
         command = [optodrive.with_name("python"), *arguments]
         return subprocess.run(command, cwd=outside, env=environment, check=True, text=True, capture_output=True).stdout
 
-    place = Path(told("-c", "import optodrive; print(optodrive.__file__)").strip())
-    if optodrive.parent.parent not in place.parents:
-        raise SystemExit(f"scripts/wheel: {place} was tried, which is not the wheel")
-    names = json.loads(
-        told("-c", "import json; from optodrive.device.config import *; print(json.dumps(shipped_configs()))")
+    package_path = Path(run_python("-c", "import optodrive; print(optodrive.__file__)").strip())
+    if optodrive.parent.parent not in package_path.parents:
+        raise SystemExit(f"scripts/wheel: {package_path} was tried, which is not the wheel")
+    config_names = json.loads(
+        run_python("-c", "import json; from optodrive.device.config import *; print(json.dumps(shipped_configs()))")
     )
-    for name in names:
-        told("-m", "optodrive.cli.main", "config", "check", "--config", name)
+    for name in config_names:
+        run_python("-m", "optodrive.cli.main", "config", "check", "--config", name)
     daemon = subprocess.Popen(
         [optodrive, "serve", "--config", "display-16", "--port", "0"],
         cwd=outside,
@@ -69,14 +69,14 @@ def tried(optodrive, outside):
             frames = {"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"3": 60}}]}
             plan = client.post("/v1/plans", params={"dry_run": True}, json=frames).raise_for_status().json()
             paths = client.get("/openapi.json").raise_for_status().json()["paths"]
-            page = (place.parent / "daemon" / "page").is_dir()
+            page = (package_path.parent / "daemon" / "page").is_dir()
             if page:
                 client.get("/", headers={"Accept": "text/html"}).raise_for_status()
     finally:
         daemon.terminate()
         status = daemon.wait(timeout=20)
         daemon.stdout.close()
-    return {"configs": names, "display": display, "planned": plan["planned"], "paths": len(paths), "page": page,
+    return {"configs": config_names, "display": display, "planned": plan["planned"], "paths": len(paths), "page": page,
             "status": status}  # fmt: skip
 
 
@@ -88,11 +88,11 @@ def main():
     options.out.mkdir(parents=True, exist_ok=True)
     for old in options.out.glob("optodrive-*.whl"):
         old.unlink()
-    wheel = build(options.out)
+    wheel = build_wheel(options.out)
     with tempfile.TemporaryDirectory() as folder:
         outside = Path(folder) / "outside"
         outside.mkdir()
-        found = tried(install(wheel, Path(folder) / "environment", options.quick), outside)
+        found = try_installation(install_wheel(wheel, Path(folder) / "environment", options.quick), outside)
     print(json.dumps({"wheel": str(wheel), "bytes": wheel.stat().st_size, **found}))
     return 0 if found["planned"] == 1 and found["status"] == 0 and len(found["configs"]) == 5 else 1
 

@@ -19,13 +19,13 @@ def pytest_addoption(parser):
     parser.addoption("--board", default=None, metavar="PORT", help="run the hardware tests on the board at PORT")
 
 
-LONG_FIRST = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
-LONGEST = ("test_calibrate_loop.py", "test_home.py", "test_ends_dark.py")
+SLOW_FOLDERS = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
+SLOW_FILES = ("test_calibrate_loop.py", "test_home.py", "test_ends_dark.py")
 """Folders and files that take long: begun last, one of them would keep one worker while the others have nothing."""
 
 
 def pytest_collection_modifyitems(config, items):
-    items.sort(key=lambda item: item.path.name not in LONGEST and item.path.parent.name not in LONG_FIRST)
+    items.sort(key=lambda item: item.path.name not in SLOW_FILES and item.path.parent.name not in SLOW_FOLDERS)
     if config.getoption("--board") is None:
         skip = pytest.mark.skip(reason="needs a real board: --board PORT")
         for item in items:

@@ -2,18 +2,18 @@
 
 import numpy as np
 
-from optodrive.device.config import Config, load_config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout, load_config
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.field_prior import Prior
+from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.field_writer import write_field
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
 
 CONFIG = load_config()
-LAYOUT = pixel_layout(CONFIG.display)
-PRIOR = Prior.of(CONFIG)
+LAYOUT = build_pixel_layout(CONFIG.display)
+PRIOR = FieldPrior.from_config(CONFIG)
 HALF_M = float(np.abs(LAYOUT.x_m).max())
-CODE_M = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad
+CODE_M = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
 NOISE_M = 10e-6
 
 
@@ -28,31 +28,31 @@ def random_codes(random, count):
     return np.rint(CENTRE_CODE + random.uniform(-HALF_M, HALF_M, (count, 2)) / CODE_M)
 
 
-def seen(truth, codes, random, false_share=0.02, noise_m=NOISE_M):
+def measure_spots(truth, codes, random, outlier_fraction=0.02, noise_m=NOISE_M):
     """Spots as a sensor sees them, and which are false: anywhere on the display."""
     places = np.column_stack(truth.position_m(codes[:, 0], codes[:, 1]))
     places = places + noise_m * random.standard_normal(places.shape)
-    false = random.random(len(codes)) < false_share
-    places[false] = random.uniform(-HALF_M, HALF_M, (int(false.sum()), 2))
-    return Spots.of(np.column_stack([codes, places])), false
+    is_outlier = random.random(len(codes)) < outlier_fraction
+    places[is_outlier] = random.uniform(-HALF_M, HALF_M, (int(is_outlier.sum()), 2))
+    return MeasuredSpots.from_table(np.column_stack([codes, places])), is_outlier
 
 
-def misses_m(truth: Truth, field, count=1500):
+def field_errors_m(truth: Truth, field, count=1500):
     """How far off the beam lands where the field sends it, anywhere on the display's square, [2, count]; codes too."""
-    wanted = np.random.default_rng(99).uniform(-HALF_M, HALF_M, (2, count))
-    codes = field.codes(*wanted)
-    return np.array(truth.position_m(*codes)) - wanted, codes
+    target_m = np.random.default_rng(99).uniform(-HALF_M, HALF_M, (2, count))
+    codes = field.codes(*target_m)
+    return np.array(truth.position_m(*codes)) - target_m, codes
 
 
-def field_file(path, seed=0, side=17):
+def calibrate_hidden_field(path, seed=0, side=17):
     """Calibrate a hidden geometry as a user would and write its field; the geometry, and a configuration with it."""
     truth = Truth.drawn(seed, CONFIG)
-    spots, _ = seen(truth, grid_codes(side), np.random.default_rng([seed, side]))
+    spots, _ = measure_spots(truth, grid_codes(side), np.random.default_rng([seed, side]))
     write_field(path, fit_field(spots, PRIOR))
-    return truth, aimed_by(path)
+    return truth, config_with_field(path)
 
 
-def aimed_by(path, config=CONFIG, **scanner):
+def config_with_field(path, config=CONFIG, **scanner):
     """The configuration with a field."""
     table = config.model_dump()
     table["scanner"] |= {"field": str(path)} | scanner

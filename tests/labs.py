@@ -4,7 +4,7 @@ import numpy as np
 
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15
@@ -30,7 +30,9 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
             real = pulses.copy()
             real[:, 2] *= np.exp(0.005 * rng.standard_normal())
             real[:, 0] += 2e-5 * rng.standard_normal()
-            told = observe(Scene(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, Active.of(terms))
+            told = simulate_signals(
+                PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values(terms)
+            )
             signals = {}
             for (signal, white), value in zip(SIGNALS, told[:2], strict=True):
                 keep, coloured = np.exp(-1.0 / rate / 0.01), np.zeros(len(t_s))

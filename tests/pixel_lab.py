@@ -7,29 +7,29 @@ import numpy as np
 
 from optodrive.cli.main import run
 from optodrive.device.config import load_config
-from optodrive.device.pixel_map import map_of, with_map
+from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
 from optodrive.link.simulator.true_pixels import PixelTruth
 
-FOREVER = 5.0
+COOLDOWN_S = 5.0
 """Times between frames in which every pixel is cold again, s."""
 
 
-def said(capsys, *arguments, status=0):
+def run_json(capsys, *arguments, status=0):
     """What a command prints as JSON."""
     capsys.readouterr()
     assert run([str(each) for each in arguments]) == status
     return json.loads(capsys.readouterr().out)
 
 
-def swept(capsys, folder, display, seed, noise=1.0, aims=None):
+def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
     """Recordings of a sweep over hidden pixels, of some aims or all."""
-    asked = said(capsys, "calibrate", "--pixels-sweep", folder / "sweep", "--config", display, "--json")
+    asked = run_json(capsys, "calibrate", "--pixels-sweep", folder / "sweep", "--config", display, "--json")
     recordings = []
     for k, aim in enumerate(asked["aims"]):
         if aims is not None and aim["name"] not in aims:
             continue
         played, out = folder / "sweep" / aim["name"], folder / f"{aim['name']}.h5"
-        told = said(
+        told = run_json(
             capsys,
             *("simulate", f"{played}.json", "--pixels-map", f"{played}.pixels.toml", "--config", display),
             *("--pixel-seed", seed, "--pixels", "all", "--near", 0.1, "--noise", noise, "--seed", 100 * seed + k),
@@ -40,26 +40,26 @@ def swept(capsys, folder, display, seed, noise=1.0, aims=None):
     return recordings
 
 
-def calibrated(capsys, folder, display, recordings):
+def calibrate_map(capsys, folder, display, recordings):
     """pixels.toml, and what was said."""
     out = folder / "pixels.toml"
-    told = said(capsys, "calibrate", "--config", display, "--out", out, "--json", "--pixels", *recordings)
+    told = run_json(capsys, "calibrate", "--config", display, "--out", out, "--json", "--pixels", *recordings)
     return out, told
 
 
-def shown_um(capsys, folder, display, seed, height_um, pixels_map=None):
+def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
     """Heights that hidden pixels reach when all are asked for one, [p], and the answer."""
     count = len(PixelTruth.drawn(seed, load_config(display)).lift)
     frame = {
         "id": "all",
         "show_at_s": 0.0,
-        "duration_s": FOREVER,
+        "duration_s": COOLDOWN_S,
         "target_um": {str(k): height_um for k in range(count)},
     }
     frames = Path(folder / "frames.json")
     frames.write_text(json.dumps({"frames": [frame]}))
     more = () if pixels_map is None else ("--pixels-map", pixels_map)
-    told = said(
+    told = run_json(
         capsys,
         *("simulate", frames, "--config", display, "--pixel-seed", seed, "--pixels", "all"),
         *("--near", 0.1, "--dt", 2e-4, "--json", *more),
@@ -67,10 +67,10 @@ def shown_um(capsys, folder, display, seed, height_um, pixels_map=None):
     return np.array([pixel["measured_max_um"] for pixel in told["pixels"]]), told
 
 
-def off_by(display, path, seed):
+def map_errors(display, path, seed):
     """Gains, relative, and offsets, m, off the truth over their stated sigmas too: [3, p] each, NaN where not known."""
-    config = with_map(load_config(display), path)
-    known, truth = map_of(config), PixelTruth.drawn(seed, config)
+    config = replace_pixel_map(load_config(display), path)
+    known, truth = load_pixel_map(config), PixelTruth.drawn(seed, config)
     lives = ~known.dead
     off = np.where(lives, [known.gain - truth.lift, known.offset_x_m - truth.x_m, known.offset_y_m - truth.y_m], np.nan)
     return off, off / [known.gain_sigma, known.offset_x_sigma_m, known.offset_y_sigma_m]

@@ -10,7 +10,7 @@ from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
 from optodrive.device.config import DisplaySection
 from optodrive.device.neighbours import Neighbours
 from optodrive.planning.limiter.budget import Caps
-from optodrive.planning.limiter.worst_case import Declared, Touch, Uncertainty, Walls
+from optodrive.planning.limiter.worst_case import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
 
 NO_CAPS = Caps(
     absorber_k=1e6,
@@ -24,7 +24,7 @@ NO_CAPS = Caps(
     pixel_window_s=1.0,
     display_mean_w=1e3,
     display_window_s=2.0,
-    least_w=0.0,
+    min_power_w=0.0,
 )
 """Caps that do not bind."""
 
@@ -78,7 +78,7 @@ def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim,
 
 
 @dataclass(frozen=True)
-class Truth:
+class TrueDisplay:
     """One display as it really is: `numbers` for the integrator, and the lattice."""
 
     numbers: tuple
@@ -105,7 +105,7 @@ class Truth:
         return peak
 
 
-def truth(model, factor=None):
+def build_true_display(model, factor=None):
     """The display of a declared model, each parameter times its factor (exponent: plus)."""
     f = dict.fromkeys(Uncertainty.__dataclass_fields__, 1.0) | {"exponent": 0.0} | (factor or {})
     walls, touch = model.walls, model.touch
@@ -124,7 +124,7 @@ def truth(model, factor=None):
         touch.wall_share * f["touch_share"] if touch else 0.0,
         touch.lag_s * f["touch_lag"] if touch else 0.0,
     )
-    return Truth(numbers, np.array(model.beside), np.array(model.frame_edges))
+    return TrueDisplay(numbers, np.array(model.beside), np.array(model.frame_edges))
 
 
 @numba.njit(cache=False)
@@ -176,7 +176,7 @@ def galvo_peak(plan, budget):
     if not len(lit):
         return 0.0
     ends_s = np.append(0.0, (plan.start_s + plan.width_s)[lit])
-    numbers = (mirrors.omega_per_s, mirrors.damping, mirrors.delay_s, mirrors.slew_rad_per_s, mirrors.mean_s)
+    numbers = (mirrors.omega_rad_per_s, mirrors.damping, mirrors.delay_s, mirrors.slew_rad_per_s, mirrors.averaging_s)
     late_s = np.maximum(ends_s[:-1], plan.start_s[lit] - mirrors.lead_s)
     return max(
         _coil(at_s, angle_rad[lit].copy(), ends_s[-1] + 0.1, *numbers)
@@ -205,29 +205,29 @@ def small_lattice(rng):
 def random_model(rng):
     """A declared model, terms left out now and then, and its uncertainty."""
     display = small_lattice(rng)
-    neighbours = Neighbours.of(display)
+    neighbours = Neighbours.from_display(display)
     pixels = len(neighbours)
     walls = touch = None
     if rng.random() < 0.85:
         r_w = rng.uniform(3.0, 40.0)
         sides = rng.random() < 0.8
-        walls = Walls(
+        walls = NominalWalls(
             r_w,
             rng.uniform(0.4, 4.0) / r_w,
             10 ** rng.uniform(2.0, 3.0) if sides else np.inf,
             10 ** rng.uniform(2.0, 3.0) if sides else np.inf,
         )
     if rng.random() < 0.85:
-        touch = Touch(rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.5, 3.0))
+        touch = NominalTouch(rng.uniform(0.05, 0.5), rng.uniform(0.1, 0.5), rng.uniform(0.5, 3.0))
     r = rng.uniform(95, 382)
-    model = Declared(
+    model = NominalThermalModel(
         epsilon=np.full(pixels, 0.66),
         r_k_per_w=np.full(pixels, r),
         c_j_per_k=np.full(pixels, rng.uniform(80e-6, 130e-6)),
         tau_g_s=rng.uniform(1e-3, 5e-3),
         ambient_k=293.15,
         exponent=float(rng.choice([0.0, 0.05, 0.3, 1.0])),
-        beside=neighbours.beside,
+        neighbours=neighbours.indices,
         frame_edges=neighbours.frame_edges,
         walls=walls,
         touch=touch,
@@ -247,7 +247,7 @@ def random_model(rng):
     return display, model, unsure
 
 
-def within(rng, unsure):
+def sample_factors(rng, unsure):
     """A factor for each parameter inside its half-width: anywhere, or at an end."""
     ends = rng.random() < 0.5
     factor = {}
@@ -258,7 +258,7 @@ def within(rng, unsure):
     return factor
 
 
-def upper(unsure):
+def upper_factors(unsure):
     """What heats most in the long run."""
     high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "touch_share", "exponent")
     return {name: getattr(unsure, name) + (0.0 if name == "exponent" else 1.0) for name in high}
@@ -267,7 +267,7 @@ def upper(unsure):
 KINDS = ("hammer", "ring", "whole", "bursts", "scatter")
 
 
-def sequence(rng, kind, pixels, span_s=3.0):
+def build_sequence(rng, kind, pixels, span_s=3.0):
     """Pixels, starts and widths of a hostile sequence; whole microseconds, one beam, dark for moves."""
     home = int(rng.integers(pixels))
     ring = rng.permutation(pixels)[: int(rng.integers(2, 9))]
@@ -289,7 +289,7 @@ def sequence(rng, kind, pixels, span_s=3.0):
     return rows
 
 
-def as_plan(rows, power_w, display):
+def build_plan(rows, power_w, display):
     """A plan of (pixel, start_s, width_s) at one power or [n]."""
     pixel, start, width = (np.array(column) for column in zip(*rows, strict=True))
     n = len(rows)

@@ -15,46 +15,46 @@ if TYPE_CHECKING:
 SENSOR_BAUD = 115_200
 
 
-class Bench(NamedTuple):
+class BoardAccess(NamedTuple):
     """A board, not yet connected, and what sees the spot, None without a sensor."""
 
-    held: "HeldBoard"
-    eyes: "Eyes | None"
+    board: "HeldBoard"
+    spot_reader: "Eyes | None"
 
 
 @contextmanager
-def bench(config: str | None) -> Iterator[Bench]:
+def open_board(config: str | None) -> Iterator[BoardAccess]:
     """The configured board and sensor; told to abort and closed whatever happens within."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.device.config import DEFAULT_CONFIG, load_config
     from optodrive.lab.commissioning.exclusive_board import HeldBoard
     from optodrive.lab.commissioning.spot_reader import Eyes
     from optodrive.lab.commissioning.spot_sensor_client import SpotSensor
-    from optodrive.link.transport.registry import make_bench
+    from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort
-    from optodrive.planning.pipeline import Display
+    from optodrive.planning.pipeline import DisplayModel
 
     loaded = load_config(config)
     # Aimed by nominal numbers: a field that is no good any more must not keep anyone from measuring a new one.
     loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     board, clock = loaded.board, MonotonicClock()
-    transport, sensor_port = make_bench(board, config or DEFAULT_CONFIG)
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)
-    with HeldBoard(Display.of(loaded), transport, clock) as held:
-        eyes = None
+    transport, sensor_port = build_bench_transport(board, config or DEFAULT_CONFIG)
+    for signal_number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(signal_number, signal.default_int_handler)
+    with HeldBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
+        spot_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)
-            eyes = Eyes(held, SpotSensor(SerialPort(port, baud, "sensor.port")), clock)
+            spot_reader = Eyes(exclusive_board, SpotSensor(SerialPort(port, baud, "sensor.port")), clock)
         try:
-            yield Bench(held, eyes)
+            yield BoardAccess(exclusive_board, spot_reader)
         except LinkError as error:
             if "cannot be opened" in str(error):
                 raise LinkError(f"{error} `optodrive serve` does as long as it runs: end it first") from None
             raise
         finally:
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(number, signal.SIG_IGN)  # on the way out nothing comes between board and ABORT
-            if eyes is not None:
-                eyes.close()
+            for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(signal_number, signal.SIG_IGN)  # on the way out nothing comes between board and ABORT
+            if spot_reader is not None:
+                spot_reader.close()

@@ -16,10 +16,10 @@ def register(app: typer.Typer) -> None:
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the resolved configuration, with every pixel and number filled in."""
     from optodrive.device.config import load_config
-    from optodrive.planning.effective_config import resolved_config
-    from optodrive.planning.pipeline import Display
+    from optodrive.planning.effective_config import build_effective_config
+    from optodrive.planning.pipeline import DisplayModel
 
-    document = resolved_config(Display.of(load_config(config)))
+    document = build_effective_config(DisplayModel.from_config(load_config(config)))
     if json:
         print_json(document)
         return
@@ -38,9 +38,9 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check a configuration file whole."""
     from optodrive.device.config import load_config
-    from optodrive.planning.pipeline import Display
+    from optodrive.planning.pipeline import DisplayModel
 
-    display = Display.of(load_config(config))
+    display = DisplayModel.from_config(load_config(config))
     if json:
         print_json({"name": display.config.name, "pixels": len(display.layout), "ok": True})
     else:

@@ -15,31 +15,31 @@ def register(app: typer.Typer) -> None:
 
 def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Show the board, the link and the queue."""
-    _print(_call(url, "GET", "/v1/state"), json)
+    _print_state(_call(url, "GET", "/v1/state"), json)
 
 
 def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Arm the board; its indicator is lit for two seconds first."""
-    _print(_call(url, "POST", "/v1/arm"), json)
+    _print_state(_call(url, "POST", "/v1/arm"), json)
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Disarm the board; also acknowledges a fault whose cause is gone."""
-    _print(_call(url, "POST", "/v1/disarm"), json)
+    _print_state(_call(url, "POST", "/v1/disarm"), json)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Gate off now; everything queued is dropped, the board disarmed."""
-    _print(_call(url, "POST", "/v1/stop"), json)
+    _print_state(_call(url, "POST", "/v1/stop"), json)
 
 
 def _call(url: str, method: str, path: str) -> dict[str, Any]:
-    from optodrive.client.http import Remote
+    from optodrive.client.http import DaemonClient
 
-    return Remote(url).call(method, path)
+    return DaemonClient(url).call(method, path)
 
 
-def _print(state: dict[str, Any], as_json: bool) -> None:
+def _print_state(state: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print_json(state)
         return

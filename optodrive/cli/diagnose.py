@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING…", help="HDF5 files or CSV folders.")]
 STDOUT = "-"
-DEFAULT_WIDTH_M = 0.4e-3
+DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
 """Where nobody says which bridge was measured: model.toml then holds for displays of that width only by R and C."""
 
 
@@ -30,13 +30,13 @@ def register(app: typer.Typer) -> None:
 
 
 @dataclass(frozen=True)
-class _Told:
+class _DiagnosisOutput:
     """An answer in all its forms; model: None where there is none to write."""
 
     document: dict[str, Any]
-    story: list[str]
-    report: str
-    model: str | None
+    narrative: list[str]
+    report_html: str
+    model_toml: str | None
 
 
 def diagnose(
@@ -59,86 +59,95 @@ def diagnose(
     ] = None,
 ) -> None:
     """Name what the simulation gets wrong in measured data, and what mending it gains."""
-    _check_extra()
+    _require_scipy()
     from optodrive.device.config import load_config
-    from optodrive.lab.diagnosis.display_diagnosis import TOGETHER
+    from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
     from optodrive.lab.recording import DisplayRuns
 
-    _check_targets(json, out)
+    _check_output_paths(json, out)
     if dask is not None and workers is not None:
         raise InputError("--workers", workers, "no such option beside --dask: a cluster has its own workers")
     settings = None if config is None else load_config(config)
     runs = DisplayRuns.open(recordings)
     title = ", ".join(path.name for path in recordings)
-    if len(runs.pixels) > TOGETHER:
-        told = _each(runs, title, seed, settings, dask, workers)
+    if len(runs.pixels) > MAX_JOINT_PIXELS:
+        output = _diagnose_per_pixel(runs, title, seed, settings, dask, workers)
     else:
-        told = _together(recordings, title, seed, settings)
-    _give(told, out, json)
+        output = _diagnose_jointly(recordings, title, seed, settings)
+    _write_output(output, out, json)
 
 
-def _together(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _Told:
+def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _DiagnosisOutput:
     """One pixel, or a few as one set of numbers."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
-    from optodrive.lab.diagnosis.model_file import model_toml
-    from optodrive.lab.diagnosis.narrative import answer, story
-    from optodrive.lab.diagnosis.priors import prior_of
-    from optodrive.lab.diagnosis.report import report
+    from optodrive.lab.diagnosis.model_file import build_model_toml
+    from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+    from optodrive.lab.diagnosis.priors import build_prior
+    from optodrive.lab.diagnosis.report import build_report
 
-    measurement = _joined(recordings)
-    prior, epsilon, width_m = prior_of(measurement, config)
+    measurement = _read_recordings(recordings)
+    prior, epsilon, width_m = build_prior(measurement, config)
     announce_compilation()
-    with _ticking() as tick:
-        found = study(measurement, seed, prior, epsilon, tick)
-    model = model_toml(found, title, width_m or DEFAULT_WIDTH_M) if found.base else None
-    return _Told(answer(found), story(found), report(found, title), model)
+    with _report_progress() as on_progress:
+        diagnosis = study(measurement, seed, prior, epsilon, on_progress)
+    model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
+    return _DiagnosisOutput(build_answer(diagnosis), build_narrative(diagnosis), build_report(diagnosis, title), model)
 
 
-def _each(
+def _diagnose_per_pixel(
     runs: "DisplayRuns", title: str, seed: int, config: "Config | None", dask: str | None, workers: int | None
-) -> _Told:
+) -> _DiagnosisOutput:
     """Many pixels, each for itself."""
     from optodrive.cli.diagnose_display import diagnose_display
-    from optodrive.lab.diagnosis.display_narrative import display_answer, display_story
-    from optodrive.lab.diagnosis.display_report import display_report
-    from optodrive.lab.diagnosis.model_file import model_toml
+    from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative
+    from optodrive.lab.diagnosis.display_report import build_display_report
+    from optodrive.lab.diagnosis.model_file import build_model_toml
 
     announce_compilation()
-    found = diagnose_display(runs, seed, config, dask, workers)
-    middle, width_m, what = found.model()
-    model = None if middle is None else model_toml(middle, title, width_m or DEFAULT_WIDTH_M, what)
-    return _Told(display_answer(found), display_story(found), display_report(found, title, config), model)
+    diagnosis = diagnose_display(runs, seed, config, dask, workers)
+    median_parameters, width_m, description = diagnosis.build_model()
+    model = (
+        None
+        if median_parameters is None
+        else build_model_toml(median_parameters, title, width_m or DEFAULT_BRIDGE_WIDTH_M, description)
+    )
+    return _DiagnosisOutput(
+        build_display_answer(diagnosis),
+        build_display_narrative(diagnosis),
+        build_display_report(diagnosis, title, config),
+        model,
+    )
 
 
-def _give(told: _Told, out: Path | None, json: str | None) -> None:
+def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) -> None:
     """Files, each whole, then words."""
     if json is not None and json != STDOUT:
-        _write(Path(json), _text(told.document))
+        _write_text(Path(json), _dump_json(output.document))
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        _write(out / "report.html", told.report)
-        _write(out / "diagnosis.json", _text(told.document))
-        if told.model is not None:
-            _write(out / "model.toml", told.model)
+        _write_text(out / "report.html", output.report_html)
+        _write_text(out / "diagnosis.json", _dump_json(output.document))
+        if output.model_toml is not None:
+            _write_text(out / "model.toml", output.model_toml)
         else:  # one of an earlier answer would be taken for this one's
             (out / "model.toml").unlink(missing_ok=True)
     if json == STDOUT:
-        print_json(told.document)
+        print_json(output.document)
         return
-    for line in told.story:
+    for line in output.narrative:
         print(line)
     if out is not None:
-        print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if told.model is not None else ""))
+        print(f"written: {out}/report.html, diagnosis.json" + (", model.toml" if output.model_toml is not None else ""))
 
 
-def _check_extra() -> None:
+def _require_scipy() -> None:
     from importlib.util import find_spec
 
     if find_spec("scipy") is None:
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
 
 
-def _check_targets(json: str | None, out: Path | None) -> None:
+def _check_output_paths(json: str | None, out: Path | None) -> None:
     """Answers go beside recordings, never over one."""
     if json is not None and json != STDOUT and (Path(json).suffix in (".h5", ".hdf5") or Path(json).is_dir()):
         raise InputError("--json", json, "a file for the answer, or - for stdout")
@@ -146,7 +155,7 @@ def _check_targets(json: str | None, out: Path | None) -> None:
         raise InputError("--out", str(out), "a folder")
 
 
-def _joined(paths: list[Path]) -> "Measurement":
+def _read_recordings(paths: list[Path]) -> "Measurement":
     from dataclasses import replace
 
     from optodrive.core.types.measurements import Measurement
@@ -158,21 +167,21 @@ def _joined(paths: list[Path]) -> "Measurement":
     return Measurement(tuple(runs))
 
 
-def _text(document: dict[str, object]) -> str:
+def _dump_json(document: dict[str, object]) -> str:
     import json
 
     return json.dumps(document, indent=2, ensure_ascii=False) + "\n"
 
 
-def _write(path: Path, text: str) -> None:
-    from optodrive.core.files import written_whole
+def _write_text(path: Path, text: str) -> None:
+    from optodrive.core.files import atomic_write
 
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 @contextmanager
-def _ticking() -> "Iterator[Callable[[str], None]]":
+def _report_progress() -> "Iterator[Callable[[str], None]]":
     """What is being done, on stderr where that is a terminal."""
     import sys
 

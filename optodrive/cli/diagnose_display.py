@@ -7,14 +7,14 @@ from time import perf_counter
 from typing import TYPE_CHECKING
 
 from optodrive.core.errors import InputError
-from optodrive.lab.recording.storage import Words
+from optodrive.lab.recording.storage import Unquoted
 
 if TYPE_CHECKING:
     from optodrive.device.config import Config
     from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer
     from optodrive.lab.recording import DisplayRuns
 
-LINES = 10
+PROGRESS_LINES = 10
 """Of progress, where stderr is no terminal."""
 
 
@@ -22,43 +22,52 @@ def diagnose_display(
     runs: "DisplayRuns", seed: int, config: "Config | None", dask: str | None, workers: int | None
 ) -> "DisplayAnswer":
     """Every pixel for itself, on local processes or a cluster; InputError where not one has an answer."""
-    from optodrive.lab.diagnosis.dask_workers import crew, done
-    from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelTask, diagnose_pixel, warm
+    from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
+    from optodrive.lab.diagnosis.display_diagnosis import (
+        DisplayAnswer,
+        PixelAnswer,
+        PixelTask,
+        compile_kernels,
+        diagnose_pixel,
+    )
 
-    began_s = perf_counter()
+    start_s = perf_counter()
     tasks = [PixelTask(item.pixel, item.read, seed, config) for item in runs.pixels]
     if runs.mirrors is not None:
         tasks.append(PixelTask(None, runs.mirrors.read, seed, config))
     if dask is None:
-        warm()
+        compile_kernels()
     pixels: list[PixelAnswer] = []
     mirrors: PixelAnswer | None = None
-    with _counting(len(runs.pixels)) as count, crew(dask, workers, most=len(tasks)) as client:
-        for task, result, error in done(client, diagnose_pixel, tasks):
+    with (
+        _report_progress(len(runs.pixels)) as report_count,
+        open_client(dask, workers, max_workers=len(tasks)) as client,
+    ):
+        for task, result, error in run_tasks(client, diagnose_pixel, tasks):
             answer = result or PixelAnswer(task.pixel, None, error)
             if task.pixel is None:
                 mirrors = answer
             else:
                 pixels.append(answer)
-                count(len(pixels))
+                report_count(len(pixels))
     pixels.sort(key=lambda item: item.pixel or 0)
-    if all(item.found is None for item in pixels):
+    if all(item.discrepancy is None for item in pixels):
         first = f"one at least; pixel {pixels[0].pixel}: {pixels[0].error}"
-        raise InputError("diagnose", Words(f"no answer for any of {len(pixels)} pixels"), first)
-    return DisplayAnswer(tuple(pixels), mirrors, perf_counter() - began_s)
+        raise InputError("diagnose", Unquoted(f"no answer for any of {len(pixels)} pixels"), first)
+    return DisplayAnswer(tuple(pixels), mirrors, perf_counter() - start_s)
 
 
 @contextmanager
-def _counting(pixels: int) -> Iterator[Callable[[int], None]]:
+def _report_progress(pixels: int) -> Iterator[Callable[[int], None]]:
     """A bar that counts pixels on stderr, or a few lines where that is no terminal."""
     if not sys.stderr.isatty():
-        steps = {pixels * (step + 1) // LINES for step in range(LINES)}
+        steps = {pixels * (step + 1) // PROGRESS_LINES for step in range(PROGRESS_LINES)}
 
-        def line(count: int) -> None:
-            if pixels >= 2 * LINES and count in steps:
+        def print_line(count: int) -> None:
+            if pixels >= 2 * PROGRESS_LINES and count in steps:
                 print(f"optodrive: {count} of {pixels} pixels", file=sys.stderr)
 
-        yield line
+        yield print_line
         return
     from rich.console import Console
     from rich.progress import (

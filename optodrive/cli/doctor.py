@@ -21,14 +21,14 @@ def register(app: typer.Typer) -> None:
 def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check computer, port and board beforehand; nothing is armed. Exit 1 where there is a problem."""
     findings = examine(config)
-    problems = sum(finding.grade == "problem" for finding in findings)
-    warnings = sum(finding.grade == "warning" for finding in findings)
+    problems = sum(finding.status == "problem" for finding in findings)
+    warnings = sum(finding.status == "warning" for finding in findings)
     if json:
         counts = {"problems": problems, "warnings": warnings}
         print_json({"ok": not problems, **counts, "findings": [finding._asdict() for finding in findings]})
     else:
         for finding in findings:
-            print(f"{MARKS[finding.grade]}  {finding.check:14} {finding.seen}")
+            print(f"{MARKS[finding.status]}  {finding.check:14} {finding.observation}")
             if finding.remedy:
                 print(f"{'':9}{'':14} {finding.remedy}")
         print(f"{problems} problems, {warnings} warnings")
@@ -40,7 +40,7 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     """All findings in order; root: the folder that stands for /."""
     from optodrive.cli import doctor_host as host
     from optodrive.cli.doctor_board import check_board
-    from optodrive.cli.doctor_finding import problem
+    from optodrive.cli.doctor_finding import report_problem
     from optodrive.cli.doctor_port import check_port
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.errors import InputError
@@ -51,7 +51,10 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     try:
         loaded = load_config(config)
     except InputError as error:
-        return [*findings, problem("configuration", str(error), "correct it; `optodrive config check` tells more")]
+        return [
+            *findings,
+            report_problem("configuration", str(error), "correct it; `optodrive config check` tells more"),
+        ]
     findings += [host.check_clock(clock, loaded.board.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]
     port, free = check_port(loaded.board, root)

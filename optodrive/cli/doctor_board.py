@@ -1,57 +1,68 @@
 """What the doctor asks the board itself: a handshake and nothing more; it is never armed."""
 
-from optodrive.cli.doctor_finding import Finding, ok, problem, warning
+from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import Config
 from optodrive.link.protocol.messages import INPUTS
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.fault_hints import hint
-from optodrive.link.session.session import Session
-from optodrive.link.transport.registry import transport_maker
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.session import BoardSession
+from optodrive.link.transport.registry import find_transport_factory
 
-ROUND_TRIP_NOTICED_S = 0.01
+ROUND_TRIP_WARNING_S = 0.01
 SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
-UNSAFE = {"interlock": "the enclosure is open", "key": "the key is off", "estop": "the emergency stop is pressed"}
+UNSAFE_REASONS = {
+    "interlock": "the enclosure is open",
+    "key": "the key is off",
+    "estop": "the emergency stop is pressed",
+}
 
 
 def check_board(config: Config, clock: Clock) -> list[Finding]:
     """Greet the board, hold its limits against the configuration's, measure the round trip, and leave it DISARMED."""
     board = config.board
-    session = Session(transport_maker(board)(), clock, Requirements.of(config))
+    session = BoardSession(find_transport_factory(board)(), clock, BoardRequirements.from_config(config))
     try:
         session.connect()
-        return [*_identity(session, config), _inputs(session), _round_trip(session)]
+        return [*_check_identity(session, config), _check_inputs(session), _check_round_trip(session)]
     except LinkError as error:
-        return [problem("board", str(error), "check power, port and board.baud")]
+        return [report_problem("board", str(error), "check power, port and board.baud")]
     except InputError as error:
-        return [problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")]
+        return [report_problem("board", f"{error.where} is {error.value}", f"expected: {error.expected}")]
     finally:
         session.close()
 
 
-def _identity(session: Session, config: Config) -> list[Finding]:
+def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
     board = session.board
-    seen = f"uid {board.uid}, firmware {board.firmware >> 16}.{board.firmware & 0xFFFF}, {board.state}"
-    limits = ok("limits", "the board's own allow what the configuration asks for")
+    observation = f"uid {board.uid}, firmware {board.firmware >> 16}.{board.firmware & 0xFFFF}, {board.state}"
+    limits = report_ok("limits", "the board's own allow what the configuration asks for")
     if board.fault:
-        return [warning("board", f"{seen} {board.fault}", hint(board.fault)), limits]
+        return [report_warning("board", f"{observation} {board.fault}", get_fault_hint(board.fault)), limits]
     if not config.board.uid:
-        return [warning("board", f"{seen}; any board would do", f'to be sure of it: board.uid = "{board.uid}"'), limits]
-    return [ok("board", seen), limits]
+        return [
+            report_warning(
+                "board", f"{observation}; any board would do", f'to be sure of it: board.uid = "{board.uid}"'
+            ),
+            limits,
+        ]
+    return [report_ok("board", observation), limits]
 
 
-def _inputs(session: Session) -> Finding:
-    now = {name: bool(session.board.inputs >> bit & 1) for bit, name in enumerate(INPUTS)}
-    wrong = [UNSAFE[name] for name in INPUTS if now[name] != SAFE_INPUTS[name]]
-    if wrong:
-        return warning("inputs", "; ".join(wrong), "the board will not arm before that is put right")
-    return ok("inputs", "enclosure closed, key on, emergency stop released")
+def _check_inputs(session: BoardSession) -> Finding:
+    input_states = {name: bool(session.board.inputs >> bit & 1) for bit, name in enumerate(INPUTS)}
+    unsafe = [UNSAFE_REASONS[name] for name in INPUTS if input_states[name] != SAFE_INPUTS[name]]
+    if unsafe:
+        return report_warning("inputs", "; ".join(unsafe), "the board will not arm before that is put right")
+    return report_ok("inputs", "enclosure closed, key on, emergency stop released")
 
 
-def _round_trip(session: Session) -> Finding:
-    trip_ms = session.link_figures()["round_trip_ms"]
-    seen = f"round trip {trip_ms:.2f} ms"
-    if trip_ms > ROUND_TRIP_NOTICED_S * 1e3:
-        return warning("link", seen, "slow: see latency above, and use a port of its own rather than a hub")
-    return ok("link", seen)
+def _check_round_trip(session: BoardSession) -> Finding:
+    trip_ms = session.collect_link_stats()["round_trip_ms"]
+    observation = f"round trip {trip_ms:.2f} ms"
+    if trip_ms > ROUND_TRIP_WARNING_S * 1e3:
+        return report_warning(
+            "link", observation, "slow: see latency above, and use a port of its own rather than a hub"
+        )
+    return report_ok("link", observation)

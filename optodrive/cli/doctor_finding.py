@@ -2,28 +2,28 @@
 
 from typing import Literal, NamedTuple
 
-Grade = Literal["ok", "warning", "problem"]
+FindingStatus = Literal["ok", "warning", "problem"]
 
 
 class Finding(NamedTuple):
     """remedy: what to do, '' where nothing is to be done."""
 
     check: str
-    grade: Grade
-    seen: str
+    status: FindingStatus
+    observation: str
     remedy: str = ""
 
 
-def ok(check: str, seen: str) -> Finding:
+def report_ok(check: str, observation: str) -> Finding:
     """All is well."""
-    return Finding(check, "ok", seen)
+    return Finding(check, "ok", observation)
 
 
-def warning(check: str, seen: str, remedy: str) -> Finding:
+def report_warning(check: str, observation: str, remedy: str) -> Finding:
     """It works, but may not always."""
-    return Finding(check, "warning", seen, remedy)
+    return Finding(check, "warning", observation, remedy)
 
 
-def problem(check: str, seen: str, remedy: str) -> Finding:
+def report_problem(check: str, observation: str, remedy: str) -> Finding:
     """It will not work."""
-    return Finding(check, "problem", seen, remedy)
+    return Finding(check, "problem", observation, remedy)

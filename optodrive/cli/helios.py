@@ -17,10 +17,10 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     announce_compilation,
-    configured,
+    format_plan_summary,
+    load_run_config,
     print_json,
-    progress,
-    report_lines,
+    show_progress,
 )
 from optodrive.core.errors import OptodriveError
 
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
     from optodrive.core.clock import Clock
     from optodrive.core.types.plans import BudgetState
     from optodrive.link.helios.dac import Helios
-    from optodrive.link.helios.heat_memory import Memory
-    from optodrive.link.helios.player import Played
-    from optodrive.link.helios.verification import ProvenFrames
-    from optodrive.planning.pipeline import Display, Prepared
+    from optodrive.link.helios.heat_memory import HeatMemory
+    from optodrive.link.helios.player import PlaybackReport
+    from optodrive.link.helios.verification import VerifiedFrames
+    from optodrive.planning.pipeline import DisplayModel, PlannedSequence
 
-ENDED_BY = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+TERMINATING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
-class _EndedError(OptodriveError):
+class _TerminatedError(OptodriveError):
     """A signal came."""
 
     code = "ended"
@@ -56,21 +56,21 @@ def info(config: ConfigOption = None, json: JsonOption = False) -> None:
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
 
-    board = configured(config, None).board
+    board = load_run_config(config, None).board
     with Helios(board, MonotonicClock()) as helios:
-        figures = {
+        document = {
             "name": helios.name,
             "firmware": helios.version,
-            "ready": helios.ready(),
+            "ready": helios.is_ready(),
             "may_emit": board.transport == "helios" and board.interlock_watched,
         }
     if json:
-        print_json(figures)
+        print_json(document)
         return
-    print(f"name             {figures['name']}")
-    print(f"firmware         {figures['firmware']}")
-    print(f"ready            {'yes' if figures['ready'] else 'no'}")
-    print(f"may emit         {'yes' if figures['may_emit'] else 'no: the configuration names no watched interlock'}")
+    print(f"name             {document['name']}")
+    print(f"firmware         {document['firmware']}")
+    print(f"ready            {'yes' if document['ready'] else 'no'}")
+    print(f"may emit         {'yes' if document['may_emit'] else 'no: the configuration names no watched interlock'}")
 
 
 def play(
@@ -86,112 +86,137 @@ def play(
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
     from optodrive.link.helios.encoding import PointScale
-    from optodrive.link.helios.heat_memory import Memory
-    from optodrive.link.helios.verification import prove
-    from optodrive.planning.feasibility import admit
-    from optodrive.planning.pipeline import Display, chosen
-    from optodrive.planning.plan_summary import summary
+    from optodrive.link.helios.heat_memory import HeatMemory
+    from optodrive.link.helios.verification import encode_verified
+    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.pipeline import DisplayModel, resolve_policy
+    from optodrive.planning.plan_summary import summarize_plan
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
-    display, clock = Display.of(configured(config, model)), MonotonicClock()
+    display, clock = DisplayModel.from_config(load_run_config(config, model)), MonotonicClock()
     helios = Helios(display.config.board, clock)
     helios.require_interlock()
     sequence = load_sequence(frames, display.config)
     announce_compilation()
-    with _signals_noted() as heed, helios:
-        memory = Memory.of(helios.name)
-        heat, fresh = display.at_rest()
-        budget = _cooled(memory, fresh, clock, heed)
-        with progress("planning") as done:
-            prepared, admission = admit(display, sequence, heat, budget, chosen(policy, strict), _both(heed, done), fit)
-        proven = prove(prepared.plan, PointScale.of(display.config), budget, display.budget)
-        with progress("playing") as done:
-            played = _played(helios, memory, prepared, proven, clock, _both(heed, done))
-    figures = {**summary(prepared, admission), "helios": _figures(display, prepared, proven, played)}
+    with _defer_signals() as raise_if_signalled, helios:
+        memory = HeatMemory.for_device(helios.name)
+        heat, cold_budget = display.build_cold_state()
+        budget = _recall_budget(memory, cold_budget, clock, raise_if_signalled)
+        with show_progress("planning") as on_progress:
+            planned_sequence, feasibility = check_feasibility(
+                display,
+                sequence,
+                heat,
+                budget,
+                resolve_policy(policy, strict),
+                _combine_progress(raise_if_signalled, on_progress),
+                fit,
+            )
+        proven = encode_verified(planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget)
+        with show_progress("playing") as on_progress:
+            playback = _play_and_store_heat(
+                helios, memory, planned_sequence, proven, clock, _combine_progress(raise_if_signalled, on_progress)
+            )
+    document = {
+        **summarize_plan(planned_sequence, feasibility),
+        "helios": _summarise_playback(display, planned_sequence, proven, playback),
+    }
     if json:
-        print_json(figures)
+        print_json(document)
         return
-    for line in [*report_lines(figures), *_lines(figures["helios"])]:
+    for line in [*format_plan_summary(document), *_format_playback(document["helios"])]:
         print(line)
 
 
 @contextmanager
-def _signals_noted() -> Iterator[Callable[[], None]]:
+def _defer_signals() -> Iterator[Callable[[], None]]:
     """Signals that end a process only leave a note here, so that none comes in the way of a stop; heed raises it."""
-    noted: list[int] = []
+    received: list[int] = []
 
-    def heed() -> None:
-        if noted:
-            raise _EndedError(f"ended by {signal.Signals(noted[0]).name}")
+    def raise_if_signalled() -> None:
+        if received:
+            raise _TerminatedError(f"ended by {signal.Signals(received[0]).name}")
 
-    before = {number: signal.signal(number, lambda which, _frame: noted.append(which)) for number in ENDED_BY}
+    previous_handlers = {
+        number: signal.signal(number, lambda which, _frame: received.append(which)) for number in TERMINATING_SIGNALS
+    }
     try:
-        yield heed
+        yield raise_if_signalled
     finally:
-        for number, handler in before.items():
+        for number, handler in previous_handlers.items():
             signal.signal(number, handler)
 
 
-def _both(heed: Callable[[], None], done: Callable[[float], None]) -> Callable[[float], None]:
-    def tick(share: float) -> None:
-        heed()
-        done(share)
+def _combine_progress(
+    raise_if_signalled: Callable[[], None], show_share: Callable[[float], None]
+) -> Callable[[float], None]:
+    def on_progress(share: float) -> None:
+        raise_if_signalled()
+        show_share(share)
 
-    return tick
+    return on_progress
 
 
-def _cooled(memory: "Memory", fresh: "BudgetState", clock: "Clock", heed: Callable[[], None]) -> "BudgetState":
+def _recall_budget(
+    memory: "HeatMemory", cold_budget: "BudgetState", clock: "Clock", raise_if_signalled: Callable[[], None]
+) -> "BudgetState":
     """The budget now, once all pulses of an earlier play have had their time."""
-    budget = memory.recall(time_of_day(), fresh)
+    budget = memory.load(time_of_day(), cold_budget)
     while budget.at_s > 0.0:
-        heed()
+        raise_if_signalled()
         clock.sleep(min(budget.at_s, 0.1))
-        budget = memory.recall(time_of_day(), fresh)
+        budget = memory.load(time_of_day(), cold_budget)
     return budget
 
 
-def _played(
+def _play_and_store_heat(
     helios: "Helios",
-    memory: "Memory",
-    prepared: "Prepared",
-    proven: "ProvenFrames",
+    memory: "HeatMemory",
+    planned_sequence: "PlannedSequence",
+    proven: "VerifiedFrames",
     clock: "Clock",
-    tick: Callable[[float], None],
-) -> "Played":
+    on_progress: Callable[[float], None],
+) -> "PlaybackReport":
     """Play, the memory written before the first light, and again after the last: a killed play counts in full."""
-    from optodrive.link.helios.heat_memory import AHEAD_S
+    from optodrive.link.helios.heat_memory import ZERO_OFFSET_S
     from optodrive.link.helios.player import play
 
-    memory.keep(prepared.budget, time_of_day() + AHEAD_S)
+    memory.save(planned_sequence.budget, time_of_day() + ZERO_OFFSET_S)
     try:
-        return play(helios, proven, clock, tick)
+        return play(helios, proven, clock, on_progress)
     finally:
-        memory.keep(prepared.budget, time_of_day() - min(proven.duration_s, prepared.budget.at_s))
+        memory.save(planned_sequence.budget, time_of_day() - min(proven.duration_s, planned_sequence.budget.at_s))
 
 
-def _figures(display: "Display", prepared: "Prepared", proven: "ProvenFrames", played: "Played") -> dict[str, Any]:
+def _summarise_playback(
+    display: "DisplayModel", planned_sequence: "PlannedSequence", proven: "VerifiedFrames", playback: "PlaybackReport"
+) -> dict[str, Any]:
     from optodrive.core.units import m_to_um
     from optodrive.link.helios.encoding import PointScale
 
-    pulses, plan = proven.pulses, prepared.plan
-    shown = display.heat_at_rest().pulses(plan.pixel[proven.row], pulses.start_s, pulses.width_s, pulses.power_w)
+    pulses, plan = proven.pulses, planned_sequence.plan
+    response = display.build_cold_heat().apply_pulses(
+        plan.pixel[proven.row], pulses.start_s, pulses.width_s, pulses.power_w
+    )
     return {
-        "points_per_s": 1.0 / PointScale.of(display.config).point_s,
-        "frames": played.frames,
+        "points_per_s": 1.0 / PointScale.from_config(display.config).point_s,
+        "frames": playback.frames,
         "energy_j": proven.energy_j,
         "energy_planned_j": float(plan.energy_j.sum()),
-        "predicted_max_um": m_to_um(float(shown.displacement_m.max())) if len(pulses) else 0.0,
-        "holes": played.holes,
-        "hole_s": played.hole_s,
+        "predicted_max_um": m_to_um(float(response.displacement_m.max())) if len(pulses) else 0.0,
+        "holes": playback.underruns,
+        "hole_s": playback.underrun_s,
     }
 
 
-def _lines(figures: dict[str, Any]) -> list[str]:
+def _format_playback(playback: dict[str, Any]) -> list[str]:
     lines = [
-        f"sent             {figures['frames']} frames at {figures['points_per_s']:.1f} points/s",
-        f"light            {figures['energy_j']:.4f} J of {figures['energy_planned_j']:.4f} J planned",
-        f"tallest so       {figures['predicted_max_um']:.1f} µm predicted of the light sent",
+        f"sent             {playback['frames']} frames at {playback['points_per_s']:.1f} points/s",
+        f"light            {playback['energy_j']:.4f} J of {playback['energy_planned_j']:.4f} J planned",
+        f"tallest so       {playback['predicted_max_um']:.1f} µm predicted of the light sent",
     ]
-    if figures["holes"]:
-        lines.append(f"holes            {figures['holes']}, dark for {figures['hole_s'] * 1e3:.1f} ms at least in all")
+    if playback["holes"]:
+        lines.append(
+            f"holes            {playback['holes']}, dark for {playback['hole_s'] * 1e3:.1f} ms at least in all"
+        )
     return lines

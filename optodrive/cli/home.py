@@ -18,7 +18,7 @@ def register(app: typer.Typer) -> None:
 
 def home(
     config: ConfigOption = None,
-    spot: Annotated[
+    spot_power_mw: Annotated[
         float, typer.Option("--spot", metavar="POWER_MW", min=0.0, help="Look with a spot of this power; else dark.")
     ] = 0.0,
     acknowledge: Annotated[
@@ -28,28 +28,28 @@ def home(
     json: JsonOption = False,
 ) -> None:
     """Bring the mirrors to their middle, look at travel, position outputs, interlock, key, stop, indicator."""
-    from optodrive.cli.board_access import bench
+    from optodrive.cli.board_access import open_board
     from optodrive.lab.commissioning.exclusive_board import check_power
     from optodrive.lab.commissioning.homing import Homing
 
-    done: list[Done] = []
+    results: list[Done] = []
 
-    def tell(step: "Done") -> None:
-        done.append(step)
+    def report_step(step: "Done") -> None:
+        results.append(step)
         if not json:
             print(f"{step.step:<11} {step.words}", flush=True)
 
     failure = "interrupted"
     try:
-        with bench(config) as (held, eyes):
-            if spot:
-                check_power(held.config, spot * 1e-3)
-            Homing(held, eyes, spot * 1e-3, acknowledge).run(tell)
+        with open_board(config) as (board, spot_reader):
+            if spot_power_mw:
+                check_power(board.config, spot_power_mw * 1e-3)
+            Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)
         failure = ""
     except OptodriveError as error:
         failure = str(error)
         raise
     finally:
         if json:
-            steps = [{"step": step.step, "ok": True, "says": step.words, **step.figures} for step in done]
+            steps = [{"step": step.step, "ok": True, "says": step.words, **step.figures} for step in results]
             print_json({"home": not failure, "steps": steps, "failure": failure or None})

@@ -26,7 +26,7 @@ from optodrive.cli import (
 from optodrive.cli.calibrate import field as calibrate
 from optodrive.core.errors import OptodriveError
 
-INTERRUPTED = 130
+EXIT_INTERRUPTED = 130
 UsageError: Any = typer.BadParameter.__bases__[0]
 """The base of every complaint about arguments; typer brings its own copy of click, or uses click's."""
 
@@ -70,7 +70,7 @@ def run(arguments: list[str]) -> int:
     try:
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
         sys.stdout.flush()
-        if status == INTERRUPTED:  # some versions of typer turn a Ctrl-C into a status
+        if status == EXIT_INTERRUPTED:  # some versions of typer turn a Ctrl-C into a status
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
@@ -78,7 +78,7 @@ def run(arguments: list[str]) -> int:
         return error.exit_status
     except (typer.Abort, KeyboardInterrupt):
         print("optodrive: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return EXIT_INTERRUPTED
     except UsageError as error:
         message = " ".join(error.format_message().split())
         if message:  # without arguments there is none: help was shown instead

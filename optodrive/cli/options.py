@@ -45,38 +45,42 @@ FitOption = Annotated[
         "--fit", help="What does not fit on the beam: even lowers all of it, priority leaves out the less important."
     ),
 ]
-LEFT_OUT_LISTED_MAX = 5
+OMITTED_LISTED_MAX = 5
 DEFAULT_URL = "http://127.0.0.1:8450"
 
 
-def model_file(path: Path) -> Path:
+def check_model_path(path: Path) -> Path:
     """The file itself; InputError for another kind, which would be taken for the name of a shipped set."""
     if path.suffix != ".toml":
         raise InputError("--model", str(path), "a .toml file")
     return path
 
 
-def configured(
+def load_run_config(
     config: str | None,
     model: Path | None,
     field: Path | None = None,
     mirrors: Path | None = None,
-    pixels_map: Path | None = None,
+    pixel_map: Path | None = None,
 ) -> "Config":
     """The configuration, following a model and what was calibrated where given; InputError with one line."""
-    from optodrive.device.config import load_config, with_mirrors
-    from optodrive.device.pixel_map import with_map
+    from optodrive.device.config import apply_measured_servo, load_config
+    from optodrive.device.pixel_map import replace_pixel_map
 
     # A file of mirrors lowers a cap: the one asked for here stands in place of the configuration's, not on top of it.
-    loaded = load_config(config) if mirrors is None else with_mirrors(load_config(config, measured=False), mirrors)
+    loaded = (
+        load_config(config)
+        if mirrors is None
+        else apply_measured_servo(load_config(config, measured_servo=False), mirrors)
+    )
     if field is not None:
         scanner = loaded.scanner.model_copy(update={"field": str(field)})
         loaded = loaded.model_copy(update={"scanner": scanner})
-    if pixels_map is not None:
-        loaded = with_map(loaded, pixels_map)
+    if pixel_map is not None:
+        loaded = replace_pixel_map(loaded, pixel_map)
     if model is None:
         return loaded
-    section = loaded.pixel_model.model_copy(update={"parameters": str(model_file(model))})
+    section = loaded.pixel_model.model_copy(update={"parameters": str(check_model_path(model))})
     return loaded.model_copy(update={"pixel_model": section})
 
 
@@ -95,7 +99,7 @@ def announce_compilation() -> None:
 
 
 @contextmanager
-def progress(label: str) -> Iterator[Callable[[float], None]]:
+def show_progress(label: str) -> Iterator[Callable[[float], None]]:
     """A bar on stderr, where that is a terminal; give it the share done, 0 to 1."""
     if not sys.stderr.isatty():
         yield lambda share: None
@@ -109,10 +113,10 @@ def progress(label: str) -> Iterator[Callable[[float], None]]:
         yield lambda share: bar.update(task, completed=share)
 
 
-def report_lines(summary: dict[str, Any]) -> list[str]:
+def format_plan_summary(summary: dict[str, Any]) -> list[str]:
     """A plan's summary as a few lines of plain words."""
     lines = [
-        *_admission(summary["admission"]),
+        *_format_feasibility(summary["admission"]),
         f"pulses           {summary['pulses']}",
         f"duration         {summary['duration_s']:.4f} s",
         f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
@@ -128,11 +132,11 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     if trimmed["pulses"]:
         reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed["by_reason"].items())
         lines.append(f"trimmed          {trimmed['pulses']} pulses, {trimmed['energy_j'] * 1e3:.2f} mJ: {reasons}")
-        lines.append(f"                 {_shortfall(summary['shortfall'])}")
+        lines.append(f"                 {_format_shortfall(summary['shortfall'])}")
     else:
         lines.append("trimmed          nothing")
     if summary["delays"]:
-        lines.append(f"waited           {_waited(summary['delays'])}")
+        lines.append(f"waited           {_format_delays(summary['delays'])}")
     lines += [f"late             {sentence}" for sentence in summary["late"][:5]]
     if len(summary["late"]) > 5:
         lines.append(f"late             and {len(summary['late']) - 5} more frames")
@@ -147,34 +151,34 @@ def report_lines(summary: dict[str, Any]) -> list[str]:
     return lines
 
 
-def _admission(admission: dict[str, Any]) -> list[str]:
-    if admission["fits"]:
-        return ["fits: yes" if admission["proof"] == "planned" else f"fits: yes, {admission['sentence']}"]
-    lines = [f"fits: no, {admission['sentence']}"]
-    if admission["fit"] == "even":
-        lines.append(f"shown            all heights and powers × {admission['height']:g}")
-    for left in admission["left_out"][:LEFT_OUT_LISTED_MAX]:
-        lines.append(f"left out         {left['name']}: {_pixels(left['pixels'])}")
-    more = len(admission["left_out"]) - LEFT_OUT_LISTED_MAX
+def _format_feasibility(feasibility: dict[str, Any]) -> list[str]:
+    if feasibility["fits"]:
+        return ["fits: yes" if feasibility["proof"] == "planned" else f"fits: yes, {feasibility['sentence']}"]
+    lines = [f"fits: no, {feasibility['sentence']}"]
+    if feasibility["fit"] == "even":
+        lines.append(f"shown            all heights and powers × {feasibility['height']:g}")
+    for omitted in feasibility["left_out"][:OMITTED_LISTED_MAX]:
+        lines.append(f"left out         {omitted['name']}: {_format_pixels(omitted['pixels'])}")
+    more = len(feasibility["left_out"]) - OMITTED_LISTED_MAX
     if more > 0:
         lines.append(f"left out         and less of {more} more")
     return lines
 
 
-def _pixels(pixels: list[int]) -> str:
+def _format_pixels(pixels: list[int]) -> str:
     listed = ", ".join(map(str, pixels[:20]))
     return (
         f"pixel{'s' if len(pixels) > 1 else ''} {listed}{f' and {len(pixels) - 20} more' if len(pixels) > 20 else ''}"
     )
 
 
-def _shortfall(shortfall: dict[str, Any]) -> str:
+def _format_shortfall(shortfall: dict[str, Any]) -> str:
     later_s = shortfall["fits_later_s"]
     fits = "at no later time" if later_s is None else f"{later_s:.3f} s later"
     return f"first pixel {shortfall['pixel']}, {shortfall['margin_j'] * 1e3:.2f} mJ too much; all of it fits {fits}"
 
 
-def _waited(delays: list[dict[str, Any]]) -> str:
-    first, whole_s = delays[0], sum(delay["wait_s"] for delay in delays)
+def _format_delays(delays: list[dict[str, Any]]) -> str:
+    first, total_s = delays[0], sum(delay["wait_s"] for delay in delays)
     where = f"{first['source']}, {first['wait_s']:.3f} s for pixel {first['pixel']} ({first['cap']})"
-    return f"{whole_s:.3f} s in {len(delays)} frames or trains, first in {where}"
+    return f"{total_s:.3f} s in {len(delays)} frames or trains, first in {where}"

@@ -16,10 +16,10 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     announce_compilation,
-    configured,
+    format_plan_summary,
+    load_run_config,
     print_json,
-    progress,
-    report_lines,
+    show_progress,
 )
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
@@ -37,30 +37,32 @@ def plan(
     model: ModelOption = None,
     field: FieldOption = None,
     mirrors: MirrorsOption = None,
-    pixels_map: PixelMapOption = None,
+    pixel_map: PixelMapOption = None,
     strict: StrictOption = False,
     policy: PolicyOption = "trim",
     fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
-    from optodrive.planning.feasibility import admit
-    from optodrive.planning.pipeline import Display, chosen
-    from optodrive.planning.plan_summary import summary, write_plan_csv
+    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.pipeline import DisplayModel, resolve_policy
+    from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
-    display = Display.of(configured(config, model, field, mirrors, pixels_map))
+    display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
-    with progress("planning") as done:
-        prepared, admission = admit(display, sequence, *display.at_rest(), chosen(policy, strict), done, fit)
+    with show_progress("planning") as on_progress:
+        planned_sequence, feasibility = check_feasibility(
+            display, sequence, *display.build_cold_state(), resolve_policy(policy, strict), on_progress, fit
+        )
     if out is not None:
-        write_plan_csv(out, prepared, display)
-    figures = summary(prepared, admission)
+        write_plan_csv(out, planned_sequence, display)
+    document = summarize_plan(planned_sequence, feasibility)
     if json:
-        print_json(figures)
+        print_json(document)
         return
-    for line in report_lines(figures):
+    for line in format_plan_summary(document):
         print(line)
     if out is not None:
         print(f"written          {out}")

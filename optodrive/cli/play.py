@@ -14,14 +14,14 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     UrlOption,
+    format_plan_summary,
     print_json,
-    progress,
-    report_lines,
+    show_progress,
 )
 from optodrive.core.errors import InputError, RefusedError
 
 if TYPE_CHECKING:
-    from optodrive.client.http import Remote
+    from optodrive.client.http import DaemonClient
 
 POLL_S = 0.1
 
@@ -46,16 +46,16 @@ def push(
     json: JsonOption = False,
 ) -> None:
     """Plan frames and trains, show them, and say what was executed."""
-    from optodrive.client.http import Remote
+    from optodrive.client.http import DaemonClient
 
     try:
         body = frames.read_bytes()
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
-    remote = Remote(url)
+    remote = DaemonClient(url)
     query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
     answer = remote.call("POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"})
-    _follow(remote, answer, wait, json)
+    _follow_plan(remote, answer, wait, json)
 
 
 def play(
@@ -70,63 +70,63 @@ def play(
     json: JsonOption = False,
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
-    from optodrive.client.http import Remote
+    from optodrive.client.http import DaemonClient
 
-    given = _parameters(pattern, values or [])
-    remote = Remote(url)
+    parameters = _parse_parameters(pattern, values or [])
+    remote = DaemonClient(url)
     query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
-    answer = remote.call("POST", f"/v1/patterns/{pattern}", json=given, params=query)
-    _follow(remote, answer, wait, json)
+    answer = remote.call("POST", f"/v1/patterns/{pattern}", json=parameters, params=query)
+    _follow_plan(remote, answer, wait, json)
 
 
 def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """List the patterns and their parameters; needs no daemon."""
     from optodrive.planning.stimuli.pattern_registry import describe_patterns
 
-    described = describe_patterns()
+    descriptions = describe_patterns()
     if json:
-        print_json({"patterns": described})
+        print_json({"patterns": descriptions})
         return
-    for item in described:
+    for item in descriptions:
         print(f"{item['name']}: {item['summary']}")
         for parameter in item["parameters"]:
             choices = f" ({', '.join(str(choice) for choice in parameter['choices'])})" if parameter["choices"] else ""
             print(f"    {parameter['name']}={parameter['default']}{choices}  {parameter['meaning']}")
 
 
-def _parameters(pattern: str, values: list[str]) -> dict[str, str]:
+def _parse_parameters(pattern: str, values: list[str]) -> dict[str, str]:
     from optodrive.planning.stimuli.pattern_registry import find_pattern
 
     known = find_pattern(pattern).parameters
-    given: dict[str, str] = {}
+    parsed: dict[str, str] = {}
     for value in values:
         key, equals, content = value.partition("=")
         if not equals or key not in {p.name for p in known}:
-            if known and known[0].name not in given and not equals:
+            if known and known[0].name not in parsed and not equals:
                 key, content = known[0].name, value  # a bare word is the first parameter: play text "hello"
             elif not equals:
                 raise InputError(f"play {pattern}", value, "key=value")
-        given[key] = content
+        parsed[key] = content
     for parameter in known:
-        if parameter.kind == "file" and parameter.name in given:
-            given[parameter.name] = _encoded(Path(given[parameter.name]))
-    return given
+        if parameter.kind == "file" and parameter.name in parsed:
+            parsed[parameter.name] = _encode_file(Path(parsed[parameter.name]))
+    return parsed
 
 
-def _encoded(path: Path) -> str:
+def _encode_file(path: Path) -> str:
     try:
         return base64.b64encode(path.read_bytes()).decode("ascii")
     except OSError as error:
         raise InputError(str(path), error.strerror, "a readable file") from None
 
 
-def _follow(remote: "Remote", answer: dict[str, Any], wait: bool, as_json: bool) -> None:
+def _follow_plan(remote: "DaemonClient", answer: dict[str, Any], wait: bool, as_json: bool) -> None:
     if wait and answer["status"] in ("queued", "running"):
-        answer = _wait(remote, answer)
+        answer = _wait_until_shown(remote, answer)
     if as_json:
         print_json(answer)
     else:
-        for line in report_lines(answer["summary"]):
+        for line in format_plan_summary(answer["summary"]):
             print(line)
         print(f"plan             {answer['plan']}: {answer['status']}")
         if answer["status"] == "done":
@@ -135,10 +135,10 @@ def _follow(remote: "Remote", answer: dict[str, Any], wait: bool, as_json: bool)
         raise RefusedError(f"plan {answer['plan']} failed: {answer['error']}")
 
 
-def _wait(remote: "Remote", answer: dict[str, Any]) -> dict[str, Any]:
-    with progress("showing") as done:
+def _wait_until_shown(remote: "DaemonClient", answer: dict[str, Any]) -> dict[str, Any]:
+    with show_progress("showing") as on_progress:
         while answer["status"] in ("queued", "running"):
             time.sleep(POLL_S)
             answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
-            done(answer["executed"] / max(1, answer["planned"]))
+            on_progress(answer["executed"] / max(1, answer["planned"]))
     return remote.call("GET", f"/v1/plans/{answer['plan']}")

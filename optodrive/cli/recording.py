@@ -49,18 +49,18 @@ def show(
 ) -> None:
     """Check a recording whole, and show what each run holds."""
     from optodrive.lab.recording import read_recording
-    from optodrive.lab.recording.summary import summary
+    from optodrive.lab.recording.summary import build_summary
 
     measurement = read_recording(recording)
-    runs = summary(measurement)
-    drawn = None if out is None else _draw(out, measurement)
+    runs = build_summary(measurement)
+    plotted_runs = None if out is None else _draw_signals(out, measurement)
     if json:
-        picture = None if out is None else {"file": str(out), "runs": drawn}
+        picture = None if out is None else {"file": str(out), "runs": plotted_runs}
         print_json({"recording": str(recording), "runs": runs, "picture": picture})
         return
     _print_table(runs)
     if out is not None:
-        part = "" if drawn == len(runs) else f", the first {drawn} of {len(runs)} runs"
+        part = "" if plotted_runs == len(runs) else f", the first {plotted_runs} of {len(runs)} runs"
         print(f"written          {out}{part}")
 
 
@@ -68,14 +68,16 @@ def merge(
     session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="As `serve --record-session` writes it.")],
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
     out: Annotated[Path, typer.Option("--out", metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a folder.")],
-    shift: Annotated[float, typer.Option("--shift", metavar="SECONDS", help="Added to every time measured.")] = 0.0,
+    time_offset_s: Annotated[
+        float, typer.Option("--shift", metavar="SECONDS", help="Added to every time measured.")
+    ] = 0.0,
     json: JsonOption = False,
 ) -> None:
     """Join a session's pulses, as executed, with what was measured meanwhile: a recording for `diagnose`."""
     from optodrive.lab.recording import write_recording
     from optodrive.lab.recording.merge import merge_session
 
-    measurement = merge_session(session, measured, shift)
+    measurement = merge_session(session, measured, time_offset_s)
     write_recording(out, measurement)
     pulses = sum(len(run.pulses) for run in measurement.runs)
     if json:
@@ -86,10 +88,10 @@ def merge(
         print(f"written          {out}")
 
 
-def _draw(out: Path, measurement: "Measurement") -> int:
-    from optodrive.lab.recording.plot import write_picture
+def _draw_signals(out: Path, measurement: "Measurement") -> int:
+    from optodrive.lab.recording.plot import write_plot
 
-    return write_picture(out, measurement)
+    return write_plot(out, measurement)
 
 
 def _print_table(runs: list[dict[str, Any]]) -> None:
@@ -102,13 +104,13 @@ def _print_table(runs: list[dict[str, Any]]) -> None:
         right = heading in ("pulses", "energy", "pixel", "samples", "missing")
         table.add_column(heading, justify="right" if right else "left", no_wrap=True)
     for run in runs:
-        for cells in _rows(run):
+        for cells in _format_rows(run):
             table.add_row(*(Text(cell) for cell in cells))
     width = max(Console().width, Console(width=TABLE_WIDTH_MAX).measure(table).maximum)
     Console(width=width, highlight=False).print(table)
 
 
-def _rows(run: dict[str, Any]) -> list[list[str]]:
+def _format_rows(run: dict[str, Any]) -> list[list[str]]:
     energy = "" if run["energy_J"] is None else f"{run['energy_J']:.4g} J"
     first = [run["run"], " ".join((run["group"] or "").split()), str(run["pulses"]), energy]
     rows = []

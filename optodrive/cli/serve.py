@@ -12,7 +12,7 @@ from optodrive.cli.options import (
     ModelOption,
     PixelMapOption,
     announce_compilation,
-    configured,
+    load_run_config,
 )
 
 if TYPE_CHECKING:
@@ -29,11 +29,11 @@ def serve(
     model: ModelOption = None,
     field: FieldOption = None,
     mirrors: MirrorsOption = None,
-    pixels_map: PixelMapOption = None,
+    pixel_map: PixelMapOption = None,
     port: Annotated[
         int | None, typer.Option("--port", min=0, max=65535, help="TCP port, instead of the configured.")
     ] = None,
-    record: Annotated[
+    capture: Annotated[
         Path | None,
         typer.Option("--record", metavar="FILE", help="Note every byte on the link to the board in a new file."),
     ] = None,
@@ -46,11 +46,11 @@ def serve(
     from optodrive.daemon.server import run
 
     def load() -> "Config":
-        loaded = configured(config, model, field, mirrors, pixels_map)
+        loaded = load_run_config(config, model, field, mirrors, pixel_map)
         if port is None:
             return loaded
         return loaded.model_copy(update={"daemon": loaded.daemon.model_copy(update={"port": port})})
 
     first = load()
     announce_compilation()
-    run(first, record, load, record_session)
+    run(first, capture, load, record_session)

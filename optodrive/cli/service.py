@@ -30,23 +30,25 @@ def install(
     json: JsonOption = False,
 ) -> None:
     """Write unit, user, udev rules and configuration; what somebody edited is never overwritten."""
-    from optodrive.cli.service_files import CONFIG, LINK, Installation, service_files
+    from optodrive.cli.service_files import CONFIG_PATH, DEVICE_LINK, Installation, build_service_files
 
     installation = Installation(root)
-    there = installation.place(CONFIG)
+    installed_config = installation.resolve(CONFIG_PATH)
     # Installed again, for an upgrade: the configuration that is there goes on.
-    source = there if config is None and there.exists() else config
-    loaded, files = service_files(source, program or Path(sys.executable).with_name("optodrive"))
-    done = installation.put(files)
+    source = installed_config if config is None and installed_config.exists() else config
+    loaded, files = build_service_files(source, program or Path(sys.executable).with_name("optodrive"))
+    actions = installation.install(files)
     if json:
-        print_json({"files": [{"path": str(path), "done": what} for path, what in done]})
+        print_json({"files": [{"path": str(path), "done": what} for path, what in actions]})
         return
-    _print(done)
+    _print_files(actions)
     if loaded.board.vendor_id is None and loaded.board.transport == "serial":
-        print(f"no udev rules: give [board] vendor_id and product_id for {LINK} and for ModemManager to leave it alone")
-    elif loaded.board.transport == "serial" and loaded.board.port != LINK:
-        print(f"[board] port is {loaded.board.port}; {LINK} is the name that stays")
-    print(f"next, as root, once {CONFIG} is as it should be:")
+        print(
+            f"no udev rules: give [board] vendor_id and product_id for {DEVICE_LINK} and for ModemManager to leave it alone"
+        )
+    elif loaded.board.transport == "serial" and loaded.board.port != DEVICE_LINK:
+        print(f"[board] port is {loaded.board.port}; {DEVICE_LINK} is the name that stays")
+    print(f"next, as root, once {CONFIG_PATH} is as it should be:")
     for line in (
         "systemd-sysusers optodrive.conf",
         "udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb",
@@ -60,12 +62,12 @@ def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
     """Remove what install wrote and nobody edited."""
     from optodrive.cli.service_files import Installation
 
-    done = Installation(root).take_away()
+    actions = Installation(root).remove()
     if json:
-        print_json({"files": [{"path": str(path), "done": what} for path, what in done]})
+        print_json({"files": [{"path": str(path), "done": what} for path, what in actions]})
         return
-    _print(done)
-    if not done:
+    _print_files(actions)
+    if not actions:
         print("nothing is installed")
     else:
         print("stop it first if it runs: systemctl disable --now optodrive; then systemctl daemon-reload")
@@ -77,15 +79,15 @@ def show(root: RootOption = Path("/"), json: JsonOption = False) -> None:
     from optodrive.cli.service_files import Installation
 
     installation = Installation(root)
-    stands = [(path, str(installation.standing(path))) for path in installation.known()]
+    statuses = [(path, str(installation.file_status(path))) for path in installation.installed_files()]
     if json:
-        print_json({"files": [{"path": str(path), "standing": standing} for path, standing in stands]})
+        print_json({"files": [{"path": str(path), "standing": standing} for path, standing in statuses]})
         return
-    _print(stands)
-    if not stands:
+    _print_files(statuses)
+    if not statuses:
         print("nothing is installed")
 
 
-def _print(lines: list[tuple[Path, str]]) -> None:
+def _print_files(lines: list[tuple[Path, str]]) -> None:
     for path, what in lines:
         print(f"{path}: {what}")

@@ -10,27 +10,27 @@ from pathlib import Path
 from typing import Literal
 
 from optodrive.core.errors import InputError, RefusedError
-from optodrive.core.files import written_whole
-from optodrive.device.config import DEFAULT_CONFIG, Config, load_config, shipped_path
+from optodrive.core.files import atomic_write
+from optodrive.device.config import DEFAULT_CONFIG, Config, load_config, locate_shipped
 
-CONFIG = Path("/etc/optodrive/config.toml")
-UNIT = Path("/etc/systemd/system/optodrive.service")
-USERS = Path("/etc/sysusers.d/optodrive.conf")
-RULES = Path("/etc/udev/rules.d/60-optodrive.rules")
-INSTALLED = Path("/etc/optodrive/installed.json")
+CONFIG_PATH = Path("/etc/optodrive/config.toml")
+UNIT_PATH = Path("/etc/systemd/system/optodrive.service")
+USERS_PATH = Path("/etc/sysusers.d/optodrive.conf")
+RULES_PATH = Path("/etc/udev/rules.d/60-optodrive.rules")
+MANIFEST_PATH = Path("/etc/optodrive/installed.json")
 FORMAT, VERSION = "optodrive-service", 1
-LINK = "/dev/optodrive-board"
-HIDDEN = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - what the unit does not see
-DAEMON = {
+DEVICE_LINK = "/dev/optodrive-board"
+HIDDEN_FOLDERS = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - what the unit does not see
+DAEMON_PATHS = {
     "socket": "/run/optodrive/optodrive.sock",
     "tokens": "/var/lib/optodrive/tokens.toml",
     "audit": "/var/lib/optodrive/audit.jsonl",
 }
-USB_ONLY = """DeviceAllow=char-usb_device rw
+USB_UNIT_LINES = """DeviceAllow=char-usb_device rw
 # libusb learns of devices over netlink.
 RestrictAddressFamilies=AF_NETLINK
 """
-Standing = Literal["missing", "as installed", "edited"]
+FileStatus = Literal["missing", "as installed", "edited"]
 
 
 @dataclass(frozen=True)
@@ -39,57 +39,57 @@ class ServiceFile:
 
     path: Path
     text: str
-    kept: bool = False
+    preserve_edits: bool = False
 
 
-def service_files(source: str | Path | None, program: Path) -> tuple[Config, list[ServiceFile]]:
+def build_service_files(source: str | Path | None, program: Path) -> tuple[Config, list[ServiceFile]]:
     """The configuration, and every file that an installation has; InputError or RefusedError for what cannot be."""
-    config, text = _configuration(source)
+    config, text = _load_configuration(source)
     files = [
-        ServiceFile(UNIT, _unit(config, program)),
-        ServiceFile(USERS, shipped_path("systemd", "optodrive.sysusers").read_text("utf-8")),
-        ServiceFile(CONFIG, text, kept=True),
+        ServiceFile(UNIT_PATH, _render_unit(config, program)),
+        ServiceFile(USERS_PATH, locate_shipped("systemd", "optodrive.sysusers").read_text("utf-8")),
+        ServiceFile(CONFIG_PATH, text, preserve_edits=True),
     ]
     if config.board.vendor_id is not None and config.board.product_id is not None:
-        files.append(ServiceFile(RULES, _rules(config)))
+        files.append(ServiceFile(RULES_PATH, _render_rules(config)))
     return config, files
 
 
-def _configuration(source: str | Path | None) -> tuple[Config, str]:
+def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
     load_config(source)  # says what is wrong by the name that was given
     path = Path(DEFAULT_CONFIG if source is None else source)
-    text = (path if path.exists() else shipped_path(f"{path}.toml")).read_text("utf-8")
+    text = (path if path.exists() else locate_shipped(f"{path}.toml")).read_text("utf-8")
     if not re.search(r"^\s*\[daemon\]", text, re.MULTILINE):
-        text += "\n[daemon]\n" + "".join(f'{key} = "{value}"\n' for key, value in DAEMON.items())
+        text += "\n[daemon]\n" + "".join(f'{key} = "{value}"\n' for key, value in DAEMON_PATHS.items())
     with tempfile.NamedTemporaryFile("w", suffix=".toml", encoding="utf-8") as whole:
         whole.write(text)
         whole.flush()
         return load_config(whole.name), text
 
 
-def _unit(config: Config, program: Path) -> str:
+def _render_unit(config: Config, program: Path) -> str:
     if not program.is_absolute() or any(c.isspace() or c in "%$\"'\\" for c in str(program)):
         raise InputError("--program", str(program), "an absolute path of plain characters")
-    hidden = next((folder for folder in HIDDEN if program.is_relative_to(folder)), None)
+    hidden = next((folder for folder in HIDDEN_FOLDERS if program.is_relative_to(folder)), None)
     if hidden is not None:
         raise RefusedError(
             f"the service sees nothing below {hidden}, and {program} lies there; install optodrive where all may read "
             "it (python3 -m venv /opt/optodrive), and run its `optodrive service install`, or name it with --program"
         )
-    text = shipped_path("systemd", "optodrive.service").read_text("utf-8").replace("@PROGRAM@", str(program))
+    text = locate_shipped("systemd", "optodrive.service").read_text("utf-8").replace("@PROGRAM@", str(program))
     if config.board.transport in ("usb", "helios"):
-        text = text.replace("\nRestrictAddressFamilies=", f"\n{USB_ONLY}RestrictAddressFamilies=", 1)
+        text = text.replace("\nRestrictAddressFamilies=", f"\n{USB_UNIT_LINES}RestrictAddressFamilies=", 1)
     return text
 
 
-def _rules(config: Config) -> str:
+def _render_rules(config: Config) -> str:
     board = config.board
     if not re.fullmatch(r"[\w.:-]*", board.serial_number, re.ASCII):
         raise InputError("board.serial_number", board.serial_number, "letters, digits, . : _ and - for a udev rule")
     matches = [f'ATTRS{{idVendor}}=="{board.vendor_id:04x}"', f'ATTRS{{idProduct}}=="{board.product_id:04x}"']
     if board.serial_number:
         matches.append(f'ATTRS{{serial}}=="{board.serial_number}"')
-    return shipped_path("systemd", "optodrive.rules").read_text("utf-8").replace("@BOARD@", ", ".join(matches))
+    return locate_shipped("systemd", "optodrive.rules").read_text("utf-8").replace("@BOARD@", ", ".join(matches))
 
 
 class Installation:
@@ -97,106 +97,108 @@ class Installation:
 
     def __init__(self, root: Path) -> None:
         self._root = root
-        self._known = self._remembered()
+        self._digests = self._load_digests()
 
-    def place(self, path: Path) -> Path:
+    def resolve(self, path: Path) -> Path:
         """Where a file of the service lies below the root."""
         return self._root / path.relative_to("/")
 
-    def standing(self, path: Path) -> Standing:
+    def file_status(self, path: Path) -> FileStatus:
         """How a file stands: as it was put there, edited since (or put there by others), or not there."""
-        place = self.place(path)
-        if not place.exists() and not place.is_symlink():
+        target = self.resolve(path)
+        if not target.exists() and not target.is_symlink():
             return "missing"
-        return "as installed" if _digest(_read(place)) == self._known.get(str(path)) else "edited"
+        return "as installed" if _compute_digest(_read_text(target)) == self._digests.get(str(path)) else "edited"
 
-    def known(self) -> Iterator[Path]:
+    def installed_files(self) -> Iterator[Path]:
         """The files that were put there."""
-        return (Path(path) for path in sorted(self._known))
+        return (Path(path) for path in sorted(self._digests))
 
-    def put(self, files: list[ServiceFile]) -> list[tuple[Path, str]]:
+    def install(self, files: list[ServiceFile]) -> list[tuple[Path, str]]:
         """Write what is not there yet or has changed; each file and what was done.
 
         RefusedError, before anything is written, where that would overwrite what somebody edited.
         """
-        edited = [file for file in files if self.standing(file.path) == "edited"]
-        obstacles = [str(self.place(file.path)) for file in edited if not (file.kept or self._same(file))]
+        edited = [file for file in files if self.file_status(file.path) == "edited"]
+        obstacles = [
+            str(self.resolve(file.path)) for file in edited if not (file.preserve_edits or self._is_current(file))
+        ]
         if obstacles:
             raise RefusedError(
                 f"{', '.join(obstacles)}: edited, or not put there by `optodrive service install`; nothing was "
                 "written. Move it away, and keep changes to the unit in a drop-in (systemctl edit optodrive)"
             )
-        done = [(file.path, self._put(file, file in edited)) for file in files]
-        self._remember()
-        return done
+        actions = [(file.path, self._install_file(file, file in edited)) for file in files]
+        self._save_digests()
+        return actions
 
-    def _put(self, file: ServiceFile, edited: bool) -> str:
-        if edited and file.kept:
+    def _install_file(self, file: ServiceFile, edited: bool) -> str:
+        if edited and file.preserve_edits:
             return "edited, left as it is"
-        self._known[str(file.path)] = _digest(file.text)
-        if self._same(file):
+        self._digests[str(file.path)] = _compute_digest(file.text)
+        if self._is_current(file):
             return "there already"
-        place = self.place(file.path)
-        done = "replaced" if place.exists() else "written"
-        _make_folder(place.parent)
-        with written_whole(place) as temporary:
+        target = self.resolve(file.path)
+        action = "replaced" if target.exists() else "written"
+        _make_folder(target.parent)
+        with atomic_write(target) as temporary:
             temporary.write_text(file.text, encoding="utf-8")
-        return done
+        return action
 
-    def take_away(self) -> list[tuple[Path, str]]:
+    def remove(self) -> list[tuple[Path, str]]:
         """Remove what was put there and is as it was; each file and what was done."""
-        done = []
-        for path in list(self.known()):
-            standing = self.standing(path)
-            if standing == "edited":
-                done.append((path, "edited, left as it is"))
+        actions = []
+        for path in list(self.installed_files()):
+            status = self.file_status(path)
+            if status == "edited":
+                actions.append((path, "edited, left as it is"))
                 continue
             try:
-                self.place(path).unlink(missing_ok=True)
+                self.resolve(path).unlink(missing_ok=True)
             except OSError as error:
-                raise InputError(str(self.place(path)), error.strerror, "a file that may be removed") from None
-            del self._known[str(path)]
-            done.append((path, "removed" if standing == "as installed" else "was not there"))
-        self._remember()
-        return done
+                raise InputError(str(self.resolve(path)), error.strerror, "a file that may be removed") from None
+            del self._digests[str(path)]
+            actions.append((path, "removed" if status == "as installed" else "was not there"))
+        self._save_digests()
+        return actions
 
-    def _same(self, file: ServiceFile) -> bool:
-        place = self.place(file.path)
-        return place.is_file() and _read(place) == file.text
+    def _is_current(self, file: ServiceFile) -> bool:
+        target = self.resolve(file.path)
+        return target.is_file() and _read_text(target) == file.text
 
-    def _remembered(self) -> dict[str, str]:
-        place = self.place(INSTALLED)
-        if not place.exists():
+    def _load_digests(self) -> dict[str, str]:
+        target = self.resolve(MANIFEST_PATH)
+        if not target.exists():
             return {}
         try:
-            document = json.loads(_read(place))
-            form, files = (document["format"], document["version"]), dict(document["sha256"])
+            document = json.loads(_read_text(target))
+            file_format, files = (document["format"], document["version"]), dict(document["sha256"])
         except (ValueError, KeyError, TypeError):
-            form, files = None, {}
-        if form != (FORMAT, VERSION):
-            raise InputError(str(place), "another format", f"{FORMAT} version {VERSION}")
+            file_format, files = None, {}
+        if file_format != (FORMAT, VERSION):
+            raise InputError(str(target), "another format", f"{FORMAT} version {VERSION}")
         return {str(path): str(digest) for path, digest in files.items()}
 
-    def _remember(self) -> None:
-        place = self.place(INSTALLED)
-        if not self._known:
-            place.unlink(missing_ok=True)
+    def _save_digests(self) -> None:
+        target = self.resolve(MANIFEST_PATH)
+        if not self._digests:
+            target.unlink(missing_ok=True)
             return
-        _make_folder(place.parent)
-        with written_whole(place) as temporary:
-            document = {"format": FORMAT, "version": VERSION, "sha256": self._known}
+        _make_folder(target.parent)
+        with atomic_write(target) as temporary:
+            document = {"format": FORMAT, "version": VERSION, "sha256": self._digests}
             temporary.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
 
-def _digest(text: str) -> str:
+def _compute_digest(text: str) -> str:
     return sha256(text.encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _read(place: Path) -> str:
+def _read_text(path: Path) -> str:
     try:
-        return place.read_text("utf-8", "surrogateescape")
+        return path.read_text("utf-8", "surrogateescape")
     except OSError as error:
-        raise InputError(str(place), error.strerror, "a readable file") from None
+        raise InputError(str(path), error.strerror, "a readable file") from None
 
 
 def _make_folder(folder: Path) -> None:

@@ -13,10 +13,10 @@ from optodrive.cli.options import (
     ModelOption,
     PixelMapOption,
     announce_compilation,
-    configured,
+    format_plan_summary,
+    load_run_config,
     print_json,
-    progress,
-    report_lines,
+    show_progress,
 )
 from optodrive.cli.plan import FramesArgument
 from optodrive.core.errors import InputError
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from optodrive.core.types.plans import ExecutedPulses
     from optodrive.device.config import Config
     from optodrive.link.simulator.true_pixels import PixelTruth
-    from optodrive.physics.thermal_state import Heat
-    from optodrive.planning.feasibility import Admission
-    from optodrive.planning.pipeline import Display, Prepared
+    from optodrive.physics.thermal_state import ThermalState
+    from optodrive.planning.feasibility import FeasibilityReport
+    from optodrive.planning.pipeline import DisplayModel, PlannedSequence
 
-PIXELS_MAX = 16
+PIXELS_RECORDED_MAX = 16
 """Without --pixels, so many of the driven pixels are looked at, the tallest first."""
 
 
@@ -52,7 +52,7 @@ def simulate(
     model: ModelOption = None,
     field: FieldOption = None,
     mirrors: MirrorsOption = None,
-    pixels_map: PixelMapOption = None,
+    pixel_map: PixelMapOption = None,
     truth: Annotated[
         Path | None,
         typer.Option("--truth", metavar="model.toml", help="What the simulated display really is; else as planned."),
@@ -63,7 +63,7 @@ def simulate(
             "--pixel-seed", min=0, help="Pixels as drawn from this seed: gains, offsets and dead ones, not as planned."
         ),
     ] = None,
-    near: Annotated[
+    post_pulse_s: Annotated[
         float | None,
         typer.Option("--near", metavar="SECONDS", help="Record each pixel only until so long after its own pulses."),
     ] = None,
@@ -73,41 +73,47 @@ def simulate(
     from optodrive.link.simulator.traces import trace, trace_near
     from optodrive.link.simulator.true_pixels import PixelTruth
     from optodrive.link.simulator.virtual_run import execute
-    from optodrive.planning.feasibility import admit
-    from optodrive.planning.pipeline import Display
+    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.pipeline import DisplayModel
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
     if not 1e-6 <= dt <= 1.0:
         raise InputError("--dt", dt, "a time between 1e-6 and 1 s")
     if not 0.0 <= noise <= 1000.0:
         raise InputError("--noise", noise, "a factor between 0 and 1000")
-    if near is not None and not 1e-3 <= near <= 10.0:
-        raise InputError("--near", near, "a time between 0.001 and 10 s")
-    display = Display.of(configured(config, model, field, mirrors, pixels_map))
-    drawn = None if pixel_seed is None else PixelTruth.drawn(pixel_seed, display.config)
-    planned = truth is None and drawn is None
-    real = display.heat_at_rest() if planned else _really(configured(config, truth or model), drawn)
-    wanted = _wanted(pixels, len(display.layout))
+    if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
+        raise InputError("--near", post_pulse_s, "a time between 0.001 and 10 s")
+    display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
+    sampled_pixels = None if pixel_seed is None else PixelTruth.drawn(pixel_seed, display.config)
+    is_nominal = truth is None and sampled_pixels is None
+    true_display = (
+        display.build_cold_heat()
+        if is_nominal
+        else _build_true_display(load_run_config(config, truth or model), sampled_pixels)
+    )
+    selected = _parse_pixels(pixels, len(display.layout))
     sequence = load_sequence(frames, display.config)
     announce_compilation()
-    with progress("planning") as done:
-        prepared, admission = admit(display, sequence, *display.at_rest(), progress=done)
-    with progress("simulating") as done:
-        executed = execute(display, prepared, done)
-    hit = executed if drawn is None else drawn.hit(executed, display.config)
-    looked_at = _tallest(prepared) if wanted is None else wanted
-    traced = (
-        [trace(real, hit, looked_at, dt)]
-        if near is None
-        else [trace_near(real, hit, pixel, dt, near) for pixel in looked_at]
+    with show_progress("planning") as on_progress:
+        planned_sequence, feasibility = check_feasibility(
+            display, sequence, *display.build_cold_state(), on_progress=on_progress
+        )
+    with show_progress("simulating") as on_progress:
+        executed = execute(display, planned_sequence, on_progress)
+    incident = executed if sampled_pixels is None else sampled_pixels.hit(executed, display.config)
+    recorded = _select_tallest(planned_sequence) if selected is None else selected
+    traces = (
+        [trace(true_display, incident, recorded, dt)]
+        if post_pulse_s is None
+        else [trace_near(true_display, incident, pixel, dt, post_pulse_s) for pixel in recorded]
     )
     if out is not None:
-        _write(out, display, executed, traced, noise, seed)
-    report = _report(display, prepared, admission, hit, traced, real)
+        _write_recording(out, display, executed, traces, noise, seed)
+    report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
     if json:
         print_json(report)
         return
-    for line in report_lines(report["summary"]):
+    for line in format_plan_summary(report["summary"]):
         print(line)
     print(f"executed         {report['executed']} of {report['planned']} planned")
     for item in report["pixels"]:
@@ -119,73 +125,75 @@ def simulate(
         print(f"written          {out}")
 
 
-def _really(config: "Config", drawn: "PixelTruth | None") -> "Heat":
+def _build_true_display(config: "Config", sampled_pixels: "PixelTruth | None") -> "ThermalState":
     """The display as it is: of the configuration's model, its pixels as drawn, or all alike; no map says what is."""
-    from optodrive.device.pixel_map import without_map
-    from optodrive.physics.parameters import display_pixels, load_parameters
-    from optodrive.physics.thermal_state import heat_at_rest
+    from optodrive.device.pixel_map import remove_pixel_map
+    from optodrive.physics.parameters import build_display_pixels, load_parameters
+    from optodrive.physics.thermal_state import build_cold_state
 
     parameters = load_parameters(config.pixel_model.parameters)
-    alike = display_pixels(without_map(config), parameters)
-    return heat_at_rest(config, parameters, alike if drawn is None else drawn.pixels(alike))
+    nominal_pixels = build_display_pixels(remove_pixel_map(config), parameters)
+    return build_cold_state(
+        config, parameters, nominal_pixels if sampled_pixels is None else sampled_pixels.pixels(nominal_pixels)
+    )
 
 
-def _wanted(pixels: str | None, count: int) -> list[int] | None:
+def _parse_pixels(pixels: str | None, count: int) -> list[int] | None:
     if pixels is None:
         return None
     if pixels == "all":
         return list(range(count))
-    wanted = []
+    selected = []
     for word in pixels.split(","):
         if not word.strip().isdigit() or int(word) >= count:
             raise InputError("--pixels", word, f"indices 0 to {count - 1}, separated by commas")
-        wanted.append(int(word))
-    return list(dict.fromkeys(wanted))
+        selected.append(int(word))
+    return list(dict.fromkeys(selected))
 
 
-def _tallest(prepared: "Prepared") -> list[int]:
-    order = prepared.plan.pixel[prepared.predicted_m.argsort()[::-1]]
-    return sorted(list(dict.fromkeys(order.tolist()))[:PIXELS_MAX])
+def _select_tallest(planned_sequence: "PlannedSequence") -> list[int]:
+    order = planned_sequence.plan.pixel[planned_sequence.predicted_m.argsort()[::-1]]
+    return sorted(list(dict.fromkeys(order.tolist()))[:PIXELS_RECORDED_MAX])
 
 
-def _write(
-    out: Path, display: "Display", executed: "ExecutedPulses", traced: "list[PixelTrace]", noise: float, seed: int
+def _write_recording(
+    out: Path, display: "DisplayModel", executed: "ExecutedPulses", traces: "list[PixelTrace]", noise: float, seed: int
 ) -> None:
     """One recording of all traces; each with the pulses that fall into its time."""
     import numpy as np
 
     from optodrive.core.types.measurements import Measurement, Run
-    from optodrive.device.pixel_map import map_of
+    from optodrive.device.pixel_map import load_pixel_map
     from optodrive.lab.recording import write_recording
     from optodrive.link.simulator.instruments import measure
 
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
-    known, random = map_of(display.config), np.random.default_rng(seed)
-    aim_m = None if known is None else np.array([known.offset_x_m, known.offset_y_m])
+    pixel_map, rng = load_pixel_map(display.config), np.random.default_rng(seed)
+    aim_m = None if pixel_map is None else np.array([pixel_map.offset_x_m, pixel_map.offset_y_m])
     width_m = display.config.display.bridge_width_m
     runs: list[Run] = []
-    for item in traced:
+    for item in traces:
         within = (pulses[:, 0] + pulses[:, 1] >= item.t_s[0]) & (pulses[:, 0] <= item.t_s[-1])
-        runs += measure(item, pulses[within], display.ambient_k, width_m, noise, random, aim_m).runs
+        runs += measure(item, pulses[within], display.ambient_k, width_m, noise, rng, aim_m).runs
     write_recording(out, Measurement(tuple(runs)))
 
 
-def _report(
-    display: "Display",
-    prepared: "Prepared",
-    admission: "Admission",
+def _build_report(
+    display: "DisplayModel",
+    planned_sequence: "PlannedSequence",
+    feasibility: "FeasibilityReport",
     executed: "ExecutedPulses",
-    traced: "list[PixelTrace]",
-    real: "Heat",
+    traces: "list[PixelTrace]",
+    true_display: "ThermalState",
 ) -> dict[str, Any]:
     from optodrive.core.units import m_to_um
-    from optodrive.planning.plan_summary import pulse_columns, summary
+    from optodrive.planning.plan_summary import list_pulse_columns, summarize_plan
 
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    simulated_m = real.copy().pulses(*columns).displacement_m
+    simulated_m = true_display.copy().apply_pulses(*columns).displacement_m
     return {
-        "summary": summary(prepared, admission),
-        "planned": len(prepared.plan),
+        "summary": summarize_plan(planned_sequence, feasibility),
+        "planned": len(planned_sequence.plan),
         "executed": len(executed),
         "complete": executed.complete,
         "simulated_max_um": m_to_um(float(simulated_m.max())) if len(executed) else 0.0,
@@ -193,16 +201,16 @@ def _report(
             {
                 "pixel": pixel,
                 "measured_max_um": m_to_um(float(item.displacement_m[:, column].max())),
-                "predicted_max_um": m_to_um(_predicted_max_m(prepared, pixel)),
+                "predicted_max_um": m_to_um(_predicted_max_m(planned_sequence, pixel)),
                 "absorber_max_c": display.config.ambient_c + float(item.absorber_k[:, column].max()),
             }
-            for item in traced
+            for item in traces
             for column, pixel in enumerate(item.pixel.tolist())
         ],
-        "pulses": pulse_columns(prepared),
+        "pulses": list_pulse_columns(planned_sequence),
     }
 
 
-def _predicted_max_m(prepared: "Prepared", pixel: int) -> float:
-    of_pixel: np.ndarray[Any, Any] = prepared.predicted_m[prepared.plan.pixel == pixel]
-    return float(of_pixel.max()) if len(of_pixel) else 0.0
+def _predicted_max_m(planned_sequence: "PlannedSequence", pixel: int) -> float:
+    displacement_m: np.ndarray[Any, Any] = planned_sequence.predicted_m[planned_sequence.plan.pixel == pixel]
+    return float(displacement_m.max()) if len(displacement_m) else 0.0

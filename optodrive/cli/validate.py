@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import JsonOption, model_file
+from optodrive.cli.options import JsonOption, check_model_path
 from optodrive.core.errors import InputError
 
 
@@ -30,10 +30,10 @@ def validate(
     if diagnose and model is not None:
         raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose begins from Text S1")
     if diagnose:
-        from optodrive.cli.validate_diagnose import diagnose as tell
+        from optodrive.cli.validate_diagnose import diagnose_paper_facts as tell
 
         tell(json)
         return
-    from optodrive.cli.validation_table import validate as print_table
+    from optodrive.cli.validation_table import print_validation as print_table
 
-    print_table(json, None if model is None else model_file(model))
+    print_table(json, None if model is None else check_model_path(model))

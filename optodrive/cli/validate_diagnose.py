@@ -7,54 +7,60 @@ from typing import TYPE_CHECKING
 from optodrive.cli.options import announce_compilation, print_json
 
 if TYPE_CHECKING:
-    from optodrive.lab.validation.study import Answer
+    from optodrive.lab.validation.study import StudyResult
 
-LITERAL = "paper_s1_literal"
-TABLE_WIDTH = 110
+LITERAL_SET = "paper_s1_literal"
+MIN_TABLE_WIDTH = 110
 """Narrower terminals wrap lines rather than lose digits."""
 
 
-def diagnose(json: bool = False) -> None:
+def diagnose_paper_facts(json: bool = False) -> None:
     """Print the story, or one JSON object."""
-    from optodrive.lab.validation.narrative import answer
-    from optodrive.lab.validation.study import study
-    from optodrive.physics.paper_facts import paper_facts
+    from optodrive.lab.validation.narrative import build_study_answer
+    from optodrive.lab.validation.study import run_study
+    from optodrive.physics.paper_facts import load_paper_facts
     from optodrive.physics.parameters import load_parameters
 
     announce_compilation()
-    with _ticking() as tick:
-        found = study(paper_facts(), load_parameters(LITERAL), tick)
+    with _report_progress() as on_progress:
+        study_result = run_study(load_paper_facts(), load_parameters(LITERAL_SET), on_progress)
     if json:
-        print_json(answer(found))
+        print_json(build_study_answer(study_result))
     else:
-        _print_story(found)
+        _print_narrative(study_result)
 
 
-def _print_story(found: "Answer") -> None:
+def _print_narrative(study_result: "StudyResult") -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from optodrive.lab.validation.narrative import HEADINGS, after_table, assumptions, before_table, rows
+    from optodrive.lab.validation.narrative import (
+        HEADINGS,
+        build_rows,
+        describe_assumptions,
+        describe_findings,
+        describe_predictions,
+    )
 
-    console = Console(width=max(Console().width, TABLE_WIDTH))
+    console = Console(width=max(Console().width, MIN_TABLE_WIDTH))
 
-    def say(lines: list[str]) -> None:
+    def print_lines(lines: list[str]) -> None:
         for line in lines:
             console.print(line, highlight=False, markup=False)
 
-    say(before_table(found))
+    print_lines(describe_findings(study_result))
     table = Table(title="Predicted without having been seen: causes chosen and fitted anew, model over measured")
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if heading == "off by" else "left")
-    for row in rows(found):
+    for row in build_rows(study_result):
         table.add_row(*row)
-    say([""])
+    print_lines([""])
     console.print(table)
-    say([*after_table(found), "", *assumptions(found)])
+    print_lines([*describe_predictions(study_result), "", *describe_assumptions(study_result)])
 
 
 @contextmanager
-def _ticking() -> Iterator[Callable[[str], None]]:
+def _report_progress() -> Iterator[Callable[[str], None]]:
     """What is being done, on stderr where that is a terminal."""
     from rich.console import Console
 

@@ -10,14 +10,14 @@ import typer
 from optodrive.cli.options import JsonOption, print_json
 
 if TYPE_CHECKING:
-    from optodrive.link.protocol.transcript import Line
+    from optodrive.link.protocol.transcript import TranscriptEntry
     from optodrive.link.session.replay import Replay
-    from optodrive.link.transport.link_capture import Tape
+    from optodrive.link.transport.link_capture import LinkCapture
 
 LISTED_MAX = 8
 """A column longer than this is only counted on a line for people; --json lists it whole."""
-BAD_SHOWN_BYTES = 32
-TapeArgument = Annotated[Path, typer.Argument(metavar="FILE", help="What `optodrive serve --record` wrote.")]
+INVALID_SHOWN_BYTES = 32
+CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="What `optodrive serve --record` wrote.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -28,46 +28,46 @@ def register(app: typer.Typer) -> None:
     app.add_typer(group, name="wire")
 
 
-def dump(file: TapeArgument, json: JsonOption = False) -> None:
+def dump(file: CaptureArgument, json: JsonOption = False) -> None:
     """List every message with its time, and totals; with --json one object a line, the totals last."""
     from optodrive.link.protocol.transcript import Transcript
-    from optodrive.link.transport.link_capture import CLOSED, OPENED, TO_BOARD, Tape
+    from optodrive.link.transport.link_capture import CLOSED, OPENED, TO_BOARD, LinkCapture
 
-    tape, transcript = Tape(file), Transcript()
-    show = _show_json if json else _show
-    for entry in tape.entries():
-        at_s = entry.host_s - tape.host_s
+    capture, transcript = LinkCapture(file), Transcript()
+    print_document = _print_json_line if json else _print_line
+    for entry in capture.read_entries():
+        at_s = entry.host_s - capture.host_s
         if entry.kind in (OPENED, CLOSED):
-            transcript.broken_off()
-            show({"t_s": at_s, "link": entry.kind})
+            transcript.reset_link()
+            print_document({"t_s": at_s, "link": entry.kind})
             continue
-        for line in transcript.take(entry.host_s, entry.kind == TO_BOARD, entry.data):
-            show(_document(line, tape))
-    totals = {**transcript.totals.figures(), "ignored_bytes": tape.ignored}
-    show({"totals": {"began_unix_s": tape.unix_s, **totals}})
+        for line in transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data):
+            print_document(_build_document(line, capture))
+    totals = {**transcript.totals.to_dict(), "ignored_bytes": capture.ignored_bytes}
+    print_document({"totals": {"began_unix_s": capture.unix_s, **totals}})
 
 
-def _document(line: "Line", tape: "Tape") -> dict[str, Any]:
-    from optodrive.link.protocol.describe import describe, name_of
+def _build_document(line: "TranscriptEntry", capture: "LinkCapture") -> dict[str, Any]:
+    from optodrive.link.protocol.describe import describe, message_name
 
-    document: dict[str, Any] = {"t_s": line.host_s - tape.host_s, "to": "board" if line.to_board else "host"}
+    document: dict[str, Any] = {"t_s": line.host_s - capture.host_s, "to": "board" if line.to_board else "host"}
     if line.message is None or line.frame is None:
-        return {**document, "bad": line.bad, "bytes": len(line.raw), "hex": line.raw.hex()}
-    document |= {"message": name_of(line.message), "session": line.frame.session}
+        return {**document, "bad": line.error, "bytes": len(line.raw), "hex": line.raw.hex()}
+    document |= {"message": message_name(line.message), "session": line.frame.session}
     if line.message.SEQUENCED and line.to_board:
-        document |= {"seq": line.frame.seq, "again": line.again}
+        document |= {"seq": line.frame.seq, "again": line.retransmitted}
     return {**document, "fields": describe(line.message)}
 
 
-def _show_json(document: dict[str, Any]) -> None:
+def _print_json_line(document: dict[str, Any]) -> None:
     sys.stdout.write(json_module.dumps(document, ensure_ascii=False) + "\n")
 
 
-def _show(document: dict[str, Any]) -> None:
+def _print_line(document: dict[str, Any]) -> None:
     if "totals" in document:
         print()
         for name, value in document["totals"].items():
-            print(f"{name.replace('_', ' '):26} {'none' if value is None else _short(value)}")
+            print(f"{name.replace('_', ' '):26} {'none' if value is None else _shorten(value)}")
         return
     at = f"{document['t_s']:12.6f}"
     if "link" in document:
@@ -75,27 +75,27 @@ def _show(document: dict[str, Any]) -> None:
         return
     arrow = "->" if document["to"] == "board" else "<-"
     if "bad" in document:
-        shown = document["hex"][: 2 * BAD_SHOWN_BYTES]
+        shown = document["hex"][: 2 * INVALID_SHOWN_BYTES]
         more = "…" if len(shown) < len(document["hex"]) else ""
         print(f"{at} {arrow} BAD {document['bad']}, {document['bytes']} bytes: {shown}{more}")
         return
     seq = f" #{document['seq']}" if "seq" in document else ""
-    again = " again" if document.get("again") else ""
-    fields = " ".join(f"{name}={_short(value)}" for name, value in document["fields"].items())
-    print(f"{at} {arrow} {document['message']}{seq}{again} {fields}".rstrip())
+    retransmitted = " again" if document.get("again") else ""
+    fields = " ".join(f"{name}={_shorten(value)}" for name, value in document["fields"].items())
+    print(f"{at} {arrow} {document['message']}{seq}{retransmitted} {fields}".rstrip())
 
 
-def _short(value: Any) -> str:
+def _shorten(value: Any) -> str:
     if isinstance(value, dict):
-        return "{" + " ".join(f"{name}={_short(inner)}" for name, inner in value.items()) + "}"
+        return "{" + " ".join(f"{name}={_shorten(inner)}" for name, inner in value.items()) + "}"
     if isinstance(value, list):
         more = ",…" if len(value) > LISTED_MAX else ""
-        return "[" + ",".join(_short(inner) for inner in value[:LISTED_MAX]) + more + "]"
+        return "[" + ",".join(_shorten(inner) for inner in value[:LISTED_MAX]) + more + "]"
     return f"{value:g}" if isinstance(value, float) and abs(value) < 1e5 else str(value)
 
 
 def replay(
-    file: TapeArgument,
+    file: CaptureArgument,
     board: Annotated[str, typer.Option("--board", metavar="PORT", help="A serial port, or `simulated`.")],
     seed: Annotated[
         int | None, typer.Option("--seed", help="The seed the recorded simulated board had; only so it arms again.")
@@ -108,12 +108,12 @@ def replay(
 ) -> None:
     """Send the host's bytes at their times to a board; exit 1 where it does otherwise. A real board is never armed."""
     from optodrive.core.errors import InputError
-    from optodrive.link.session.replay import compare
+    from optodrive.link.session.replay import compare_traces
 
     if board != "simulated" and (seed is not None or limits is not None):
         raise InputError("--board", board, "simulated, for --seed and --limits are the simulated board's")
-    result = _replayed(file, board, seed, limits, baud)
-    verdict = compare(result.recorded, result.replayed)
+    result = _run_replay(file, board, seed, limits, baud)
+    verdict = compare_traces(result.recorded, result.replayed)
     if json:
         print_json(verdict)
     else:
@@ -122,25 +122,25 @@ def replay(
         raise typer.Exit(1)
 
 
-def _replayed(file: Path, board: str, seed: int | None, limits: Path | None, baud: int) -> "Replay":
+def _run_replay(file: Path, board: str, seed: int | None, limits: Path | None, baud: int) -> "Replay":
     from optodrive.core.clock import ManualClock, MonotonicClock
     from optodrive.link.session.replay import Replay, clock_shift_s
     from optodrive.link.simulator.board_core import BoardCore
     from optodrive.link.simulator.board_limits import BoardSettings, load_settings
     from optodrive.link.simulator.memory_link import MemoryLink
-    from optodrive.link.transport.link_capture import Tape
+    from optodrive.link.transport.link_capture import LinkCapture
     from optodrive.link.transport.serial_port import SerialPort
 
-    tape = Tape(file)
+    capture = LinkCapture(file)
     if board == "simulated":
-        shift_s = clock_shift_s(tape.entries())
-        clock = ManualClock(max(0.0, tape.host_s + shift_s))
+        shift_s = clock_shift_s(capture.read_entries())
+        clock = ManualClock(max(0.0, capture.host_s + shift_s))
         settings = BoardSettings() if limits is None else load_settings(limits)
         result = Replay(MemoryLink(BoardCore(settings, seed=seed), clock), clock, shift_s, may_arm=True)
     else:
         real = MonotonicClock()
-        result = Replay(SerialPort(board, baud), real, real.now_s() - tape.host_s, may_arm=False)
-    result.run(tape.entries())
+        result = Replay(SerialPort(board, baud), real, real.now_s() - capture.host_s, may_arm=False)
+    result.run(capture.read_entries())
     return result
 
 
@@ -150,13 +150,13 @@ def _print_verdict(verdict: dict[str, Any], result: "Replay") -> None:
     print(f"states           {states['recorded']} recorded, {states['replayed']} replayed")
     if states["first_difference"] is not None:
         at = states["first_difference"]
-        was, now = (_state(account.states, at) for account in (result.recorded, result.replayed))
+        was, now = (_format_state(account.states, at) for account in (result.recorded, result.replayed))
         print(f"first difference state {at + 1}: recorded {was}, replayed {now}")
     counts = ", ".join(f"{executed[name]} {name}" for name in ("recorded", "replayed", "missing", "changed", "moved"))
     print(f"points executed  {counts}, by {executed['largest_move_ticks']} ticks at most")
 
 
-def _state(states: list[tuple[str, str, str]], at: int) -> str:
+def _format_state(states: list[tuple[str, str, str]], at: int) -> str:
     if at >= len(states):
         return "nothing more"
     state, fault, reason = states[at]

@@ -5,12 +5,12 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from optodrive.client.http import Answer, problem_error
+from optodrive.client.http import JsonObject, build_error
 from optodrive.core.errors import OptodriveError, RefusedError
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import PixelLayout
 
-RUNNING = ("queued", "running")
+UNFINISHED_STATUSES = ("queued", "running")
 
 
 class State(NamedTuple):
@@ -25,10 +25,10 @@ class State(NamedTuple):
     waiting: int
     running: str | None
     underruns: int
-    answer: Answer
+    answer: JsonObject
 
     @classmethod
-    def of(cls, answer: Answer) -> Self:
+    def from_response(cls, answer: JsonObject) -> Self:
         """From GET /v1/state."""
         board, queue = answer["board"], answer["queue"]
         return cls(
@@ -71,13 +71,13 @@ class Plan:
     duration_s: float
     heights_um: FloatArray | None
     layout: PixelLayout
-    answer: Answer
+    answer: JsonObject
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
     @classmethod
-    def of(cls, answer: Answer, layout: PixelLayout) -> Self:
+    def from_response(cls, answer: JsonObject, layout: PixelLayout) -> Self:
         """From an answer of /v1/plans or /v1/patterns."""
         admission = answer["summary"]["admission"]
         return cls(
@@ -91,7 +91,7 @@ class Plan:
             dropped=answer["dropped"],
             fits=None if admission is None else admission["fits"],
             duration_s=answer["summary"]["duration_s"],
-            heights_um=_tallest_um(answer, len(layout)),
+            heights_um=_max_heights_um(answer, len(layout)),
             layout=layout,
             answer=answer,
         )
@@ -99,7 +99,7 @@ class Plan:
     @property
     def ended(self) -> bool:
         """Whether nothing more will happen to it."""
-        return self.status not in RUNNING
+        return self.status not in UNFINISHED_STATUSES
 
     @property
     def trimmed(self) -> int:
@@ -117,26 +117,28 @@ class Plan:
         value = self.answer["simulated_max_um"]
         return None if value is None else float(value)
 
-    def checked(self) -> Self:
+    def raise_if_failed(self) -> Self:
         """Itself; RefusedError where it failed."""
         if self.status == "failed":
             raise RefusedError(f"plan {self.plan_id} failed: {self.error}")
         return self
 
     def __repr__(self) -> str:
-        tallest = "" if self.heights_um is None else f", tallest {self.heights_um.max():.1f} µm"
-        return f"<Plan {self.plan_id} {self.name!r}: {self.status}, {self.executed} of {self.planned} pulses{tallest}>"
+        max_height = "" if self.heights_um is None else f", tallest {self.heights_um.max():.1f} µm"
+        return (
+            f"<Plan {self.plan_id} {self.name!r}: {self.status}, {self.executed} of {self.planned} pulses{max_height}>"
+        )
 
     def _repr_png_(self) -> bytes | None:
         """For notebooks: its heights on the display."""
         if self.heights_um is None:
             return None
-        from optodrive.client.picture import png
+        from optodrive.client.picture import render_png
 
-        return png(self.layout, self.heights_um)
+        return render_png(self.layout, self.heights_um)
 
 
-def _tallest_um(answer: Answer, pixels: int) -> FloatArray | None:
+def _max_heights_um(answer: JsonObject, pixels: int) -> FloatArray | None:
     executed: dict[str, Any] | None = answer["executed_pulses"]
     if executed is not None and executed["simulated_um"]:
         pixel, height_um = executed["pixel"], executed["simulated_um"]
@@ -144,9 +146,9 @@ def _tallest_um(answer: Answer, pixels: int) -> FloatArray | None:
         pixel, height_um = answer["pulses"]["pixel"], answer["pulses"]["predicted_um"]
     else:
         return None
-    tallest_um = np.zeros(pixels)
-    np.maximum.at(tallest_um, np.asarray(pixel, dtype=np.int64), np.asarray(height_um, dtype=np.float64))
-    return tallest_um
+    heights_um = np.zeros(pixels)
+    np.maximum.at(heights_um, np.asarray(pixel, dtype=np.int64), np.asarray(height_um, dtype=np.float64))
+    return heights_um
 
 
 class FrameResult(NamedTuple):
@@ -161,14 +163,14 @@ class FrameResult(NamedTuple):
     error: OptodriveError | None
     simulated_max_um: float | None
     latency: dict[str, float | None]
-    answer: Answer
+    answer: JsonObject
 
     @classmethod
-    def of(cls, answer: Answer) -> Self:
+    def from_message(cls, answer: JsonObject) -> Self:
         """From one answer of the stream."""
         error = answer.get("error")
         if isinstance(error, dict):
-            error = problem_error(int(error["status"]), error)
+            error = build_error(int(error["status"]), error)
         elif error is not None:
             error = RefusedError(f"frame {answer['frame']}: {error}")
         return cls(

@@ -9,68 +9,68 @@ from numpy.typing import ArrayLike
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.units import um_to_m
-from optodrive.device.config import DisplaySection, PixelLayout, pixel_layout
-from optodrive.planning.stimuli.streamed_frame import HEADER, MAGIC, NUMBER_MAX, UNIT_M
+from optodrive.device.config import DisplaySection, PixelLayout, build_pixel_layout
+from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 
-Heights = Mapping[int, float] | ArrayLike
+HeightsLike = Mapping[int, float] | ArrayLike
 """Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by place; NaN or 0 where nothing is asked."""
 
-TENTHS_MAX = 0xFFFF
+TENTHS_UM_MAX = 0xFFFF
 
 
-def layout_of(config: Mapping[str, Any]) -> PixelLayout:
+def build_layout(config: Mapping[str, Any]) -> PixelLayout:
     """Where the pixels lie, from the daemon's configuration."""
     section = {key: value for key, value in config["display"].items() if key != "pixels"}
-    return pixel_layout(DisplaySection.model_validate(section))
+    return build_pixel_layout(DisplaySection.model_validate(section))
 
 
-def by_pixel(heights_um: Heights, layout: PixelLayout) -> FloatArray:
+def convert_to_pixels(heights_um: HeightsLike, layout: PixelLayout) -> FloatArray:
     """Heights [p] in µm, 0 where nothing is asked; InputError for shapes and heights that cannot be."""
     if isinstance(heights_um, Mapping):
-        return _checked(_from_mapping(heights_um, len(layout)))
+        return _check_heights(_convert_mapping(heights_um, len(layout)))
     try:
-        given = np.asarray(heights_um, dtype=np.float64)
+        array = np.asarray(heights_um, dtype=np.float64)
     except (TypeError, ValueError):
         raise InputError("heights_um", heights_um, "numbers in µm", "bad_target") from None
     rows, columns = int(layout.row.max()) + 1, int(layout.column.max()) + 1
-    if given.shape == (rows, columns):
-        return _checked(given[layout.row, layout.column])
-    if given.shape != (len(layout),):
+    if array.shape == (rows, columns):
+        return _check_heights(array[layout.row, layout.column])
+    if array.shape != (len(layout),):
         expected = f"{{pixel: µm}}, an array of {len(layout)}, or one of {rows} rows and {columns} columns"
-        raise InputError("heights_um", given.shape, expected, "bad_target")
-    return _checked(given)
+        raise InputError("heights_um", array.shape, expected, "bad_target")
+    return _check_heights(array)
 
 
-def _from_mapping(heights_um: Mapping[Any, Any], pixels: int) -> FloatArray:
-    found = np.zeros(pixels)
+def _convert_mapping(heights_um: Mapping[Any, Any], pixels: int) -> FloatArray:
+    array = np.zeros(pixels)
     for pixel, height_um in heights_um.items():
         if not isinstance(pixel, int | np.integer) or not 0 <= pixel < pixels:
             raise InputError("heights_um", pixel, f"a pixel, 0…{pixels - 1}", "unknown_pixel")
         try:
-            found[pixel] = height_um
+            array[pixel] = height_um
         except (TypeError, ValueError):
             raise InputError(f"heights_um[{pixel}]", height_um, "a height ≥ 0 in µm", "bad_target") from None
-    return found
+    return array
 
 
-def _checked(heights_um: FloatArray) -> FloatArray:
-    wrong = np.flatnonzero((heights_um < 0) | np.isinf(heights_um))
-    if wrong.size:
-        pixel = int(wrong[0])
+def _check_heights(heights_um: FloatArray) -> FloatArray:
+    invalid = np.flatnonzero((heights_um < 0) | np.isinf(heights_um))
+    if invalid.size:
+        pixel = int(invalid[0])
         raise InputError(f"heights_um[{pixel}]", float(heights_um[pixel]), "a height ≥ 0 in µm", "bad_target")
     return np.nan_to_num(heights_um)
 
 
-def to_json(heights_um: FloatArray) -> dict[str, float]:
+def encode_json(heights_um: FloatArray) -> dict[str, float]:
     """Driven pixels and their heights, as FRAMES.json has them."""
     return {str(pixel): float(heights_um[pixel]) for pixel in np.flatnonzero(heights_um).tolist()}
 
 
-def to_bytes(number: int, heights_um: FloatArray) -> bytes:
+def encode_frame(number: int, heights_um: FloatArray) -> bytes:
     """A stream's frame; InputError for heights that its 16 bits do not hold."""
-    tenths = np.rint(um_to_m(heights_um) / UNIT_M)
+    tenths = np.rint(um_to_m(heights_um) / HEIGHT_UNIT_M)
     pixel = int(tenths.argmax())
-    if tenths[pixel] > TENTHS_MAX:
-        expected = f"at most {TENTHS_MAX / 10:g} µm in a stream"
+    if tenths[pixel] > TENTHS_UM_MAX:
+        expected = f"at most {TENTHS_UM_MAX / 10:g} µm in a stream"
         raise InputError(f"heights_um[{pixel}]", float(heights_um[pixel]), expected, "bad_target")
-    return HEADER.pack(MAGIC, number & NUMBER_MAX) + tenths.astype("<u2").tobytes()
+    return HEADER.pack(MAGIC, number & FRAME_NUMBER_MAX) + tenths.astype("<u2").tobytes()

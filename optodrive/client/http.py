@@ -19,41 +19,41 @@ from optodrive.core.errors import (
     OverBudgetError,
     RefusedError,
 )
-from optodrive.daemon.web.tokens import VARIABLE, read_token
+from optodrive.daemon.web.tokens import TOKEN_VARIABLE, read_token
 
-Answer = dict[str, Any]
+JsonObject = dict[str, Any]
 DEFAULT_URL = "http://127.0.0.1:8450"
 TIMEOUT_S = 60.0
 RETRY_S = 0.1
-STOP_TRIES = 3
+STOP_ATTEMPTS = 3
 STOP_TIMEOUT_S = 3.0
-BAD_INPUT = (400, 404, 413, 422)
-NEVER_SENT = (httpx.ConnectError, httpx.ConnectTimeout)
-BY_CODE: dict[str, type[OptodriveError]] = {
+INPUT_ERROR_STATUSES = (400, 404, 413, 422)
+NOT_SENT_ERRORS = (httpx.ConnectError, httpx.ConnectTimeout)
+ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
     "not_ready": NotReadyError,
     "board_fault": BoardFaultError,
     "link": LinkError,
 }
-STOP_UNHEARD = (
+STOP_UNANSWERED = (
     "stop was not answered by {url} ({error}): what it plays may go on to its end; use the emergency stop or the key"
 )
 
 
-class Access:
+class Endpoint:
     """Where the daemon is and what opens it. token: as given, from OPTODRIVE_TOKEN, or the file the daemon wrote.
 
     place: the address as given; url: what requests name; unix: the path of the daemon's Unix socket, if it is that
     """
 
-    def __init__(self, place: str, token: str | None) -> None:
-        parts = urlsplit(place)
-        self.place = place.rstrip("/")
-        self.unix = parts.path if parts.scheme == "unix" and not parts.netloc and parts.path != "/" else None
-        if not self.unix and (parts.scheme not in ("http", "https") or not parts.hostname):
-            raise InputError("--url", place, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
-        self.url = "http://localhost" if self.unix else self.place
-        self._port = None if self.unix else parts.port or (443 if parts.scheme == "https" else 80)
-        self._given = token
+    def __init__(self, address: str, token: str | None) -> None:
+        parts = urlsplit(address)
+        self.address = address.rstrip("/")
+        self.unix_path = parts.path if parts.scheme == "unix" and not parts.netloc and parts.path != "/" else None
+        if not self.unix_path and (parts.scheme not in ("http", "https") or not parts.hostname):
+            raise InputError("--url", address, f"an address like {DEFAULT_URL} or unix:/run/optodrive/optodrive.sock")
+        self.url = "http://localhost" if self.unix_path else self.address
+        self._port = None if self.unix_path else parts.port or (443 if parts.scheme == "https" else 80)
+        self._explicit_token = token
         self._token = token or read_token(self._port)
 
     @property
@@ -61,183 +61,189 @@ class Access:
         """What every request carries."""
         return {"Authorization": f"Bearer {self._token}"}
 
-    def renewed(self) -> bool:
+    def renew_token(self) -> bool:
         """Whether there is another token than the one just refused: a daemon that restarted has made a new one."""
-        if self._given is not None:
+        if self._explicit_token is not None:
             return False
-        before, self._token = self._token, read_token(self._port)
-        return self._token != before
+        previous, self._token = self._token, read_token(self._port)
+        return self._token != previous
 
-    def socket(self) -> socket.socket | None:
+    def open_unix_socket(self) -> socket.socket | None:
         """A connection to the Unix socket, OSError where nobody answers; None where the daemon has an address."""
-        if self.unix is None:
+        if self.unix_path is None:
             return None
         link = socket.socket(socket.AF_UNIX)
         try:
-            link.connect(self.unix)
+            link.connect(self.unix_path)
         except OSError:
             link.close()
             raise
         return link
 
-    def client(self, timeout_s: float) -> httpx.Client:
+    def open_client(self, timeout_s: float) -> httpx.Client:
         """Connections to the daemon."""
-        transport = httpx.HTTPTransport(uds=self.unix)
+        transport = httpx.HTTPTransport(uds=self.unix_path)
         return httpx.Client(base_url=self.url, transport=transport, timeout=timeout_s)
 
-    def async_client(self, timeout_s: float) -> httpx.AsyncClient:
+    def open_async_client(self, timeout_s: float) -> httpx.AsyncClient:
         """The same for asyncio."""
-        transport = httpx.AsyncHTTPTransport(uds=self.unix)
+        transport = httpx.AsyncHTTPTransport(uds=self.unix_path)
         return httpx.AsyncClient(base_url=self.url, transport=transport, timeout=timeout_s)
 
-    def unreachable(self, error: Exception) -> LinkError:
+    def build_unreachable_error(self, error: Exception) -> LinkError:
         """The error where nobody answers."""
-        why = str(error) or type(error).__name__
-        return LinkError(f"no daemon answers at {self.place} ({why}); is `optodrive serve` running?")
+        cause = str(error) or type(error).__name__
+        return LinkError(f"no daemon answers at {self.address} ({cause}); is `optodrive serve` running?")
 
-    def unheard(self, error: Exception) -> LinkError:
+    def build_stop_error(self, error: Exception) -> LinkError:
         """The error where stop was not answered."""
-        return LinkError(STOP_UNHEARD.format(url=self.place, error=str(error) or type(error).__name__))
+        return LinkError(STOP_UNANSWERED.format(url=self.address, error=str(error) or type(error).__name__))
 
 
-class Remote:
+class DaemonClient:
     """A running daemon. patience_s: how long what may be sent again is, once the daemon has answered before."""
 
-    def __init__(self, url: str, token: str | None = None, patience_s: float = 0.0) -> None:
-        self.access = Access(url, token)
-        self._patience_s = patience_s
-        self._known = False
-        self._client = self.access.client(TIMEOUT_S)
+    def __init__(self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0) -> None:
+        self.endpoint = Endpoint(url, token)
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._has_responded = False
+        self._client = self.endpoint.open_client(TIMEOUT_S)
 
     def close(self) -> None:
         """Close the connections."""
         self._client.close()
 
-    def call(self, method: str, path: str, safe: bool | None = None, **request: Any) -> Answer:
+    def call(self, method: str, path: str, idempotent: bool | None = None, **request: Any) -> JsonObject:
         """One request; the answer's JSON, or one of the package's errors with the problem's own sentence.
 
         safe: it may be sent again, as a GET may; else it is only where it surely was not heard
         """
-        safe = method == "GET" if safe is None else safe
-        until_s = time.monotonic() + (self._patience_s if self._known else 0.0)
+        idempotent = method == "GET" if idempotent is None else idempotent
+        deadline_s = time.monotonic() + (self._reconnect_timeout_s if self._has_responded else 0.0)
         headers = request.pop("headers", {})
         while True:
             try:
-                response = self._client.request(method, path, headers=headers | self.access.headers, **request)
+                response = self._client.request(method, path, headers=headers | self.endpoint.headers, **request)
             except httpx.TransportError as error:
-                if time.monotonic() >= until_s or not (safe or isinstance(error, NEVER_SENT)):
-                    raise self.access.unreachable(error) from None
+                if time.monotonic() >= deadline_s or not (idempotent or isinstance(error, NOT_SENT_ERRORS)):
+                    raise self.endpoint.build_unreachable_error(error) from None
                 time.sleep(RETRY_S)
                 continue
-            if response.status_code == 401 and self.access.renewed():
+            if response.status_code == 401 and self.endpoint.renew_token():
                 continue
-            self._known = True
-            return taken(response)
+            self._has_responded = True
+            return parse_response(response)
 
-    def stop(self) -> Answer:
+    def stop(self) -> JsonObject:
         """POST /v1/stop on a connection of its own, for an old one may be broken without knowing; thrice if need be."""
         error: Exception = LinkError("never tried")
-        for _ in range(STOP_TRIES):
+        for _ in range(STOP_ATTEMPTS):
             try:
-                with self.access.client(STOP_TIMEOUT_S) as fresh:
-                    response = fresh.post("/v1/stop", headers=self.access.headers)
-                    if response.status_code == 401 and self.access.renewed():
-                        response = fresh.post("/v1/stop", headers=self.access.headers)
-                    return taken(response)
-            except httpx.TransportError as trouble:
-                error = trouble
-        raise self.access.unheard(error)
+                with self.endpoint.open_client(STOP_TIMEOUT_S) as client:
+                    response = client.post("/v1/stop", headers=self.endpoint.headers)
+                    if response.status_code == 401 and self.endpoint.renew_token():
+                        response = client.post("/v1/stop", headers=self.endpoint.headers)
+                    return parse_response(response)
+            except httpx.TransportError as transport_error:
+                error = transport_error
+        raise self.endpoint.build_stop_error(error)
 
 
-class AsyncRemote:
+class AsyncDaemonClient:
     """The same for asyncio."""
 
-    def __init__(self, url: str, token: str | None = None, patience_s: float = 0.0) -> None:
-        self.access = Access(url, token)
-        self._patience_s = patience_s
-        self._known = False
-        self._client = self.access.async_client(TIMEOUT_S)
+    def __init__(self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0) -> None:
+        self.endpoint = Endpoint(url, token)
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._has_responded = False
+        self._client = self.endpoint.open_async_client(TIMEOUT_S)
 
     async def close(self) -> None:
         """Close the connections."""
         await self._client.aclose()
 
-    async def call(self, method: str, path: str, safe: bool | None = None, **request: Any) -> Answer:
+    async def call(self, method: str, path: str, idempotent: bool | None = None, **request: Any) -> JsonObject:
         """As `Remote.call`."""
-        safe = method == "GET" if safe is None else safe
-        until_s = time.monotonic() + (self._patience_s if self._known else 0.0)
+        idempotent = method == "GET" if idempotent is None else idempotent
+        deadline_s = time.monotonic() + (self._reconnect_timeout_s if self._has_responded else 0.0)
         headers = request.pop("headers", {})
         while True:
             try:
-                response = await self._client.request(method, path, headers=headers | self.access.headers, **request)
+                response = await self._client.request(method, path, headers=headers | self.endpoint.headers, **request)
             except httpx.TransportError as error:
-                if time.monotonic() >= until_s or not (safe or isinstance(error, NEVER_SENT)):
-                    raise self.access.unreachable(error) from None
+                if time.monotonic() >= deadline_s or not (idempotent or isinstance(error, NOT_SENT_ERRORS)):
+                    raise self.endpoint.build_unreachable_error(error) from None
                 await asyncio.sleep(RETRY_S)
                 continue
-            if response.status_code == 401 and self.access.renewed():
+            if response.status_code == 401 and self.endpoint.renew_token():
                 continue
-            self._known = True
-            return taken(response)
+            self._has_responded = True
+            return parse_response(response)
 
-    async def stop(self) -> Answer:
+    async def stop(self) -> JsonObject:
         """As `Remote.stop`."""
         error: Exception = LinkError("never tried")
-        for _ in range(STOP_TRIES):
+        for _ in range(STOP_ATTEMPTS):
             try:
-                async with self.access.async_client(STOP_TIMEOUT_S) as fresh:
-                    response = await fresh.post("/v1/stop", headers=self.access.headers)
-                    if response.status_code == 401 and self.access.renewed():
-                        response = await fresh.post("/v1/stop", headers=self.access.headers)
-                    return taken(response)
-            except httpx.TransportError as trouble:
-                error = trouble
-        raise self.access.unheard(error)
+                async with self.endpoint.open_async_client(STOP_TIMEOUT_S) as client:
+                    response = await client.post("/v1/stop", headers=self.endpoint.headers)
+                    if response.status_code == 401 and self.endpoint.renew_token():
+                        response = await client.post("/v1/stop", headers=self.endpoint.headers)
+                    return parse_response(response)
+            except httpx.TransportError as transport_error:
+                error = transport_error
+        raise self.endpoint.build_stop_error(error)
 
 
-def taken(response: httpx.Response) -> Answer:
+def parse_response(response: httpx.Response) -> JsonObject:
     """The answer's JSON; raises what a problem document tells."""
     if response.is_success:
-        answer: Answer = response.json()
-        return answer
+        content: JsonObject = response.json()
+        return content
     try:
         document = response.json()
     except ValueError:
         document = None
-    raise problem_error(response.status_code, document)
+    raise build_error(response.status_code, document)
 
 
-def problem_error(status: int, document: object) -> OptodriveError:
+def build_error(status: int, document: object) -> OptodriveError:
     """An error of the package's own kinds from a problem document, which it keeps as `problem`."""
     if not isinstance(document, Mapping) or "detail" not in document:
         return LinkError(f"the daemon answered {status} without a problem document")
-    error = _kind(status, document)
+    error = _build_typed_error(status, document)
     error.problem = dict(document)
     error.code = str(document.get("code", error.code))
     return error
 
 
-def _kind(status: int, document: Mapping[str, Any]) -> OptodriveError:
+def _build_typed_error(status: int, document: Mapping[str, Any]) -> OptodriveError:
     detail, code = str(document["detail"]), str(document.get("code"))
     if status == 401:
-        return InputError("token", "the one given", f"the daemon's own ({VARIABLE}, or the file it wrote): {detail}")
-    if status in BAD_INPUT:
+        return InputError(
+            "token", "the one given", f"the daemon's own ({TOKEN_VARIABLE}, or the file it wrote): {detail}"
+        )
+    if status in INPUT_ERROR_STATUSES:
         where, expected = document.get("where"), document.get("expected")
         if where is not None and expected is not None:
-            return InputError(str(where), _Verbatim(str(document.get("value"))), str(expected))
+            return InputError(str(where), _PreformattedRepr(str(document.get("value"))), str(expected))
         return InputError("request", status, detail)
     if code == "over_budget":
-        later_s = document["fits_later_s"]
+        fits_after_s = document["fits_later_s"]
         return OverBudgetError(
-            detail, document["pixel"], document["cap"], document["margin_j"], inf if later_s is None else later_s
+            detail,
+            document["pixel"],
+            document["cap"],
+            document["margin_j"],
+            inf if fits_after_s is None else fits_after_s,
         )
-    error = BY_CODE.get(code, RefusedError)(detail)
+    error = ERROR_BY_CODE.get(code, RefusedError)(detail)
     if isinstance(error, RefusedError):
-        error.admission = document.get("admission")
+        error.feasibility = document.get("admission")
     return error
 
 
-class _Verbatim:
+class _PreformattedRepr:
     """A value whose repr was already made at the other end."""
 
     def __init__(self, text: str) -> None:

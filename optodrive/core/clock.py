@@ -47,7 +47,7 @@ class ManualClock:
         self._now_s += duration_s
 
 
-def claim_processor() -> None:
+def request_realtime_scheduling() -> None:
     """Ask that this thread need not wait for the processor behind others: whoever renews a lease must not be late.
 
     Threads that it starts later inherit it, so that none of them holds the interpreter while it waits itself. Where it

@@ -31,7 +31,7 @@ class RefusedError(OptodriveError):
     """The input is well formed, but what it asks for is refused (limits, deadlines, reach)."""
 
     code = "refused"
-    admission: Mapping[str, object] | None = None
+    feasibility: Mapping[str, object] | None = None
     """What was found of a sequence that does not fit, as `Admission.answer` gives it."""
 
 
@@ -89,7 +89,7 @@ def abbreviate(value: object, limit: int = 60) -> str:
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
-def nearest(name: str, known: list[str]) -> str:
+def suggest_nearest(name: str, known: list[str]) -> str:
     """A phrase that names the known word nearest to `name`, or all of them when none is near."""
     match = get_close_matches(name, known, n=1, cutoff=0.5)
     return f"nearest is '{match[0]}'" if match else "one of " + ", ".join(known)

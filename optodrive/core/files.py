@@ -12,7 +12,7 @@ from optodrive.core.errors import InputError
 
 
 @contextmanager
-def written_whole(path: Path) -> Iterator[Path]:
+def atomic_write(path: Path) -> Iterator[Path]:
     """Give a temporary file beside `path` that takes its place when the block ends well, and is gone when it does not.
 
     InputError, naming the path, where it cannot be written.

@@ -17,6 +17,6 @@ class Histogram:
         self._counts[bisect_left(self.bounds, value)] += 1
         self.sum += value
 
-    def cumulative(self) -> list[int]:
+    def cumulative_counts(self) -> list[int]:
         """Values at most each bound, and all of them at the end."""
         return list(accumulate(self._counts))

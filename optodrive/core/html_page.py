@@ -17,30 +17,34 @@ svg { width: 100%; height: auto; background: #fafafa; border: 1px solid #ddd; }
 """
 
 
-def page(title: str, verdict: str, story: list[str], body: Iterable[str]) -> str:
+def render_page(title: str, verdict: str, narrative: list[str], body: Iterable[str]) -> str:
     """HTML. story: its first line becomes the heading; body: what follows, HTML already."""
-    lines = [line for line in story if line]
+    lines = [line for line in narrative if line]
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
         f"<title>{escape(title)}: {escape(verdict)}</title><style>{STYLE}</style></head><body>",
         f"<h1>{escape(lines[0])}</h1><p>{escape(title)}</p>",
-        *(f"<p{_kind(line)}>{escape(line.strip())}</p>" for line in lines[1:]),
+        *(f"<p{_class_attribute(line)}>{escape(line.strip())}</p>" for line in lines[1:]),
         *body,
         "</body></html>",
     ]
     return "\n".join(parts)
 
 
-def table(head: Iterable[str], rows: Iterable[Iterable[str]], numbers: frozenset[int] = frozenset()) -> str:
+def render_table(
+    header: Iterable[str], rows: Iterable[Iterable[str]], numeric_columns: frozenset[int] = frozenset()
+) -> str:
     """Cells are HTML already; numbers: columns set to the right."""
-    top = "".join(f"<th>{name}</th>" for name in head)
+    header_cells = "".join(f"<th>{name}</th>" for name in header)
     cells = (
-        "".join(f"<td class='n'>{cell}</td>" if at in numbers else f"<td>{cell}</td>" for at, cell in enumerate(row))
+        "".join(
+            f"<td class='n'>{cell}</td>" if at in numeric_columns else f"<td>{cell}</td>" for at, cell in enumerate(row)
+        )
         for row in rows
     )
-    return f"<table><tr>{top}</tr>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
+    return f"<table><tr>{header_cells}</tr>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
-def _kind(line: str) -> str:
+def _class_attribute(line: str) -> str:
     """Lines of a list, and what belongs to the line above, stand closer."""
     return " class='item'" if line.startswith(("- ", "  ")) else ""

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.core.types.arrays import FloatArray
 
-BLOCK = 50_000
+ROWS_PER_WRITE = 50_000
 """Rows written at a time."""
 
 
@@ -20,15 +20,15 @@ def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
         raise InputError(str(path), "not text", "a CSV file, UTF-8") from None
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
-    head, _, body = text.partition("\n")
-    names = tuple(name.strip() for name in head.strip().split(","))
+    header, _, body = text.partition("\n")
+    names = tuple(name.strip() for name in header.strip().split(","))
     if names != columns:
-        raise InputError(f"{path}: first line", head.strip(), f"'{','.join(columns)}'")
+        raise InputError(f"{path}: first line", header.strip(), f"'{','.join(columns)}'")
     body = body.strip().replace("\r", "")
     rows = body.count("\n") + 1 if body else 0
-    table = _at_once(body, rows, len(columns))
+    table = _parse_all(body, rows, len(columns))
     if table is None:
-        table = _row_by_row(path, body, columns)
+        table = _parse_rows(path, body, columns)
     bad = np.argwhere(~np.isfinite(table))
     if len(bad):
         row, column = bad[0].tolist()
@@ -36,7 +36,7 @@ def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
     return table
 
 
-def _at_once(body: str, rows: int, columns: int) -> FloatArray | None:
+def _parse_all(body: str, rows: int, columns: int) -> FloatArray | None:
     """The table, or None where something is not as it should be."""
     if body.count(",") != rows * (columns - 1):
         return None
@@ -47,7 +47,7 @@ def _at_once(body: str, rows: int, columns: int) -> FloatArray | None:
     return values.reshape(rows, columns) if len(values) == rows * columns else None
 
 
-def _row_by_row(path: Path, body: str, columns: tuple[str, ...]) -> FloatArray:
+def _parse_rows(path: Path, body: str, columns: tuple[str, ...]) -> FloatArray:
     rows = []
     for number, line in enumerate(body.split("\n"), start=2):
         cells = line.split(",")
@@ -72,8 +72,8 @@ def _is_number(cell: str) -> bool:
 def write_columns(path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...]) -> None:
     """Write a table [n, columns], whole or not at all; formats: one a column, as %.3f."""
     line = ",".join(formats) + "\n"
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(columns) + "\n")
-        for first in range(0, len(table), BLOCK):
-            block = table[first : first + BLOCK]
+        for first in range(0, len(table), ROWS_PER_WRITE):
+            block = table[first : first + ROWS_PER_WRITE]
             file.write(line * len(block) % tuple(block.ravel().tolist()))

@@ -14,11 +14,11 @@ from typing import Literal
 
 JOURNAL = Path("/run/systemd/journal/socket")
 LINE_MAX = 8000
-Level = Literal["err", "warning", "notice", "info"]
-PRIORITY: dict[Level, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
+LogLevel = Literal["err", "warning", "notice", "info"]
+PRIORITY: dict[LogLevel, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
 
 
-class Log:
+class DaemonLog:
     """Where lines go. journal: the journal's socket, None for stderr."""
 
     def __init__(self, journal: Path | None = None) -> None:
@@ -26,36 +26,36 @@ class Log:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
-    def say(self, line: str, level: Level = "info", **fields: object) -> None:
+    def write(self, line: str, level: LogLevel = "info", **fields: object) -> None:
         """Say a line; what cannot be said is lost. fields: upper-case names, for the journal only."""
         with suppress(OSError):  # a log that cannot be written must not end what it is about
             if self._journal is None:
                 sys.stderr.write(f"optodrive: {line}\n")
                 sys.stderr.flush()
             else:
-                self._socket.sendto(entry(line, level, fields), self._journal)
+                self._socket.sendto(format_entry(line, level, fields), self._journal)
 
     def warn(self, line: str) -> None:
         """Say that something is not as it should be."""
-        self.say(line, "warning")
+        self.write(line, "warning")
 
     def close(self) -> None:
         """Give the socket back."""
         self._socket.close()
 
-    def take_logging(self) -> None:
+    def attach_to_root_logger(self) -> None:
         """Say what libraries log, from warnings on."""
         handler = _Handler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
 
 
-def entry(line: str, level: Level, fields: dict[str, object]) -> bytes:
+def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes:
     """An entry in the journal's own form; values of several lines are sent by their length."""
-    named = {"MESSAGE": line, "PRIORITY": PRIORITY[level], "SYSLOG_IDENTIFIER": "optodrive"}
-    named |= {f"OPTODRIVE_{name}": value for name, value in fields.items()}
+    entry_fields = {"MESSAGE": line, "PRIORITY": PRIORITY[level], "SYSLOG_IDENTIFIER": "optodrive"}
+    entry_fields |= {f"OPTODRIVE_{name}": value for name, value in fields.items()}
     parts = []
-    for name, value in named.items():
+    for name, value in entry_fields.items():
         data = str(value)[:LINE_MAX].encode()
         if b"\n" in data:
             parts.append(name.encode() + b"\n" + len(data).to_bytes(8, "little") + data + b"\n")
@@ -64,21 +64,21 @@ def entry(line: str, level: Level, fields: dict[str, object]) -> bytes:
     return b"".join(parts)
 
 
-def daemon_log() -> Log:
+def open_daemon_log() -> DaemonLog:
     """The journal where it says that stderr is its own ($JOURNAL_STREAM), else stderr."""
     with suppress(OSError, ValueError):
         device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
-        there = os.fstat(2)
-        if (there.st_dev, there.st_ino) == (int(device), int(inode)) and JOURNAL.exists():
-            return Log(JOURNAL)
-    return Log()
+        stderr_stat = os.fstat(2)
+        if (stderr_stat.st_dev, stderr_stat.st_ino) == (int(device), int(inode)) and JOURNAL.exists():
+            return DaemonLog(JOURNAL)
+    return DaemonLog()
 
 
 class _Handler(logging.Handler):
-    def __init__(self, log: Log) -> None:
+    def __init__(self, log: DaemonLog) -> None:
         super().__init__()
         self._log = log
 
     def emit(self, record: logging.LogRecord) -> None:
-        level: Level = "err" if record.levelno >= logging.ERROR else "warning"
-        self._log.say(self.format(record), level, LOGGER=record.name)
+        level: LogLevel = "err" if record.levelno >= logging.ERROR else "warning"
+        self._log.write(self.format(record), level, LOGGER=record.name)

@@ -7,7 +7,7 @@ from contextlib import suppress
 
 from optodrive.core.clock import Clock
 
-WATCHDOG_SHARE = 0.2
+WATCHDOG_FRACTION = 0.2
 """The watchdog is fed after this share of the time it allows."""
 
 
@@ -20,36 +20,36 @@ class Notifier:
         self._clock = clock
         watched = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())
         allowed_us = environment.get("WATCHDOG_USEC", "")
-        self._every_s = int(allowed_us) * 1e-6 * WATCHDOG_SHARE if watched and allowed_us.isdigit() else None
+        self._interval_s = int(allowed_us) * 1e-6 * WATCHDOG_FRACTION if watched and allowed_us.isdigit() else None
         self._fed_s = -float("inf")
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
 
     @property
-    def listened_to(self) -> bool:
+    def is_enabled(self) -> bool:
         """Whether a service manager started this process."""
         return bool(self._address)
 
-    def tell(self, *lines: str) -> None:
+    def send(self, *lines: str) -> None:
         """Say something, for example READY=1."""
         if self._address:
             with suppress(OSError):
                 self._socket.sendto("\n".join(lines).encode(), self._address)
 
-    def reloading(self) -> None:
+    def notify_reloading(self) -> None:
         """Say that a reload begins; READY=1 ends it."""
-        self.tell("RELOADING=1", f"MONOTONIC_USEC={round(self._clock.now_s() * 1e6)}")
+        self.send("RELOADING=1", f"MONOTONIC_USEC={round(self._clock.now_s() * 1e6)}")
 
     def close(self) -> None:
         """Tell nobody any more."""
         self._address = ""
         self._socket.close()
 
-    def alive(self) -> None:
+    def feed_watchdog(self) -> None:
         """Feed the watchdog where it is time to; called at every turn of the engine's loop, by that loop alone."""
-        if self._every_s is None:
+        if self._interval_s is None:
             return
         now_s = self._clock.now_s()
-        if now_s - self._fed_s >= self._every_s:
+        if now_s - self._fed_s >= self._interval_s:
             self._fed_s = now_s
-            self.tell("WATCHDOG=1")
+            self.send("WATCHDOG=1")

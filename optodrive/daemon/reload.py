@@ -6,41 +6,41 @@ from typing import Any
 
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.log import Log
+from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.web.access_policy import Door
-from optodrive.daemon.web.tokens import private_tokens
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.tokens import read_private_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
-from optodrive.planning.pipeline import Display
+from optodrive.planning.pipeline import DisplayModel
 
-TAKEN_AT_ONCE = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
+RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
 """Keys of [daemon]; the file of tokens is read again too."""
-NOT_WHILE = ("ARMING", "ARMED", "RUNNING", "HOLD")
+NON_RELOADABLE_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
-def require_dark(board_state: str) -> None:
+def require_disarmed(board_state: str) -> None:
     """NotReadyError while the board may emit: what it runs under stays as it was when it was armed."""
-    if board_state in NOT_WHILE:
+    if board_state in NON_RELOADABLE_STATES:
         raise NotReadyError(f"nothing is reloaded while the board is {board_state}; disarm it first")
 
 
-def changed(running: Config, new: Config) -> tuple[list[str], list[str]]:
+def split_changed_keys(running: Config, new: Config) -> tuple[list[str], list[str]]:
     """Keys that differ: those that are taken at once, and those that wait for a restart."""
-    keys = _differing(running.model_dump(), new.model_dump(), "")
-    at_once = [key for key in keys if key in {f"daemon.{name}" for name in TAKEN_AT_ONCE}]
-    return at_once, [key for key in keys if key not in at_once]
+    keys = _find_differences(running.model_dump(), new.model_dump(), "")
+    reloaded = [key for key in keys if key in {f"daemon.{name}" for name in RELOADABLE_KEYS}]
+    return reloaded, [key for key in keys if key not in reloaded]
 
 
-def taken(running: Config, new: Config) -> Config:
+def merge_reloadable(running: Config, new: Config) -> Config:
     """The configuration that runs, with what is taken at once from the new one."""
-    daemon = running.daemon.model_copy(update={name: getattr(new.daemon, name) for name in TAKEN_AT_ONCE})
+    daemon = running.daemon.model_copy(update={name: getattr(new.daemon, name) for name in RELOADABLE_KEYS})
     return running.model_copy(update={"daemon": daemon})
 
 
-def sentence(at_once: list[str], waiting: list[str], tokens_file: Path | None) -> str:
+def describe_reload(reloaded: list[str], waiting: list[str], tokens_file: Path | None) -> str:
     """What a reload did, in one line."""
-    parts = [f"taken: {', '.join(at_once)}" if at_once else "nothing to be taken at once"]
+    parts = [f"taken: {', '.join(reloaded)}" if reloaded else "nothing to be taken at once"]
     if tokens_file is not None:
         parts.append(f"tokens read again from {tokens_file}")
     if waiting:
@@ -48,64 +48,64 @@ def sentence(at_once: list[str], waiting: list[str], tokens_file: Path | None) -
     return "reloaded; " + "; ".join(parts)
 
 
-def _differing(old: dict[str, Any], new: dict[str, Any], under: str) -> list[str]:
+def _find_differences(old: dict[str, Any], new: dict[str, Any], prefix: str) -> list[str]:
     keys = []
     for key in sorted({*old, *new}):
         before, after = old.get(key), new.get(key)
         if isinstance(before, dict) and isinstance(after, dict):
-            keys += _differing(before, after, f"{under}{key}.")
+            keys += _find_differences(before, after, f"{prefix}{key}.")
         elif before != after:
-            keys.append(under + key)
+            keys.append(prefix + key)
     return keys
 
 
-class Reloading:
+class ConfigReloader:
     """SIGHUP from a service manager: the configuration is read again, checked whole, and taken as far as can be."""
 
     def __init__(
         self,
         config: Config,
-        again: Callable[[], Config] | None,
+        read_config: Callable[[], Config] | None,
         engine: Engine,
-        door: Door,
+        access_policy: AccessPolicy,
         server: Server,
         notifier: Notifier,
-        log: Log,
+        log: DaemonLog,
     ) -> None:
         self._running = config
-        self._again = again
+        self._read_config = read_config
         self._engine = engine
-        self._door = door
+        self._access_policy = access_policy
         self._server = server
         self._notifier = notifier
         self._log = log
 
-    def asked_for(self, *_: object) -> None:
+    def request_reload(self, *_: object) -> None:
         """Reload soon, between two callbacks of the web server's loop; before that runs there is nothing to reload."""
         if self._server.loop is not None:
             self._server.loop.call_soon_threadsafe(self._reload)
 
     def _reload(self) -> None:
-        self._notifier.reloading()
+        self._notifier.notify_reloading()
         try:
-            self._log.say(self._take(), "notice", EVENT="reloaded")
+            self._log.write(self._apply(), "notice", EVENT="reloaded")
         except OptodriveError as error:
-            self._log.say(f"not reloaded, all stays as it was: {error}", "err", EVENT="reload-refused")
+            self._log.write(f"not reloaded, all stays as it was: {error}", "err", EVENT="reload-refused")
         finally:
-            self._notifier.tell("READY=1")
+            self._notifier.send("READY=1")
 
-    def _take(self) -> str:
-        assert self._again is not None  # noqa: S101 - else the signal ends the daemon
-        require_dark(self._engine.board_state)
-        new = self._again()
-        Display.of(new)  # finds what is wrong between the sections, as at a start
-        at_once, waiting = changed(self._running, new)
-        self._running = taken(self._running, new)
+    def _apply(self) -> str:
+        assert self._read_config is not None  # noqa: S101 - else the signal ends the daemon
+        require_disarmed(self._engine.board_state)
+        new = self._read_config()
+        DisplayModel.from_config(new)  # finds what is wrong between the sections, as at a start
+        reloaded, waiting = split_changed_keys(self._running, new)
+        self._running = merge_reloadable(self._running, new)
         daemon = self._running.daemon
         file = Path(daemon.tokens) if daemon.tokens else None
-        tokens = self._door.tokens if file is None else private_tokens(file)
-        self._door.take(tokens, daemon)
+        tokens = self._access_policy.tokens if file is None else read_private_tokens(file)
+        self._access_policy.update(tokens, daemon)
         self._server.config.ws_max_size = daemon.body_max_bytes
-        if self._door.audit is not None:
-            self._door.audit.note({"event": "reloaded", "taken": at_once, "waiting": waiting})
-        return sentence(at_once, waiting, file)
+        if self._access_policy.audit is not None:
+            self._access_policy.audit.record({"event": "reloaded", "taken": reloaded, "waiting": waiting})
+        return describe_reload(reloaded, waiting, file)

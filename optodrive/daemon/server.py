@@ -11,30 +11,30 @@ import uvicorn
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import LinkError
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.session_notes import recorder_of
-from optodrive.daemon.log import daemon_log
+from optodrive.daemon.engine.session_notes import start_session_recorder
+from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
-from optodrive.daemon.reload import Reloading
-from optodrive.daemon.web.access_policy import Door
-from optodrive.daemon.web.api import make_app
-from optodrive.daemon.web.audit import Audit
-from optodrive.daemon.web.listeners import tcp_listener, unix_listener
-from optodrive.daemon.web.tokens import daemon_tokens
+from optodrive.daemon.reload import ConfigReloader
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.audit import AuditLog
+from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
+from optodrive.daemon.web.tokens import load_daemon_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
-from optodrive.link.transport.link_capture import TapeWriter
-from optodrive.link.transport.recorded import RecordedTransport
-from optodrive.link.transport.registry import transport_maker
-from optodrive.planning.pipeline import Display
+from optodrive.link.transport.link_capture import LinkCaptureWriter
+from optodrive.link.transport.recorded import CapturingTransport
+from optodrive.link.transport.registry import find_transport_factory
+from optodrive.planning.pipeline import DisplayModel
 
-GRACE_S = 2
+SHUTDOWN_GRACE_S = 2
 
 
 def run(
     config: Config,
-    record: Path | None = None,
-    again: Callable[[], Config] | None = None,
-    record_session: Path | None = None,
+    capture_path: Path | None = None,
+    read_config: Callable[[], Config] | None = None,
+    session_path: Path | None = None,
 ) -> None:
     """Serve until a signal; the board is told to stop on the way out, and goes dark by itself if that is not heard.
 
@@ -42,40 +42,40 @@ def run(
     manager's SIGHUP asks for that, any other ends the daemon, for its terminal has gone.
     record_session: note every plan in this HDF5 file, which must be new; else as the configuration says
     """
-    with ExitStack() as ending:  # closed from the last to the first: the engine before all others
-        log = daemon_log()
-        ending.callback(log.close)
-        make_transport = transport_maker(config.board)
-        listeners = [tcp_listener(config.daemon.host, config.daemon.port)]
-        ending.callback(listeners[0].close)
+    with ExitStack() as exit_stack:  # closed from the last to the first: the engine before all others
+        log = open_daemon_log()
+        exit_stack.callback(log.close)
+        make_transport = find_transport_factory(config.board)
+        listeners = [open_tcp_listener(config.daemon.host, config.daemon.port)]
+        exit_stack.callback(listeners[0].close)
         port = listeners[0].getsockname()[1]
         clock, transport = MonotonicClock(), make_transport()
-        if record is not None:
-            transport = RecordedTransport(transport, TapeWriter(record, clock.now_s(), log.warn), clock)
+        if capture_path is not None:
+            transport = CapturingTransport(transport, LinkCaptureWriter(capture_path, clock.now_s(), log.warn), clock)
         notifier = Notifier(clock)
-        ending.callback(notifier.close)
-        engine = Engine(Display.of(config), transport, clock)
-        engine.say = log.warn
-        engine.on_turn = notifier.alive
-        recorder = recorder_of(engine, record_session, log)
+        exit_stack.callback(notifier.close)
+        engine = Engine(DisplayModel.from_config(config), transport, clock)
+        engine.on_warning = log.warn
+        engine.on_loop = notifier.feed_watchdog
+        recorder = start_session_recorder(engine, session_path, log)
         if recorder is not None:
-            ending.callback(recorder.close)
-        audit = Audit(Path(config.daemon.audit), log.warn) if config.daemon.audit else None
+            exit_stack.callback(recorder.close)
+        audit = AuditLog(Path(config.daemon.audit), log.warn) if config.daemon.audit else None
         if audit is not None:
-            ending.callback(audit.close)
-            ending.callback(audit.note, {"event": "ended"})
+            exit_stack.callback(audit.close)
+            exit_stack.callback(audit.record, {"event": "ended"})
         unix = Path(config.daemon.socket) if config.daemon.socket else None
         if unix is not None:
-            listeners.append(unix_listener(unix))
-            ending.callback(_unlink, unix)
-            ending.callback(listeners[1].close)
-        tokens, path = daemon_tokens(config.daemon.tokens, port)
+            listeners.append(open_unix_listener(unix))
+            exit_stack.callback(_unlink, unix)
+            exit_stack.callback(listeners[1].close)
+        tokens, path = load_daemon_tokens(config.daemon.tokens, port)
         if not config.daemon.tokens:  # made for this run
-            ending.callback(_unlink, path)
-        ending.callback(engine.close)
+            exit_stack.callback(_unlink, path)
+        exit_stack.callback(engine.close)
         engine.start()
-        door = Door(tokens, config.daemon, audit)
-        app = make_app(engine, door)
+        access_policy = AccessPolicy(tokens, config.daemon, audit)
+        app = build_app(engine, access_policy)
         server = Server(
             uvicorn.Config(
                 app,
@@ -83,34 +83,36 @@ def run(
                 access_log=False,
                 server_header=False,
                 proxy_headers=False,  # a caller does not say by itself from where it calls
-                timeout_graceful_shutdown=GRACE_S,
+                timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
                 ws="websockets-sansio",
                 ws_max_size=config.daemon.body_max_bytes,
             )
         )
-        log.take_logging()
+        log.attach_to_root_logger()
 
-        def leave(*_: object) -> None:
+        def shut_down(*_: object) -> None:
             engine.stop()  # dark first: the server may wait for callers that are slow to go
             app.state.telemetry.close()
-            notifier.tell("STOPPING=1")
+            notifier.send("STOPPING=1")
             server.should_exit = True
 
-        reloading = Reloading(config, again, engine, door, server, notifier, log)
+        reloader = ConfigReloader(config, read_config, engine, access_policy, server, notifier, log)
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, leave)
-        if notifier.listened_to and again is not None:
-            signal.signal(signal.SIGHUP, reloading.asked_for)
-        also = f" and {unix}" if unix else ""
-        print(f"optodrive: {config.name} on http://{config.daemon.host}:{port}{also}, token in {path}", flush=True)
+            signal.signal(number, shut_down)
+        if notifier.is_enabled and read_config is not None:
+            signal.signal(signal.SIGHUP, reloader.request_reload)
+        socket_text = f" and {unix}" if unix else ""
+        print(
+            f"optodrive: {config.name} on http://{config.daemon.host}:{port}{socket_text}, token in {path}", flush=True
+        )
         if sys.stdout.isatty():  # a secret: to whoever sits there, never to a log
-            secret = tokens.strongest.secret
+            secret = tokens.most_privileged.secret
             print(f"optodrive: the page, for you alone: http://{config.daemon.host}:{port}/#token={secret}", flush=True)
         print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
         if audit is not None:
-            audit.note({"event": "started", "display": config.name})
+            audit.record({"event": "started", "display": config.name})
         engine.on_failure = lambda: setattr(server, "should_exit", True)
-        server.on_ready = lambda: notifier.tell("READY=1", f"STATUS=board at {engine.link_name}")
+        server.on_ready = lambda: notifier.send("READY=1", f"STATUS=board at {engine.link_name}")
         server.run(sockets=listeners)
         if engine.failure is not None:
             raise LinkError(f"the engine failed, the board was told to abort: {engine.failure!r}")

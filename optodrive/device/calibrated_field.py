@@ -8,34 +8,34 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, Geometry, lands_m
-from optodrive.device.field_surface import Extent, terms
+from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry, beam_position_m
+from optodrive.device.field_surface import Extent, evaluate_terms
 
-Mapping = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
-BLOCK = 8192
+PointMap = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+BLOCK_POINTS = 8192
 """Places worked on at a time: their numbers fit into the cache."""
-ROUNDS = 8
-NEAR_CODE = 1.0
+MAX_ITERATIONS = 8
+CODE_TOLERANCE = 1.0
 """Codes are looked for until the last step was shorter: the next would be a hundredth of it at most."""
-FOLDED = 10.0
+FOLDOVER_FACTOR = 10.0
 """The beam lands no farther off than so many times what the last step nominally is; else it is another place."""
-START_ORDER = 7
-START_NODES = 40
-OUTSIDE = 0.01
+GUESS_ORDER = 7
+GUESS_NODES = 40
+OUTSIDE_WEIGHT = 0.01
 """Weight of places outside the extent, where nearly nothing is looked up, for the start."""
-BEYOND = 1.1
+GUESS_MARGIN = 1.1
 """The start is good for codes up to so many times the converter's range, and best up to so many times the extent."""
 
 
 @dataclass(frozen=True, eq=False)
-class Field:
+class CalibratedField:
     """Physical geometry and smooth surface; arrays are read-only.
 
     surface_m: [2, TERMS] coefficients of x and y; rad_per_code, focal_length_m: of the configuration it was made for
     sigma_grid_m: [k, k] one sigma on either axis from edge to edge of the extent, rows by y
     """
 
-    geometry: Geometry
+    geometry: FieldGeometry
     surface_m: FloatArray
     extent: Extent
     rad_per_code: float
@@ -47,15 +47,15 @@ class Field:
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Where the beam lands for codes, whole or not, m; any shape."""
-        return _blockwise(self._position, x_code, y_code)
+        return _apply_blockwise(self._block_position_m, x_code, y_code)
 
-    def codes(self, x_m: ArrayLike, y_m: ArrayLike, beyond: bool = False) -> tuple[FloatArray, FloatArray]:
+    def codes(self, x_m: ArrayLike, y_m: ArrayLike, extrapolate: bool = False) -> tuple[FloatArray, FloatArray]:
         """Codes, not rounded, that lead the beam to places, m; any shape. NaN where no code of the converter does.
 
         beyond: also codes that a converter of a larger range would have.
         """
-        x_code, y_code = _blockwise(self._codes, x_m, y_m)
-        if beyond:
+        x_code, y_code = _apply_blockwise(self._solve_codes, x_m, y_m)
+        if extrapolate:
             return x_code, y_code
         outside = (np.minimum(x_code, y_code) < 0.0) | (np.maximum(x_code, y_code) > CODE_MAX)
         return np.where(outside, np.nan, x_code), np.where(outside, np.nan, y_code)
@@ -67,7 +67,7 @@ class Field:
 
     def sigma_m(self, x_code: ArrayLike, y_code: ArrayLike) -> FloatArray:
         """One sigma of the position on either axis, m; any shape. Infinite outside the extent: nothing is claimed."""
-        shares = self.extent.shares(np.asarray(x_code, dtype=np.float64), np.asarray(y_code, dtype=np.float64))
+        shares = self.extent.normalise(np.asarray(x_code, dtype=np.float64), np.asarray(y_code, dtype=np.float64))
         last = len(self.sigma_grid_m) - 1
         inside = (np.abs(shares[0]) <= 1.0) & (np.abs(shares[1]) <= 1.0)
         x_at, y_at = (np.where(inside, share + 1.0, 0.0) * 0.5 * last for share in shares)
@@ -78,60 +78,60 @@ class Field:
         high = grid[row + 1, column] * (1.0 - x_part) + grid[row + 1, column + 1] * x_part
         return np.asarray(np.where(inside, low * (1.0 - y_part) + high * y_part, np.inf), dtype=np.float64)
 
-    def _position(self, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _block_position_m(self, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:
         """[n] each."""
         scale = self.rad_per_code
-        x_m, y_m = lands_m(self.geometry, (x_code - CENTRE_CODE) * scale, (y_code - CENTRE_CODE) * scale)
-        more = terms(self.extent, x_code, y_code) @ self.surface_m.T
+        x_m, y_m = beam_position_m(self.geometry, (x_code - CENTRE_CODE) * scale, (y_code - CENTRE_CODE) * scale)
+        more = evaluate_terms(self.extent, x_code, y_code) @ self.surface_m.T
         return x_m + more[:, 0], y_m + more[:, 1]
 
-    def _codes(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _solve_codes(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """From a polynomial's guess, moved by what the guess makes of the miss until that is nothing. [n] each.
 
         The guess has nearly the field's slope, so each round is one of Newton's.
         """
-        guess = self._guess(x_m, y_m)
+        guess = self._guess_codes(x_m, y_m)
         found = guess
-        for _ in range(ROUNDS):
-            at_x_m, at_y_m = self._position(found[:, 0], found[:, 1])
-            step = guess - self._guess(at_x_m, at_y_m)
+        for _ in range(MAX_ITERATIONS):
+            at_x_m, at_y_m = self._block_position_m(found[:, 0], found[:, 1])
+            step = guess - self._guess_codes(at_x_m, at_y_m)
             found = found + step
-            if not np.any(np.abs(step) > NEAR_CODE):
+            if not np.any(np.abs(step) > CODE_TOLERANCE):
                 break
         # Far out the guess folds over: it says the same of another place.
         off_m = np.hypot(at_x_m - x_m, at_y_m - y_m)
-        near_m = FOLDED * NEAR_CODE * 2.0 * self.focal_length_m * self.rad_per_code
-        lost = ~(np.all(np.abs(step) <= NEAR_CODE, axis=1) & (off_m <= near_m))
+        near_m = FOLDOVER_FACTOR * CODE_TOLERANCE * 2.0 * self.focal_length_m * self.rad_per_code
+        lost = ~(np.all(np.abs(step) <= CODE_TOLERANCE, axis=1) & (off_m <= near_m))
         found[lost] = np.nan
         return found[:, 0], found[:, 1]
 
-    def _guess(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
+    def _guess_codes(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
         """Codes by the polynomial, [n, 2]."""
-        scale_m, coefficients = self._start
-        guess: FloatArray = _powers(x_m / scale_m, y_m / scale_m) @ coefficients
+        scale_m, coefficients = self._guess_polynomial
+        guess: FloatArray = _build_monomials(x_m / scale_m, y_m / scale_m) @ coefficients
         return guess
 
     @cached_property
-    def _start(self) -> tuple[float, FloatArray]:
+    def _guess_polynomial(self) -> tuple[float, FloatArray]:
         """Scale in m and coefficients [powers, 2] of a polynomial from places to codes, over the converter's range."""
-        node = np.cos(np.pi * (np.arange(START_NODES) + 0.5) / START_NODES) * BEYOND * (CODE_MAX - CENTRE_CODE)
+        node = np.cos(np.pi * (np.arange(GUESS_NODES) + 0.5) / GUESS_NODES) * GUESS_MARGIN * (CODE_MAX - CENTRE_CODE)
         x_code, y_code = (CENTRE_CODE + axis.ravel() for axis in np.meshgrid(node, node))
-        x_m, y_m = self._position(x_code, y_code)
+        x_m, y_m = self._block_position_m(x_code, y_code)
         scale_m = float(max(np.abs(x_m).max(), np.abs(y_m).max()))
         wanted = np.column_stack([x_code, y_code])
-        outside = np.maximum(*np.abs(self.extent.shares(x_code, y_code))) > BEYOND
-        weight = np.where(outside, OUTSIDE, 1.0)[:, None]
-        powers = _powers(x_m / scale_m, y_m / scale_m)
+        outside = np.maximum(*np.abs(self.extent.normalise(x_code, y_code))) > GUESS_MARGIN
+        weight = np.where(outside, OUTSIDE_WEIGHT, 1.0)[:, None]
+        powers = _build_monomials(x_m / scale_m, y_m / scale_m)
         coefficients = np.asarray(np.linalg.lstsq(powers * weight, wanted * weight, rcond=None)[0], dtype=np.float64)
         return scale_m, coefficients
 
 
-def _powers(x: FloatArray, y: FloatArray) -> FloatArray:
+def _build_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
     """Monomials of total degree up to START_ORDER, [n, powers]."""
-    out = np.empty((len(x), (START_ORDER + 1) * (START_ORDER + 2) // 2), order="F")
+    out = np.empty((len(x), (GUESS_ORDER + 1) * (GUESS_ORDER + 2) // 2), order="F")
     out[:, 0] = 1.0
     at = 0
-    for degree in range(1, START_ORDER + 1):
+    for degree in range(1, GUESS_ORDER + 1):
         before, at = at, at + degree
         for index in range(degree):
             np.multiply(out[:, before + index], x, out=out[:, at + index])
@@ -139,13 +139,13 @@ def _powers(x: FloatArray, y: FloatArray) -> FloatArray:
     return out
 
 
-def _blockwise(function: Mapping, first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
+def _apply_blockwise(function: PointMap, first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Apply a function of two flat arrays to blocks of two arrays of any shape."""
     one, two = np.broadcast_arrays(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     shape = one.shape
     one, two = one.ravel(), two.ravel()
     out = np.empty((2, len(one)))
-    for start in range(0, len(one), BLOCK):
-        part = slice(start, start + BLOCK)
+    for start in range(0, len(one), BLOCK_POINTS):
+        part = slice(start, start + BLOCK_POINTS)
         out[0, part], out[1, part] = function(one[part], two[part])
     return out[0].reshape(shape), out[1].reshape(shape)

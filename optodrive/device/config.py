@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 
@@ -20,17 +20,17 @@ DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time one point of the wire protocol can carry (16 bit, microseconds)."""
 
-CODES_A_SIDE = 32_767
+HALF_RANGE_CODES = 32_767
 """Steps of the board's converter from the middle to the end of a mirror's range."""
-HELIOS_CODES_A_SIDE = 2_047
+HELIOS_HALF_RANGE_CODES = 2_047
 """The same of a Helios, whose converter has 12 bits."""
 POWER_STEPS = 65_535
 """Steps of the board's duty from none to the laser's full power."""
 HELIOS_POWER_STEPS = 255
-HELIOS_EARLY_POINTS = 5
+HELIOS_TIMING_SLACK_POINTS = 5
 """Light on a Helios begins up to two points late (rounding; the end of a frame) and ends up to three early (the same,
 and the dark point before a pulse that follows at once)."""
-HELIOS_POINT_LONGER_S = 1e-8
+HELIOS_POINT_EXCESS_S = 1e-8
 """A point lasts up to a tick of the board's clock longer than asked for."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -61,7 +61,7 @@ class DisplaySection(Section):
     pixel_map: Annotated[str, Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
-    def _missing_places_exist(self) -> Self:
+    def _check_missing_places(self) -> Self:
         for row, column in self.missing:
             if not (0 <= row < self.rows and 0 <= column < self.columns):
                 raise ValueError(
@@ -107,7 +107,7 @@ class ScannerSection(ServoSection):
 
     aim_error_m: how far a settled beam may stand from where it should. field: file of a calibrated field in place of
     the ideal lens, from the configuration's folder; mirrors: the same of measured servos, which go before those stated.
-    codes_a_side: steps of the converter from the middle to the end of the range.
+    half_range_codes: steps of the converter from the middle to the end of the range.
     """
 
     focal_length_m: Positive
@@ -115,12 +115,12 @@ class ScannerSection(ServoSection):
     aim_error_m: NonNegative
     field: Annotated[str, Field(min_length=1)] | None = None
     mirrors: Annotated[str, Field(min_length=1)] | None = None
-    codes_a_side: int = CODES_A_SIDE
+    half_range_codes: int = HALF_RANGE_CODES
 
     @property
-    def code_rad(self) -> float:
+    def rad_per_code(self) -> float:
         """Mirror angle of one step of the converter, rad: range_rad is the most it can say."""
-        return self.range_rad / self.codes_a_side
+        return self.range_rad / self.half_range_codes
 
 
 class UncertaintySection(Section):
@@ -144,7 +144,7 @@ class LimitsSection(Section):
     absorber_max_c, wall_max_c, touch_max_c: temperatures anywhere on the display, wall and touch surface as far as
     the parameter set has them. galvo_acceleration_rms_max_rad_per_s2: of either mirror, mean over galvo_mean_s.
     pulse_energy_max_j caps a pulse, and what several pulses leave in a pixel's bucket, which leaks at
-    pixel_mean_power_max_w. Pulses on a pixel closer than pulse_rest_min_s count as one against pulse_width_max_s.
+    pixel_mean_power_max_w. Pulses on a pixel closer than pulse_gap_min_s count as one against pulse_width_max_s.
     """
 
     absorber_max_c: float
@@ -154,7 +154,7 @@ class LimitsSection(Section):
     galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
     pulse_energy_max_j: Positive
     pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
-    pulse_rest_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
+    pulse_gap_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
     pixel_mean_power_max_w: Positive
     pixel_mean_window_s: Positive
     display_mean_power_max_w: Positive
@@ -181,7 +181,7 @@ class BoardSection(Section):
     interlock_watched: bool = False
 
     @model_validator(mode="after")
-    def _board_can_be_found(self) -> Self:
+    def _check_address(self) -> Self:
         if self.transport == "serial" and not self.port:
             raise ValueError("transport 'serial' needs port, for example \"/dev/ttyACM0\"")
         if self.transport == "usb" and (self.vendor_id is None or self.product_id is None):
@@ -189,10 +189,10 @@ class BoardSection(Section):
         return self
 
     @property
-    def early_s(self) -> float:
+    def timing_slack_s(self) -> float:
         """By how much two times of a plan may come nearer to each other on this board, s; a tick is none."""
-        point_s = 1.0 / self.points_per_s + HELIOS_POINT_LONGER_S
-        return HELIOS_EARLY_POINTS * point_s if self.transport == "helios" else 0.0
+        point_s = 1.0 / self.points_per_s + HELIOS_POINT_EXCESS_S
+        return HELIOS_TIMING_SLACK_POINTS * point_s if self.transport == "helios" else 0.0
 
 
 class SensorSection(Section):
@@ -239,7 +239,7 @@ class Config(Section):
     daemon: DaemonSection = DaemonSection()
 
     @model_validator(mode="after")
-    def _limits_do_not_cross(self) -> Self:
+    def _check_limits(self) -> Self:
         limits, laser = self.limits, self.laser
         for key in ("absorber_max_c", "wall_max_c", "touch_max_c"):
             if getattr(limits, key) <= self.ambient_c:
@@ -265,8 +265,8 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _field_reaches_the_display(self) -> Self:
-        layout = pixel_layout(self.display)
+    def _check_scan_range(self) -> Self:
+        layout = build_pixel_layout(self.display)
         reach_m = 2.0 * self.scanner.range_rad * self.scanner.focal_length_m
         farthest_m = float(max(np.abs(layout.x_m).max(), np.abs(layout.y_m).max()))
         if farthest_m > reach_m:
@@ -276,9 +276,9 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _focus_fits_on_the_absorber(self) -> Self:
+    def _check_focus(self) -> Self:
         display, laser = self.display, self.laser
-        least_rad = 2.0 * self.scanner.code_rad
+        least_rad = 2.0 * self.scanner.rad_per_code
         for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
             if tolerance_rad <= least_rad:
                 raise ValueError(
@@ -289,17 +289,17 @@ class Config(Section):
         return self
 
     @model_validator(mode="after")
-    def _steps_are_the_converters(self) -> Self:
-        steps = HELIOS_CODES_A_SIDE if self.board.transport == "helios" else CODES_A_SIDE
-        if self.scanner.codes_a_side != steps:
+    def _check_converter_codes(self) -> Self:
+        steps = HELIOS_HALF_RANGE_CODES if self.board.transport == "helios" else HALF_RANGE_CODES
+        if self.scanner.half_range_codes != steps:
             raise ValueError(
-                f"scanner.codes_a_side {self.scanner.codes_a_side} must be {steps}, "
+                f"scanner.half_range_codes {self.scanner.half_range_codes} must be {steps}, "
                 f"the converter's steps behind board.transport '{self.board.transport}'"
             )
         return self
 
     @property
-    def least_power_w(self) -> float:
+    def min_power_w(self) -> float:
         """The laser power that the board's smallest step stands for, W; it rounds down."""
         steps = HELIOS_POWER_STEPS if self.board.transport == "helios" else POWER_STEPS
         return self.laser.max_power_w / steps
@@ -331,7 +331,7 @@ class PixelLayout:
         return len(self.x_m)
 
 
-def pixel_layout(display: DisplaySection) -> PixelLayout:
+def build_pixel_layout(display: DisplaySection) -> PixelLayout:
     """Pixel positions of a lattice; missing places take no index."""
     missing = set(display.missing)
     places = [
@@ -349,19 +349,19 @@ def pixel_layout(display: DisplaySection) -> PixelLayout:
     )
 
 
-def shipped_path(*parts: str) -> Path:
+def locate_shipped(*parts: str) -> Path:
     """A file that ships with the package: from the wheel, or from the source tree beside the package."""
     package = Path(str(files("optodrive")))
     installed = package / "_shipped" / "configs"
     return (installed if installed.is_dir() else package.parent / "configs").joinpath(*parts)
 
 
-def shipped_configs() -> list[str]:
+def list_shipped_configs() -> list[str]:
     """Names of the configurations that ship with the package."""
-    return sorted(path.stem for path in shipped_path().glob("display-*.toml"))
+    return sorted(path.stem for path in locate_shipped().glob("display-*.toml"))
 
 
-def load_config(source: str | Path | None = None, measured: bool = True) -> Config:
+def load_config(source: str | Path | None = None, measured_servo: bool = True) -> Config:
     """Read a configuration file, or a shipped one by its name; raises InputError with one line.
 
     measured: with the mirrors' file it names, else with the servo it states.
@@ -369,22 +369,22 @@ def load_config(source: str | Path | None = None, measured: bool = True) -> Conf
     source = DEFAULT_CONFIG if source is None else source
     path = Path(source)
     if not path.exists():
-        if str(source) not in shipped_configs():
-            raise InputError("--config", str(source), "a file, or " + ", ".join(shipped_configs()))
-        path = shipped_path(f"{source}.toml")
+        if str(source) not in list_shipped_configs():
+            raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
+        path = locate_shipped(f"{source}.toml")
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
-    _place_beside(path, table.get("scanner"), ("field", "mirrors"))
-    _place_beside(path, table.get("display"), ("pixel_map",))
+    _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
+    _resolve_paths(path, table.get("display"), ("pixel_map",))
     try:
         config = Config.model_validate(table)
     except ValidationError as error:
-        raise input_error(error, str(path), Config) from None
+        raise build_input_error(error, str(path), Config) from None
     mirrors = config.scanner.mirrors
-    return with_mirrors(config, Path(mirrors)) if measured and mirrors is not None else config
+    return apply_measured_servo(config, Path(mirrors)) if measured_servo and mirrors is not None else config
 
 
-def _place_beside(path: Path, section: object, keys: tuple[str, ...]) -> None:
+def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:
     """Files that a section names are looked for from the configuration's folder."""
     for key in keys:
         if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
@@ -408,14 +408,14 @@ class MirrorsFile(Section):
     axes: dict[str, Any] = {}
 
 
-def with_mirrors(config: Config, path: Path) -> Config:
+def apply_measured_servo(config: Config, path: Path) -> Config:
     """The configuration with measured servos, and the galvo cap that they leave; InputError with one line."""
     table = read_toml(path)
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
     try:
         measured = MirrorsFile.model_validate(table)
     except ValidationError as error:
-        raise input_error(error, str(path), MirrorsFile) from None
+        raise build_input_error(error, str(path), MirrorsFile) from None
     scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
     stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
     cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}
@@ -430,15 +430,15 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
         raise InputError(f"{path}: version", table.get("version"), f"{version}, the one this release reads")
 
 
-def input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
+def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
     """The first of pydantic's complaints as one line; an unknown key comes with the nearest known one."""
     complaints = error.errors(include_url=False)
     first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
     place = ".".join(str(part) for part in first["loc"])
     label = f"{where}: {place}" if place else where
     if first["type"] == "extra_forbidden":
-        known = _known_keys(model, first["loc"][:-1]) if model else []
-        expected = f"a known key, {nearest(str(first['loc'][-1]), known)}" if known else "no such key"
+        known = _list_known_keys(model, first["loc"][:-1]) if model else []
+        expected = f"a known key, {suggest_nearest(str(first['loc'][-1]), known)}" if known else "no such key"
         return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "missing":
@@ -448,7 +448,7 @@ def input_error(error: ValidationError, where: str, model: type[BaseModel] | Non
     return InputError(label, first["input"], message)
 
 
-def _known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
+def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
     for part in path:
         item = model.model_fields.get(str(part))
         if item is None or not (isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel)):

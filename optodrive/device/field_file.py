@@ -9,10 +9,10 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
-from optodrive.device.calibrated_field import Field
-from optodrive.device.config import Section, check_format, input_error
-from optodrive.device.field_geometry import Geometry
-from optodrive.device.field_surface import ORDER, TERMS, Extent
+from optodrive.device.calibrated_field import CalibratedField
+from optodrive.device.config import Section, build_input_error, check_format
+from optodrive.device.field_geometry import FieldGeometry
+from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 
 FORMAT = "optodrive-field"
 VERSION = 1
@@ -32,15 +32,15 @@ class _Extent(Section):
 
 class _Surface(Section):
     order: Literal[6]
-    x_m: Annotated[tuple[float, ...], Item(min_length=TERMS, max_length=TERMS)]
-    y_m: Annotated[tuple[float, ...], Item(min_length=TERMS, max_length=TERMS)]
+    x_m: Annotated[tuple[float, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
+    y_m: Annotated[tuple[float, ...], Item(min_length=TERM_COUNT, max_length=TERM_COUNT)]
 
 
 class _Uncertainty(Section):
     sigma_m: Annotated[tuple[tuple[Annotated[float, Item(gt=0)], ...], ...], Item(min_length=2)]
 
 
-class _File(Section):
+class _FieldFile(Section):
     format: str
     version: int
     about: dict[str, str | float | int] = Item(default_factory=dict)
@@ -51,12 +51,12 @@ class _File(Section):
     uncertainty: _Uncertainty
 
 
-def plain(text: str) -> str:
+def strip_toml_specials(text: str) -> str:
     """Text without what would end a string of TOML."""
     return "".join(letter for letter in text if letter.isprintable() and letter not in '"\\')
 
 
-def field_toml(field: Field, about: dict[str, str | float | int]) -> str:
+def format_field(field: CalibratedField, about: dict[str, str | float | int]) -> str:
     """TOML of format optodrive-field, version 1."""
     extent = field.extent
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
@@ -74,22 +74,22 @@ def field_toml(field: Field, about: dict[str, str | float | int]) -> str:
     return "\n".join([*lines, "]"]) + "\n"
 
 
-def read_field(path: Path) -> Field:
+def load_field(path: Path) -> CalibratedField:
     """Read field.toml; InputError with one line for another format or version, or what does not belong there."""
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
     try:
-        content = _File.model_validate(table)
+        content = _FieldFile.model_validate(table)
     except ValidationError as error:
-        raise input_error(error, str(path), _File) from None
-    missing = set(Geometry._fields) ^ set(content.geometry)
+        raise build_input_error(error, str(path), _FieldFile) from None
+    missing = set(FieldGeometry._fields) ^ set(content.geometry)
     if missing:
-        raise InputError(f"{path}: geometry", ", ".join(sorted(missing)), f"just {', '.join(Geometry._fields)}")
+        raise InputError(f"{path}: geometry", ", ".join(sorted(missing)), f"just {', '.join(FieldGeometry._fields)}")
     grid = content.uncertainty.sigma_m
     if any(len(row) != len(grid) for row in grid):
         raise InputError(f"{path}: uncertainty.sigma_m", [len(row) for row in grid], "as many columns as rows")
-    return Field(
-        geometry=Geometry(**content.geometry),
+    return CalibratedField(
+        geometry=FieldGeometry(**content.geometry),
         surface_m=np.array([content.surface.x_m, content.surface.y_m]),
         extent=Extent(**content.extent.model_dump()),
         rad_per_code=content.scanner.rad_per_code,

@@ -11,10 +11,10 @@ from math import asin, cos, exp, pi, sqrt
 from optodrive.device.config import ScannerSection
 from optodrive.device.servo import Servo
 
-HALVINGS = 50
+BISECTION_STEPS = 50
 
 
-def servo_of(scanner: ScannerSection) -> Servo:
+def build_servo(scanner: ScannerSection) -> Servo:
     """The servo of either mirror as configured."""
     return Servo(scanner.bandwidth_hz, scanner.damping, scanner.delay_s, scanner.slew_rad_per_s)
 
@@ -25,7 +25,7 @@ def pole_per_s(servo: Servo) -> complex:
     return complex(-servo.damping * omega, omega * sqrt(1.0 - servo.damping**2))
 
 
-def settled_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
+def settling_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
     """From a move's command until its error is within tolerance_rad for good and its ramp is over, s. All above 0."""
     pole, ramp_s = pole_per_s(servo), move_rad / servo.slew
     swing = -1j * servo.slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
@@ -40,7 +40,7 @@ def settled_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
     inside_s = turn_s
     if not beyond(outside_s):
         return servo.delay + ramp_s
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle_s = 0.5 * (outside_s + inside_s)
         if beyond(middle_s):
             outside_s = middle_s
@@ -49,7 +49,7 @@ def settled_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
     return servo.delay + ramp_s + inside_s
 
 
-def outlasting(servo: Servo) -> float:
+def envelope_factor(servo: Servo) -> float:
     """What is left of a swing that keeps within a tolerance: t later at most this × exp(−ζω t) of the tolerance.
 
     From phase φ on, exp(−ζω t) |cos(ω_d t + φ)| reaches at most 1, and at least the larger of cos φ and of its next
@@ -57,7 +57,7 @@ def outlasting(servo: Servo) -> float:
     """
     turn, decay = pi - asin(servo.damping), servo.damping / sqrt(1.0 - servo.damping**2)
     low, high = 0.0, 0.5 * pi
-    for _ in range(HALVINGS):
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         if cos(middle) > sqrt(1.0 - servo.damping**2) * exp(-decay * (turn - middle)):
             low = middle

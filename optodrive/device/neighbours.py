@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.types.arrays import IntArray, freeze_arrays
-from optodrive.device.config import DisplaySection, pixel_layout
+from optodrive.device.config import DisplaySection, build_pixel_layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,7 +16,7 @@ class Neighbours:
     no heat crosses there.
     """
 
-    beside: IntArray
+    indices: IntArray
     frame_edges: IntArray
 
     def __post_init__(self) -> None:
@@ -26,9 +26,9 @@ class Neighbours:
         return len(self.frame_edges)
 
     @classmethod
-    def of(cls, display: DisplaySection) -> "Neighbours":
+    def from_display(cls, display: DisplaySection) -> "Neighbours":
         """The neighbours on a display's lattice."""
-        layout = pixel_layout(display)
+        layout = build_pixel_layout(display)
         index = np.full((display.rows + 2, display.columns + 2), -1, dtype=np.int64)
         index[layout.row + 1, layout.column + 1] = np.arange(len(layout))
         row, column = layout.row + 1, layout.column + 1

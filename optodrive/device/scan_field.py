@@ -8,11 +8,11 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config, PixelLayout
 
-STEP_M = 1e-4
+DERIVATIVE_STEP_M = 1e-4
 """Slopes are taken over so much to either side."""
 
 
-class AimedField(Protocol):
+class ScanField(Protocol):
     """Where to command the mirrors; an ideal field, or a calibrated one."""
 
     def angles_rad(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -31,7 +31,7 @@ class IdealField:
         return x_m / (2.0 * self.focal_length_m), y_m / (2.0 * self.focal_length_m)
 
 
-def largest_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
+def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
     """The most that either mirror turns from a pixel to one beside it, also diagonally; 0 without neighbours."""
     rows, columns = layout.row.tolist(), layout.column.tolist()
     place = {(row, column): at for at, (row, column) in enumerate(zip(rows, columns, strict=True))}
@@ -47,18 +47,18 @@ def largest_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) 
     return float(max(np.abs(angle[one] - angle[other]).max() for angle in (x_rad, y_rad)))
 
 
-def tolerance_share(field: AimedField, layout: PixelLayout, config: Config) -> float:
+def tolerance_ratio(field: ScanField, layout: PixelLayout, config: Config) -> float:
     """By what share of the nominal tolerance both mirrors may be off at once, anywhere, with the focus on the absorber.
 
     A beam that is turned by a little more than nominally, or askew, leaves less.
     """
     slopes = []
-    for x_step_m, y_step_m in ((STEP_M, 0.0), (0.0, STEP_M)):
+    for x_step_m, y_step_m in ((DERIVATIVE_STEP_M, 0.0), (0.0, DERIVATIVE_STEP_M)):
         high, low = (
             np.stack(field.angles_rad(layout.x_m + sign * x_step_m, layout.y_m + sign * y_step_m))
             for sign in (1.0, -1.0)
         )
-        slopes.append((high - low) / (2.0 * STEP_M))
+        slopes.append((high - low) / (2.0 * DERIVATIVE_STEP_M))
     metres_per_rad = np.linalg.inv(np.stack(slopes, axis=-1).transpose(1, 0, 2))
     tolerance_rad = np.array(config.tolerance_rad)
     room_m = 2.0 * config.scanner.focal_length_m * tolerance_rad

@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 
-STEPS = 24
+STEPS_PER_TIME_CONSTANT = 24
 """Steps in the servo's shortest time."""
 
 
@@ -22,15 +22,15 @@ class Servo:
     slew: float
 
 
-def follow(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, servo: Servo | None) -> FloatArray:
+def simulate_servo(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, servo: Servo | None) -> FloatArray:
     """Angle at t_s, rad, of a command held from each at_s until the next; before the first one: the first."""
     if servo is None:
         row = np.clip(np.searchsorted(at_s, t_s, side="right") - 1, 0, len(at_s) - 1)
         return np.asarray(command_rad[row], dtype=np.float64)
     out = np.zeros(len(t_s))
     omega = 2.0 * pi * servo.frequency
-    step_s = 1.0 / (omega * STEPS) * 2.0
-    _follow(
+    step_s = 1.0 / (omega * STEPS_PER_TIME_CONSTANT) * 2.0
+    _integrate_servo(
         np.array(at_s) + servo.delay,
         np.array(command_rad),
         np.array(t_s),
@@ -44,7 +44,7 @@ def follow(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, servo: Se
 
 
 @kernel
-def _follow(
+def _integrate_servo(
     at_s: FloatArray,
     command_rad: FloatArray,
     t_s: FloatArray,

@@ -14,24 +14,24 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
-from optodrive.device.gate_timing import outlasting, pole_per_s, servo_of, settled_s
-from optodrive.device.pixel_map import aimed_layout
-from optodrive.device.scan_field import AimedField, largest_step_rad, tolerance_share
+from optodrive.device.gate_timing import build_servo, envelope_factor, pole_per_s, settling_s
+from optodrive.device.pixel_map import build_aim_layout
+from optodrive.device.scan_field import ScanField, max_neighbour_step_rad, tolerance_ratio
 from optodrive.device.servo import Servo
 
-CALM_SHARE = 0.01
+LONG_DWELL_SHARE = 0.01
 """Share of the tolerance that is kept for what is left of the moves before, once they have had time to die out."""
-HALVINGS = 40
-NARROWER = 0.03
+BISECTION_STEPS = 40
+INTERVAL_SHARE = 0.03
 """Share of the tolerance given away, at the most, so that a few moves can stand for all those between them."""
-UPWARDS = 1.0 - 1e-6
+CEIL_OFFSET = 1.0 - 1e-6
 """Added to a number of pitches it gives the next whole one upwards, but for what is only rounding."""
 
-Table = tuple[int, ...]
+TimesUs = tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class MoveModel:
+class SettlingTable:
     """Times of moves between pixels, by pitches: no move takes no time.
 
     pitch_rad: the lattice's; in a calibrated field the largest step between neighbours
@@ -41,90 +41,93 @@ class MoveModel:
     """
 
     pitch_rad: float
-    calm_us: int
-    calm: tuple[Table, Table]
-    hasty: tuple[Table, Table]
-    lead_us: int
+    long_dwell_us: int
+    after_long_dwell: tuple[TimesUs, TimesUs]
+    after_short_dwell: tuple[TimesUs, TimesUs]
+    lead_in_us: int
 
     @classmethod
-    def of(cls, config: Config, field: AimedField | None = None) -> Self:
+    def from_config(cls, config: Config, field: ScanField | None = None) -> Self:
         """Tables for a configuration's lattice, servo, absorber and focus; field: a calibrated one, else ideal."""
-        return cls._whole_pitches(config) if field is None else cls._any_distance(config, field)
+        return cls._for_whole_pitches(config) if field is None else cls._for_any_distance(config, field)
 
     @classmethod
-    def _any_distance(cls, config: Config, field: AimedField) -> Self:
+    def _for_any_distance(cls, config: Config, field: ScanField) -> Self:
         """Places of a calibrated field lie at any distance: a pitch's time is enough for all that is not longer."""
-        layout = aimed_layout(config)
+        layout = build_aim_layout(config)
         angles_rad = field.angles_rad(layout.x_m, layout.y_m)
-        nominal = _Moves.of(config, tolerance_share(field, layout, config))
-        moves = replace(nominal, pitch_rad=largest_step_rad(layout, *angles_rad) or nominal.pitch_rad)
-        share = moves.hasty_share()
+        nominal = _ServoMoves.from_config(config, tolerance_ratio(field, layout, config))
+        moves = replace(nominal, pitch_rad=max_neighbour_step_rad(layout, *angles_rad) or nominal.pitch_rad)
+        share = moves.short_dwell_share()
         # The first move begins in the middle, or on any pixel.
         spans_rad = [max(float(np.ptp(angle_rad)), float(np.abs(angle_rad).max())) for angle_rad in angles_rad]
-        far = [int(span_rad / moves.pitch_rad + UPWARDS) for span_rad in spans_rad]
+        far = [int(span_rad / moves.pitch_rad + CEIL_OFFSET) for span_rad in spans_rad]
         calm, hasty = (
-            (moves.any_table(0, max(1, *far), left), moves.any_table(1, max(1, *far), left))
-            for left in (CALM_SHARE, share)
+            (moves.build_interval_table(0, max(1, *far), left), moves.build_interval_table(1, max(1, *far), left))
+            for left in (LONG_DWELL_SHARE, share)
         )
-        return cls(moves.pitch_rad, moves.calm_us(share), calm, hasty, max(hasty[0][far[0]], hasty[1][far[1]]))
+        return cls(moves.pitch_rad, moves.long_dwell_us(share), calm, hasty, max(hasty[0][far[0]], hasty[1][far[1]]))
 
     @classmethod
-    def _whole_pitches(cls, config: Config) -> Self:
-        moves, display = _Moves.of(config), config.display
-        share = moves.hasty_share()
+    def _for_whole_pitches(cls, config: Config) -> Self:
+        moves, display = _ServoMoves.from_config(config), config.display
+        share = moves.short_dwell_share()
         farthest = max(1, display.rows - 1, display.columns - 1)
-        calm, hasty = ((moves.table(0, farthest, left), moves.table(1, farthest, left)) for left in (CALM_SHARE, share))
+        calm, hasty = (
+            (moves.build_table(0, farthest, left), moves.build_table(1, farthest, left))
+            for left in (LONG_DWELL_SHARE, share)
+        )
         # Only a first move, from the middle of an even lattice, goes half pitches.
         halves = [
-            1e6 * moves.time_s(axis, 0.5 * odd, share)
+            1e6 * moves.settling_s(axis, 0.5 * odd, share)
             for axis, count in enumerate((display.columns, display.rows))
             for odd in range(1, count if count % 2 == 0 else 0, 2)
         ]
         lead_us = max(hasty[0][display.columns - 1], hasty[1][display.rows - 1], *(ceil(each) for each in halves))
-        return cls(moves.pitch_rad, moves.calm_us(share), calm, hasty, lead_us)
+        return cls(moves.pitch_rad, moves.long_dwell_us(share), calm, hasty, lead_us)
 
-    def time_us(self, dx_rad: float, dy_rad: float, lit_us: int = 0) -> int:
+    def settling_us(self, dx_rad: float, dy_rad: float, dwell_us: int = 0) -> int:
         """Dark time for a move, rounded up to whole pitches, µs; after a stay of lit_us since the gate opened."""
-        tables = self.calm if lit_us >= self.calm_us else self.hasty
-        x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + UPWARDS)]
-        y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + UPWARDS)]
+        tables = self.after_long_dwell if dwell_us >= self.long_dwell_us else self.after_short_dwell
+        x_us = tables[0][int(abs(dx_rad) / self.pitch_rad + CEIL_OFFSET)]
+        y_us = tables[1][int(abs(dy_rad) / self.pitch_rad + CEIL_OFFSET)]
         return x_us if x_us > y_us else y_us
 
-    def least_us(self, dx_rad: FloatArray, dy_rad: FloatArray) -> int:
+    def min_settling_us(self, dx_rad: FloatArray, dy_rad: FloatArray) -> int:
         """The least dark time that any of several moves can take, µs; both [k]."""
         x_us, y_us = (
-            np.array(table)[(np.abs(way_rad) / self.pitch_rad + UPWARDS).astype(np.int64)]
-            for table, way_rad in zip(self.calm, (dx_rad, dy_rad), strict=True)
+            np.array(table)[(np.abs(way_rad) / self.pitch_rad + CEIL_OFFSET).astype(np.int64)]
+            for table, way_rad in zip(self.after_long_dwell, (dx_rad, dy_rad), strict=True)
         )
         return int(np.maximum(x_us, y_us).min())
 
 
 @dataclass(frozen=True)
-class _Moves:
+class _ServoMoves:
     """The servo's moves on one lattice. room_rad: tolerance of x and y, less half a code by which the aim is off."""
 
     servo: Servo
     pitch_rad: float
     code_rad: float
-    room_rad: tuple[float, float]
-    shortest_s: float
+    tolerance_rad: tuple[float, float]
+    min_pulse_s: float
 
     @classmethod
-    def of(cls, config: Config, tolerance_share: float = 1.0) -> Self:
+    def from_config(cls, config: Config, tolerance_ratio: float = 1.0) -> Self:
         scanner = config.scanner
         x_rad, y_rad = (
-            tolerance_share * tolerance_rad - 0.5 * scanner.code_rad for tolerance_rad in config.tolerance_rad
+            tolerance_ratio * tolerance_rad - 0.5 * scanner.rad_per_code for tolerance_rad in config.tolerance_rad
         )
         pitch_rad = config.display.pitch_m / (2.0 * scanner.focal_length_m)
         shortest_s = int(1e6 / config.laser.pwm_hz) * 1e-6
-        return cls(servo_of(scanner), pitch_rad, scanner.code_rad, (x_rad, y_rad), shortest_s)
+        return cls(build_servo(scanner), pitch_rad, scanner.rad_per_code, (x_rad, y_rad), shortest_s)
 
-    def time_s(self, axis: int, pitches: float, share: float) -> float:
+    def settling_s(self, axis: int, pitches: float, share: float) -> float:
         """Time of a move with a share of the tolerance kept for what is left of others. A code more may be moved."""
-        tolerance_rad = (1.0 - share) * self.room_rad[axis] - self.code_rad
-        return settled_s(self.servo, pitches * self.pitch_rad, tolerance_rad)
+        tolerance_rad = (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
+        return settling_s(self.servo, pitches * self.pitch_rad, tolerance_rad)
 
-    def any_time_s(self, axis: int, pitches: int, share: float) -> float:
+    def interval_settling_s(self, axis: int, pitches: int, share: float) -> float:
         """Enough for every move of more than a pitch less than so many, up to so many.
 
         What swings on after a move, as a complex amplitude, changes by no more than 1/√(1 − ζ²) of what the move does,
@@ -133,48 +136,52 @@ class _Moves:
         """
         before_rad = (pitches - 1) * self.pitch_rad
         slope = exp(pole_per_s(self.servo).real * before_rad / self.servo.slew) / sqrt(1.0 - self.servo.damping**2)
-        tolerance_rad = (1.0 - share) * self.room_rad[axis] - self.code_rad
-        steps = ceil(self.pitch_rad * slope / (NARROWER * tolerance_rad))
+        tolerance_rad = (1.0 - share) * self.tolerance_rad[axis] - self.code_rad
+        steps = ceil(self.pitch_rad * slope / (INTERVAL_SHARE * tolerance_rad))
         narrower_rad = tolerance_rad - slope * self.pitch_rad / steps
         ends_rad = (before_rad + self.pitch_rad * (1 + np.arange(steps)) / steps).tolist()
-        return max(settled_s(self.servo, end_rad, narrower_rad) for end_rad in ends_rad)
+        return max(settling_s(self.servo, end_rad, narrower_rad) for end_rad in ends_rad)
 
-    def any_table(self, axis: int, farthest: int, share: float) -> Table:
-        return _by_way([0, *(ceil(1e6 * self.any_time_s(axis, way, share)) for way in range(1, farthest + 1))])
+    def build_interval_table(self, axis: int, farthest: int, share: float) -> TimesUs:
+        return _enforce_subadditivity(
+            [0, *(ceil(1e6 * self.interval_settling_s(axis, way, share)) for way in range(1, farthest + 1))]
+        )
 
-    def table(self, axis: int, farthest: int, share: float) -> Table:
-        return _by_way([0, *(ceil(1e6 * self.time_s(axis, pitches, share)) for pitches in range(1, farthest + 1))])
+    def build_table(self, axis: int, farthest: int, share: float) -> TimesUs:
+        return _enforce_subadditivity(
+            [0, *(ceil(1e6 * self.settling_s(axis, pitches, share)) for pitches in range(1, farthest + 1))]
+        )
 
-    def _one_pitch_s(self, share: float) -> float:
-        return min(self.time_s(axis, 1, share) for axis in range(2))
+    def _pitch_settling_s(self, share: float) -> float:
+        return min(self.settling_s(axis, 1, share) for axis in range(2))
 
-    def _kept(self, share: float) -> float:
+    def _residual_factor(self, share: float) -> float:
         """How far a swing dies out from one gate to the next: over the shortest pulse and the shortest move."""
-        return exp(pole_per_s(self.servo).real * (self.shortest_s + self._one_pitch_s(share)))
+        return exp(pole_per_s(self.servo).real * (self.min_pulse_s + self._pitch_settling_s(share)))
 
-    def hasty_share(self) -> float:
+    def short_dwell_share(self) -> float:
         """Share of the tolerance that all former moves together may still have when pulses are as short as can be.
 
         A larger share makes moves longer and thereby leaves less: the share is where both meet.
         """
 
         def left(share: float) -> float:
-            kept = self._kept(share)
-            return outlasting(self.servo) * kept / (1.0 - kept)
+            kept = self._residual_factor(share)
+            return envelope_factor(self.servo) * kept / (1.0 - kept)
 
-        return max(CALM_SHARE, _meeting(left, 1.0 - 1.01 * self.code_rad / min(self.room_rad)))
+        return max(LONG_DWELL_SHARE, _bisect_fixed_point(left, 1.0 - 1.01 * self.code_rad / min(self.tolerance_rad)))
 
-    def calm_us(self, hasty_share: float) -> int:
+    def long_dwell_us(self, short_dwell_share: float) -> int:
         """The stay after which all former moves together have no more than CALM_SHARE left when the next gate opens."""
         rate_per_s = -pole_per_s(self.servo).real
-        needed = outlasting(self.servo) / (CALM_SHARE * (1.0 - self._kept(hasty_share)))
-        return max(0, ceil(1e6 * (log(needed) / rate_per_s - self._one_pitch_s(CALM_SHARE))))
+        needed = envelope_factor(self.servo) / (LONG_DWELL_SHARE * (1.0 - self._residual_factor(short_dwell_share)))
+        return max(0, ceil(1e6 * (log(needed) / rate_per_s - self._pitch_settling_s(LONG_DWELL_SHARE))))
 
 
-def _meeting(falling: Callable[[float], float], most: float) -> float:
+def _bisect_fixed_point(falling: Callable[[float], float], high_limit: float) -> float:
     """Where a falling function of a share meets the share, or just above."""
-    low, high = 0.0, most
-    for _ in range(HALVINGS):
+    low, high = 0.0, high_limit
+    for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
         if falling(middle) > middle:
             low = middle
@@ -183,7 +190,7 @@ def _meeting(falling: Callable[[float], float], most: float) -> float:
     return high
 
 
-def _by_way(times_us: list[int]) -> Table:
+def _enforce_subadditivity(times_us: list[int]) -> TimesUs:
     """Rising times at or above those given with none above the sum of two that lead as far.
 
     A pulse between them may be trimmed to nothing: then the mirrors go all the way in the time of both moves.

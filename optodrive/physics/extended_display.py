@@ -10,23 +10,35 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.device.neighbours import Neighbours
-from optodrive.physics.extended_pulses import carry, glow, heights, shortest, walk
-from optodrive.physics.nominal_display import TIME_ROUNDING_S, Heights, Peaks, kernel_columns, nothing
+from optodrive.physics.extended_pulses import (
+    add_peaks_after_off,
+    advance_states,
+    apply_pulses,
+    find_shortest_pulse,
+    simulate_displacement,
+)
+from optodrive.physics.nominal_display import (
+    TIME_ROUNDING_S,
+    DisplayState,
+    PulsePeaks,
+    build_kernel_columns,
+    ignore_progress,
+)
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.snapshot import View, glance
-from optodrive.physics.term import AMBIENT_K, CONTEXT, DOSE, FULL_W, MINE, PIXEL, Values
-from optodrive.physics.term_kernels import STATES
-from optodrive.physics.terms import known_terms
+from optodrive.physics.snapshot import SnapshotCache, compute_snapshot
+from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, FULL_W, ILLUMINATED_PIXEL, IS_TARGET, TermValues
+from optodrive.physics.term_kernels import STATE_COUNT
+from optodrive.physics.terms import discover_terms
 
 MISALIGNED, CROSSTALK = "beam_misalignment", "neighbour_crosstalk"
-PIECE = 128
+BATCH = 128
 """Pulses or pixels between two ticks: a tenth of a second on a slow machine."""
 
 
-class ExtendedHeat:
+class ExtendedThermalState:
     """The heat of every pixel of a display; mutable. Pixels carry their own time, all on one time line.
 
     values: term → parameter → SI value; only terms with kernels have an effect here.
@@ -35,68 +47,76 @@ class ExtendedHeat:
     def __init__(
         self,
         pixels: PixelArray,
-        values: Mapping[str, Values],
+        values: Mapping[str, TermValues],
         ambient_k: float,
         full_w: float,
         neighbours: Neighbours,
         at_s: float = 0.0,
     ) -> None:
         self.pixels = pixels
-        self._values, self._active = values, Active.of(values)
-        self._beside = neighbours.beside if CROSSTALK in values else np.zeros((len(pixels), 0), dtype=np.int64)
-        self._beside = np.ascontiguousarray(self._beside)
+        self._values, self._active = values, ActiveTerms.from_values(values)
+        self._neighbours = neighbours.indices if CROSSTALK in values else np.zeros((len(pixels), 0), dtype=np.int64)
+        self._neighbours = np.ascontiguousarray(self._neighbours)
         self._columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
-        self._context = np.zeros(CONTEXT)
+        self._context = np.zeros(CONTEXT_SIZE)
         self._context[FULL_W], self._context[AMBIENT_K], self._context[DOSE] = full_w, ambient_k, 1.0
         self._at_s = np.full(len(pixels), at_s)
-        self._dark_s = np.full(len(pixels), 1.0)
-        self._states = np.zeros((len(pixels), STATES))
-        self._view: View | None = None
+        self._off_s = np.full(len(pixels), 1.0)
+        self._states = np.zeros((len(pixels), STATE_COUNT))
+        self._snapshot_cache: SnapshotCache | None = None
 
-    def copy(self) -> "ExtendedHeat":
+    def copy(self) -> "ExtendedThermalState":
         """An independent copy."""
-        return self.shifted(0.0)
+        return self.copy_shifted(0.0)
 
-    def shifted(self, offset_s: float) -> "ExtendedHeat":
+    def copy_shifted(self, offset_s: float) -> "ExtendedThermalState":
         """A copy on a time line whose zero lies offset_s earlier."""
-        twin = ExtendedHeat.__new__(ExtendedHeat)
+        twin = ExtendedThermalState.__new__(ExtendedThermalState)
         vars(twin).update(vars(self))
         twin._at_s = self._at_s + offset_s
-        twin._dark_s, twin._states = self._dark_s.copy(), self._states.copy()
-        twin._view = None
+        twin._off_s, twin._states = self._off_s.copy(), self._states.copy()
+        twin._snapshot_cache = None
         return twin
 
-    def pulses(
+    def apply_pulses(
         self,
         pixel: IntArray,
         start_s: FloatArray,
         width_s: FloatArray,
         power_w: FloatArray,
-        tick: Callable[[], None] = nothing,
-    ) -> Peaks:
+        on_progress: Callable[[], None] = ignore_progress,
+    ) -> PulsePeaks:
         """Light pixels one after the other; all [n], pulses in order of time, power the mean incident one.
 
         tick is called again and again meanwhile. ValueError for a pulse that starts before its pixel's last event, or
         that of one beside it where they exchange heat; those before it have been.
         """
-        columns = kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
-        peaks = Peaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
-        display = (self._columns, self._at_s, self._dark_s, self._states, self._beside)
+        columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
+        peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
+        display = (self._columns, self._at_s, self._off_s, self._states, self._neighbours)
         last = np.full(len(self.pixels), -1)
-        for begin in range(0, len(pixel), PIECE):
-            end = min(begin + PIECE, len(pixel))
-            done = walk(*display, self._active, self._context, *columns, *peaks, last, begin, end)
+        for begin in range(0, len(pixel), BATCH):
+            end = min(begin + BATCH, len(pixel))
+            done = apply_pulses(*display, self._active, self._context, *columns, *peaks, last, begin, end)
             if done < end:
-                raise self._too_early(int(pixel[done]), float(start_s[done]))
-            tick()
-        for begin in range(0, len(self.pixels), PIECE):
-            end = min(begin + PIECE, len(self.pixels))
-            glow(self._columns, self._states, self._active, self._context, last, begin, end, peaks.displacement_m)
-            tick()
+                raise self._time_order_error(int(pixel[done]), float(start_s[done]))
+            on_progress()
+        for begin in range(0, len(self.pixels), BATCH):
+            end = min(begin + BATCH, len(self.pixels))
+            add_peaks_after_off(
+                self._columns, self._states, self._active, self._context, last, begin, end, peaks.displacement_m
+            )
+            on_progress()
         return peaks
 
-    def pulse_for_peak(
-        self, pixel: int, at_s: float, target_m: float, drive: DriveRange, least_periods: int = 1, from_s: float = 0.0
+    def solve_pulse(
+        self,
+        pixel: int,
+        start_s: float,
+        target_m: float,
+        drive: DriveRange,
+        min_periods: int = 1,
+        peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
         """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
 
@@ -104,60 +124,62 @@ class ExtendedHeat:
         from_s: the peak counts only from so long after the pulse's start on, beyond its end.
         ValueError for a time before the pixel's last event.
         """
-        if at_s < self._at_s[pixel] - TIME_ROUNDING_S:
-            raise self._too_early(pixel, at_s)
-        context, one = self._context.copy(), self.pixels.each[pixel]
-        context[PIXEL], context[MINE] = pixel, 1.0
-        room, lit = np.zeros((8, STATES)), np.zeros((drive.max_periods + 1, STATES))
+        if start_s < self._at_s[pixel] - TIME_ROUNDING_S:
+            raise self._time_order_error(pixel, start_s)
+        context, one = self._context.copy(), self.pixels.elements[pixel]
+        context[ILLUMINATED_PIXEL], context[IS_TARGET] = pixel, 1.0
+        room, lit = np.zeros((8, STATE_COUNT)), np.zeros((drive.max_periods + 1, STATE_COUNT))
         room[0] = self._states[pixel]
-        dark_s, wait_s = float(self._dark_s[pixel]), max(0.0, float(at_s - self._at_s[pixel]))
-        carry(one, self._active, context, True, room, 0.0, dark_s, wait_s)
-        span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
-        periods, duty = shortest(one, self._active, context, room, lit, dark_s + wait_s, target_m, *span, from_s)
+        dark_s, wait_s = float(self._off_s[pixel]), max(0.0, float(start_s - self._at_s[pixel]))
+        advance_states(one, self._active, context, True, room, 0.0, dark_s, wait_s)
+        span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+        periods, duty = find_shortest_pulse(
+            one, self._active, context, room, lit, dark_s + wait_s, target_m, *span, peak_after_s
+        )
         return (periods, duty) if periods else None
 
-    def reaches_m(self, drive: DriveRange) -> FloatArray:
+    def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
         alone = -1.0 if MISALIGNED not in self._values else self._values[MISALIGNED]["pixel"]
-        kinds = [(pixel, index == alone) for index, pixel in enumerate(self.pixels.each)]
+        kinds = [(pixel, index == alone) for index, pixel in enumerate(self.pixels.elements)]
         width_s = drive.max_periods * drive.period_s
         reach: dict[tuple[Pixel, bool], float] = {}
         for index, kind in enumerate(kinds):
             if kind not in reach:
-                fresh = self.shifted(0.0)
+                fresh = self.copy_shifted(0.0)
                 fresh._states[:], fresh._at_s[:] = 0.0, 0.0
                 one = (np.array([index]), np.zeros(1), np.array([width_s]), np.array([drive.max_power_w]))
-                reach[kind] = float(fresh.pulses(*one).displacement_m[0])
+                reach[kind] = float(fresh.apply_pulses(*one).displacement_m[0])
         return np.array([reach[kind] for kind in kinds])
 
-    def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
+    def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
         """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
         """
-        felt = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._beside[pixel].tolist()])])
+        felt = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])])
         first_s = min(float(t_s[0]), float(felt[0, 0]) if len(felt) else np.inf)
         if first_s < self._at_s[pixel] - TIME_ROUNDING_S:
-            raise self._too_early(pixel, first_s)
-        last = (float(self._at_s[pixel]), float(self._dark_s[pixel]), self._states[pixel].copy())
+            raise self._time_order_error(pixel, first_s)
+        last = (float(self._at_s[pixel]), float(self._off_s[pixel]), self._states[pixel].copy())
         height_m = np.zeros(len(t_s))
-        one = self.pixels.each[pixel]
-        heights(one, self._active, self._context.copy(), pixel, *last, felt, np.array(t_s), height_m)
+        one = self.pixels.elements[pixel]
+        simulate_displacement(one, self._active, self._context.copy(), pixel, *last, felt, np.array(t_s), height_m)
         return height_m
 
-    def at(self, at_s: float) -> Heights:
+    def state_at(self, at_s: float) -> DisplayState:
         """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's.
 
         Asked again and again for later times it goes on from the last answer: a display is stepped through but once.
         """
-        if self._view is None:
-            self._view = View.of(self._states)
-        seen = Heights(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
-        display = (self._columns, self._at_s, self._dark_s, self._states)
-        glance(*display, self._active, self._context, self._view, float(at_s), *seen)
+        if self._snapshot_cache is None:
+            self._snapshot_cache = SnapshotCache.from_states(self._states)
+        seen = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        display = (self._columns, self._at_s, self._off_s, self._states)
+        compute_snapshot(*display, self._active, self._context, self._snapshot_cache, float(at_s), *seen)
         return seen
 
-    def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
+    def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """What instruments show of some pixels from rest at times t_s [m], increasing.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError where the display is not at rest.
@@ -165,19 +187,19 @@ class ExtendedHeat:
         if self._states.any():
             raise ValueError("a display with terms is traced from rest only")
         # What lifts the membrane does not act back on the gas: without it the membrane shows the gas's own rise.
-        bare = {key: own for key, own in self._values.items() if known_terms()[key].kernels.lifts is None}
+        bare = {key: own for key, own in self._values.items() if discover_terms()[key].kernels.membrane_drive is None}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
         columns = []
         for index in pixels:
-            own = pulses[np.isin(pulses[:, 3], [index, *self._beside[index].tolist()])]
-            scene = Scene(own, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
-            one = self.pixels.each[index]
-            absorber_k, displacement_m, force_n = observe(scene, one, self._active)
+            own = pulses[np.isin(pulses[:, 3], [index, *self._neighbours[index].tolist()])]
+            scene = PixelExperiment(own, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
+            one = self.pixels.elements[index]
+            absorber_k, displacement_m, force_n = simulate_signals(scene, one, self._active)
             # Of a dead membrane nothing could be read.
-            gas_k = observe(scene, one._replace(kappa_m_per_k=1.0), Active.of(bare))[1]
+            gas_k = simulate_signals(scene, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(bare))[1]
             columns.append((absorber_k, gas_k, displacement_m, force_n))
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)
 
-    def _too_early(self, pixel: int, at_s: float) -> ValueError:
+    def _time_order_error(self, pixel: int, at_s: float) -> ValueError:
         return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")

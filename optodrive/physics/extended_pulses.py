@@ -7,50 +7,57 @@ import numpy as np
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.physics.nominal_display import TIME_ROUNDING_S, one_pixel
+from optodrive.physics.nominal_display import TIME_ROUNDING_S, pixel_at
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, outputs, sample, step, step_s
-from optodrive.physics.term import ABSORBER, MINE, PIXEL, POWER_W
+from optodrive.physics.pixel_ode import ActiveTerms, interpolate_states, next_step_s, output_signal, step
+from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
 
-DISPLACEMENT = 1
+DISPLACEMENT_SIGNAL = 1
 """Number of the signal in `forward.outputs`."""
-SETTLED_SHARE, SETTLED = 0.7, 8.0
+DECAYED_SHARE, DECAYED_TIME_CONSTANTS = 0.7, 8.0
 """In the dark a membrane below this share of its largest displacement so many gas time constants later is past it."""
-AT_REST_K = 1e-6
-CLOSE = 1e-5
+COLD_K = 1e-6
+PEAK_TOLERANCE = 1e-5
 """A peak this close to its target, relative, is there."""
 
 
 @kernel
-def carry(
-    pixel: Pixel, active: Active, c: FloatArray, own: bool, room: FloatArray, at_s: float, since_s: float, for_s: float
+def advance_states(
+    pixel: Pixel,
+    active: ActiveTerms,
+    c: FloatArray,
+    is_target: bool,
+    work: FloatArray,
+    at_s: float,
+    since_edge_s: float,
+    duration_s: float,
 ) -> tuple[float, float]:
     """Advance the states room[0] by for_s under the context's power; the most the membrane and the absorber do.
 
     since_s: time since the light last changed; displacement in m, absorber in K.
     """
-    peak_m = outputs(pixel, active, room[0], c, DISPLACEMENT)
-    peak_k = room[0, ABSORBER]
+    peak_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
+    peak_k = work[0, ABSORBER]
     done_s, fresh = 0.0, True
-    while done_s < for_s:
-        if c[POWER_W] == 0.0 and np.abs(room[0]).max() < AT_REST_K:
-            room[0] = 0.0
+    while done_s < duration_s:
+        if c[POWER_W] == 0.0 and np.abs(work[0]).max() < COLD_K:
+            work[0] = 0.0
             break
-        h_s = step_s(pixel, active, since_s + done_s)
-        last = done_s + 1.3 * h_s >= for_s
+        h_s = next_step_s(pixel, active, since_edge_s + done_s)
+        last = done_s + 1.3 * h_s >= duration_s
         if last:
-            h_s = for_s - done_s
-        step(pixel, active, c, own, fresh, at_s + done_s, since_s + done_s, h_s, room)
-        begin_m = outputs(pixel, active, room[0], c, DISPLACEMENT)
-        end_m = outputs(pixel, active, room[2], c, DISPLACEMENT)
-        sample(active.rows, room, 0.0, h_s, 0.5 * h_s)
-        middle_m = outputs(pixel, active, room[7], c, DISPLACEMENT)
+            h_s = duration_s - done_s
+        step(pixel, active, c, is_target, fresh, at_s + done_s, since_edge_s + done_s, h_s, work)
+        begin_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
+        end_m = output_signal(pixel, active, work[2], c, DISPLACEMENT_SIGNAL)
+        interpolate_states(active.state_rows, work, 0.0, h_s, 0.5 * h_s)
+        middle_m = output_signal(pixel, active, work[7], c, DISPLACEMENT_SIGNAL)
         peak_m = max(peak_m, end_m, _vertex_m(begin_m, middle_m, end_m))
-        peak_k = max(peak_k, room[2, ABSORBER])
-        room[0] = room[2]
-        room[1] = room[3]
+        peak_k = max(peak_k, work[2, ABSORBER])
+        work[0] = work[2]
+        work[1] = work[3]
         fresh = False
-        done_s = for_s if last else done_s + h_s
+        done_s = duration_s if last else done_s + h_s
     return peak_m, peak_k
 
 
@@ -65,32 +72,34 @@ def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
 
 
 @kernel
-def _afterglow_m(pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, since_s: float, from_s: float) -> float:
+def _peak_after_off_m(
+    pixel: Pixel, active: ActiveTerms, c: FloatArray, work: FloatArray, since_edge_s: float, peak_after_s: float
+) -> float:
     """The most the membrane does in the dark, from_s after the states room[0] or later; the states move."""
     c[POWER_W] = 0.0
-    if from_s > 0.0:
-        carry(pixel, active, c, True, room, 0.0, since_s, from_s)
-        since_s += from_s
-    peak_m, done_s = outputs(pixel, active, room[0], c, DISPLACEMENT), 0.0
+    if peak_after_s > 0.0:
+        advance_states(pixel, active, c, True, work, 0.0, since_edge_s, peak_after_s)
+        since_edge_s += peak_after_s
+    peak_m, done_s = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL), 0.0
     piece_s = pixel.tau_g_s
     while True:
-        here_m = carry(pixel, active, c, True, room, done_s, since_s + done_s, piece_s)[0]
+        here_m = advance_states(pixel, active, c, True, work, done_s, since_edge_s + done_s, piece_s)[0]
         peak_m = max(peak_m, here_m)
         done_s += piece_s
-        settled = done_s > SETTLED * pixel.tau_g_s
-        if settled and outputs(pixel, active, room[0], c, DISPLACEMENT) <= SETTLED_SHARE * peak_m:
+        settled = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
+        if settled and output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL) <= DECAYED_SHARE * peak_m:
             break
     return peak_m
 
 
 @kernel
-def walk(
+def apply_pulses(
     columns: FloatArray,
     at_s: FloatArray,
-    dark_s: FloatArray,
+    off_s: FloatArray,
     states: FloatArray,
-    beside: IntArray,
-    active: Active,
+    neighbours: IntArray,
+    active: ActiveTerms,
     context: FloatArray,
     pixel: IntArray,
     start_s: FloatArray,
@@ -98,7 +107,7 @@ def walk(
     power_w: FloatArray,
     peak_m: FloatArray,
     peak_k: FloatArray,
-    last: IntArray,
+    last_pulse: IntArray,
     begin: int,
     end: int,
 ) -> int:
@@ -110,41 +119,41 @@ def walk(
     """
     room, c = np.zeros((8, states.shape[1])), context.copy()
     for row in range(begin, end):
-        for side in range(-1, beside.shape[1]):
-            i = pixel[row] if side < 0 else beside[pixel[row], side]
+        for side in range(-1, neighbours.shape[1]):
+            i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i >= 0 and start_s[row] - at_s[i] < -TIME_ROUNDING_S:
                 return row
-        for side in range(-1, beside.shape[1]):
+        for side in range(-1, neighbours.shape[1]):
             own = side < 0
-            i = pixel[row] if own else beside[pixel[row], side]
+            i = pixel[row] if own else neighbours[pixel[row], side]
             if i < 0:
                 continue
-            one, wait_s = one_pixel(columns, i), max(0.0, start_s[row] - at_s[i])
+            one, wait_s = pixel_at(columns, i), max(0.0, start_s[row] - at_s[i])
             room[0] = states[i]
-            c[POWER_W], c[PIXEL], c[MINE] = 0.0, pixel[row], 1.0 if own else 0.0
-            glow_m, _ = carry(one, active, c, own, room, 0.0, dark_s[i], wait_s)
-            if last[i] >= 0:
-                peak_m[last[i]] = max(peak_m[last[i]], glow_m)
+            c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, pixel[row], 1.0 if own else 0.0
+            glow_m, _ = advance_states(one, active, c, own, room, 0.0, off_s[i], wait_s)
+            if last_pulse[i] >= 0:
+                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], glow_m)
             before_k = room[0, ABSORBER]
             c[POWER_W] = power_w[row]
-            lit_m, lit_k = carry(one, active, c, own, room, 0.0, 0.0, width_s[row])
+            lit_m, lit_k = advance_states(one, active, c, own, room, 0.0, 0.0, width_s[row])
             if own:
-                last[i] = row
+                last_pulse[i] = row
                 peak_k[row] = max(before_k, lit_k)
-            if last[i] >= 0:
-                peak_m[last[i]] = max(peak_m[last[i]], lit_m)
+            if last_pulse[i] >= 0:
+                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], lit_m)
             states[i] = room[0]
-            at_s[i], dark_s[i] = start_s[row] + width_s[row], 0.0
+            at_s[i], off_s[i] = start_s[row] + width_s[row], 0.0
     return end
 
 
 @kernel
-def glow(
+def add_peaks_after_off(
     columns: FloatArray,
     states: FloatArray,
-    active: Active,
+    active: ActiveTerms,
     context: FloatArray,
-    last: IntArray,
+    last_pulse: IntArray,
     begin: int,
     end: int,
     peak_m: FloatArray,
@@ -152,25 +161,25 @@ def glow(
     """What the last pulses of the pixels begin to end still bring in the dark after them."""
     room, c = np.zeros((8, states.shape[1])), context.copy()
     for i in range(begin, end):
-        if last[i] >= 0:
+        if last_pulse[i] >= 0:
             room[0] = states[i]
-            c[PIXEL], c[MINE] = i, 1.0
-            glow_m = _afterglow_m(one_pixel(columns, i), active, c, room, 0.0, 0.0)
-            peak_m[last[i]] = max(peak_m[last[i]], glow_m)
+            c[ILLUMINATED_PIXEL], c[IS_TARGET] = i, 1.0
+            glow_m = _peak_after_off_m(pixel_at(columns, i), active, c, room, 0.0, 0.0)
+            peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], glow_m)
 
 
 @kernel
-def heights(
+def simulate_displacement(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
     index: int,
     at_s: float,
-    dark_s: float,
+    off_s: float,
     state: FloatArray,
     pulses: FloatArray,
     t_s: FloatArray,
-    height_m: FloatArray,
+    displacement_m: FloatArray,
 ) -> None:
     """Fill in the displacement of pixel `index` at t_s [m], under pulses [n, 4] on it and beside it.
 
@@ -178,101 +187,107 @@ def heights(
     """
     room = np.zeros((8, len(state)))
     room[0] = state
-    now_s, since_s, row = at_s, dark_s, 0
+    now_s, since_s, row = at_s, off_s, 0
     for edge in range(2 * len(pulses) + 1):
         pulse, lit, own = edge // 2, edge % 2 == 1, True
-        c[POWER_W], c[PIXEL], c[MINE] = 0.0, index, 1.0
+        c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, index, 1.0
         until_s = np.inf
         if pulse < len(pulses):
             own = pulses[pulse, 3] == index
-            c[PIXEL], c[MINE] = pulses[pulse, 3], 1.0 if own else 0.0
+            c[ILLUMINATED_PIXEL], c[IS_TARGET] = pulses[pulse, 3], 1.0 if own else 0.0
             until_s = pulses[pulse, 0] + (pulses[pulse, 1] if lit else 0.0)
             c[POWER_W] = pulses[pulse, 2] if lit else 0.0
         while row < len(t_s) and t_s[row] <= until_s:
             for_s = max(0.0, t_s[row] - now_s)
-            carry(pixel, active, c, own, room, 0.0, since_s, for_s)
+            advance_states(pixel, active, c, own, room, 0.0, since_s, for_s)
             now_s, since_s = now_s + for_s, since_s + for_s
-            height_m[row] = outputs(pixel, active, room[0], c, DISPLACEMENT)
+            displacement_m[row] = output_signal(pixel, active, room[0], c, DISPLACEMENT_SIGNAL)
             row += 1
         if row == len(t_s):
             break
-        carry(pixel, active, c, own, room, 0.0, since_s, max(0.0, until_s - now_s))
+        advance_states(pixel, active, c, own, room, 0.0, since_s, max(0.0, until_s - now_s))
         now_s, since_s = max(now_s, until_s), 0.0
 
 
 @kernel
-def _peak_after_m(
-    pixel: Pixel, active: Active, c: FloatArray, room: FloatArray, state: FloatArray, since_s: float, from_s: float
+def _peak_after_state_m(
+    pixel: Pixel,
+    active: ActiveTerms,
+    c: FloatArray,
+    work: FloatArray,
+    state: FloatArray,
+    since_edge_s: float,
+    peak_after_s: float,
 ) -> float:
-    room[0] = state
-    return _afterglow_m(pixel, active, c, room, since_s, from_s)
+    work[0] = state
+    return _peak_after_off_m(pixel, active, c, work, since_edge_s, peak_after_s)
 
 
 @kernel
-def shortest(
+def find_shortest_pulse(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    room: FloatArray,
-    lit: FloatArray,
-    dark_s: float,
-    goal_m: float,
+    work: FloatArray,
+    on_states: FloatArray,
+    off_s: float,
+    target_m: float,
     max_power_w: float,
     period_s: float,
-    least_periods: int,
+    min_periods: int,
     max_periods: int,
-    from_s: float,
+    peak_after_s: float,
 ) -> tuple[int, float]:
     """As pulse_for_peak, from the states room[0]; no periods where no pulse is needed.
 
     lit: [max_periods + 1, STATES] room for the states after each period at full power: one path holds all widths.
     """
-    lit[0] = room[0]
-    if _peak_after_m(pixel, active, c, room, lit[0], dark_s, from_s) >= goal_m:
+    on_states[0] = work[0]
+    if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
         return 0, 0.0
     high, highest_m = max_periods, 0.0
-    room[0] = lit[0]
+    work[0] = on_states[0]
     for period in range(max_periods):
         c[POWER_W] = max_power_w
-        highest_m = carry(pixel, active, c, True, room, 0.0, period * period_s, period_s)[0]
-        lit[period + 1] = room[0]
-        if highest_m >= goal_m and from_s <= 0.0:
-            high = max(period + 1, least_periods)
+        highest_m = advance_states(pixel, active, c, True, work, 0.0, period * period_s, period_s)[0]
+        on_states[period + 1] = work[0]
+        if highest_m >= target_m and peak_after_s <= 0.0:
+            high = max(period + 1, min_periods)
             break
-    low = least_periods - 1
+    low = min_periods - 1
     while high - low > 1:
         middle = (low + high) // 2
-        dark_from_s = max(0.0, from_s - middle * period_s)
-        if _peak_after_m(pixel, active, c, room, lit[middle], 0.0, dark_from_s) >= goal_m:
+        dark_from_s = max(0.0, peak_after_s - middle * period_s)
+        if _peak_after_state_m(pixel, active, c, work, on_states[middle], 0.0, dark_from_s) >= target_m:
             high = middle
         else:
             low = middle
-    return high, _duty(pixel, active, c, room, lit[0], goal_m, max_power_w, high * period_s, from_s)
+    return high, _solve_duty(pixel, active, c, work, on_states[0], target_m, max_power_w, high * period_s, peak_after_s)
 
 
 @kernel
-def _duty(
+def _solve_duty(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    room: FloatArray,
+    work: FloatArray,
     state: FloatArray,
-    goal_m: float,
+    target_m: float,
     max_power_w: float,
     width_s: float,
-    from_s: float,
+    peak_after_s: float,
 ) -> float:
     """The duty at which a pulse's peak is goal_m, by the Illinois form of false position; 1 where none is."""
     low, high = 0.0, 1.0
-    short_m = _peak_after_m(pixel, active, c, room, state, 0.0, from_s) - goal_m
-    over_m = _pulse_peak_m(pixel, active, c, room, state, max_power_w, width_s, from_s) - goal_m
+    short_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
+    over_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
     if over_m <= 0.0:
         return 1.0
     kept = 0
     for _ in range(30):
         duty = (low * over_m - high * short_m) / (over_m - short_m)
-        miss_m = _pulse_peak_m(pixel, active, c, room, state, duty * max_power_w, width_s, from_s) - goal_m
-        if abs(miss_m) <= CLOSE * goal_m:
+        miss_m = _pulse_peak_m(pixel, active, c, work, state, duty * max_power_w, width_s, peak_after_s) - target_m
+        if abs(miss_m) <= PEAK_TOLERANCE * target_m:
             return duty
         if miss_m > 0.0:
             high, over_m = duty, miss_m
@@ -288,16 +303,16 @@ def _duty(
 @kernel
 def _pulse_peak_m(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    room: FloatArray,
+    work: FloatArray,
     state: FloatArray,
     power_w: float,
     width_s: float,
-    from_s: float,
+    peak_after_s: float,
 ) -> float:
-    room[0] = state
+    work[0] = state
     c[POWER_W] = power_w
-    lit_m = carry(pixel, active, c, True, room, 0.0, 0.0, width_s)[0]
-    dark_m = _afterglow_m(pixel, active, c, room, 0.0, max(0.0, from_s - width_s))
-    return max(lit_m, dark_m) if from_s <= 0.0 else dark_m
+    lit_m = advance_states(pixel, active, c, True, work, 0.0, 0.0, width_s)[0]
+    dark_m = _peak_after_off_m(pixel, active, c, work, 0.0, max(0.0, peak_after_s - width_s))
+    return max(lit_m, dark_m) if peak_after_s <= 0.0 else dark_m

@@ -10,16 +10,16 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
-from optodrive.physics.pulse_for_height import DriveRange, reach_m, shortest
+from optodrive.physics.pulse_for_height import DriveRange, find_shortest_pulse, max_displacement_m
 
 TIME_ROUNDING_S = 1e-9
 
 
-def nothing() -> None:
+def ignore_progress() -> None:
     """Done while something takes its time, where nobody asked for more."""
 
 
-class Peaks(NamedTuple):
+class PulsePeaks(NamedTuple):
     """The most each pulse [n] brings its pixel to, from its start to the pixel's next pulse, or for ever.
 
     displacement_m: membrane; absorber_k: absorber over ambient, which is its rise at one end of the pulse.
@@ -29,14 +29,14 @@ class Peaks(NamedTuple):
     absorber_k: FloatArray
 
 
-class Heights(NamedTuple):
+class DisplayState(NamedTuple):
     """A display at one time. displacement_m: membrane; absorber_k: absorber over ambient; both [p]."""
 
     displacement_m: FloatArray
     absorber_k: FloatArray
 
 
-def kernel_columns(
+def build_kernel_columns(
     pixels: int, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
     """Pulses [n] as a kernel takes them, which does not look where it writes: IndexError for no pixel of `pixels`.
@@ -51,7 +51,7 @@ def kernel_columns(
     return index, np.array(start_s, dtype=float), np.array(width_s, dtype=float), np.array(power_w, dtype=float)
 
 
-class DisplayHeat:
+class NominalThermalState:
     """The heat of every pixel of a display; mutable. Pixels carry their own time, all on one time line."""
 
     def __init__(self, pixels: PixelArray, at_s: float = 0.0) -> None:
@@ -61,55 +61,61 @@ class DisplayHeat:
         self._theta_k = np.zeros(len(pixels))
         self._gamma_k = np.zeros(len(pixels))
 
-    def copy(self) -> "DisplayHeat":
+    def copy(self) -> "NominalThermalState":
         """An independent copy."""
-        return self.shifted(0.0)
+        return self.copy_shifted(0.0)
 
-    def shifted(self, offset_s: float) -> "DisplayHeat":
+    def copy_shifted(self, offset_s: float) -> "NominalThermalState":
         """A copy on a time line whose zero lies offset_s earlier."""
-        twin = DisplayHeat.__new__(DisplayHeat)
+        twin = NominalThermalState.__new__(NominalThermalState)
         twin.pixels, twin._columns = self.pixels, self._columns
         twin._at_s = self._at_s + offset_s
         twin._theta_k = self._theta_k.copy()
         twin._gamma_k = self._gamma_k.copy()
         return twin
 
-    def rises(self, pixel: int, at_s: float) -> tuple[float, float]:
+    def rises_k(self, pixel: int, at_s: float) -> tuple[float, float]:
         """Absorber and gas rise, K, of a pixel left dark until at_s; ValueError for a time before its last event."""
         dark_s = at_s - self._at_s[pixel]
         if dark_s < -TIME_ROUNDING_S:
-            raise self._too_early(pixel, at_s)
-        return advance(self.pixels.each[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, dark_s))
+            raise self._time_order_error(pixel, at_s)
+        return advance(self.pixels.elements[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, dark_s))
 
-    def _too_early(self, pixel: int, at_s: float) -> ValueError:
+    def _time_order_error(self, pixel: int, at_s: float) -> ValueError:
         return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
 
-    def pulse(self, pixel: int, start_s: float, width_s: float, power_w: float) -> None:
+    def apply_pulse(self, pixel: int, start_s: float, width_s: float, power_w: float) -> None:
         """Light a pixel from start_s for width_s at the mean incident power power_w."""
-        self.pulses(np.array([pixel]), np.array([start_s]), np.array([width_s]), np.array([power_w]))
+        self.apply_pulses(np.array([pixel]), np.array([start_s]), np.array([width_s]), np.array([power_w]))
 
-    def pulses(
+    def apply_pulses(
         self,
         pixel: IntArray,
         start_s: FloatArray,
         width_s: FloatArray,
         power_w: FloatArray,
-        tick: Callable[[], None] = nothing,
-    ) -> Peaks:
+        on_progress: Callable[[], None] = ignore_progress,
+    ) -> PulsePeaks:
         """Light pixels one after the other; all [n], pulses of a pixel in order of time, power the mean incident one.
 
         tick is not needed here: a million pulses take a fifth of a second.
         ValueError for a pulse that starts before its pixel's last event; those before it have been.
         """
-        columns = kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
-        peaks = Peaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
-        done = _walk(self._columns, self._at_s, self._theta_k, self._gamma_k, *columns, *peaks)
+        columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
+        peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
+        done = _apply_pulses(self._columns, self._at_s, self._theta_k, self._gamma_k, *columns, *peaks)
         if done < len(pixel):
-            raise self._too_early(int(pixel[done]), float(start_s[done]))
+            raise self._time_order_error(int(pixel[done]), float(start_s[done]))
         return peaks
 
-    def pulse_for_peak(
-        self, pixel: int, at_s: float, target_m: float, drive: DriveRange, least_periods: int = 1, from_s: float = 0.0
+    def solve_pulse(
+        self,
+        pixel: int,
+        start_s: float,
+        target_m: float,
+        drive: DriveRange,
+        min_periods: int = 1,
+        peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
         """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
 
@@ -119,25 +125,25 @@ class DisplayHeat:
         """
         if not 0 <= pixel < len(self._at_s):
             raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
-        span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
+        span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
         state = (self._columns, self._at_s, self._theta_k, self._gamma_k)
-        periods, duty = _shortest_at(*state, pixel, float(at_s), float(target_m), *span, float(from_s))
+        periods, duty = _solve_pulse_at(*state, pixel, float(start_s), float(target_m), *span, float(peak_after_s))
         if periods < 0:
-            raise self._too_early(pixel, at_s)
+            raise self._time_order_error(pixel, start_s)
         return (periods, duty) if periods else None
 
-    def reaches_m(self, drive: DriveRange) -> FloatArray:
+    def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
-        reach = {pixel: reach_m(pixel, drive) for pixel in set(self.pixels.each)}
-        return np.array([reach[pixel] for pixel in self.pixels.each])
+        reach = {pixel: max_displacement_m(pixel, drive) for pixel in set(self.pixels.elements)}
+        return np.array([reach[pixel] for pixel in self.pixels.elements])
 
     def peak_m(self, pixel: int, within_s: float = float("inf")) -> float:
         """Largest displacement, m, of a pixel from its last event on, within_s seconds at most."""
-        parameters = self.pixels.each[pixel]
+        parameters = self.pixels.elements[pixel]
         peak_k, _ = cooling_peak(parameters, self._theta_k[pixel], self._gamma_k[pixel], within_s)
         return parameters.kappa_m_per_k * peak_k
 
-    def trace(self, pixel: int, pulses: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def simulate_rises_k(self, pixel: int, pulses: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Absorber and gas rise, K, each [m], of a pixel at times t_s [m], increasing; the heat stays as it is.
 
         pulses: [n, 3] start_s, width_s, power_w in order; ValueError for one, or a time, before the last event.
@@ -149,24 +155,24 @@ class DisplayHeat:
                 raise ValueError(f"pixel {pixel} at {asked_s[early[0]]} s: its last event is at {after_s[early[0]]} s")
         absorber_k, gas_k = np.zeros(len(t_s)), np.zeros(len(t_s))
         start = self._at_s[pixel], self._theta_k[pixel], self._gamma_k[pixel]
-        _sample(self.pixels.each[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
+        _sample_rises(self.pixels.elements[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
         return absorber_k, gas_k
 
-    def heights_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
+    def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
         """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
         """
-        gas_k = self.trace(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
-        return self.pixels.each[pixel].kappa_m_per_k * gas_k
+        gas_k = self.simulate_rises_k(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
+        return self.pixels.elements[pixel].kappa_m_per_k * gas_k
 
-    def at(self, at_s: float) -> Heights:
+    def state_at(self, at_s: float) -> DisplayState:
         """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's."""
-        seen = Heights(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
-        _glance(self._columns, self._at_s, self._theta_k, self._gamma_k, float(at_s), *seen)
+        seen = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        _compute_snapshot(self._columns, self._at_s, self._theta_k, self._gamma_k, float(at_s), *seen)
         return seen
 
-    def traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
+    def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
         """Exact values of some pixels at times t_s [m], increasing.
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order, after each pixel's last event.
@@ -174,8 +180,8 @@ class DisplayHeat:
         absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
         for column, index in enumerate(pixels):
             own = pulses[pulses[:, 3] == index, :3]
-            absorber_k[:, column], gas_k[:, column] = self.trace(index, own, t_s)
-        each = [self.pixels.each[index] for index in pixels]
+            absorber_k[:, column], gas_k[:, column] = self.simulate_rises_k(index, own, t_s)
+        each = [self.pixels.elements[index] for index in pixels]
         return PixelTrace(
             t_s=t_s,
             pixel=np.array(pixels, dtype=np.int64),
@@ -187,7 +193,7 @@ class DisplayHeat:
 
 
 @kernel
-def _walk(
+def _apply_pulses(
     columns: FloatArray,
     at_s: FloatArray,
     theta_k: FloatArray,
@@ -206,7 +212,7 @@ def _walk(
     last = np.full(len(at_s), -1)
     for row in range(len(pixel)):
         i = pixel[row]
-        one = one_pixel(columns, i)
+        one = pixel_at(columns, i)
         dark_s = start_s[row] - at_s[i]
         if dark_s < -TIME_ROUNDING_S:
             return row
@@ -222,65 +228,67 @@ def _walk(
         last[i] = row
     for i in range(len(at_s)):
         if last[i] >= 0:
-            one = one_pixel(columns, i)
+            one = pixel_at(columns, i)
             glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
             peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
     return len(pixel)
 
 
 @kernel
-def _glance(
+def _compute_snapshot(
     columns: FloatArray,
     at_s: FloatArray,
     theta_k: FloatArray,
     gamma_k: FloatArray,
     now_s: float,
-    height_m: FloatArray,
+    displacement_m: FloatArray,
     absorber_k: FloatArray,
 ) -> None:
     """Fill in every pixel [p] at now_s, left dark since its last event."""
     for i in range(len(at_s)):
-        one = one_pixel(columns, i)
+        one = pixel_at(columns, i)
         absorber_k[i], gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, now_s - at_s[i]))
-        height_m[i] = one.kappa_m_per_k * gas_k
+        displacement_m[i] = one.kappa_m_per_k * gas_k
 
 
 @kernel
-def _shortest_at(
+def _solve_pulse_at(
     columns: FloatArray,
     last_s: FloatArray,
     theta_k: FloatArray,
     gamma_k: FloatArray,
     i: int,
-    at_s: float,
+    start_s: float,
     target_m: float,
     max_power_w: float,
     period_s: float,
-    least_periods: int,
+    min_periods: int,
     max_periods: int,
-    from_s: float,
+    peak_after_s: float,
 ) -> tuple[int, float]:
     """As pulse_for_peak; no periods where no pulse is needed, fewer where at_s is too early.
 
     In one kernel, because each call from Python costs as much as what it does.
     """
-    one, dark_s = one_pixel(columns, i), at_s - last_s[i]
+    one, dark_s = pixel_at(columns, i), start_s - last_s[i]
     if dark_s < -TIME_ROUNDING_S:
         return -1, 0.0
     absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, dark_s))
     goal_k = target_m / one.kappa_m_per_k
-    return shortest(one, absorber_k, gas_k, goal_k, max_power_w, period_s, least_periods, max_periods, from_s)
+    return find_shortest_pulse(
+        one, absorber_k, gas_k, goal_k, max_power_w, period_s, min_periods, max_periods, peak_after_s
+    )
 
 
 @kernel
-def one_pixel(columns: FloatArray, i: int) -> Pixel:
+def pixel_at(columns: FloatArray, i: int) -> Pixel:
     """A row of [p, 6], the fields of `Pixel`."""
     one = columns[i]
     return Pixel(one[0], one[1], one[2], one[3], one[4], one[5])
 
 
 @kernel
-def _sample(
+def _sample_rises(
     one: Pixel,
     end_s: float,
     theta_k: float,

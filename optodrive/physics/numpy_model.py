@@ -15,8 +15,8 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.pixel import GAS_FRACTION
-from optodrive.physics.term import Flows, Term, Values, View
-from optodrive.physics.terms import check_needs, find_term
+from optodrive.physics.term import HeatFlows, StateView, Term, TermValues
+from optodrive.physics.terms import check_requirements, find_term
 
 STEPS = 20
 """Steps of the fourth order in the quickest time constant: errors of 1e-7 of a rise."""
@@ -24,7 +24,7 @@ ITERATIONS = 30
 """Of the search for the quickest exchange: it finds the rate from below, to a few per cent."""
 
 
-class Rates(NamedTuple):
+class StateRates(NamedTuple):
     """state_per_s: [s, p]; absorbed_w, left_w: [p] into the absorbers, and to ambient for good."""
 
     state_per_s: FloatArray
@@ -61,19 +61,19 @@ class Model:
     def __init__(
         self,
         pixels: PixelArray,
-        values: Mapping[str, Values],
+        values: Mapping[str, TermValues],
         ambient_k: float,
         neighbours: Neighbours | None = None,
     ) -> None:
         self.pixels = pixels
         self.ambient_k = ambient_k
         self._neighbours = neighbours
-        self._terms: list[tuple[Term, Values]] = [
+        self._terms: list[tuple[Term, TermValues]] = [
             (find_term(f"terms.{key}", key, values[key]), values[key]) for key in values
         ]
-        check_needs("terms", values)
+        check_requirements("terms", values)
         for key in values:
-            if not find_term(f"terms.{key}", key, values[key]).whole_display:
+            if not find_term(f"terms.{key}", key, values[key]).is_display_term:
                 raise InputError(f"terms.{key}", key, "a term that the model of a whole display knows")
         self._capacity_j_per_k: dict[str, FloatArray] = {"absorber_k": pixels.c_j_per_k}
         for term, own in self._terms:
@@ -83,21 +83,21 @@ class Model:
         self.states = ("absorber_k", "gas_k", *list(self._capacity_j_per_k)[1:], *followers)
 
     @classmethod
-    def of(
+    def from_parameters(
         cls, parameters: ParameterSet, pixels: PixelArray, ambient_k: float, neighbours: Neighbours | None = None
     ) -> "Model":
         """The model of a parameter set."""
         values = {key: {name: item.value for name, item in term.items()} for key, term in parameters.terms.items()}
         return cls(pixels, values, ambient_k, neighbours)
 
-    def at_rest(self) -> FloatArray:
+    def cold_states(self) -> FloatArray:
         """[s, p] zeros."""
         return np.zeros((len(self.states), len(self.pixels)))
 
-    def _view(self, state_k: FloatArray) -> View:
-        return View(dict(zip(self.states, state_k, strict=True)), self.ambient_k, self._neighbours)
+    def _view(self, state_k: FloatArray) -> StateView:
+        return StateView(dict(zip(self.states, state_k, strict=True)), self.ambient_k, self._neighbours)
 
-    def rates(self, state_k: FloatArray, power_w: FloatArray) -> Rates:
+    def rates(self, state_k: FloatArray, power_w: FloatArray) -> StateRates:
         """Rates of change of states [s, p] under incident power [p]."""
         view, pixels = self._view(state_k), self.pixels
         absorber_k, gas_k, wall_k = state_k[0], state_k[1], view.wall_k()
@@ -105,16 +105,16 @@ class Model:
         for term, own in self._terms:
             bridge = term.bridge_k_per_w(own, view, bridge)
         absorbed_w = pixels.epsilon * power_w
-        flows = Flows({"absorber_k": absorbed_w}, np.zeros(len(pixels)))
+        flows = HeatFlows({"absorber_k": absorbed_w}, np.zeros(len(pixels)))
         wall = "wall_k" if "wall_k" in self._capacity_j_per_k else None
-        flows.move("absorber_k", wall, (absorber_k - wall_k) / bridge)
+        flows.add_flow("absorber_k", wall, (absorber_k - wall_k) / bridge)
         for term, own in self._terms:
-            term.flow(own, view, flows)
+            term.add_flows(own, view, flows)
         moves = {name: flows.into_w[name] / capacity for name, capacity in self._capacity_j_per_k.items()}
         moves["gas_k"] = (GAS_FRACTION * (absorber_k + wall_k) - gas_k) / pixels.tau_g_s
         for term, own in self._terms:
             moves |= term.rates_k_per_s(own, view)
-        return Rates(np.stack([moves[name] for name in self.states]), absorbed_w, np.asarray(flows.left_w))
+        return StateRates(np.stack([moves[name] for name in self.states]), absorbed_w, np.asarray(flows.lost_w))
 
     def outputs(self, state_k: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Displacement, m, and blocked force, N, of states [s, p] or [s, m, p]: the same without s."""
@@ -132,17 +132,17 @@ class Model:
         return float(sum((capacity * rises[name]).sum() for name, capacity in self._capacity_j_per_k.items()))
 
     @property
-    def _quickest_s(self) -> float:
+    def _min_time_constant_s(self) -> float:
         dark_w = np.zeros(len(self.pixels))
         times_s = [float((self.pixels.r_k_per_w * self.pixels.c_j_per_k).min()), float(self.pixels.tau_g_s.min())]
         # A step from nothing shows how quickly each state would be where it is driven to.
         for row in range(2, len(self.states)):
-            state_k = self.at_rest()
+            state_k = self.cold_states()
             state_k[row] = 1.0
             rate = np.abs(self.rates(state_k, dark_w).state_per_s[row]).max()
             times_s.append(1.0 / float(rate))
         # Pixels that exchange heat are quickest against each other, which equal pixels do not show: power iteration.
-        state_k = np.random.default_rng(0).choice([-1.0, 1.0], size=self.at_rest().shape)
+        state_k = np.random.default_rng(0).choice([-1.0, 1.0], size=self.cold_states().shape)
         for _ in range(ITERATIONS):
             moving = self.rates(state_k, dark_w).state_per_s
             rate = np.abs(moving).max()
@@ -157,8 +157,8 @@ class Model:
         """
         edges_s = np.array([0.0, *(drive.start_s for drive in drives)])
         powers = [np.zeros(len(self.pixels)), *(drive.power_w for drive in drives)]
-        step_s = self._quickest_s / steps
-        state_k, now_s, heat_j = self.at_rest(), 0.0, np.zeros(2)
+        step_s = self._min_time_constant_s / steps
+        state_k, now_s, heat_j = self.cold_states(), 0.0, np.zeros(2)
         kept, heats, edge = [], [], 0
         for until_s in t_s.tolist():
             while now_s < until_s:
@@ -169,7 +169,7 @@ class Model:
                 heat_j, now_s = heat_j + more_j, next_s
             kept.append(state_k)
             heats.append([*heat_j, self.stored_j(state_k)])
-        return self._told(t_s, np.array(kept), np.array(heats))
+        return self._build_trace(t_s, np.array(kept), np.array(heats))
 
     def _advance(
         self, state_k: FloatArray, power_w: FloatArray, time_s: float, step_s: float
@@ -188,7 +188,7 @@ class Model:
             heat_j += h / 6 * np.array([sums[1].sum(), sums[2].sum()])
         return state_k, heat_j
 
-    def _told(self, t_s: FloatArray, states_k: FloatArray, heats_j: FloatArray) -> ModelTrace:
+    def _build_trace(self, t_s: FloatArray, states_k: FloatArray, heats_j: FloatArray) -> ModelTrace:
         displacement_m, force_n = self.outputs(states_k.transpose(1, 0, 2))
         return ModelTrace(
             t_s=t_s,

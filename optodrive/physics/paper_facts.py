@@ -5,14 +5,14 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal, cast
 
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 
 AMBIENT_C = 20.0
 """Ambient of the paper's single-pixel runs: 527 °C at a rise of 507 K."""
 
 
 @dataclass(frozen=True)
-class Fact:
+class PaperFact:
     """One number of the paper: relation '=' for a value, '<' for an upper bound; uncertainty None where it gives none.
 
     Units are SI; temperatures in °C as the paper has them.
@@ -34,21 +34,21 @@ class Fact:
         zero = AMBIENT_C if self.unit == "°C" else 0.0
         return (model - zero) / (self.value - zero)
 
-    def missed(self, model: float, tolerance: float) -> bool:
+    def is_contradicted(self, model: float, tolerance: float) -> bool:
         """Whether a model lies off by more than tolerance (1 = as much as the fact itself), or above a bound."""
         ratio = self.ratio(model)
         return model > self.value if ratio is None else abs(ratio - 1.0) > tolerance
 
 
 @cache
-def paper_facts() -> dict[str, Fact]:
+def load_paper_facts() -> dict[str, PaperFact]:
     """Every fact by its id, in the file's order."""
-    with shipped_path("paper_facts.csv").open(encoding="utf-8", newline="") as file:
-        return {row["id"]: _fact(row) for row in csv.DictReader(file)}
+    with locate_shipped("paper_facts.csv").open(encoding="utf-8", newline="") as file:
+        return {row["id"]: _parse_fact(row) for row in csv.DictReader(file)}
 
 
-def _fact(row: dict[str, str]) -> Fact:
-    return Fact(
+def _parse_fact(row: dict[str, str]) -> PaperFact:
+    return PaperFact(
         id=row["id"],
         quantity=row["quantity"],
         relation=cast(Literal["=", "<"], row["relation"]),

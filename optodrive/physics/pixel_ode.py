@@ -17,40 +17,51 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.term import (
     ABSORBER,
     AMBIENT_K,
-    CONTEXT,
+    BRIDGE_FLOW_W,
+    CONTEXT_SIZE,
     DOSE,
-    FLOW_W,
+    FAR_END_K,
     FULL_W,
     GAS,
-    MINE,
+    ILLUMINATED_PIXEL,
+    IS_TARGET,
     NEIGHBOUR,
-    PIXEL,
     POWER_W,
-    SESSION,
-    SHOWN,
-    SINCE_S,
+    SENSOR,
+    SESSION_TIME,
+    SINCE_EDGE_S,
     TIME_S,
     WALL,
-    WALL_K,
-    Values,
+    TermValues,
 )
-from optodrive.physics.term_kernels import CHAINS, OWN_ROW, ROW, STATES, TERMS, VALUES
-from optodrive.physics.terms import known_terms
+from optodrive.physics.term_kernels import CHAINS, FOLLOWER_ROW, MAX_PARAMETERS, STATE_COUNT, TERM_ROW, TERMS
+from optodrive.physics.terms import discover_terms
 
-FIRST, FIRST_QUICK_S = 0.15, 1e-5
+FIRST_STEP, FIRST_STEP_FAST_S = 0.15, 1e-5
 """First step after an edge, in gas time constants; and where a term moves more quickly than the gas."""
-GROWTH = 0.2
+STEP_GROWTH = 0.2
 """After an edge a step may be so much of the time since then longer."""
-EARLY, LATE, SETTLED = 0.35, 1.2, 12.0
+MAX_STEP_EARLY, MAX_STEP_LATE, LATE_AFTER = 0.35, 1.2, 12.0
 """Longest step in gas time constants, before and after so many of them from an edge."""
-LONGEST_S = 6e-3
+MAX_STEP_S = 6e-3
 """Steps beyond 2.78 of the shortest time of a term (2.5 ms) would not be stable."""
 
-light, capacity, bridge, leaving, wall, rates, lifts, pushes, reads, lag = CHAINS
+(
+    optical_power,
+    heat_capacity,
+    bridge_resistance,
+    heat_loss,
+    wall_rise,
+    rates,
+    membrane_drive,
+    force_drive,
+    sensor_reading,
+    sensor_lag,
+) = CHAINS
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class PixelExperiment:
     """One run as seen from one pixel.
 
     pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam; t_s: samples of temperature, displacement
@@ -65,8 +76,8 @@ class Scene:
     t_s: tuple[FloatArray, FloatArray, FloatArray]
     dose_before: float = 0.0
     dose_per_j: float = 0.0
-    session: float = 0.0
-    session_per_s: float = 0.0
+    session_time: float = 0.0
+    session_time_per_s: float = 0.0
     full_w: float = 2.45
 
     def __post_init__(self) -> None:
@@ -75,61 +86,81 @@ class Scene:
         object.__setattr__(self, "t_s", tuple(np.array(times, dtype=np.float64) for times in self.t_s))
 
 
-class Active(NamedTuple):
+class ActiveTerms(NamedTuple):
     """Terms that are on, [terms], and their parameters, [terms, VALUES]; rows: of the states that move.
 
     quick: whether a term moves more quickly than the gas.
     """
 
     on: IntArray
-    v: FloatArray
-    rows: IntArray
-    quick: bool
+    values: FloatArray
+    state_rows: IntArray
+    is_fast: bool
 
     @classmethod
-    def of(cls, values: Mapping[str, Values]) -> "Active":
+    def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
         """From term → parameter → SI value; terms without kernels have no effect here."""
-        on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), VALUES))
+        on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
         rows = [ABSORBER, GAS, *([WALL] if "wall_heating" in values else []), NEIGHBOUR]
         for key, own in values.items():
-            row = ROW[key]
+            row = TERM_ROW[key]
             on[row] = 1
             v[row, : len(own)] = [own[item.name] for item in TERMS[row].parameters]
-            rows += range(OWN_ROW[row], OWN_ROW[row] + len(TERMS[row].followers))
-        quick = any(known_terms()[key].quick for key in values)
+            rows += range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(TERMS[row].followers))
+        quick = any(discover_terms()[key].is_fast for key in values)
         return cls(on, v, np.array(rows), quick)
 
 
-def observe(
-    scene: Scene, pixel: Pixel, active: Active, late_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+def simulate_signals(
+    experiment: PixelExperiment,
+    pixel: Pixel,
+    active: ActiveTerms,
+    clock_delay_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Temperature rise shown, K, displacement, m, and force, N, at the scene's samples; clocks late by late_s."""
-    out = (np.zeros(len(scene.t_s[0])), np.zeros(len(scene.t_s[1])), np.zeros(len(scene.t_s[2])))
-    context = np.zeros(CONTEXT)
-    context[FULL_W], context[AMBIENT_K], context[PIXEL] = scene.full_w, scene.ambient_k, scene.pixel
-    span = (scene.dose_before, scene.dose_per_j, scene.session, scene.session_per_s)
-    _run(scene.pulses, scene.pixel, scene.t_s, late_s, span, pixel, active, context, np.zeros((8, STATES)), out)
+    out = (np.zeros(len(experiment.t_s[0])), np.zeros(len(experiment.t_s[1])), np.zeros(len(experiment.t_s[2])))
+    context = np.zeros(CONTEXT_SIZE)
+    context[FULL_W], context[AMBIENT_K], context[ILLUMINATED_PIXEL] = (
+        experiment.full_w,
+        experiment.ambient_k,
+        experiment.pixel,
+    )
+    span = (experiment.dose_before, experiment.dose_per_j, experiment.session_time, experiment.session_time_per_s)
+    _simulate(
+        experiment.pulses,
+        experiment.pixel,
+        experiment.t_s,
+        clock_delay_s,
+        span,
+        pixel,
+        active,
+        context,
+        np.zeros((8, STATE_COUNT)),
+        out,
+    )
     return out
 
 
 @kernel
-def change(pixel: Pixel, active: Active, y: FloatArray, c: FloatArray, own: bool, dy: FloatArray) -> None:
+def evaluate_rates(
+    pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, is_target: bool, dy: FloatArray
+) -> None:
     """dy/dt [STATES] under the command in the context; own: the light is on this pixel, else on one beside it."""
-    on, v = active.on, active.v
-    lit_w = light(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else 0.0
-    wall_k = wall(on, v, y, c, y[WALL])
-    c[WALL_K] = wall_k
-    c[FLOW_W] = (y[ABSORBER] - wall_k) / bridge(on, v, y, c, pixel.r_k_per_w)
-    into_w = (pixel.epsilon * lit_w if own else 0.0) - c[FLOW_W] - leaving(on, v, y, c, 0.0)
-    dy[ABSORBER] = into_w / capacity(on, v, y, c, pixel.c_j_per_k)
+    on, v = active.on, active.values
+    lit_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else 0.0
+    wall_k = wall_rise(on, v, y, c, y[WALL])
+    c[FAR_END_K] = wall_k
+    c[BRIDGE_FLOW_W] = (y[ABSORBER] - wall_k) / bridge_resistance(on, v, y, c, pixel.r_k_per_w)
+    into_w = (pixel.epsilon * lit_w if is_target else 0.0) - c[BRIDGE_FLOW_W] - heat_loss(on, v, y, c, 0.0)
+    dy[ABSORBER] = into_w / heat_capacity(on, v, y, c, pixel.c_j_per_k)
     dy[GAS] = (0.5 * (y[ABSORBER] + wall_k) - y[GAS]) / pixel.tau_g_s
-    beside_w = (0.0 if own else pixel.epsilon * lit_w) - y[NEIGHBOUR] / pixel.r_k_per_w
+    beside_w = (0.0 if is_target else pixel.epsilon * lit_w) - y[NEIGHBOUR] / pixel.r_k_per_w
     dy[NEIGHBOUR] = beside_w / pixel.c_j_per_k
     rates(on, v, y, c, dy)
 
 
 @kernel
-def _shown_k(before_k: float, from_k: float, slope: float, to_k: float, tau_s: float, h_s: float) -> float:
+def _lagged_reading_k(before_k: float, from_k: float, slope: float, to_k: float, tau_s: float, h_s: float) -> float:
     """A first-order lag after h_s, exactly, of a parabola from from_k with a slope to to_k."""
     bend = (to_k - from_k - slope * h_s) / h_s**2
     at_start = from_k - slope * tau_s + 2.0 * bend * tau_s**2
@@ -140,152 +171,158 @@ def _shown_k(before_k: float, from_k: float, slope: float, to_k: float, tau_s: f
 @kernel
 def step(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    own: bool,
-    fresh: bool,
+    is_target: bool,
+    after_edge: bool,
     at_s: float,
-    since_s: float,
+    since_edge_s: float,
     h_s: float,
-    room: FloatArray,
+    work: FloatArray,
 ) -> None:
     """One step of Runge–Kutta: room [8, STATES] holds y and dy/dt at its start (0, 1), and at its end (2, 3).
 
     fresh: the light has changed, dy/dt at the start is not known yet.
     """
-    y, y1 = room[0], room[2]
-    k1, k2, k3, k4, part = room[1], room[4], room[5], room[6], room[7]
-    c[TIME_S], c[SINCE_S] = at_s, since_s
-    if fresh:
-        change(pixel, active, y, c, own, k1)
-    rows = active.rows
-    c[TIME_S], c[SINCE_S] = at_s + 0.5 * h_s, since_s + 0.5 * h_s
+    y, y1 = work[0], work[2]
+    k1, k2, k3, k4, part = work[1], work[4], work[5], work[6], work[7]
+    c[TIME_S], c[SINCE_EDGE_S] = at_s, since_edge_s
+    if after_edge:
+        evaluate_rates(pixel, active, y, c, is_target, k1)
+    rows = active.state_rows
+    c[TIME_S], c[SINCE_EDGE_S] = at_s + 0.5 * h_s, since_edge_s + 0.5 * h_s
     for row in rows:
         part[row] = y[row] + 0.5 * h_s * k1[row]
-    change(pixel, active, part, c, own, k2)
+    evaluate_rates(pixel, active, part, c, is_target, k2)
     for row in rows:
         part[row] = y[row] + 0.5 * h_s * k2[row]
-    change(pixel, active, part, c, own, k3)
-    c[TIME_S], c[SINCE_S] = at_s + h_s, since_s + h_s
+    evaluate_rates(pixel, active, part, c, is_target, k3)
+    c[TIME_S], c[SINCE_EDGE_S] = at_s + h_s, since_edge_s + h_s
     for row in rows:
         part[row] = y[row] + h_s * k3[row]
-    change(pixel, active, part, c, own, k4)
+    evaluate_rates(pixel, active, part, c, is_target, k4)
     for row in rows:
         y1[row] = y[row] + h_s / 6.0 * (k1[row] + 2.0 * k2[row] + 2.0 * k3[row] + k4[row])
-    change(pixel, active, y1, c, own, room[3])
-    tau_s = lag(active.on, active.v, y, c, 0.0)
+    evaluate_rates(pixel, active, y1, c, is_target, work[3])
+    tau_s = sensor_lag(active.on, active.values, y, c, 0.0)
     if tau_s > 0.0:
-        y1[SHOWN] = _shown_k(y[SHOWN], y[ABSORBER], k1[ABSORBER], y1[ABSORBER], tau_s, h_s)
-        k1[SHOWN], room[3, SHOWN] = (y[ABSORBER] - y[SHOWN]) / tau_s, (y1[ABSORBER] - y1[SHOWN]) / tau_s
+        y1[SENSOR] = _lagged_reading_k(y[SENSOR], y[ABSORBER], k1[ABSORBER], y1[ABSORBER], tau_s, h_s)
+        k1[SENSOR], work[3, SENSOR] = (y[ABSORBER] - y[SENSOR]) / tau_s, (y1[ABSORBER] - y1[SENSOR]) / tau_s
     else:
-        y1[SHOWN], k1[SHOWN], room[3, SHOWN] = y1[ABSORBER], k1[ABSORBER], room[3, ABSORBER]
+        y1[SENSOR], k1[SENSOR], work[3, SENSOR] = y1[ABSORBER], k1[ABSORBER], work[3, ABSORBER]
 
 
 @kernel
-def step_s(pixel: Pixel, active: Active, since_s: float) -> float:
+def next_step_s(pixel: Pixel, active: ActiveTerms, since_edge_s: float) -> float:
     """How long the next step may be, so long after the light changed."""
-    most = LATE if since_s > SETTLED * pixel.tau_g_s else EARLY
+    most = MAX_STEP_LATE if since_edge_s > LATE_AFTER * pixel.tau_g_s else MAX_STEP_EARLY
     return min(
-        LONGEST_S,
-        GROWTH * since_s + (FIRST_QUICK_S if active.quick else FIRST * pixel.tau_g_s),
+        MAX_STEP_S,
+        STEP_GROWTH * since_edge_s + (FIRST_STEP_FAST_S if active.is_fast else FIRST_STEP * pixel.tau_g_s),
         most * pixel.tau_g_s,
     )
 
 
 @kernel
-def sample(rows: IntArray, room: FloatArray, at_s: float, h_s: float, sample_s: float) -> None:
+def interpolate_states(rows: IntArray, work: FloatArray, at_s: float, h_s: float, sample_s: float) -> None:
     """States at a time within the step, into row 7."""
     u = (sample_s - at_s) / h_s
     rest = 1.0 - u
     for row in rows:
-        y0, f0, y1, f1 = room[0, row], room[1, row], room[2, row], room[3, row]
+        y0, f0, y1, f1 = work[0, row], work[1, row], work[2, row], work[3, row]
         ends = (1.0 + 2.0 * u) * rest * rest * y0 + u * u * (3.0 - 2.0 * u) * y1
-        room[7, row] = ends + h_s * u * rest * (rest * f0 - u * f1)
-    y0, f0, y1, f1 = room[0, SHOWN], room[1, SHOWN], room[2, SHOWN], room[3, SHOWN]
+        work[7, row] = ends + h_s * u * rest * (rest * f0 - u * f1)
+    y0, f0, y1, f1 = work[0, SENSOR], work[1, SENSOR], work[2, SENSOR], work[3, SENSOR]
     ends = (1.0 + 2.0 * u) * rest * rest * y0 + u * u * (3.0 - 2.0 * u) * y1
-    room[7, SHOWN] = ends + h_s * u * rest * (rest * f0 - u * f1)
+    work[7, SENSOR] = ends + h_s * u * rest * (rest * f0 - u * f1)
 
 
 @kernel
-def outputs(pixel: Pixel, active: Active, y: FloatArray, c: FloatArray, signal: int) -> float:
+def output_signal(pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, signal: int) -> float:
     """One signal of states: temperature rise shown, displacement, force."""
     if signal == 0:
-        return float(reads(active.on, active.v, y, c, y[SHOWN]))
+        return float(sensor_reading(active.on, active.values, y, c, y[SENSOR]))
     if signal == 1:
-        return float(pixel.kappa_m_per_k * lifts(active.on, active.v, y, c, y[GAS]))
-    return float(pixel.phi_n_per_k * pushes(active.on, active.v, y, c, y[GAS]))
+        return float(pixel.kappa_m_per_k * membrane_drive(active.on, active.values, y, c, y[GAS]))
+    return float(pixel.phi_n_per_k * force_drive(active.on, active.values, y, c, y[GAS]))
 
 
 @kernel
-def _fill(
+def _fill_samples(
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    room: FloatArray,
+    work: FloatArray,
     at_s: float,
     h_s: float,
     t_s: FloatArray,
-    late_s: float,
+    clock_delay_s: float,
     span: tuple[float, float, float, float],
     signal: int,
     index: int,
     out: FloatArray,
 ) -> int:
-    while index < len(t_s) and t_s[index] - late_s <= at_s + h_s:
-        sample_s = max(at_s, t_s[index] - late_s)
-        sample(active.rows, room, at_s, h_s, sample_s)
-        c[TIME_S], c[SESSION] = t_s[index], span[2] + span[3] * t_s[index]
-        out[index] = outputs(pixel, active, room[7], c, signal)
+    while index < len(t_s) and t_s[index] - clock_delay_s <= at_s + h_s:
+        sample_s = max(at_s, t_s[index] - clock_delay_s)
+        interpolate_states(active.state_rows, work, at_s, h_s, sample_s)
+        c[TIME_S], c[SESSION_TIME] = t_s[index], span[2] + span[3] * t_s[index]
+        out[index] = output_signal(pixel, active, work[7], c, signal)
         index += 1
     return index
 
 
 @kernel
-def _run(
+def _simulate(
     pulses: FloatArray,
     number: int,
     t_s: tuple[FloatArray, FloatArray, FloatArray],
-    late_s: tuple[float, float, float],
+    clock_delay_s: tuple[float, float, float],
     span: tuple[float, float, float, float],
     pixel: Pixel,
-    active: Active,
+    active: ActiveTerms,
     c: FloatArray,
-    room: FloatArray,
+    work: FloatArray,
     out: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
     until_s = 0.0
     for signal in range(3):
         if len(t_s[signal]):
-            until_s = max(until_s, t_s[signal][-1] - late_s[signal])
+            until_s = max(until_s, t_s[signal][-1] - clock_delay_s[signal])
     index = np.zeros(3, dtype=np.int64)
     now_s, edge_s, row, dose = 0.0, 0.0, 0, span[0]
     shining, own, fresh = False, True, True
     while now_s < until_s or now_s == 0.0:
         if row < len(pulses) and not shining and pulses[row, 0] <= now_s:
             shining, edge_s, fresh = True, now_s, True
-            c[POWER_W], c[PIXEL], own = pulses[row, 2], pulses[row, 3], pulses[row, 3] == number
-            c[MINE] = 1.0 if own else 0.0
+            c[POWER_W], c[ILLUMINATED_PIXEL], own = pulses[row, 2], pulses[row, 3], pulses[row, 3] == number
+            c[IS_TARGET] = 1.0 if own else 0.0
         end_s = until_s + 1e-3
         if shining:
             end_s = pulses[row, 0] + pulses[row, 1]
         elif row < len(pulses):
             end_s = pulses[row, 0]
         since_s = now_s - edge_s
-        h_s = step_s(pixel, active, since_s)
+        h_s = next_step_s(pixel, active, since_s)
         last = now_s + 1.3 * h_s >= end_s
         if last:
             h_s = end_s - now_s
         if h_s > 0.0:
             c[DOSE] = dose
-            step(pixel, active, c, own, fresh, now_s, since_s, h_s, room)
-            index[0] = _fill(pixel, active, c, room, now_s, h_s, t_s[0], late_s[0], span, 0, index[0], out[0])
-            index[1] = _fill(pixel, active, c, room, now_s, h_s, t_s[1], late_s[1], span, 1, index[1], out[1])
-            index[2] = _fill(pixel, active, c, room, now_s, h_s, t_s[2], late_s[2], span, 2, index[2], out[2])
-            dose += c[MINE] * c[POWER_W] * h_s * span[1]
+            step(pixel, active, c, own, fresh, now_s, since_s, h_s, work)
+            index[0] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[0], clock_delay_s[0], span, 0, index[0], out[0]
+            )
+            index[1] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[1], clock_delay_s[1], span, 1, index[1], out[1]
+            )
+            index[2] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[2], clock_delay_s[2], span, 2, index[2], out[2]
+            )
+            dose += c[IS_TARGET] * c[POWER_W] * h_s * span[1]
             fresh = False
-            for state in active.rows:
-                room[0, state], room[1, state] = room[2, state], room[3, state]
-            room[0, SHOWN], room[1, SHOWN] = room[2, SHOWN], room[3, SHOWN]
+            for state in active.state_rows:
+                work[0, state], work[1, state] = work[2, state], work[3, state]
+            work[0, SENSOR], work[1, SENSOR] = work[2, SENSOR], work[3, SENSOR]
         now_s = end_s if last else now_s + h_s
         if last:
             edge_s, fresh = now_s, True

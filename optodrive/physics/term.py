@@ -13,24 +13,36 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.neighbours import Neighbours
 
-Values = Mapping[str, float]
+TermValues = Mapping[str, float]
 """A term's parameters, SI, by name."""
 
 
-ABSORBER, GAS, WALL, NEIGHBOUR, SHOWN, OWN = range(6)
+ABSORBER, GAS, WALL, NEIGHBOUR, SENSOR, FIRST_FOLLOWER = range(6)
 """Rows of a single pixel's states in kernels: its own three, the absorber beside it, what a thermometer that lags
 shows, then each term's followers."""
-POWER_W, FULL_W, SINCE_S, DOSE, PIXEL, AMBIENT_K, FLOW_W, WALL_K, TIME_S, SESSION, MINE = range(11)
+(
+    POWER_W,
+    FULL_W,
+    SINCE_EDGE_S,
+    DOSE,
+    ILLUMINATED_PIXEL,
+    AMBIENT_K,
+    BRIDGE_FLOW_W,
+    FAR_END_K,
+    TIME_S,
+    SESSION_TIME,
+    IS_TARGET,
+) = range(11)
 """What kernels are told beside the states.
 
 Commanded and full power, time since the gate opened, dose so far as a share of the recording's, the index of the pixel
 that is lit, ambient, the bridge's heat flow, its far end's rise, time in the run, and in the session from −1 to 1, and
 whether the light is on this very pixel.
 """
-CONTEXT = 11
+CONTEXT_SIZE = 11
 
 Modifier = Callable[[FloatArray, FloatArray, int, FloatArray, float], float]
-Mover = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
+RateWriter = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
 
 
 class Kernels(NamedTuple):
@@ -44,16 +56,16 @@ class Kernels(NamedTuple):
     a finger, K; reads: the rise that the thermometer shows, K; lag: the thermometer's, s
     """
 
-    light: Modifier | None = None
-    capacity: Modifier | None = None
-    bridge: Modifier | None = None
-    leaving: Modifier | None = None
-    wall: Modifier | None = None
-    rates: Mover | None = None
-    lifts: Modifier | None = None
-    pushes: Modifier | None = None
-    reads: Modifier | None = None
-    lag: Modifier | None = None
+    optical_power: Modifier | None = None
+    heat_capacity: Modifier | None = None
+    bridge_resistance: Modifier | None = None
+    heat_loss: Modifier | None = None
+    wall_rise: Modifier | None = None
+    rates: RateWriter | None = None
+    membrane_drive: Modifier | None = None
+    force_drive: Modifier | None = None
+    sensor_reading: Modifier | None = None
+    sensor_lag: Modifier | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +80,7 @@ class TermParameter:
     source: str
 
 
-class View(NamedTuple):
+class StateView(NamedTuple):
     """What a term sees: rises above ambient by the names of states, each [p]; ambient; the lattice."""
 
     rise_k: Mapping[str, FloatArray]
@@ -80,40 +92,40 @@ class View(NamedTuple):
         return self.rise_k.get("wall_k", np.zeros_like(self.rise_k["absorber_k"]))
 
 
-class Most(NamedTuple):
+class OperatingEnvelope(NamedTuple):
     """The most there is: one absorber's rise; all absorbers' rises together, one beam's, K; the laser's power, W."""
 
     absorber_k: float
-    together_k: float
+    summed_absorbers_k: float
     full_w: float
 
 
-class Warming(NamedTuple):
+class HeatGainBound(NamedTuple):
     """The most a term adds to what warms.
 
     Factors on the power absorbed and on the heat capacity of a hot absorber; and what warms everything otherwise, K.
     """
 
-    power: float = 1.0
-    capacity: float = 1.0
-    everywhere_k: float = 0.0
+    power_factor: float = 1.0
+    capacity_factor: float = 1.0
+    uniform_rise_k: float = 0.0
 
 
-NO_WARMING = Warming()
+NO_HEAT_GAIN = HeatGainBound()
 
 
 @dataclass
-class Flows:
+class HeatFlows:
     """Heat on its way, W, each [p]: into a node, by its name; and to ambient for good."""
 
     into_w: dict[str, FloatArray] = field(default_factory=dict)
-    left_w: FloatArray | float = 0.0
+    lost_w: FloatArray | float = 0.0
 
-    def move(self, source: str | None, target: str | None, power_w: FloatArray) -> None:
+    def add_flow(self, source: str | None, target: str | None, power_w: FloatArray) -> None:
         """Let heat flow from a node to another; None is ambient, at either end."""
         for node, gained_w in ((source, -power_w), (target, power_w)):
             if node is None:
-                self.left_w = self.left_w + gained_w
+                self.lost_w = self.lost_w + gained_w
             else:
                 self.into_w[node] = self.into_w.get(node, 0.0) + gained_w
 
@@ -131,45 +143,45 @@ class Term:
 
     key: str
     parameters: tuple[TermParameter, ...] = ()
-    needs: tuple[str, ...] = ()
+    requires: tuple[str, ...] = ()
     heat_nodes: Mapping[str, str] = {}
     followers: tuple[str, ...] = ()
     kernels: Kernels = Kernels()
-    suspect: str = ""
-    by_run: bool = False
-    quick: bool = False
-    never_warmer: bool = False
+    signature: str = ""
+    varies_between_runs: bool = False
+    is_fast: bool = False
+    cannot_add_heat: bool = False
 
     @property
-    def whole_display(self) -> bool:
+    def is_display_term(self) -> bool:
         """Whether the term acts in the model of a whole display, not in the compiled single pixel alone."""
         hooks = ("bridge_k_per_w", "flow", "rates_k_per_s", "displacement_m", "force_n")
         return any(getattr(type(self), name) is not getattr(Term, name) for name in hooks)
 
     @property
-    def single_pixel(self) -> bool:
+    def is_pixel_term(self) -> bool:
         """Whether nothing of the term is lost in the compiled single pixel."""
-        return any(self.kernels) or not self.whole_display
+        return any(self.kernels) or not self.is_display_term
 
-    def warming(self, values: Values, most: Most) -> Warming | None:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
         """What a bound on heat must add for the term; None where it cannot say, and the limiter refuses the term."""
-        return NO_WARMING if self.never_warmer else None
+        return NO_HEAT_GAIN if self.cannot_add_heat else None
 
-    def bridge_k_per_w(self, values: Values, view: View, r_k_per_w: FloatArray) -> FloatArray:
+    def bridge_k_per_w(self, values: TermValues, view: StateView, r_k_per_w: FloatArray) -> FloatArray:
         """The bridge's resistance, given what it would be without the term: [p]."""
         return r_k_per_w
 
-    def flow(self, values: Values, view: View, flows: Flows) -> None:
+    def add_flows(self, values: TermValues, view: StateView, flows: HeatFlows) -> None:
         """Add heat flows between nodes and to ambient."""
 
-    def rates_k_per_s(self, values: Values, view: View) -> dict[str, FloatArray]:
+    def rates_k_per_s(self, values: TermValues, view: StateView) -> dict[str, FloatArray]:
         """How fast the term's followers move: name → [p]."""
         return {}
 
-    def displacement_m(self, values: Values, view: View, displacement_m: FloatArray) -> FloatArray:
+    def displacement_m(self, values: TermValues, view: StateView, displacement_m: FloatArray) -> FloatArray:
         """The membrane's displacement, given what it would be without the term: [p]."""
         return displacement_m
 
-    def force_n(self, values: Values, view: View, force_n: FloatArray) -> FloatArray:
+    def force_n(self, values: TermValues, view: StateView, force_n: FloatArray) -> FloatArray:
         """Blocked force, given what it would be without the term: [p]."""
         return force_n

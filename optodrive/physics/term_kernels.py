@@ -12,43 +12,43 @@ from pathlib import Path
 from tempfile import mkdtemp
 from typing import Any, NamedTuple
 
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.core.kernels import code_folder
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.physics.term import OWN, Kernels, Term
-from optodrive.physics.terms import known_terms
+from optodrive.physics.term import FIRST_FOLLOWER, Kernels, Term
+from optodrive.physics.terms import discover_terms
 
-VALUES = 4
+MAX_PARAMETERS = 4
 """Room for so many parameters a term."""
 
-Chain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, float], float]
-Moving = Callable[[IntArray, FloatArray, FloatArray, FloatArray, FloatArray], None]
+HookChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, float], float]
+RateChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, FloatArray], None]
 
 
-class Chains(NamedTuple):
+class HookChains(NamedTuple):
     """One function a hook: (on, v, y, c, x), on [terms], v [terms, VALUES]; x passes through the terms that are on."""
 
-    light: Chain
-    capacity: Chain
-    bridge: Chain
-    leaving: Chain
-    wall: Chain
-    rates: Moving
-    lifts: Chain
-    pushes: Chain
-    reads: Chain
-    lag: Chain
+    optical_power: HookChain
+    heat_capacity: HookChain
+    bridge_resistance: HookChain
+    heat_loss: HookChain
+    wall_rise: HookChain
+    rates: RateChain
+    membrane_drive: HookChain
+    force_drive: HookChain
+    sensor_reading: HookChain
+    sensor_lag: HookChain
 
 
-TERMS: tuple[Term, ...] = tuple(known_terms()[key] for key in sorted(known_terms()))
+TERMS: tuple[Term, ...] = tuple(discover_terms()[key] for key in sorted(discover_terms()))
 """Every term, in the order of `on` and `v`."""
-ROW = {term.key: row for row, term in enumerate(TERMS)}
-STATES = OWN + sum(len(term.followers) for term in TERMS)
-OWN_ROW = tuple(OWN + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
+TERM_ROW = {term.key: row for row, term in enumerate(TERMS)}
+STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
+FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
 """Row of each term's first follower."""
 
 
-def _source() -> str:
+def _generate_source() -> str:
     lines = ["from optodrive.core.kernels import kernel"]
     calls: dict[str, list[str]] = {hook: [] for hook in Kernels._fields}
     for row, term in enumerate(TERMS):
@@ -59,19 +59,19 @@ def _source() -> str:
             name = f"{term.key}_{hook}"
             lines.append(f"from {function.__module__} import {function.__name__} as {name}")
             target = "" if hook == "rates" else "x = "
-            calls[hook] += [f"    if on[{row}]:", f"        {target}{name}(v[{row}], y, {OWN_ROW[row]}, c, x)"]
+            calls[hook] += [f"    if on[{row}]:", f"        {target}{name}(v[{row}], y, {FOLLOWER_ROW[row]}, c, x)"]
     for hook, body in calls.items():
         lines += ["", "", "@kernel", f"def {hook}(on, v, y, c, x):", *body, "    return x"]
     return "\n".join(lines) + "\n"
 
 
-def _composed() -> Any:
-    source = _source()
+def _load_generated_module() -> Any:
+    source = _generate_source()
     name = f"optodrive_chains_{sha256(source.encode()).hexdigest()[:16]}"
     folder = code_folder() or Path(mkdtemp())
     path = folder / f"{name}.py"
     if not path.exists():
-        with written_whole(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(source)
     spec = spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
@@ -82,5 +82,5 @@ def _composed() -> Any:
     return module
 
 
-_MODULE = _composed()
-CHAINS = Chains(*(getattr(_MODULE, hook) for hook in Chains._fields))
+_MODULE = _load_generated_module()
+CHAINS = HookChains(*(getattr(_MODULE, hook) for hook in HookChains._fields))

@@ -20,11 +20,11 @@ import numpy as np
 from optodrive.core.kernels import vector_kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.neighbours import Neighbours
-from optodrive.physics.nominal_display import TIME_ROUNDING_S, kernel_columns
+from optodrive.physics.nominal_display import TIME_ROUNDING_S, build_kernel_columns
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel, cooling_peak, gas_peak
 
-RATES_APART = 1e-8
+MIN_RATE_SEPARATION = 1e-8
 """A mode whose rate meets the gas's is moved off by this share, or its gas would need a form of its own.
 
 Rises are then wrong by about as little: less by the rate, and no more by the digits that near rates lose.
@@ -34,7 +34,7 @@ SERIES_REACH = 0.5
 """The series of these coefficients leaves out less than 1e-16 up to here."""
 
 
-class Walls(NamedTuple):
+class WallParameters(NamedTuple):
     """What surrounds each cell: wall to ambient, the wall's heat capacity, wall to wall beside it, wall to frame."""
 
     r_k_per_w: float
@@ -43,7 +43,7 @@ class Walls(NamedTuple):
     frame_k_per_w: float
 
     @classmethod
-    def of(cls, parameters: ParameterSet) -> "Walls":
+    def from_parameters(cls, parameters: ParameterSet) -> "WallParameters":
         """The terms wall_heating and, where there is one, lateral_conduction of a parameter set."""
         wall, side = parameters.terms["wall_heating"], parameters.terms.get("lateral_conduction")
         return cls(
@@ -66,7 +66,7 @@ class WallPeaks(NamedTuple):
     wall_k: FloatArray
 
 
-class Heat(NamedTuple):
+class ModalAmplitudes(NamedTuple):
     """Amplitudes [p], a mode each: the absorber's rise in the mode's two motions, and the gas's own, K."""
 
     first_k: FloatArray
@@ -93,14 +93,14 @@ class Modes(NamedTuple):
     second_k_per_j: FloatArray
     gas_k_per_j: FloatArray
     gas_per_s: float
-    first_most_per_s: float
-    second_most_per_s: float
+    first_max_per_s: float
+    second_max_per_s: float
 
     @classmethod
-    def of(cls, pixel: Pixel, walls: Walls, neighbours: Neighbours) -> "Modes":
+    def diagonalise(cls, pixel: Pixel, walls: WallParameters, neighbours: Neighbours) -> "Modes":
         """Diagonalise a display of equal cells; takes a second or so for 1,511, once for any number of simulations."""
-        wall_w_per_k, share = np.linalg.eigh(conductances_w_per_k(walls, neighbours))
-        first_per_s, second_per_s, tangent = _motions(pixel, walls, wall_w_per_k)
+        wall_w_per_k, share = np.linalg.eigh(build_conductances_w_per_k(walls, neighbours))
+        first_per_s, second_per_s, tangent = _solve_motions(pixel, walls, wall_w_per_k)
         wall_per_absorber = np.sqrt(pixel.c_j_per_k / walls.c_j_per_k)
         first_wall, second_wall = -tangent * wall_per_absorber, wall_per_absorber / tangent
         first_gas = GAS_FRACTION * (1.0 + first_wall) / (1.0 - first_per_s * pixel.tau_g_s)
@@ -120,21 +120,23 @@ class Modes(NamedTuple):
             second_k_per_j=second_k_per_j,
             gas_k_per_j=-(first_gas * first_k_per_j + second_gas * second_k_per_j),
             gas_per_s=1.0 / pixel.tau_g_s,
-            first_most_per_s=float(first_per_s.max()),
-            second_most_per_s=float(second_per_s.max()),
+            first_max_per_s=float(first_per_s.max()),
+            second_max_per_s=float(second_per_s.max()),
         )
 
 
-def conductances_w_per_k(walls: Walls, neighbours: Neighbours) -> FloatArray:
+def build_conductances_w_per_k(walls: WallParameters, neighbours: Neighbours) -> FloatArray:
     """[p, p] heat that leaves the wall of a row for each kelvin of the wall of a column."""
-    pixel, side = np.nonzero(neighbours.beside >= 0)
+    pixel, side = np.nonzero(neighbours.indices >= 0)
     matrix = np.zeros((len(neighbours), len(neighbours)))
-    matrix[pixel, neighbours.beside[pixel, side]] = -1.0 / walls.side_k_per_w
+    matrix[pixel, neighbours.indices[pixel, side]] = -1.0 / walls.side_k_per_w
     np.fill_diagonal(matrix, 1.0 / walls.r_k_per_w + neighbours.frame_edges / walls.frame_k_per_w - matrix.sum(axis=1))
     return matrix
 
 
-def _motions(pixel: Pixel, walls: Walls, wall_w_per_k: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _solve_motions(
+    pixel: Pixel, walls: WallParameters, wall_w_per_k: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Each mode's two rates, [p] 1/s, and the tangent between its motions and absorber and wall by themselves, [p].
 
     In √C θ and √C_w w the two equations are symmetric, and one Jacobi rotation makes them independent.
@@ -148,41 +150,41 @@ def _motions(pixel: Pixel, walls: Walls, wall_w_per_k: FloatArray) -> tuple[Floa
     # The smaller from the product of both, which has lost no digits.
     larger_per_s = rates_per_s.max(axis=0)
     smaller_per_s = absorber_per_s * wall_w_per_k / walls.c_j_per_k / larger_per_s
-    rates_per_s = _apart(np.where(rates_per_s < larger_per_s, smaller_per_s, rates_per_s), 1.0 / pixel.tau_g_s)
+    rates_per_s = _separate_rates(np.where(rates_per_s < larger_per_s, smaller_per_s, rates_per_s), 1.0 / pixel.tau_g_s)
     return rates_per_s[0], rates_per_s[1], tangent
 
 
-def _apart(rate_per_s: FloatArray, gas_per_s: float) -> FloatArray:
-    meets = np.abs(rate_per_s - gas_per_s) < RATES_APART * gas_per_s
-    return np.where(meets, (1.0 - RATES_APART) * gas_per_s, rate_per_s)
+def _separate_rates(rate_per_s: FloatArray, gas_per_s: float) -> FloatArray:
+    meets = np.abs(rate_per_s - gas_per_s) < MIN_RATE_SEPARATION * gas_per_s
+    return np.where(meets, (1.0 - MIN_RATE_SEPARATION) * gas_per_s, rate_per_s)
 
 
-class LatticeHeat:
+class CoupledDisplay:
     """The heat of a display of equal cells with walls, from rest; mutable. All pixels share one time."""
 
     def __init__(self, modes: Modes, at_s: float = 0.0) -> None:
         self._modes = modes
         self._at_s = np.array([at_s])
-        self._now = _nothing(len(modes.share))
+        self._now = _zero_amplitudes(len(modes.share))
 
-    def pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> WallPeaks:
+    def apply_pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> WallPeaks:
         """Light pixels one after the other; all [n], in order of time, power the mean incident one.
 
         ValueError for a pulse that starts before the last event; those before it have been.
         """
-        columns = kernel_columns(len(self._modes.share), pixel, start_s, width_s, power_w)
+        columns = build_kernel_columns(len(self._modes.share), pixel, start_s, width_s, power_w)
         peaks = WallPeaks(*np.zeros((3, len(pixel))))
-        done = _walk(self._modes, self._now, self._at_s, *columns, *peaks)
+        done = _apply_pulses(self._modes, self._now, self._at_s, *columns, *peaks)
         if done < len(pixel):
             raise ValueError(f"the display was advanced to {self._at_s[0]} s, {start_s[done]} s lies before it")
         return peaks
 
-    def rises(self, at_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def rises_k(self, at_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Rises of absorber, wall and gas, K, each [p], left dark until at_s; ValueError for a time before the last."""
         dark_s = at_s - float(self._at_s[0])
         if dark_s < -TIME_ROUNDING_S:
             raise ValueError(f"the display was advanced to {self._at_s[0]} s, {at_s} s lies before it")
-        modes, then = self._modes, _nothing(len(self._modes.share))
+        modes, then = self._modes, _zero_amplitudes(len(self._modes.share))
         _advance(modes, self._now, then, 0, 0.0, max(0.0, dark_s))
         wall_k = modes.first_wall * then.first_k + modes.second_wall * then.second_k
         gas_k = modes.first_gas * then.first_k + modes.second_gas * then.second_k + then.gas_k
@@ -190,14 +192,14 @@ class LatticeHeat:
         return modes.share @ absorber_k, modes.share @ wall_k, modes.share @ gas_k
 
 
-def _nothing(modes: int) -> Heat:
-    return Heat(np.zeros(modes), np.zeros(modes), np.zeros(modes))
+def _zero_amplitudes(modes: int) -> ModalAmplitudes:
+    return ModalAmplitudes(np.zeros(modes), np.zeros(modes), np.zeros(modes))
 
 
 @vector_kernel
-def _walk(
+def _apply_pulses(
     modes: Modes,
-    now: Heat,
+    now: ModalAmplitudes,
     at_s: FloatArray,
     pixel: IntArray,
     start_s: FloatArray,
@@ -215,27 +217,27 @@ def _walk(
     the turn is left out of it: it comes through two walls.
     """
     one = modes.pixel
-    spare = Heat(np.empty_like(now.gas_k), np.empty_like(now.gas_k), np.empty_like(now.gas_k))
+    spare = ModalAmplitudes(np.empty_like(now.gas_k), np.empty_like(now.gas_k), np.empty_like(now.gas_k))
     next_s = _next_on_pixel(len(now.gas_k), pixel, start_s)
     for row in range(len(pixel)):
         i, lit_w, lit_s = pixel[row], power_w[row], width_s[row]
         if start_s[row] - at_s[0] < -TIME_ROUNDING_S:
             return row
         _advance(modes, now, now, i, 0.0, max(0.0, start_s[row] - at_s[0]))
-        before_k, held_k, least_k = _read(modes, now, i)
+        before_k, held_k, least_k = _read_rises(modes, now, i)
         turn_s = gas_peak(one, before_k - held_k, least_k - held_k, lit_w, lit_s)[1]
         most_k = least_k
         if 0.0 < turn_s < lit_s:
             _advance(modes, now, spare, i, lit_w, turn_s)
-            most_k = max(most_k, _read(modes, spare, i)[2])
+            most_k = max(most_k, _read_rises(modes, spare, i)[2])
         _advance(modes, now, now, i, lit_w, lit_s)
         at_s[0] = start_s[row] + lit_s
-        after_k, held_k, end_k = _read(modes, now, i)
+        after_k, held_k, end_k = _read_rises(modes, now, i)
         turn_s = cooling_peak(one, after_k - held_k, end_k - held_k, max(0.0, next_s[row] - at_s[0]))[1]
         most_k = max(most_k, end_k)
         if turn_s > 0.0:
             _advance(modes, now, spare, i, 0.0, turn_s)
-            most_k = max(most_k, _read(modes, spare, i)[2])
+            most_k = max(most_k, _read_rises(modes, spare, i)[2])
         peak_m[row] = one.kappa_m_per_k * most_k
         peak_k[row] = max(before_k, after_k)
         wall_k[row] = held_k
@@ -254,14 +256,16 @@ def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatAr
 
 
 @vector_kernel
-def _advance(modes: Modes, before: Heat, after: Heat, pixel: int, power_w: float, time_s: float) -> None:
+def _advance(
+    modes: Modes, before: ModalAmplitudes, after: ModalAmplitudes, pixel: int, power_w: float, time_s: float
+) -> None:
     """Amplitudes after time_s at constant power on one pixel; before and after may be the same."""
     share = modes.share[pixel]
     light_j = power_w * time_s
-    mean, left = _decay(modes.first_per_s, modes.first_most_per_s, time_s)
-    _move(before.first_k, after.first_k, left, light_j, share, modes.first_k_per_j, mean)
-    mean, left = _decay(modes.second_per_s, modes.second_most_per_s, time_s)
-    _move(before.second_k, after.second_k, left, light_j, share, modes.second_k_per_j, mean)
+    mean, left = _decay(modes.first_per_s, modes.first_max_per_s, time_s)
+    _advance_motion(before.first_k, after.first_k, left, light_j, share, modes.first_k_per_j, mean)
+    mean, left = _decay(modes.second_per_s, modes.second_max_per_s, time_s)
+    _advance_motion(before.second_k, after.second_k, left, light_j, share, modes.second_k_per_j, mean)
     gas_left = exp(-modes.gas_per_s * time_s)
     gas_light_j = power_w * -expm1(-modes.gas_per_s * time_s) / modes.gas_per_s
     for k in range(len(share)):
@@ -269,7 +273,7 @@ def _advance(modes: Modes, before: Heat, after: Heat, pixel: int, power_w: float
 
 
 @vector_kernel
-def _move(
+def _advance_motion(
     before_k: FloatArray,
     after_k: FloatArray,
     left: FloatArray,
@@ -315,7 +319,7 @@ def _series(x: float) -> float:
 
 
 @vector_kernel
-def _read(modes: Modes, heat: Heat, pixel: int) -> tuple[float, float, float]:
+def _read_rises(modes: Modes, heat: ModalAmplitudes, pixel: int) -> tuple[float, float, float]:
     """Rises of absorber, wall and gas of one pixel, K."""
     absorber_k, wall_k, gas_k = 0.0, 0.0, 0.0
     share = modes.share[pixel]

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from optodrive.planning.pipeline import Display
+from optodrive.planning.pipeline import DisplayModel
 
 
-def resolved_config(display: Display) -> dict[str, Any]:
+def build_effective_config(display: DisplayModel) -> dict[str, Any]:
     """`optodrive config show --json`: sections as configured, pixels' places, a move's time, the model's numbers."""
     config, layout = display.config, display.layout
     resolved = config.model_dump(mode="json")
@@ -13,9 +13,11 @@ def resolved_config(display: Display) -> dict[str, Any]:
         {"index": index, "x_m": x_m, "y_m": y_m, "bridge_width_m": config.display.bridge_width_m}
         for index, (x_m, y_m) in enumerate(zip(layout.x_m.tolist(), layout.y_m.tolist(), strict=True))
     ]
-    moves = display.machine.moves
-    resolved["scanner"]["move_pitch_s"] = moves.time_us(moves.pitch_rad, moves.pitch_rad, moves.calm_us) * 1e-6
-    pixel = display.parameters.pixel(config.display.bridge_width_m)
+    moves = display.scan_head.settling
+    resolved["scanner"]["move_pitch_s"] = (
+        moves.settling_us(moves.pitch_rad, moves.pitch_rad, moves.long_dwell_us) * 1e-6
+    )
+    pixel = display.parameters.build_pixel(config.display.bridge_width_m)
     resolved["pixel_model"].update(
         {
             "R": pixel.r_k_per_w,

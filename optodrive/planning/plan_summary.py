@@ -6,81 +6,85 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.core.units import m_to_um
-from optodrive.planning.feasibility import Admission
-from optodrive.planning.pipeline import Display, Prepared, Shortfall, lateness
-from optodrive.planning.scheduler.interleaving import Together
+from optodrive.planning.feasibility import FeasibilityReport
+from optodrive.planning.pipeline import DisplayModel, PlannedSequence, Shortfall, describe_lateness
+from optodrive.planning.scheduler.interleaving import SimultaneousFrame
 
 DEAD_LISTED_MAX = 20
 PULSES_LISTED_MAX = 20_000
 """An answer lists pulses one by one up to this many."""
 
 
-def summary(prepared: Prepared, admission: Admission | None = None) -> dict[str, Any]:
+def summarize_plan(planned: PlannedSequence, admission: FeasibilityReport | None = None) -> dict[str, Any]:
     """Whether all of it fits, what will be shown, when, how high, what was taken away and why; JSON-able."""
-    plan = prepared.plan
+    plan = planned.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
-    asked_m = np.nan_to_num(plan.target_m)
-    together = {item.source: _together(item) for item in prepared.together}
-    tallest = int(np.argmax(prepared.predicted_m)) if len(plan) else None
+    target_m = np.nan_to_num(plan.target_m)
+    simultaneous = {item.source: _simultaneous_to_json(item) for item in planned.simultaneous}
+    tallest = int(np.argmax(planned.predicted_m)) if len(plan) else None
     return {
-        "admission": None if admission is None else admission.answer(),
+        "admission": None if admission is None else admission.to_dict(),
         "pulses": len(plan),
-        "duration_s": prepared.duration_s,
+        "duration_s": planned.duration_s,
         "beam_on_s": beam_on_s,
-        "beam_on_share": beam_on_s / prepared.duration_s if len(plan) else 0.0,
-        "moves_s": float(plan.settle_s.sum()),
-        "lead_s": prepared.lead_s,
-        "mirrors_rest_s": prepared.rested_s,
+        "beam_on_share": beam_on_s / planned.duration_s if len(plan) else 0.0,
+        "moves_s": float(plan.settling_s.sum()),
+        "lead_s": planned.lead_in_s,
+        "mirrors_rest_s": planned.galvo_pause_s,
         "energy_j": float(plan.energy_j.sum()),
         "tallest_pixel": None if tallest is None else int(plan.pixel[tallest]),
-        "predicted_max_um": 0.0 if tallest is None else m_to_um(float(prepared.predicted_m[tallest])),
-        "tallest_asked_um": None if tallest is None else _finite(m_to_um(float(plan.target_m[tallest]))),
-        "asked_max_um": m_to_um(float(asked_m.max())) if len(plan) else 0.0,
+        "predicted_max_um": 0.0 if tallest is None else m_to_um(float(planned.predicted_m[tallest])),
+        "tallest_asked_um": None if tallest is None else _finite_or_none(m_to_um(float(plan.target_m[tallest]))),
+        "asked_max_um": m_to_um(float(target_m.max())) if len(plan) else 0.0,
         "headroom_min_k": float(plan.headroom_k.min()),
-        "trimmed": _trimmed(prepared),
-        "shortfall": _shortfall(prepared.shortfall),
+        "trimmed": _summarize_trimming(planned),
+        "shortfall": _shortfall_to_json(planned.shortfall),
         "delays": [
             {
-                "source": _source(prepared, item.source),
+                "source": _name_source(planned, item.source),
                 "pixel": item.pixel,
                 "cap": item.cap,
                 "wait_s": item.wait_s,
             }
-            for item in prepared.delays
+            for item in planned.delays
         ],
-        "dead": {"pixels": list(prepared.dead), "count": len(prepared.dead), "sentence": dead_sentence(prepared.dead)},
+        "dead": {
+            "pixels": list(planned.dead_pixels),
+            "count": len(planned.dead_pixels),
+            "sentence": describe_dead_pixels(planned.dead_pixels),
+        },
         "skipped": [
             {
-                "frame": _source(prepared, item.source),
+                "frame": _name_source(planned, item.source),
                 "pixel": item.pixel,
                 "target_um": m_to_um(item.target_m),
                 "reason": "the heat left in the pixel reaches the target by itself",
             }
-            for item in prepared.skipped
+            for item in planned.skipped
         ],
         "frames": [
             {
                 "frame": timing.frame_id,
                 "show_at_s": timing.show_at_s,
-                "first_pulse_s": timing.first_s,
-                "finished_s": timing.finished_s,
-                "due_s": timing.due_s,
+                "first_pulse_s": timing.first_pulse_s,
+                "finished_s": timing.end_s,
+                "due_s": timing.deadline_s,
                 "late_s": timing.late_s,
                 "pulses": timing.pulses,
-                "in_time": timing.in_time,
-                "together": together.get(timing.source),
+                "in_time": timing.on_time,
+                "together": simultaneous.get(timing.source),
             }
-            for timing in prepared.frames
+            for timing in planned.frames
         ],
         # A frame that waited for a cap, or comes after one that did, is late for that and not for want of beam time.
-        "late": [lateness(timing) for timing in prepared.frames if timing.late_s > 0 and not prepared.delays],
-        "train_late_s": prepared.train_late_s,
+        "late": [describe_lateness(timing) for timing in planned.frames if timing.late_s > 0 and not planned.delays],
+        "train_late_s": planned.train_lateness_max_s,
     }
 
 
-def dead_sentence(dead: tuple[int, ...]) -> str | None:
+def describe_dead_pixels(dead: tuple[int, ...]) -> str | None:
     """Which pixels were left out, in words; None where none were."""
     if not dead:
         return None
@@ -93,23 +97,23 @@ def dead_sentence(dead: tuple[int, ...]) -> str | None:
     return f"pixels {listed} are dead: left out"
 
 
-def _shortfall(shortfall: Shortfall | None) -> dict[str, Any] | None:
+def _shortfall_to_json(shortfall: Shortfall | None) -> dict[str, Any] | None:
     if shortfall is None:
         return None
-    return vars(shortfall) | {"fits_later_s": _finite(shortfall.fits_later_s)}
+    return vars(shortfall) | {"fits_later_s": _finite_or_none(shortfall.fits_after_s)}
 
 
-def _together(item: Together) -> dict[str, Any]:
+def _simultaneous_to_json(item: SimultaneousFrame) -> dict[str, Any]:
     return {key: value for key, value in vars(item).items() if key != "source"}
 
 
-def _source(prepared: Prepared, source: int) -> str:
-    frames = prepared.sequence.frames
+def _name_source(planned: PlannedSequence, source: int) -> str:
+    frames = planned.sequence.frames
     return frames[source].frame_id if source < len(frames) else f"train {source - len(frames)}"
 
 
-def _trimmed(prepared: Prepared) -> dict[str, Any]:
-    plan = prepared.plan
+def _summarize_trimming(planned: PlannedSequence) -> dict[str, Any]:
+    plan = planned.plan
     rows = np.flatnonzero(plan.reason != "")
     reasons, counts = np.unique(plan.reason[rows], return_counts=True)
     worst = rows[np.argsort(-plan.trimmed_j[rows], kind="stable")[:20]]
@@ -123,21 +127,21 @@ def _trimmed(prepared: Prepared) -> dict[str, Any]:
                 "start_s": float(plan.start_s[row]),
                 "trimmed_j": float(plan.trimmed_j[row]),
                 "reason": str(plan.reason[row]),
-                "predicted_um": m_to_um(float(prepared.predicted_m[row])),
-                "target_um": _finite(m_to_um(float(plan.target_m[row]))),
+                "predicted_um": m_to_um(float(planned.predicted_m[row])),
+                "target_um": _finite_or_none(m_to_um(float(plan.target_m[row]))),
             }
             for row in worst
         ],
     }
 
 
-def _finite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def pulse_columns(prepared: Prepared) -> dict[str, list[Any]] | None:
+def list_pulse_columns(planned: PlannedSequence) -> dict[str, list[Any]] | None:
     """The plan's pulses by column, or None where there are more than PULSES_LISTED_MAX."""
-    plan = prepared.plan
+    plan = planned.plan
     if len(plan) > PULSES_LISTED_MAX:
         return None
     return {
@@ -148,8 +152,8 @@ def pulse_columns(prepared: Prepared) -> dict[str, list[Any]] | None:
         "energy_j": plan.energy_j.tolist(),
         "trimmed_j": plan.trimmed_j.tolist(),
         "reason": [str(reason) for reason in plan.reason],
-        "target_um": [_finite(value) for value in m_to_um(plan.target_m).tolist()],
-        "predicted_um": m_to_um(prepared.predicted_m).tolist(),
+        "target_um": [_finite_or_none(value) for value in m_to_um(plan.target_m).tolist()],
+        "predicted_um": m_to_um(planned.predicted_m).tolist(),
     }
 
 
@@ -169,29 +173,29 @@ PLAN_COLUMNS = (
 )
 
 
-def write_plan_csv(path: Path, prepared: Prepared, display: Display) -> None:
+def write_plan_csv(path: Path, planned: PlannedSequence, display: DisplayModel) -> None:
     """Write plan.csv, one row a pulse in order; whole or not at all."""
-    plan = prepared.plan
+    plan = planned.plan
     rows = zip(
         plan.start_s.tolist(),
         plan.width_s.tolist(),
         plan.power_w.tolist(),
         plan.pixel.tolist(),
-        display.machine.layout.x_m[plan.pixel].tolist(),
-        display.machine.layout.y_m[plan.pixel].tolist(),
+        display.scan_head.layout.x_m[plan.pixel].tolist(),
+        display.scan_head.layout.y_m[plan.pixel].tolist(),
         plan.x_rad.tolist(),
         plan.y_rad.tolist(),
         plan.energy_j.tolist(),
         plan.trimmed_j.tolist(),
         plan.reason.tolist(),
-        m_to_um(prepared.predicted_m).tolist(),
+        m_to_um(planned.predicted_m).tolist(),
         strict=True,
     )
-    with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(PLAN_COLUMNS)
-        writer.writerows([_number(value) for value in row] for row in rows)
+        writer.writerows([_round_number(value) for value in row] for row in rows)
 
 
-def _number(value: float | int | str) -> float | int | str:
+def _round_number(value: float | int | str) -> float | int | str:
     return float(f"{value:.12g}") if isinstance(value, float) else value

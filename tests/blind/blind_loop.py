@@ -16,10 +16,10 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.config import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.model_file import model_toml
-from optodrive.lab.diagnosis.priors import prior_of
+from optodrive.lab.diagnosis.model_file import build_model_toml
+from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.recording import read_recording
-from optodrive.planning.pipeline import Display, Prepared, prepare
+from optodrive.planning.pipeline import DisplayModel, PlannedSequence, plan_sequence
 
 WIDTH_M = 0.4e-3
 SHARES = (0.15, 0.6)
@@ -48,7 +48,7 @@ class Loop:
 def close_loop(case: Case, folder: Path) -> Loop:
     """Diagnose the case, plan the same heights with both models, ask the hidden display what comes out."""
     measurement = read_recording(case.path)
-    prior, epsilon, width_m = prior_of(measurement, None)
+    prior, epsilon, width_m = build_prior(measurement, None)
     found = diagnose(measurement, prior=prior, epsilon=epsilon)
     nominal = replace(found, base=case.base, terms={}, verdict="none", causes=())
     plain = _display(nominal, folder / "nominal.toml", width_m or WIDTH_M)
@@ -56,30 +56,32 @@ def close_loop(case: Case, folder: Path) -> Loop:
     frames = _frames(plain, extended)
     errors, trimmed = [], []
     for display in (plain, extended):
-        prepared = prepare(display, frames, *display.at_rest())
+        prepared = plan_sequence(display, frames, *display.build_cold_state())
         trimmed.append(int(np.count_nonzero(prepared.plan.reason != "")))
         errors.append(height_errors(case, display, prepared))
     rms = [float(np.sqrt(np.mean(np.square(item)))) for item in errors]
     return Loop(found.verdict, found.causes, rms[0], rms[1], len(errors[0]), max(trimmed))
 
 
-def _display(found: Discrepancy, path: Path, width_m: float) -> Display:
-    path.write_text(model_toml(found, "blind", width_m))
+def _display(found: Discrepancy, path: Path, width_m: float) -> DisplayModel:
+    path.write_text(build_model_toml(found, "blind", width_m))
     config = load_config("display-16")
     display = config.display.model_copy(update={"bridge_width_m": width_m})
     section = config.pixel_model.model_copy(update={"parameters": str(path)})
-    return Display.of(config.model_copy(update={"display": display, "pixel_model": section}))
+    return DisplayModel.from_config(config.model_copy(update={"display": display, "pixel_model": section}))
 
 
-def _frames(*displays: Display) -> FrameSequence:
+def _frames(*displays: DisplayModel) -> FrameSequence:
     """A ladder of heights over the pixels, and the same upside down while the walls are still warm."""
-    reach_m = np.min([display.heat_at_rest().reaches_m(display.machine.drive).min() for display in displays])
+    reach_m = np.min(
+        [display.build_cold_heat().max_displacement_m(display.scan_head.drive).min() for display in displays]
+    )
     ladder_m = reach_m * np.linspace(*SHARES, len(displays[0].layout))
     up, down = TactileFrame("up", 0.0, 0.8, ladder_m), TactileFrame("down", 1.2, 0.8, ladder_m[::-1])
     return FrameSequence((up, down), ())
 
 
-def height_errors(case: Case, display: Display, prepared: Prepared) -> np.ndarray:
+def height_errors(case: Case, display: DisplayModel, prepared: PlannedSequence) -> np.ndarray:
     """(true − asked) / asked of every pulse [n], true by the hidden display as the session left it."""
     plan = prepared.plan
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])

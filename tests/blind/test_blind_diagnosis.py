@@ -10,8 +10,8 @@ import pytest
 
 from blind_lab import draw
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.narrative import answer
-from optodrive.lab.diagnosis.priors import prior_of
+from optodrive.lab.diagnosis.narrative import build_answer
+from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.recording import read_recording
 
 SEED = int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000)
@@ -21,8 +21,8 @@ pytestmark = pytest.mark.timeout(600)  # nine cases are drawn and diagnosed befo
 
 def found(case):
     measurement = read_recording(case.path)
-    prior, epsilon, _ = prior_of(measurement, None)
-    return answer(diagnose(measurement, 0, prior, epsilon))
+    prior, epsilon, _ = build_prior(measurement, None)
+    return build_answer(diagnose(measurement, 0, prior, epsilon))
 
 
 @pytest.fixture(scope="module")

@@ -3,15 +3,15 @@ from pathlib import Path
 import pytest
 
 from benches import at_rest, board_at_rest, daemon_at_rest, kept, make_board, make_daemon  # noqa: F401 - fixtures
-from window import PATIENCE_MS, Visit, chromium
+from window import TIMEOUT_MS, PageVisit, launch_chromium
 
 
 @pytest.fixture(scope="module")  # its loop runs in this process meanwhile: tests with loops of their own come after
 def browser():
-    with chromium() as browser:
+    with launch_chromium() as browser:
         from playwright.sync_api import expect
 
-        expect.set_options(timeout=PATIENCE_MS)
+        expect.set_options(timeout=TIMEOUT_MS)
         yield browser
 
 
@@ -20,7 +20,7 @@ def visit(browser):
     visits = []
 
     def open_visit(host, **options):
-        visits.append(Visit(browser, host.url, **options))
+        visits.append(PageVisit(browser, host.url, **options))
         return visits[-1]
 
     yield open_visit

@@ -25,7 +25,7 @@ value = true
 """
 
 
-def place(page, across, up):
+def canvas_point(page, across, up):
     """A point of the display's canvas, shares of it from the bottom left."""
     page.locator("#display").scroll_into_view_if_needed()
     box = page.locator("#display").bounding_box()
@@ -33,9 +33,9 @@ def place(page, across, up):
 
 
 def draw_line(page):
-    page.mouse.move(*place(page, 0.31, 0.52))
+    page.mouse.move(*canvas_point(page, 0.31, 0.52))
     page.mouse.down()
-    page.mouse.move(*place(page, 0.69, 0.52), steps=10)
+    page.mouse.move(*canvas_point(page, 0.69, 0.52), steps=10)
     page.mouse.up()
     expect(page.locator("#drawn")).to_have_text("9 drawn")
 
@@ -51,7 +51,7 @@ def preview(page):
     expect(page.get_by_role("button", name="Play")).to_be_enabled()
 
 
-def play_a_while(page):
+def start_long_pattern(page):
     """Something that runs for seconds, from the library."""
     page.get_by_text("Library", exact=True).click()
     page.locator("#pattern").select_option("vibration")
@@ -80,7 +80,7 @@ def test_draw_preview_arm_play_and_what_was_felt(visit, daemon):
     highest_um = float(re.search(r"highest ([\d.]+) µm", result.inner_text()).group(1))
     assert highest_um == pytest.approx(100, rel=0.02)
     expect(page.locator("#timeline-text")).to_contain_text("9 pulses were executed, none trimmed")
-    assert window.complaints_but() == []
+    assert window.unexpected_errors() == []
 
 
 def test_what_is_changed_after_the_preview_cannot_be_played(visit, daemon):
@@ -105,7 +105,7 @@ def test_arming_takes_a_second_control_within_five_seconds(visit, daemon):
 def test_stop_ends_what_plays(visit, daemon, board, how):
     page = visit(daemon).open()
     arm(page)
-    play_a_while(page)
+    start_long_pattern(page)
     wait_for(lambda: board.of("pulse"), "light")
     if how == "key":
         page.locator("#height, #pattern").locator("visible=true").first.focus()
@@ -145,7 +145,7 @@ def test_an_open_interlock_is_said_in_words_and_acknowledged(visit, make_board, 
     window = visit(daemon)
     page = window.open()
     arm(page)
-    play_a_while(page)
+    start_long_pattern(page)
     trouble = page.get_by_role("alert").filter(has_text="Fault: INTERLOCK")
     expect(trouble).to_contain_text("close the enclosure")
     expect(page.locator("#board")).to_have_text("board: FAULT")
@@ -154,7 +154,7 @@ def test_an_open_interlock_is_said_in_words_and_acknowledged(visit, make_board, 
     expect(page.locator("#board")).to_have_text("board: DISARMED")
     expect(trouble).to_be_hidden()
     arm(page)
-    assert window.complaints_but() == []
+    assert window.unexpected_errors() == []
 
 
 def test_a_daemon_started_anew_is_found_again_and_not_armed(visit, make_board, make_daemon):
@@ -174,7 +174,7 @@ def test_a_daemon_started_anew_is_found_again_and_not_armed(visit, make_board, m
     assert second.board_state() == "DISARMED"
     draw_line(page)
     preview(page)
-    assert window.complaints_but("ERR_CONNECTION_REFUSED", "ERR_INCOMPLETE", "ERR_EMPTY") == []
+    assert window.unexpected_errors("ERR_CONNECTION_REFUSED", "ERR_INCOMPLETE", "ERR_EMPTY") == []
 
 
 def test_another_token_is_asked_for(visit, daemon, browser):
@@ -318,7 +318,7 @@ def test_frames_come_while_something_plays_on_1511_pixels(visit, make_board, mak
     before = frames()
     wait_for(lambda: frames() > before + 20, "frames")
     expect(page.locator("#summary")).to_contain_text("pixels above 1 µm")
-    assert window.complaints_but() == []
+    assert window.unexpected_errors() == []
 
 
 @pytest.mark.parametrize(

@@ -16,12 +16,12 @@ FLAGS = (
     "--disable-component-update",
     "--disable-sync",
 )
-PATIENCE_MS = 30_000
+TIMEOUT_MS = 30_000
 WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 
 @contextmanager
-def chromium():
+def launch_chromium():
     """A browser without windows, with a new profile: what one run leaves, no other finds."""
     assert CHROMIUM, "the page is tested in Chromium, which is missing: apt-get install chromium"
     from playwright.sync_api import sync_playwright
@@ -34,16 +34,18 @@ def chromium():
             browser.close()
 
 
-class Visit:
+class PageVisit:
     """A window on a daemon's page, which notes what the page complains of."""
 
     def __init__(self, browser, url, viewport=WIDE, **options):
         self.context = browser.new_context(viewport=viewport, **options)
         self.page = self.context.new_page()
-        self.page.set_default_timeout(PATIENCE_MS)
-        self.complaints = []
-        self.page.on("console", lambda line: line.type in ("error", "warning") and self.complaints.append(line.text))
-        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.set_default_timeout(TIMEOUT_MS)
+        self.console_errors = []
+        self.page.on(
+            "console", lambda line: line.type in ("error", "warning") and self.console_errors.append(line.text)
+        )
+        self.page.on("pageerror", lambda error: self.console_errors.append(str(error)))
         self.url = url
 
     def open(self, token=TOKEN):
@@ -53,11 +55,11 @@ class Visit:
             self.page.get_by_text("live", exact=True).wait_for()
         except Exception as error:
             raise AssertionError(
-                f"the page did not come to life: {self.page.inner_text('body')[:500]!r} {self.complaints}"
+                f"the page did not come to life: {self.page.inner_text('body')[:500]!r} {self.console_errors}"
             ) from error
         return self.page
 
-    def complaints_but(self, *expected):
+    def unexpected_errors(self, *expected):
         """What the page complained of, less what was meant to go wrong; the 401 that asks for the token is one."""
         expected = ("401", *expected)
-        return [line for line in self.complaints if not any(part in line for part in expected)]
+        return [line for line in self.console_errors if not any(part in line for part in expected)]

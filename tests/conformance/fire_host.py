@@ -78,6 +78,6 @@ class FireHost:
                 job = self.begin(count)
                 self.until(lambda: job.finished or session.board.state in ("DISARMED", "FAULT"), patience_s)
         except LinkError:
-            session.drop()
+            session.disconnect()
         else:
             session.close()

@@ -14,8 +14,8 @@ from fire_host import FireHost, configured
 from scenario import audit_log
 
 from optodrive.core.clock import MonotonicClock
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 
 TURN_S = 0.002
@@ -110,7 +110,9 @@ class PtyRig(FireHost):
         self.proxy = Proxy(self.board.port, link, up, down)
         clock = MonotonicClock()
         port = WitnessedPort(str(link), self.witness)
-        super().__init__(Session(port, clock, Requirements.of(configured(lease_s=1.0))), clock, up, down)
+        super().__init__(
+            BoardSession(port, clock, BoardRequirements.from_config(configured(lease_s=1.0))), clock, up, down
+        )
 
     def finish(self):
         """End host, proxy and board; the number of pulses in its log, which keeps its word."""

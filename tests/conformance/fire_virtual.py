@@ -6,8 +6,8 @@ from scenario import audit_log
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import LinkError
-from optodrive.link.session.board_requirements import BITS_A_BYTE, Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BITS_PER_BYTE, BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.memory_link import PASSAGE_S, MemoryLink
@@ -96,8 +96,8 @@ class FireRig(FireHost):
         self._state = "BOOT"
         config = config or configured()
         self.core = make_core(BoardSettings(**settings), self.log.append, seed=seed)
-        self.link = FireLink(self.core, clock, up, down, config.board.baud / BITS_A_BYTE if paced else 0)
-        super().__init__(Session(self.link, clock, Requirements.of(config)), clock, up, down)
+        self.link = FireLink(self.core, clock, up, down, config.board.baud / BITS_PER_BYTE if paced else 0)
+        super().__init__(BoardSession(self.link, clock, BoardRequirements.from_config(config)), clock, up, down)
 
     def check(self):
         """The log so far keeps its word; forget it. The number of pulses."""

@@ -2,9 +2,9 @@
 
 from board_table import table
 
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 
-PAGE = shipped_path().parent / "docs" / "board.md"
+PAGE = locate_shipped().parent / "docs" / "board.md"
 
 
 def test_the_page_has_the_table_of_this_suite():

@@ -114,7 +114,7 @@ def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_ri
     rig.proxy.cut()
     with pytest.raises(LinkError):
         rig.until(lambda: False, 5.0)
-    rig.session.drop()
+    rig.session.disconnect()
     wait_for(lambda: rig.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
     assert not rig.board.lit()
     wait_for(lambda: Path(rig.session.port).exists(), "the port's return")

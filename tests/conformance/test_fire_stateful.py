@@ -17,7 +17,7 @@ from hypothesis.stateful import (
 from spoken import HOST
 
 from optodrive.core.errors import LinkError
-from optodrive.link.session.session import Session
+from optodrive.link.session.session import BoardSession
 
 UNSAFE = (("interlock", False), ("key", False), ("estop", True))
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
@@ -55,7 +55,7 @@ class Owner(RuleBasedStateMachine):
             while self.rig.clock.now_s() < until_s and not condition():
                 self.session.step(0.002, lease)
         except LinkError:
-            self.session.drop()
+            self.session.disconnect()
             self.allowed = self.times("armed")
 
     # --- what the owner does ---
@@ -169,14 +169,14 @@ TestOwner.settings = settings(max_examples=60, stateful_step_count=30)
 
 
 def test_a_session_that_arms_again_by_itself_is_found_out(monkeypatch):
-    connect = Session.connect
+    connect = BoardSession.connect
 
     def eager(self):
         connect(self)
         if self.board.state == "DISARMED":
             self.arm()
 
-    monkeypatch.setattr(Session, "connect", eager)
+    monkeypatch.setattr(BoardSession, "connect", eager)
     once = settings(max_examples=200, stateful_step_count=30, phases=[Phase.generate], database=None)
     with pytest.raises(AssertionError, match="armed by itself"):
         run_state_machine_as_test(Owner, settings=once)

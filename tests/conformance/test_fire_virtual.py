@@ -12,7 +12,7 @@ from spoken import HOST
 
 from optodrive.link.session import board_requirements
 from optodrive.link.session import session as session_module
-from optodrive.link.session.board_requirements import BITS_A_BYTE, FRAME_BYTES
+from optodrive.link.session.board_requirements import BITS_PER_BYTE, FRAME_BYTES
 from optodrive.link.simulator.board_limits import OWN
 
 STORMS = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
@@ -127,7 +127,7 @@ def filled_in_s(baud, loss, seed):
     rig.up.loss = rig.down.loss = loss
     began_s = rig.clock.now_s()
     job = rig.session.begin(rig.points.make(LINES[baud]), rig.session.board_s() + 60.0, inf)
-    assert rig.until(lambda: job.all_sent and rig.session.quiet, 50.0)
+    assert rig.until(lambda: job.is_fully_sent and rig.session.is_acknowledged, 50.0)
     took_s = rig.clock.now_s() - began_s
     rig.session.close()
     rig.check()
@@ -138,7 +138,7 @@ def filled_in_s(baud, loss, seed):
 def test_goodput_of_a_full_line_at_one_percent_loss(baud):
     """Points delivered in a time, over what the same line delivers without loss; each lost frame costs those behind."""
     clean_s = filled_in_s(baud, 0.0, 0)
-    assert clean_s < 1.1 * LINES[baud] * (FRAME_BYTES / 24) * BITS_A_BYTE / baud, "the line was not full"
+    assert clean_s < 1.1 * LINES[baud] * (FRAME_BYTES / 24) * BITS_PER_BYTE / baud, "the line was not full"
     lossy_s = [filled_in_s(baud, 0.01, seed) for seed in range(1, 11)]
     goodput = clean_s * len(lossy_s) / sum(lossy_s)
     print(f"a full line of {baud} baud at 1 % loss: {goodput:.1%}, of ten runs {clean_s / max(lossy_s):.1%} at worst")
@@ -160,7 +160,7 @@ def dark_after_abort_at_s(baud, executed):
     assert rig.armed()
     job = rig.begin(4000, dark_us=4500, ahead_s=inf)  # as slow as pulses are: the line is full until all are there
     assert rig.until(lambda: job.executed_rows > executed and rig.core.gate, 10.0)
-    assert not job.all_sent
+    assert not job.is_fully_sent
     aborted_s = rig.clock.now_s()
     rig.session.abort()
     assert rig.until(lambda: rig.core.state == "DISARMED", 1.0)
@@ -170,7 +170,7 @@ def dark_after_abort_at_s(baud, executed):
 
 def abort_bound_s(baud):
     """What PROTOCOL.md lets be in flight, and 5 ms."""
-    return max(2 * FRAME_BYTES * BITS_A_BYTE / baud, 0.02) + 0.005
+    return max(2 * FRAME_BYTES * BITS_PER_BYTE / baud, 0.02) + 0.005
 
 
 @pytest.mark.parametrize("baud", LINES)
@@ -181,7 +181,7 @@ def test_an_abort_is_heard_5_ms_after_what_is_in_flight(baud):
 
 
 def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
-    monkeypatch.setattr(board_requirements, "FLIGHT_S", 0.1)
+    monkeypatch.setattr(board_requirements, "MAX_IN_FLIGHT_S", 0.1)
     assert dark_after_abort_s(115_200) > abort_bound_s(115_200)
 
 

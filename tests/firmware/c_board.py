@@ -40,10 +40,14 @@ class Trace(ctypes.Structure):
         """As the Python board logs it."""
         kind = TRACE_KINDS[self.kind]
         done = "" if self.on else " done"
-        why = f"point {self.index}{done}" if self.is_point else m.REASONS[self.reason]
+        why = f"point {self.index}{done}" if self.is_point else m.EVENT_REASONS[self.reason]
         more = {
             "gate": {"on": self.on, "reason": why},
-            "state": {"state": m.STATES[self.state], "before": m.STATES[self.before], "reason": m.REASONS[self.reason]},
+            "state": {
+                "state": m.STATES[self.state],
+                "before": m.STATES[self.before],
+                "reason": m.EVENT_REASONS[self.reason],
+            },
             "fault": {"fault": m.FAULTS[self.fault]},
             "pulse": {name: getattr(self, name) for name in ("index", "x", "y", "duty", "on_us", "off_us")},
             "rx_error": {"bad_frames": self.index},
@@ -114,7 +118,7 @@ class CBoard:
         self._library = library
         self._sink = sink or (lambda entry: None)
         self._handle = library.shim_new(
-            settings.limits.body(),
+            settings.limits.encode_body(),
             bytes.fromhex(settings.uid),
             settings.cell_codes,
             settings.queue_points,

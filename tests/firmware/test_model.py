@@ -5,9 +5,9 @@ import subprocess
 
 import pytest
 
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 
-MODEL = shipped_path().parent / "firmware_protocol" / "model" / "board.pml"
+MODEL = locate_shipped().parent / "firmware_protocol" / "model" / "board.pml"
 MUTANTS = range(1, 7)
 
 

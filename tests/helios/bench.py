@@ -10,21 +10,21 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config, load_config
 from optodrive.link.helios.dac import Helios
 from optodrive.link.helios.encoding import PointScale
-from optodrive.link.helios.verification import prove
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.link.helios.verification import encode_verified
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 
 
 def config_of(name="display-16", **board):
     """A shipped configuration with a Helios."""
     table = load_config(name).model_dump()
     table["board"] |= {"transport": "helios", "interlock_watched": True} | board
-    table["scanner"]["codes_a_side"] = 2047
+    table["scanner"]["half_range_codes"] = 2047
     return Config.model_validate(table)
 
 
 @cache
 def display_of(name="display-16", points_per_s=40_000):
-    return Display.of(config_of(name, points_per_s=points_per_s))
+    return DisplayModel.from_config(config_of(name, points_per_s=points_per_s))
 
 
 def frame_of(display, height_m=20e-6, duration_s=1.0):
@@ -37,9 +37,9 @@ def train_of(width_s=0.02, gap_s=0.02, power_w=1.0, pixel=5, duration_s=0.3):
 
 def proven_of(display, sequence):
     """The plan and its proven frames."""
-    heat, budget = display.at_rest()
-    plan = prepare(display, sequence, heat, budget).plan
-    return plan, prove(plan, PointScale.of(display.config), budget, display.budget)
+    heat, budget = display.build_cold_state()
+    plan = plan_sequence(display, sequence, heat, budget).plan
+    return plan, encode_verified(plan, PointScale.from_config(display.config), budget, display.budget)
 
 
 class Bench:

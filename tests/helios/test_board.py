@@ -19,16 +19,16 @@ def frame(points=100, rate=40_000, level=0):
 
     table = np.zeros((points, 7), dtype=np.uint8)
     table[:-1, 3:] = level
-    return HeliosFrame.of(table, rate)
+    return HeliosFrame.from_points(table, rate)
 
 
 def test_opened_it_is_known_and_dark():
     bench = Bench(name="Helios 77", version=6)
     with bench.helios as helios:
         assert (helios.version, helios.name) == (6, "Helios 77")
-        assert bench.device.host_version == board_module.SPOKEN_VERSION
+        assert bench.device.host_version == board_module.PROTOCOL_VERSION
         assert not bench.device.shutter
-        assert bench.clock.now_s() >= board_module.ENABLE_S + board_module.STOP_S
+        assert bench.clock.now_s() >= board_module.ENABLE_DELAY_S + board_module.STOP_DELAY_S
     assert bench.emulated.alternate == 0
 
 
@@ -99,8 +99,8 @@ def test_only_one_answer_means_ready(answers, ready):
     bench = Bench()
     with bench.helios as helios:
         bench.emulated.garbage.extend(answers)
-        assert helios.ready() is ready
-        assert helios.ready() is True
+        assert helios.is_ready() is ready
+        assert helios.is_ready() is True
 
 
 def test_no_answer_is_not_ready_and_a_late_one_is_not_taken_for_the_next():
@@ -108,10 +108,10 @@ def test_no_answer_is_not_ready_and_a_late_one_is_not_taken_for_the_next():
     with bench.helios as helios:
         helios.open_shutter()
         bench.emulated.deaf = 1
-        assert helios.ready() is False  # the answer "ready" is still on its way
+        assert helios.is_ready() is False  # the answer "ready" is still on its way
         helios.send(frame(900))
         helios.send(frame(900))
-        assert helios.ready() is False  # now a frame waits: the late answer would lie
+        assert helios.is_ready() is False  # now a frame waits: the late answer would lie
 
 
 @pytest.mark.parametrize("board", [{"interlock_watched": False}, {"transport": "simulated"}])
@@ -163,7 +163,7 @@ def test_left_by_any_exception_it_is_stopped_and_shut(error):
         use()
     light = bench.device.light()
     assert light
-    assert bench.device.dark_from_s() < bench.clock.now_s() - board_module.STOP_S + 0.01
+    assert bench.device.dark_from_s() < bench.clock.now_s() - board_module.STOP_DELAY_S + 0.01
     assert not bench.device.shutter
     assert bench.device.colour == (0, 0, 0, 0)
 
@@ -194,11 +194,11 @@ def test_an_unplugged_board_is_told_and_closes_without_a_fuss():
     bench.helios.open()
     bench.emulated.unplugged_at_s = bench.clock.now_s()
     with pytest.raises(LinkError, match="unplugged"):
-        bench.helios.ready()
+        bench.helios.is_ready()
     with pytest.raises(LinkError, match="may not have heard"):
         bench.helios.close()
     with pytest.raises(LinkError, match="not open"):
-        bench.helios.ready()
+        bench.helios.is_ready()
 
 
 def test_a_dead_host_leaves_the_shutter_as_it_was_and_a_new_one_closes_it():
@@ -207,7 +207,7 @@ def test_a_dead_host_leaves_the_shutter_as_it_was_and_a_new_one_closes_it():
     bench.helios.open_shutter()
     bench.emulated.dies_at_s = bench.clock.now_s()
     with pytest.raises(HostDeadError):
-        bench.helios.ready()
+        bench.helios.is_ready()
     bench.emulated.dies_at_s = float("inf")
     assert bench.device.shutter
     with Helios(config_of().board, bench.clock, bench.emulated):

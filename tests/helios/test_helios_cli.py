@@ -11,7 +11,7 @@ from helios.emulated import HostDeadError
 from optodrive.cli import helios as helios_cli
 from optodrive.cli.main import run
 from optodrive.core.errors import LinkError
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
 DAY_S = 1.7e9
@@ -35,10 +35,10 @@ class Desk:
         self.frames.write_text(json.dumps(sequence_to_json(sequence)))
 
     def config(self, watched="true", steps=2047):
-        text = shipped_path("display-16.toml").read_text()
+        text = locate_shipped("display-16.toml").read_text()
         text = text.replace('transport = "simulated"', f'transport = "helios"\ninterlock_watched = {watched}')
         path = self.folder / "helios.toml"
-        path.write_text(text.replace("[scanner]", f"[scanner]\ncodes_a_side = {steps}"))
+        path.write_text(text.replace("[scanner]", f"[scanner]\nhalf_range_codes = {steps}"))
         return ["--config", str(path)]
 
     def play(self, *options):
@@ -106,10 +106,10 @@ def test_without_a_watched_interlock_one_line_and_no_light(desk, capsys):
 
 def test_a_converter_of_another_width_is_refused(desk, capsys):
     assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
-    assert "scanner.codes_a_side 32767 must be 2047" in capsys.readouterr().err
+    assert "scanner.half_range_codes 32767 must be 2047" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("number", helios_cli.ENDED_BY)
+@pytest.mark.parametrize("number", helios_cli.TERMINATING_SIGNALS)
 def test_a_signal_ends_the_light_by_a_stop(desk, capsys, number):
     desk.ask(LONG)
     emulated, sent = desk.bench.emulated, []

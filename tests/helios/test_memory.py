@@ -8,9 +8,9 @@ import pytest
 from helios.bench import display_of, train_of
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
-from optodrive.link.helios.heat_memory import AHEAD_S, Memory
-from optodrive.planning.limiter.limiter import fresh_state
-from optodrive.planning.pipeline import prepare
+from optodrive.link.helios.heat_memory import ZERO_OFFSET_S, HeatMemory
+from optodrive.planning.limiter.limiter import cold_state
+from optodrive.planning.pipeline import plan_sequence
 
 DAY_S = 1.7e9
 
@@ -18,13 +18,13 @@ DAY_S = 1.7e9
 @pytest.fixture
 def memory(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
-    return Memory.of("Helios 12/../3")
+    return HeatMemory.for_device("Helios 12/../3")
 
 
 def after_a_play():
     display = display_of()
-    heat, budget = display.at_rest()
-    return display, prepare(
+    heat, budget = display.build_cold_state()
+    return display, plan_sequence(
         display, train_of(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0), heat, budget
     ).budget
 
@@ -34,14 +34,14 @@ def test_it_lies_where_programs_keep_things(memory, tmp_path):
 
 
 def test_nothing_played_is_at_rest(memory):
-    fresh = fresh_state(16)
-    assert memory.recall(DAY_S, fresh) is fresh
+    fresh = cold_state(16)
+    assert memory.load(DAY_S, fresh) is fresh
 
 
 def test_a_budget_comes_back_on_the_time_line_that_begins_now(memory):
     _, budget = after_a_play()
-    memory.keep(budget, DAY_S)
-    back = memory.recall(DAY_S + 100.0, fresh_state(16))
+    memory.save(budget, DAY_S)
+    back = memory.load(DAY_S + 100.0, cold_state(16))
     for item in fields(BudgetState):
         before, after = np.asarray(getattr(budget, item.name)), np.asarray(getattr(back, item.name))
         moved = 100.0 if item.name.endswith("_at_s") or item.name in ("at_s", "dark_since_s", "recent_start_s") else 0.0
@@ -50,38 +50,38 @@ def test_a_budget_comes_back_on_the_time_line_that_begins_now(memory):
 
 def test_played_again_at_once_less_is_allowed_than_from_rest(memory):
     display, budget = after_a_play()
-    memory.keep(budget, DAY_S)
+    memory.save(budget, DAY_S)
     sequence = train_of(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0)
     energies = []
     for later_s in (budget.at_s, 3600.0):
-        recalled = memory.recall(DAY_S + later_s, fresh_state(16))
-        energies.append(prepare(display, sequence, display.at_rest()[0], recalled).plan.energy_j.sum())
-    from_rest = prepare(display, sequence, *display.at_rest()).plan.energy_j.sum()
+        recalled = memory.load(DAY_S + later_s, cold_state(16))
+        energies.append(plan_sequence(display, sequence, display.build_cold_state()[0], recalled).plan.energy_j.sum())
+    from_rest = plan_sequence(display, sequence, *display.build_cold_state()).plan.energy_j.sum()
     assert energies[0] < 0.9 * from_rest
     assert energies[1] == pytest.approx(from_rest)
 
 
 def test_a_killed_play_may_still_be_on(memory):
     _, budget = after_a_play()
-    memory.keep(budget, DAY_S + AHEAD_S)
-    assert memory.recall(DAY_S + 0.1, fresh_state(16)).at_s == pytest.approx(budget.at_s + AHEAD_S - 0.1, abs=1e-6)
+    memory.save(budget, DAY_S + ZERO_OFFSET_S)
+    assert memory.load(DAY_S + 0.1, cold_state(16)).at_s == pytest.approx(budget.at_s + ZERO_OFFSET_S - 0.1, abs=1e-6)
 
 
 def test_what_does_not_tell_is_refused_by_name(memory):
     _, budget = after_a_play()
-    memory.keep(budget, DAY_S)
+    memory.save(budget, DAY_S)
     with pytest.raises(InputError, match=r"Helios-12-3\.npz: pixels: got 16, expected 437"):
-        memory.recall(DAY_S, fresh_state(437))
+        memory.load(DAY_S, cold_state(437))
     with pytest.raises(InputError, match="the time of day: got"):
-        memory.recall(DAY_S - 5.0, fresh_state(16))
+        memory.load(DAY_S - 5.0, cold_state(16))
     with memory.path.open("wb") as file:
         np.savez(file, format="optodrive-helios-memory", version=0)
     with pytest.raises(InputError, match="expected optodrive-helios-memory 1"):
-        memory.recall(DAY_S, fresh_state(16))
+        memory.load(DAY_S, cold_state(16))
     memory.path.write_bytes(memory.path.read_bytes()[:100])
     with pytest.raises(InputError, match="a file that can be read; remove it once the display has cooled"):
-        memory.recall(DAY_S, fresh_state(16))
+        memory.load(DAY_S, cold_state(16))
     memory.path.unlink()
     memory.path.mkdir()
     with pytest.raises(InputError, match="a file that can be written"):
-        memory.keep(replace(budget), DAY_S)
+        memory.save(replace(budget), DAY_S)

@@ -8,7 +8,7 @@ from helios.emulated import HostDeadError
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.helios import player as player_module
 from optodrive.link.helios.encoding import PointScale
-from optodrive.link.helios.frames import DARK_WITHIN_S, POINT_BYTES
+from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, POINT_BYTES
 from optodrive.link.helios.player import play
 
 
@@ -25,8 +25,8 @@ def test_what_shines_is_what_was_proven(name, rate):
     bench = Bench(display.config.board)
     with bench.helios as helios:
         played = play(helios, proven, bench.clock)
-    light, scale = light_of(bench), PointScale.of(display.config)
-    assert played.holes == 0
+    light, scale = light_of(bench), PointScale.from_config(display.config)
+    assert played.underruns == 0
     assert played.frames == len(proven.frames) == bench.device.frames_played
     assert len(light) == len(proven.pulses)
     start_s = np.array([stretch[0] for stretch in light])
@@ -78,7 +78,7 @@ def test_a_host_that_is_killed_leaves_dark_within_the_bound(after_s):
     with pytest.raises(HostDeadError):
         play(bench.helios, proven, bench.clock)
     bench.emulated.pass_time(60.0)
-    assert bench.device.dark_from_s() <= killed_s + DARK_WITHIN_S
+    assert bench.device.dark_from_s() <= killed_s + HOST_LOSS_EMISSION_MAX_S
     assert not any(bench.device.colour)
 
 
@@ -92,7 +92,7 @@ def test_the_bound_is_not_idle():
             play(bench.helios, proven, bench.clock)
         bench.emulated.pass_time(1.0)
         worst_s = max(worst_s, bench.device.dark_from_s() - killed_s)
-    assert 0.7 * DARK_WITHIN_S < worst_s <= DARK_WITHIN_S
+    assert 0.7 * HOST_LOSS_EMISSION_MAX_S < worst_s <= HOST_LOSS_EMISSION_MAX_S
 
 
 def test_a_mutant_that_forgets_play_once_is_seen_to_shine_for_ever():
@@ -185,12 +185,12 @@ def test_a_stretch_of_bad_answers_makes_holes_that_are_dark_and_told(fault):
                 setattr(bench.emulated, fault, quiet)
 
     played = play(bench.helios, proven, bench.clock, disturb)
-    assert played.holes >= 1
-    assert played.hole_s > 0.0
+    assert played.underruns >= 1
+    assert played.underrun_s > 0.0
     light = light_of(bench)
     width_s = sum(end_s - begin_s for begin_s, end_s, *_ in light)
     assert width_s == pytest.approx(proven.pulses.width_s.sum(), abs=1e-6)
-    assert bench.device.starved == played.holes + 1  # and the end
+    assert bench.device.starved == played.underruns + 1  # and the end
 
 
 def test_a_frame_that_is_not_taken_whole_ends_it():
@@ -208,4 +208,4 @@ def test_progress_is_told_from_nothing_to_all():
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
     assert shares == sorted(shares)
-    assert player_module.PATIENCE_S > DARK_WITHIN_S
+    assert player_module.READY_TIMEOUT_S > HOST_LOSS_EMISSION_MAX_S

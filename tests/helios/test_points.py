@@ -13,8 +13,8 @@ from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.link.helios.encoding import PointScale, decode, encode
-from optodrive.link.helios.frames import FRAME_MAX_S, HeliosFrame, fills_packets, point_ticks, points_of
-from optodrive.link.helios.verification import check
+from optodrive.link.helios.frames import FRAME_MAX_S, HeliosFrame, is_whole_packets, parse_points, point_ticks
+from optodrive.link.helios.verification import verify_frames
 from optodrive.planning.limiter.limiter import limit
 
 
@@ -24,7 +24,7 @@ def test_the_rate_is_the_boards(asked, true):
 
 
 def test_which_frames_fill_whole_packets():
-    assert [points for points in range(4096) if fills_packets(points)] == list(range(45, 4096, 64))
+    assert [points for points in range(4096) if is_whole_packets(points)] == list(range(45, 4096, 64))
 
 
 @st.composite
@@ -52,7 +52,7 @@ def sequences(draw):
 def test_light_lies_within_the_plan_and_loses_no_more_than_stated(sequence, rate):
     display = display_of(points_per_s=rate)
     plan, proven = proven_of(display, sequence)
-    scale, pulses, row = PointScale.of(display.config), proven.pulses, proven.row
+    scale, pulses, row = PointScale.from_config(display.config), proven.pulses, proven.row
     end_s, plan_end_s = pulses.start_s + pulses.width_s, plan.start_s + plan.width_s
     assert (pulses.start_s >= plan.start_s[row] - 1e-9).all()
     assert (end_s <= plan_end_s[row] + 1e-9).all()
@@ -68,11 +68,11 @@ def test_light_lies_within_the_plan_and_loses_no_more_than_stated(sequence, rate
         assert lit_s > plan.width_s[index] - (1 + parts.sum() + touching[index]) * scale.point_s - 1e-9
         assert pulses.power_w[parts].min() > plan.power_w[index] - scale.full_power_w / 255
     for frame in proven.frames:
-        points, asked = points_of(frame.data)
+        points, asked = parse_points(frame.data)
         assert frame.data[-1] == 2
         assert not points[-1, 3:].any()
         assert asked == rate
-        assert not fills_packets(len(points))
+        assert not is_whole_packets(len(points))
         assert frame.duration_s <= FRAME_MAX_S
 
 
@@ -113,7 +113,7 @@ def test_a_plan_right_at_the_mirrors_cap_is_proven():
 def test_without_what_whole_points_add_to_the_moves_that_plan_is_refused():
     """The mutant: planned as if mirrors left when planned, the proof finds them above their cap."""
     display = display_of()
-    exact = display.budget._replace(mirrors=display.budget.mirrors._replace(early_s=0.0))
+    exact = display.budget._replace(mirrors=display.budget.galvo._replace(early_s=0.0))
     with pytest.raises(LocalProtocolError, match="galvo_acceleration"):
         proven_of(replace(display, budget=exact), FrameSequence(trains=AT_THE_CAP))
 
@@ -123,7 +123,7 @@ def test_without_what_whole_points_add_to_the_moves_that_plan_is_refused():
 def test_times_come_no_nearer_than_the_budget_counts(sequence, rate):
     display = display_of(points_per_s=rate)
     plan, proven = proven_of(display, sequence)
-    early_s, pulses, row = display.budget.mirrors.early_s, proven.pulses, proven.row
+    early_s, pulses, row = display.budget.galvo.interval_shrink_s, proven.pulses, proven.row
     begins, ends = np.unique(row, return_index=True)[1], len(row) - 1 - np.unique(row[::-1], return_index=True)[1]
     late_s = pulses.start_s[begins] - plan.start_s[row[begins]]
     sooner_s = (plan.start_s + plan.width_s)[row[ends]] - (pulses.start_s + pulses.width_s)[ends]
@@ -133,12 +133,12 @@ def test_times_come_no_nearer_than_the_budget_counts(sequence, rate):
 def test_mirrors_leave_with_the_first_point_after_a_pulse():
     display = display_of()
     plan, proven = proven_of(display, frame_of(display))
-    scale = PointScale.of(display.config)
-    points = np.concatenate([points_of(frame.data)[0] for frame in proven.frames]).astype(int)
+    scale = PointScale.from_config(display.config)
+    points = np.concatenate([parse_points(frame.data)[0] for frame in proven.frames]).astype(int)
     x, y, lit = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2], points[:, 6] > 0
     ends = np.flatnonzero(lit[:-1] & ~lit[1:]) + 1
     ends = ends[x[ends] != x[ends - 1]]
-    codes = scale.codes(plan.x_rad), scale.codes(plan.y_rad)
+    codes = scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)
     for end in ends:
         index = int(np.searchsorted(plan.start_s, end * scale.point_s, side="right"))
         assert (x[end], y[end]) == (codes[0][index], codes[1][index])
@@ -161,17 +161,19 @@ def test_pulses_without_a_gap_stay_apart():
     plan, proven = proven_of(display, FrameSequence(trains=trains))
     assert plan.start_s[1] == pytest.approx(plan.start_s[0] + plan.width_s[0])
     assert proven.row.tolist() == [0, 1]
-    assert (plan.width_s - proven.pulses.width_s < 3 * PointScale.of(display.config).point_s).all()
+    assert (plan.width_s - proven.pulses.width_s < 3 * PointScale.from_config(display.config).point_s).all()
 
 
 def test_a_plan_without_pulses_is_dark():
     display = display_of()
-    plan, _ = limit(EMPTY_PLAN, display.at_rest()[1], display.budget)
-    frames = encode(plan, PointScale.of(display.config))
-    assert len(decode([frame.data for frame in frames], PointScale.of(display.config))) == 0
-    lit = HeliosFrame.checked(LIT * 2 + DARK + GOOD)
+    plan, _ = limit(EMPTY_PLAN, display.build_cold_state()[1], display.budget)
+    frames = encode(plan, PointScale.from_config(display.config))
+    assert len(decode([frame.data for frame in frames], PointScale.from_config(display.config))) == 0
+    lit = HeliosFrame.from_bytes(LIT * 2 + DARK + GOOD)
     with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
-        check([lit.data], plan, PointScale.of(display.config), display.at_rest()[1], display.budget)
+        verify_frames(
+            [lit.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
+        )
 
 
 def test_a_long_rest_is_all_dark_frames():
@@ -205,7 +207,7 @@ LIT, DARK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
 )
 def test_frames_that_may_not_leave(data, words):
     with pytest.raises(LocalProtocolError, match=words):
-        HeliosFrame.checked(data)
+        HeliosFrame.from_bytes(data)
 
 
 def _brighter(points):
@@ -236,33 +238,33 @@ MUTANTS = [_brighter, _sooner, _later, _aside, _elsewhere]
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_mutants_of_the_bytes_are_caught_before_they_leave(mutant):
     display = display_of()
-    scale, budget = PointScale.of(display.config), display.at_rest()[1]
+    scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, proven = proven_of(display, frame_of(display))
     frames = [frame.data for frame in proven.frames]
-    check(frames, plan, scale, budget, display.budget)
-    number = next(index for index, data in enumerate(frames) if points_of(data)[0][:-3, 6].any())
-    points = points_of(frames[number])[0].copy()
+    verify_frames(frames, plan, scale, budget, display.budget)
+    number = next(index for index, data in enumerate(frames) if parse_points(data)[0][:-3, 6].any())
+    points = parse_points(frames[number])[0].copy()
     mutant(points)
     frames[number] = points.tobytes() + frames[number][-5:]
     with pytest.raises(LocalProtocolError, match=r"beyond the plan's pulses|last point"):
-        check(frames, plan, scale, budget, display.budget)
+        verify_frames(frames, plan, scale, budget, display.budget)
 
 
 def test_a_plan_that_no_limiter_saw_is_caught_by_the_budget():
     display = display_of()
-    scale, budget = PointScale.of(display.config), display.at_rest()[1]
+    scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, _ = proven_of(display, train_of(width_s=0.04, gap_s=0.002, power_w=1.0, duration_s=0.5))
     hot = replace(plan, power_w=np.full(len(plan), scale.full_power_w))
     frames = [frame.data for frame in encode(hot, scale)]
     with pytest.raises(LocalProtocolError, match="passes a cap"):
-        check(frames, hot, scale, budget, display.budget)
+        verify_frames(frames, hot, scale, budget, display.budget)
 
 
 def test_a_board_that_plays_faster_than_thought_is_caught():
     """A mutant of the rate: bytes that say 50 kHz for points laid out at 40 kHz."""
     display = display_of()
-    scale, budget = PointScale.of(display.config), display.at_rest()[1]
+    scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, proven = proven_of(display, frame_of(display))
     frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in proven.frames]
     with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
-        check(frames, plan, scale, budget, display.budget)
+        verify_frames(frames, plan, scale, budget, display.budget)

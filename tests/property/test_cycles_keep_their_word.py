@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 from pixel_ode import height_um
 
 PIXELS = (25, 26, 47, 46)
@@ -22,7 +22,7 @@ SETTLE_S = 0.35
 def display_of(bridge_width_m):
     config = load_config("display-437")
     section = config.display.model_copy(update={"bridge_width_m": bridge_width_m})
-    return Display.of(config.model_copy(update={"display": section}))
+    return DisplayModel.from_config(config.model_copy(update={"display": section}))
 
 
 def trains_of(count, period_s, target_m, swing_m):
@@ -41,7 +41,7 @@ def bounds_um(display, trains, word):
 def bound_um(display, trains, word):
     """The most or the least that the refusal of the first train names, µm, or None where the trains are planned."""
     try:
-        prepare(display, FrameSequence(trains=trains), *display.at_rest())
+        plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
     except InputError as error:
         if f"{word} " not in str(error):
             return None
@@ -67,15 +67,15 @@ def test_steady_cycles_have_the_height_and_the_swing_that_was_asked(count, data)
         share = data.draw(st.floats(0.0, 1.0))
         swing_m = 1e-6 * (1.001 * smallest_um + share * (0.999 * largest_um - 1.001 * smallest_um))
     trains = trains_of(count, period_s, target_m, swing_m)
-    result = prepare(display, FrameSequence(trains=trains), *display.at_rest())
+    result = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
     plan = result.plan
     assume(not plan.trimmed_j.any())
-    assert result.train_late_s < 1e-9
+    assert result.train_lateness_max_s < 1e-9
     train = data.draw(st.sampled_from(trains))
     rows = plan.pixel == train.pixel
-    starts_s = train.pulse_starts_s()[-4:-1] + result.lead_s
+    starts_s = train.pulse_starts_s()[-4:-1] + result.lead_in_s
     t_s = np.linspace(starts_s[0], starts_s[-1] + period_s, 601)
-    own = display.pixels.each[train.pixel]
+    own = display.pixels.elements[train.pixel]
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w])[rows]
     each = height_um(own, pulses, t_s)[:-1].reshape(3, 200)
     assert each.max(axis=1) == pytest.approx(np.full(3, 1e6 * target_m), rel=0.03)
@@ -87,6 +87,6 @@ def test_near_full_power_wide_and_narrow_pulses_do_not_take_turns():
     """The steady pulse, 13 periods, needs 99 % of the laser's power: wanting ever so little more, 14 would be had."""
     display = display_of(0.2e-3)
     train = HeightTrain(PIXELS[0], 0.0, 0.37, 0.005859, 551.5e-6, 13.63635e-6)
-    plan = prepare(display, FrameSequence(trains=(train,)), *display.at_rest()).plan
-    assert plan.width_s[-20:] == pytest.approx(np.full(20, 13 * display.machine.drive.period_s))
+    plan = plan_sequence(display, FrameSequence(trains=(train,)), *display.build_cold_state()).plan
+    assert plan.width_s[-20:] == pytest.approx(np.full(20, 13 * display.scan_head.drive.period_s))
     assert plan.power_w[-20:] == pytest.approx(np.full(20, plan.power_w[-1]), rel=1e-3)

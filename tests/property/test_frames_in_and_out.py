@@ -24,16 +24,16 @@ FRAME = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"3": 50}}
 TRAIN = {"pixel": 3, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": 2.0}
 
 
-def accepted(value):
+def is_accepted(value):
     """Whether a sequence was made of it; anything but a refusal in one line is an error."""
     try:
         parse_sequence(value, CONFIG, "frames.json")
     except InputError as error:
-        return not _one_line(error)
+        return not _is_one_line(error)
     return True
 
 
-def _one_line(error):
+def _is_one_line(error):
     assert "\n" not in str(error)
     return True
 
@@ -72,25 +72,25 @@ def test_what_is_written_is_read_again(frames, periods, gap_s, power_w):
 
 @given(JSON)
 def test_any_json_is_read_or_refused(value):
-    assert not accepted(value)
-    assert not accepted(json.dumps(value))
+    assert not is_accepted(value)
+    assert not is_accepted(json.dumps(value))
 
 
 @given(st.sampled_from(sorted(FRAME)), JSON)
 def test_any_value_in_a_frame_is_read_or_refused(key, value):
-    if accepted({"frames": [{**FRAME, key: value}]}):
+    if is_accepted({"frames": [{**FRAME, key: value}]}):
         assert type(value) in ((dict, list) if key == "target_um" else (int, float))
 
 
 @given(st.sampled_from(sorted(TRAIN)), JSON)
 def test_any_value_in_a_train_is_read_or_refused(key, value):
-    if accepted({"trains": [{**TRAIN, key: value}]}):
+    if is_accepted({"trains": [{**TRAIN, key: value}]}):
         assert type(value) in (int, float)
 
 
 @given(st.binary(max_size=60))
 def test_any_bytes_are_refused(body):
-    assert not accepted(body)
+    assert not is_accepted(body)
 
 
 @given(
@@ -111,7 +111,7 @@ def test_overlaps_are_found_as_by_comparing_every_pair(rows):
         for _, at, wide, gap, long in rows
     ]
     clash = any(a < d and c < b for i, one in enumerate(spans) for two in spans[:i] for a, b in one for c, d in two)
-    assert accepted({"trains": entries}) != clash
+    assert is_accepted({"trains": entries}) != clash
 
 
 @given(
@@ -129,9 +129,9 @@ def test_known_text_is_shown_whole(text):
 
 
 def _dots(text):
-    from optodrive.planning.stimuli.braille import word_cells
+    from optodrive.planning.stimuli.braille import encode_word
 
-    return sum(len(cell) for word in text.split() for cell in word_cells(word))
+    return sum(len(cell) for word in text.split() for cell in encode_word(word))
 
 
 def _pictures():
@@ -158,7 +158,7 @@ def test_a_damaged_picture_is_read_or_refused(name, data):
     try:
         sequence = build_pattern(name, {"file": file}, CONFIG)
     except InputError as error:
-        _one_line(error)
+        _is_one_line(error)
         return
     for frame in sequence.frames:
         assert frame.duration_s > 0

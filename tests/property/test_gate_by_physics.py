@@ -9,16 +9,16 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from displays import DISPLAYS
-from hidden_field import field_file
+from hidden_field import calibrate_hidden_field
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
-from optodrive.device.settling import MoveModel
+from optodrive.device.settling import SettlingTable
 from optodrive.link.helios.encoding import PointScale, decode, encode
-from optodrive.link.helios.frames import points_of
+from optodrive.link.helios.frames import parse_points
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 GRID_S = 1e-6
@@ -66,24 +66,24 @@ def ideal(display, x_rad, y_rad):
 
 def outside_m(display, plan, lands=ideal):
     """How far the focus, with its aim error, reaches over an absorber's edge while lit, m; negative: it never does."""
-    scale = Requirements.of(display.config).scale
+    scale = BoardRequirements.from_config(display.config).scale
     points = quantise(plan, scale)
     x, y, dark, on, _ = points.table.astype(np.int64).T
     begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s
     lit = np.flatnonzero(on)
     from_s, lit_s = begin_s[lit] + dark[lit] * scale.tick_s, on[lit] * scale.tick_s
-    angles_rad = scale.angles(x), scale.angles(y)
+    angles_rad = scale.to_angles_rad(x), scale.to_angles_rad(y)
     return reaches_over_m(display, begin_s, angles_rad, from_s, lit_s, plan.pixel[points.row[lit]], lands)
 
 
 def outside_on_helios_m(display, plan):
     """The same of a Helios' points, as decoded from the bytes of its frames."""
-    scale = PointScale.of(display.config)
+    scale = PointScale.from_config(display.config)
     frames = [frame.data for frame in encode(plan, scale)]
-    points = np.concatenate([points_of(data)[0] for data in frames]).astype(np.int64)
+    points = np.concatenate([parse_points(data)[0] for data in frames]).astype(np.int64)
     codes = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2]
     begin = np.flatnonzero(np.append(True, (np.diff(codes[0]) != 0) | (np.diff(codes[1]) != 0)))
-    angles = tuple(scale.angles(code[begin]) for code in codes)
+    angles = tuple(scale.to_angles_rad(code[begin]) for code in codes)
     pulses = decode(frames, scale)
     pixel = plan.pixel[np.searchsorted(plan.start_s, pulses.start_s + 1e-9, side="right") - 1]
     return reaches_over_m(display, begin * scale.point_s, angles, pulses.start_s, pulses.width_s, pixel)
@@ -115,14 +115,14 @@ def reaches_over_m(display, begin_s, angles_rad, from_s, width_s, pixel_of, land
 
 
 def planned(display, sequence):
-    return prepare(display, sequence, *display.at_rest()).plan
+    return plan_sequence(display, sequence, *display.build_cold_state()).plan
 
 
 def changed(name, **sections):
     table = DISPLAYS[name].config.model_dump()
     for section, values in sections.items():
         table[section] |= values
-    return Display.of(Config.model_validate(table))
+    return DisplayModel.from_config(Config.model_validate(table))
 
 
 @st.composite
@@ -189,8 +189,8 @@ def on_helios(display, points_per_s):
     """The same display behind a Helios."""
     table = display.config.model_dump()
     table["board"] |= {"transport": "helios", "points_per_s": points_per_s}
-    table["scanner"]["codes_a_side"] = 2047
-    return Display.of(Config.model_validate(table))
+    table["scanner"]["half_range_codes"] = 2047
+    return DisplayModel.from_config(Config.model_validate(table))
 
 
 @settings(max_examples=60)
@@ -210,7 +210,7 @@ def test_on_a_helios_whose_steps_are_coarse(data):
 def test_on_a_helios_in_a_full_frame(name, height_m):
     display = on_helios(DISPLAYS[name], 40_000)
     assert outside_on_helios_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
-    early = with_moves(display, Early(display.machine.moves))
+    early = with_moves(display, Early(display.scan_head.settling))
     assert outside_on_helios_m(early, planned(early, frame(early, 50e-6))) > 2e-5
 
 
@@ -221,7 +221,7 @@ def test_in_the_experiments_of_the_paper(number):
 
 
 def with_moves(display, moves):
-    return replace(display, machine=replace(display.machine, moves=moves))
+    return replace(display, scan_head=replace(display.machine, settling=moves))
 
 
 class Early:
@@ -237,7 +237,7 @@ class Early:
 @pytest.mark.parametrize("name", ["display-16", "display-437"])
 def test_a_gate_that_opens_earlier_is_caught(name):
     display = DISPLAYS[name]
-    early = with_moves(display, Early(display.machine.moves))
+    early = with_moves(display, Early(display.scan_head.settling))
     assert outside_m(early, planned(early, frame(early, 50e-6))) > 2e-5
 
 
@@ -261,7 +261,7 @@ def test_hasty_moves_taken_for_calm_ones_are_caught():
         limits={"galvo_acceleration_rms_max_rad_per_s2": 1e9},
     )
     assert outside_m(display, planned(display, there_and_back(display))) <= 0
-    always_calm = with_moves(display, replace(display.machine.moves, calm_us=0))
+    always_calm = with_moves(display, replace(display.scan_head.settling, long_dwell_us=0))
     assert outside_m(always_calm, planned(always_calm, there_and_back(always_calm))) > 2e-5
 
 
@@ -274,8 +274,8 @@ def by_the_field(display, x_rad, y_rad):
 @pytest.fixture(scope="module")
 def in_a_field(tmp_path_factory):
     """Display-437 with a field calibrated on a hidden geometry."""
-    _, config = field_file(tmp_path_factory.mktemp("field") / "field.toml", seed=3)
-    return Display.of(config)
+    _, config = calibrate_hidden_field(tmp_path_factory.mktemp("field") / "field.toml", seed=3)
+    return DisplayModel.from_config(config)
 
 
 def anywhere(display):
@@ -291,6 +291,6 @@ def test_in_a_calibrated_field(in_a_field):
 
 def test_moves_of_the_ideal_lattice_in_a_calibrated_field_are_caught(in_a_field):
     """What a nominal pitch needs, given to places a little farther apart."""
-    ideal_moves = MoveModel.of(in_a_field.config)
+    ideal_moves = SettlingTable.from_config(in_a_field.config)
     loose = with_moves(in_a_field, replace(ideal_moves, pitch_rad=1.1 * ideal_moves.pitch_rad))
     assert outside_m(loose, planned(loose, anywhere(loose)), by_the_field) > ROUNDING_M

@@ -7,11 +7,11 @@ from displays import DISPLAYS
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
-from optodrive.planning.budget_setup import declared
+from optodrive.planning.budget_setup import build_nominal_model
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.limiter import fresh_state, limit
-from optodrive.planning.limiter.worst_case import Uncertainty, heat_bound
-from warmth import NO_CAPS, as_plan, galvo_peak, truth, upper, window_peak_w
+from optodrive.planning.limiter.limiter import cold_state, limit
+from optodrive.planning.limiter.worst_case import Uncertainty, build_heat_bound
+from warmth import NO_CAPS, build_plan, build_true_display, galvo_peak, upper_factors, window_peak_w
 
 
 def hammer(span_s, width_s=0.010, rest_s=5.2e-4, pixel=0):
@@ -38,7 +38,9 @@ SCENARIOS = {
 def model_of(name):
     display = DISPLAYS[name]
     parameters = load_parameters(display.config.pixel_model.parameters)
-    return declared(parameters, display.pixels, Neighbours.of(display.config.display), 20.0 + ZERO_CELSIUS_K)
+    return build_nominal_model(
+        parameters, display.pixels, Neighbours.from_display(display.config.display), 20.0 + ZERO_CELSIUS_K
+    )
 
 
 def unchanged(budget):
@@ -54,21 +56,21 @@ def share(guard, factor=None, mutate=unchanged, carry=kept):
     name, binding, rows, pause_s = SCENARIOS[guard]
     display, model = DISPLAYS[name], model_of(name)
     caps = NO_CAPS._replace(**binding)
-    budget = Budget(caps, display.budget.heat, display.budget.mirrors)
+    budget = Budget(caps, display.budget.heat, display.budget.galvo)
     pixels = len(model.epsilon)
     offset_s = rows[-1][1] + rows[-1][2] + pause_s
     again = [(pixel, start_s + offset_s, width_s) for pixel, start_s, width_s in rows]
-    state, passed = fresh_state(pixels), []
+    state, passed = cold_state(pixels), []
     for part in (rows, again):
-        piece, after = limit(as_plan(part, 2.45, display.config.display), state, mutate(budget))
+        piece, after = limit(build_plan(part, 2.45, display.config.display), state, mutate(budget))
         passed.append(piece)
         state = carry(after, state, offset_s, pixels)
-    plan = as_plan(rows + again, np.concatenate([piece.power_w for piece in passed]), display.config.display)
+    plan = build_plan(rows + again, np.concatenate([piece.power_w for piece in passed]), display.config.display)
     if guard == "galvo":
         return galvo_peak(plan, budget) / caps.galvo_rad2_per_s4
     if guard == "diode":
         return window_peak_w(plan, caps.display_window_s) / caps.display_mean_w
-    absorber, _, wall, touch = truth(model, factor).peaks(plan)
+    absorber, _, wall, touch = build_true_display(model, factor).peaks(plan)
     return {
         "absorber": absorber / caps.absorber_k,
         "wall": wall / caps.wall_k,
@@ -85,7 +87,7 @@ def test_the_limiter_is_not_cowardly(guard):
 def worst(guard):
     unsure = Uncertainty(**DISPLAYS[SCENARIOS[guard][0]].config.limits.uncertainty.model_dump())
     slow = {name: 1 - getattr(unsure, name) for name in ("absorber_capacity", "wall_capacity", "touch_lag", "gas_lag")}
-    return upper(unsure) | slow
+    return upper_factors(unsure) | slow
 
 
 def test_every_guard_holds_at_the_upper_corner():
@@ -116,14 +118,14 @@ def wrong_constant(guard):
         elif guard == "diode":
             caps = caps._replace(display_window_s=2.0 * caps.display_window_s)
         else:
-            mirrors = mirrors._replace(omega_per_s=0.8 * mirrors.omega_per_s)
+            mirrors = mirrors._replace(omega_rad_per_s=0.8 * mirrors.omega_rad_per_s)
         return Budget(caps, heat, mirrors)
 
     return dict(mutate=mutate)
 
 
 def forgotten_over_a_pause(guard):
-    return dict(carry=lambda state, before, at_s, pixels: fresh_state(pixels, at_s))
+    return dict(carry=lambda state, before, at_s, pixels: cold_state(pixels, at_s))
 
 
 def unacknowledged_not_counted(guard):
@@ -150,9 +152,9 @@ def test_a_mutant_is_caught(guard, mutant):
 def on_its_way_counted_double(heat):
     """Heat that counts as arrived is taken off twice, and thought to come twice as slowly."""
     return heat._replace(
-        wall_flight=2 * heat.wall_flight,
-        touch_flight=2 * heat.touch_flight,
-        least_rate_per_s=0.5 * heat.least_rate_per_s,
+        wall_transit_credit=2 * heat.wall_transit_credit,
+        touch_transit_credit=2 * heat.touch_transit_credit,
+        lower_bound_rate_per_s=0.5 * heat.lower_bound_rate_per_s,
     )
 
 
@@ -161,7 +163,7 @@ def test_heat_on_its_way_taken_off_twice_is_caught(guard):
     """With nothing unsure, so that no other margin hides it."""
     name, binding, _, _ = SCENARIOS[guard]
     exact = Uncertainty(**dict.fromkeys(Uncertainty.__dataclass_fields__, 0.0))
-    heat = heat_bound(model_of(name), exact, NO_CAPS._replace(**binding), DISPLAYS[name].config.laser.max_power_w)
+    heat = build_heat_bound(model_of(name), exact, NO_CAPS._replace(**binding), DISPLAYS[name].config.laser.max_power_w)
     assert 0.97 <= share(guard, mutate=lambda budget: budget._replace(heat=heat)) <= 1 + 1e-9
     twice = on_its_way_counted_double(heat)
     assert share(guard, mutate=lambda budget: budget._replace(heat=twice)) > 1.0005

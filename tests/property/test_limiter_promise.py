@@ -8,10 +8,21 @@ from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
-from optodrive.planning.limiter.budget import Budget, Mirrors
-from optodrive.planning.limiter.limiter import fired, fresh_state, limit, shifted
-from optodrive.planning.limiter.worst_case import heat_bound
-from warmth import KINDS, NO_CAPS, as_plan, galvo_peak, random_model, sequence, truth, upper, window_peak_w, within
+from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.limiter import cold_state, commit_until, limit, shift_state
+from optodrive.planning.limiter.worst_case import build_heat_bound
+from warmth import (
+    KINDS,
+    NO_CAPS,
+    build_plan,
+    build_sequence,
+    build_true_display,
+    galvo_peak,
+    random_model,
+    sample_factors,
+    upper_factors,
+    window_peak_w,
+)
 
 FULL_W = 2.45
 
@@ -30,25 +41,25 @@ def random_caps(rng):
 
 def random_mirrors(rng):
     """Servos that ring and servos that creep; every ramp ends in the dark that `sequence` leaves."""
-    return Mirrors(
-        omega_per_s=2 * np.pi * 10 ** rng.uniform(2.3, 3.6),
+    return GalvoModel(
+        omega_rad_per_s=2 * np.pi * 10 ** rng.uniform(2.3, 3.6),
         damping=rng.uniform(0.3, 0.9),
         delay_s=rng.uniform(0.0, 1e-4),
         slew_rad_per_s=10 ** rng.uniform(2.0, 2.5),
-        lead_s=rng.uniform(5e-4, 3e-3),
-        mean_s=rng.choice([0.1, 1.0, 3.0]),
-        code_rad=0.0,
-        early_s=0.0,
+        lead_in_s=rng.uniform(5e-4, 3e-3),
+        averaging_s=rng.choice([0.1, 1.0, 3.0]),
+        code_step_rad=0.0,
+        interval_shrink_s=0.0,
     )
 
 
 def budget_of(model, unsure, caps, mirrors):
-    return Budget(caps, heat_bound(model, unsure, caps, FULL_W), mirrors)
+    return Budget(caps, build_heat_bound(model, unsure, caps, FULL_W), mirrors)
 
 
 def limited_in_pieces(rng, plan, budget, pixels):
     """The plan limited piece by piece; a piece may be called off in the middle, its fired pulses count."""
-    state, kept, at = fresh_state(pixels), [], 0
+    state, kept, at = cold_state(pixels), [], 0
     while at < len(plan):
         until = at + int(rng.integers(1, 120))
         rows = slice(at, until)
@@ -57,11 +68,11 @@ def limited_in_pieces(rng, plan, budget, pixels):
         if rng.random() < 0.2:
             stop_s = float(rng.choice(piece.start_s))
             kept.append((piece, piece.start_s < stop_s))
-            state = fired(piece, stop_s, state, budget)
+            state = commit_until(piece, stop_s, state, budget)
         else:
             kept.append((piece, np.full(len(piece), True)))
             state = after
-        state = shifted(shifted(state, 7.0), -7.0)
+        state = shift_state(shift_state(state, 7.0), -7.0)
         at = until
     columns = {
         name: np.concatenate([vars(piece)[name][fired_rows] for piece, fired_rows in kept]) for name in vars(plan)
@@ -80,13 +91,13 @@ def passed(kind, seed):
     rng = np.random.default_rng(seed)
     display, model, unsure = random_model(rng)
     caps = random_caps(rng)
-    rows = sequence(rng, kind, len(model.epsilon), rng.uniform(0.5, 4.0))
-    asked = as_plan(rows, FULL_W * rng.uniform(0.3, 1.0, len(rows)) ** rng.choice([0.0, 1.0]), display)
+    rows = build_sequence(rng, kind, len(model.epsilon), rng.uniform(0.5, 4.0))
+    asked = build_plan(rows, FULL_W * rng.uniform(0.3, 1.0, len(rows)) ** rng.choice([0.0, 1.0]), display)
     budget = budget_of(model, unsure, caps, random_mirrors(rng))
     plan = limited_in_pieces(rng, asked, budget, len(model.epsilon))
     if not len(plan):
         return {}
-    real = truth(model, upper(unsure) if rng.random() < 0.3 else within(rng, unsure))
+    real = build_true_display(model, upper_factors(unsure) if rng.random() < 0.3 else sample_factors(rng, unsure))
     absorber, _, wall, touch = real.peaks(plan)
     return {
         "absorber": absorber / caps.absorber_k,

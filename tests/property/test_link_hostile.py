@@ -27,7 +27,7 @@ class Rig:
         self.host = HostConnection()
         self.now_us = 0
         self.heard = []
-        self.host.hello(1)
+        self.host.send_hello(1)
         self.turn()
         self.host.send(m.ArmReq(5))
         self.turn()
@@ -182,7 +182,7 @@ def said(core, what, detail):
             "hello": [m.Hello(1, 0, 3)],
             "flush": [m.Flush()],
         }[what]
-    return [(message.TYPE, message.body()) for message in messages]
+    return [(message.TYPE, message.encode_body()) for message in messages]
 
 
 @settings(max_examples=200)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.physics.nominal_display import DisplayHeat
+from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
@@ -48,39 +48,39 @@ def stepped(columns):
 
 @given(st.lists(one_pulse, min_size=1, max_size=30))
 def test_the_walk_is_every_step(rows):
-    columns, heat = columns_of(rows), DisplayHeat(ARRAY)
-    peaks = heat.pulses(*columns)
+    columns, heat = columns_of(rows), NominalThermalState(ARRAY)
+    peaks = heat.apply_pulses(*columns)
     moves, absorbers, state = stepped(columns)
     assert peaks.displacement_m == pytest.approx(np.array(moves), rel=1e-12, abs=1e-300)
     assert peaks.absorber_k == pytest.approx(np.array(absorbers), rel=1e-12, abs=1e-300)
     for index, (at_s, *rises) in enumerate(state):
-        assert heat.rises(index, at_s) == pytest.approx(tuple(rises), rel=1e-12, abs=1e-300)
+        assert heat.rises_k(index, at_s) == pytest.approx(tuple(rises), rel=1e-12, abs=1e-300)
 
 
 @given(st.lists(one_pulse, min_size=2, max_size=20), st.data())
 def test_pulses_in_two_lists_leave_the_same_heat(rows, data):
     columns = columns_of(rows)
     cut = data.draw(st.integers(0, len(rows)))
-    whole, parts = DisplayHeat(ARRAY), DisplayHeat(ARRAY)
-    whole.pulses(*columns)
-    parts.pulses(*(column[:cut] for column in columns))
-    parts.pulses(*(column[cut:] for column in columns))
+    whole, parts = NominalThermalState(ARRAY), NominalThermalState(ARRAY)
+    whole.apply_pulses(*columns)
+    parts.apply_pulses(*(column[:cut] for column in columns))
+    parts.apply_pulses(*(column[cut:] for column in columns))
     end_s = columns[1][-1] + columns[2][-1]
-    assert [whole.rises(i, end_s) for i in range(3)] == [parts.rises(i, end_s) for i in range(3)]
+    assert [whole.rises_k(i, end_s) for i in range(3)] == [parts.rises_k(i, end_s) for i in range(3)]
 
 
 def test_read_only_and_narrow_columns_are_taken():
     pixel, start_s = np.array([0, 2], dtype=np.int32), np.array([0.0, 0.1])
     pixel.flags.writeable = start_s.flags.writeable = False
     half = np.array([0.01, 0.02], dtype=np.float32)
-    assert DisplayHeat(ARRAY).pulses(pixel, start_s, half, half).displacement_m.min() > 0
+    assert NominalThermalState(ARRAY).apply_pulses(pixel, start_s, half, half).displacement_m.min() > 0
 
 
 def test_pixels_that_are_not_there_and_torn_columns_are_refused():
     one = np.ones(1)
     with pytest.raises(IndexError, match="3 to 3 of 3"):
-        DisplayHeat(ARRAY).pulses(np.array([3]), one, one, one)
+        NominalThermalState(ARRAY).apply_pulses(np.array([3]), one, one, one)
     with pytest.raises(IndexError, match="-1 to -1 of 3"):
-        DisplayHeat(ARRAY).pulses(np.array([-1]), one, one, one)
+        NominalThermalState(ARRAY).apply_pulses(np.array([-1]), one, one, one)
     with pytest.raises(ValueError, match="differ in length"):
-        DisplayHeat(ARRAY).pulses(np.array([0]), one, np.ones(2), one)
+        NominalThermalState(ARRAY).apply_pulses(np.array([0]), one, np.ones(2), one)

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.physics.pulse_for_height import reach_m
-from optodrive.planning.pipeline import prepare
+from optodrive.physics.pulse_for_height import max_displacement_m
+from optodrive.planning.pipeline import plan_sequence
 
 STEP_S = 2e-5
 
@@ -38,7 +38,7 @@ def sequences(draw, name):
     """A few frames on a few pixels, close in time, and perhaps a train."""
     display = DISPLAYS[name]
     count = len(display.layout)
-    most_um = reach_m(display.pixels.each[0], display.machine.drive) * 1e6
+    most_um = max_displacement_m(display.pixels.elements[0], display.scan_head.drive) * 1e6
     chosen = draw(st.lists(st.integers(0, count - 1), min_size=1, max_size=4, unique=True))
     frames, at_s = [], 0.0
     for k in range(draw(st.integers(1, 4))):
@@ -64,14 +64,14 @@ def sequences(draw, name):
 def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
     display = DISPLAYS[name]
     sequence = data.draw(sequences(name))
-    result = prepare(display, sequence, *display.at_rest())
+    result = plan_sequence(display, sequence, *display.build_cold_state())
     plan = result.plan
     cap_k = display.config.limits.absorber_max_c - display.config.ambient_c
     ends_s = plan.start_s + plan.width_s
     for pixel in np.unique(plan.pixel):
         rows = np.flatnonzero(plan.pixel == pixel)
         pulses = list(zip(plan.start_s[rows], plan.width_s[rows], plan.power_w[rows], strict=True))
-        time, absorber, height = integrate(display.pixels.each[pixel], pulses, ends_s[rows[-1]] + 0.05)
+        time, absorber, height = integrate(display.pixels.elements[pixel], pulses, ends_s[rows[-1]] + 0.05)
         assert absorber.max() <= cap_k
         assert result.plan.headroom_k[pixel] <= cap_k - absorber.max() + 1e-6
         until = np.append(plan.start_s[rows[1:]], np.inf)

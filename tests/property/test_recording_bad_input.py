@@ -91,7 +91,7 @@ def reads_or_refuses(path):
     for run, listed in zip(measurement.runs, index.runs, strict=True):
         assert_in_order(run)
         counts = {name: len(signal.t_s) for name, signal in run.signals.items()}
-        assert {name: signal.samples for name, signal in listed.signals.items()} == counts
+        assert {name: signal.sample_count for name, signal in listed.signals.items()} == counts
 
 
 def assert_in_order(run):
@@ -114,7 +114,7 @@ def assert_in_order(run):
 @given(st.data())
 def test_bytes_changed_or_cut_off(valid, path, data):
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sandboxed_probe, "CPU_S", 2)
+        patch.setattr(sandboxed_probe, "CPU_LIMIT_S", 2)
         content = bytearray((valid / "r.h5").read_bytes())
         for _ in range(data.draw(st.integers(0, 8))):
             content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
@@ -190,7 +190,7 @@ def test_members_attributes_and_datasets_replaced(valid, path, data):
             except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError):
                 continue
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hdf5, "try_out", lambda path: None)  # written by the library itself, so no harm to it
+        patch.setattr(hdf5, "probe_in_sandbox", lambda path: None)  # written by the library itself, so no harm to it
         reads_or_refuses(path)
 
 
@@ -262,7 +262,7 @@ def test_every_number_and_text_comes_back_from_both_forms(
         base.mkdir()
         write_recording(path, Measurement((run,)))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(hdf5, "try_out", lambda path: None)
+            patch.setattr(hdf5, "probe_in_sandbox", lambda path: None)
             (read,) = read_recording(path).runs
         assert (read.ambient_k, read.attributes) == (ambient_k, attributes)
         assert read.signals["force_N"].sigma == sigma

@@ -12,16 +12,16 @@ from optodrive.device.neighbours import Neighbours
 from optodrive.physics.numpy_model import STEPS, Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.terms import known_terms
+from optodrive.physics.terms import discover_terms
 
-LATTICE = Neighbours.of(DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4))
-TERMS = {key: term for key, term in known_terms().items() if term.whole_display}
+LATTICE = Neighbours.from_display(DisplaySection(rows=2, columns=2, pitch_m=4e-3, bridge_width_m=4e-4))
+TERMS = {key: term for key, term in discover_terms().items() if term.is_display_term}
 LAGS_S = st.floats(1e-3, 64e-3)
 SUBSETS = [
     keys
     for size in range(len(TERMS) + 1)
     for keys in combinations(TERMS, size)
-    if all(need in keys for key in keys for need in TERMS[key].needs)
+    if all(need in keys for key in keys for need in TERMS[key].requires)
 ]
 
 

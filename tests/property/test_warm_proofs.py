@@ -4,16 +4,16 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.daemon.engine.thermal_estimate import Thermal
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.device.config import load_config
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.planning.limiter.limiter import fired, verify
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.limiter.limiter import commit_until, verify
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 
 CONFIG = load_config()
-DISPLAY = Display.of(CONFIG)
-SCALE = Requirements.of(CONFIG).scale
+DISPLAY = DisplayModel.from_config(CONFIG)
+SCALE = BoardRequirements.from_config(CONFIG).scale
 STRONG, BRISK = (0.040, 0.001, 2.4), (0.010, 0.010, 1.0)
 """Width, gap, s, and power, W: the first is trimmed by three caps, at times to nothing."""
 
@@ -21,20 +21,22 @@ STRONG, BRISK = (0.040, 0.001, 2.4), (0.010, 0.010, 1.0)
 @pytest.mark.parametrize("seed", range(2))
 def test_plans_that_follow_each_other_and_are_cut_short(seed):
     random = np.random.default_rng(seed)
-    thermal, now_s, dark, touched = Thermal(*DISPLAY.at_rest()), 3.0, 0, 0
+    thermal, now_s, dark, touched = ThermalEstimate(*DISPLAY.build_cold_state()), 3.0, 0, 0
     for _ in range(40):
         start_s = round(now_s + random.uniform(0.05, 3.0), 6)
-        _, budget = thermal.seen_from(start_s)
+        _, budget = thermal.shift_to_plan(start_s)
         width_s, gap_s, power_w = STRONG if random.random() < 0.6 else BRISK
         train = PulseTrain(200, 0.0, 3.0, width_s, gap_s, power_w)
-        plan = prepare(DISPLAY, FrameSequence((), (train,)), DISPLAY.heat_at_rest(), budget).plan
+        plan = plan_sequence(DISPLAY, FrameSequence((), (train,)), DISPLAY.build_cold_heat(), budget).plan
         points = quantise(plan, SCALE)
-        decoded = decode(points.payload(), SCALE)
+        decoded = decode(points.encode_payload(), SCALE)
         verify(plan, points.row[decoded.index], decoded, budget, DISPLAY.budget)
         dark += len(plan) - len(decoded.index)
         touched += np.count_nonzero(plan.reason == "touch_temperature")
         until_s = random.uniform(0.2, 4.0)
-        thermal = Thermal.after_plan(DISPLAY.heat_at_rest(), fired(plan, until_s, budget, DISPLAY.budget), start_s)
+        thermal = ThermalEstimate.from_plan(
+            DISPLAY.build_cold_heat(), commit_until(plan, until_s, budget, DISPLAY.budget), start_s
+        )
         now_s = start_s + until_s
     assert dark
     assert touched
@@ -42,10 +44,10 @@ def test_plans_that_follow_each_other_and_are_cut_short(seed):
 
 def test_light_that_the_board_cannot_give_is_none():
     trains = tuple(
-        PulseTrain(200, 0.05 * k, 0.01, 0.01, 0.001, share * CONFIG.least_power_w) for k, share in enumerate((0.9, 1.0))
+        PulseTrain(200, 0.05 * k, 0.01, 0.01, 0.001, share * CONFIG.min_power_w) for k, share in enumerate((0.9, 1.0))
     )
-    heat, budget = DISPLAY.at_rest()
-    plan = prepare(DISPLAY, FrameSequence((), trains), heat, budget).plan
+    heat, budget = DISPLAY.build_cold_state()
+    plan = plan_sequence(DISPLAY, FrameSequence((), trains), heat, budget).plan
     points = quantise(plan, SCALE)
     assert points.table[:, 4].tolist() == [0, 1]
-    assert fired(plan, 1.0, budget, DISPLAY.budget).recent_power_w.tolist() == [CONFIG.least_power_w]
+    assert commit_until(plan, 1.0, budget, DISPLAY.budget).recent_power_w.tolist() == [CONFIG.min_power_w]

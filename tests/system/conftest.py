@@ -5,7 +5,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.device.config import load_config
 from optodrive.link.transport.serial_port import SerialPort
-from optodrive.planning.pipeline import Display
+from optodrive.planning.pipeline import DisplayModel
 from rig import config_text
 
 
@@ -13,7 +13,7 @@ from rig import config_text
 def engine(board, tmp_path):  # noqa: F811
     config = tmp_path / "engine.toml"
     config.write_text(config_text(board.port))
-    display = Display.of(load_config(config))
+    display = DisplayModel.from_config(load_config(config))
     engine = Engine(display, SerialPort(str(board.port), display.config.board.baud), MonotonicClock())
     engine.start()
     yield engine

@@ -12,13 +12,13 @@ import time
 
 import numpy as np
 
-from optodrive.core.clock import MonotonicClock, claim_processor
+from optodrive.core.clock import MonotonicClock, request_realtime_scheduling
 from optodrive.device.config import Config, load_config
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 
 PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)])
@@ -65,24 +65,24 @@ def train():
 
 
 def main(name):
-    claim_processor()  # as the daemon's loop does
+    request_realtime_scheduling()  # as the daemon's loop does
     table = load_config("display-16").model_dump()
     table["board"]["baud"] = BAUD
     port = NotedPort(name)
-    session = Session(port, MonotonicClock(), Requirements.of(Config.model_validate(table)))
+    session = BoardSession(port, MonotonicClock(), BoardRequirements.from_config(Config.model_validate(table)))
     session.connect()
     if session.board.state == "FAULT":
         session.disarm()
         until(session, lambda: session.board.state == "DISARMED")
     session.arm()
-    until(session, lambda: session.ready)
-    tell(clock_s=session.board_s() - time.monotonic(), within_s=session.link_figures()["round_trip_ms"] * 0.5e-3)
+    until(session, lambda: session.is_ready)
+    tell(clock_s=session.board_s() - time.monotonic(), within_s=session.collect_link_stats()["round_trip_ms"] * 0.5e-3)
     session.begin(train(), session.board_s() + 0.05, AHEAD_S)
     until(session, lambda: port.report is not None)
     tell(lit={"index": port.report.first_index, "tick": port.report.records[0][0]})
     until(session, lambda: select.select([sys.stdin], [], [], 0)[0])
     tell(closed_s=time.monotonic())
-    session.drop()
+    session.disconnect()
     sys.stdin.read()
 
 

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import optodrive
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from rig import OPTODRIVE
 
 SCMP_ACT_ALLOW = 0x7FFF0000
@@ -69,7 +69,7 @@ def write_filter(path):
 def allowed_calls():
     """The system calls that the unit allows, its sets taken apart."""
     allowed = set()
-    unit = shipped_path("systemd", "optodrive.service").read_text()
+    unit = locate_shipped("systemd", "optodrive.service").read_text()
     for line in re.findall(r"^SystemCallFilter=(.+)$", unit, re.MULTILINE):
         calls = {call for word in line.lstrip("~").split() for call in taken_apart(word)}
         allowed = allowed - calls if line.startswith("~") else allowed | calls

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import httpx
 
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
@@ -98,7 +98,7 @@ class Board:
 
 def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
     """A shipped configuration for a board at a port, and a sensor at another."""
-    text = shipped_path(f"{name}.toml").read_text()
+    text = locate_shipped(f"{name}.toml").read_text()
     text, count = re.subn(r"(?m)^lease_s = \S+", f"lease_s = {lease_s}", text)
     assert count == 1
     text = re.sub(r'transport = "simulated".*', f'transport = "serial"\nport = "{port}"', text)

@@ -14,8 +14,8 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.device.config import load_config
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 from rig import wait_for
 
@@ -204,13 +204,15 @@ def test_a_process_that_is_kept_from_the_processor_is_not_a_board_that_is_late(b
 
 
 def test_the_session_works_over_the_real_port(board):
-    session = Session(
-        SerialPort(str(board.port), 1_000_000), MonotonicClock(), Requirements.of(load_config("display-16"))
+    session = BoardSession(
+        SerialPort(str(board.port), 1_000_000),
+        MonotonicClock(),
+        BoardRequirements.from_config(load_config("display-16")),
     )
     session.connect()
     try:
         assert session.board.state == "DISARMED"
-        assert 0 < session.link_figures()["round_trip_ms"] < 50
+        assert 0 < session.collect_link_stats()["round_trip_ms"] < 50
     finally:
         session.close()
     wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
@@ -333,7 +335,7 @@ def test_bytes_come_no_faster_than_the_line_carries_them(tmp_path):
     try:
         wait_for(port.exists, "the port")
         host = Host(port).hello()
-        frame = encode_frame(Frame(m.Clock.TYPE, 0, host.session, m.Clock(0x01010101).body()))
+        frame = encode_frame(Frame(m.Clock.TYPE, 0, host.session, m.Clock(0x01010101).encode_body()))
         count = -(-2000 // len(frame))
         time.sleep(0.5)  # an idle line saves nothing up
         began = time.monotonic()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from optodrive.device.config import load_config
-from optodrive.device.field_file import read_field
+from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
 from optodrive.lab.commissioning.predicted_error import display_codes
 from optodrive.link.simulator.board_limits import OWN
@@ -55,11 +55,11 @@ def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, mo
     answer = json.loads(told)
     assert answer["goal_reached"] is True
     assert answer["spots"] <= 25
-    field = read_field(out)
+    field = load_field(out)
     assert rms_um(missed_m(field, geometry)) <= 10.0
     spots = read_spots(tmp_path / "field.spots.csv")
     assert len(spots) == answer["spots"]
-    nominal_m = (np.array([spots.x_code, spots.y_code]) - 32768) * CONFIG.scanner.code_rad * 2 * 0.220
+    nominal_m = (np.array([spots.x_code, spots.y_code]) - 32768) * CONFIG.scanner.rad_per_code * 2 * 0.220
     assert np.hypot(*(nominal_m - [spots.x_m, spots.y_m])).max() > 0.3e-3  # without the field it misses
     assert not session_spots(out)
     pulses = assert_dark(board).of("pulse")
@@ -85,9 +85,9 @@ def test_ctrl_c_and_on(make_board, start, tmp_path):
     assert status == 0, errors
     assert f"going on with {len(kept)} spots" in errors
     answer = json.loads(told)
-    assert read_spots(tmp_path / "field.spots.csv").table()[: len(kept)] == pytest.approx(np.array(kept))
+    assert read_spots(tmp_path / "field.spots.csv").to_table()[: len(kept)] == pytest.approx(np.array(kept))
     assert len(assert_dark(board).of("pulse")) - lit <= 3 * (answer["spots"] - len(kept)) + 3
-    assert rms_um(missed_m(read_field(out), 3)) <= 10.0
+    assert rms_um(missed_m(load_field(out), 3)) <= 10.0
 
 
 @pytest.mark.slow
@@ -171,7 +171,7 @@ def test_nudged_by_a_person(make_board, start, tmp_path):
     status, told, errors = command.ended()
     assert status == 0, errors
     assert json.loads(told)["spots"] == 9
-    assert rms_um(missed_m(read_field(out), 4)) <= 40.0
+    assert rms_um(missed_m(load_field(out), 4)) <= 40.0
     assert_dark(board)
 
 

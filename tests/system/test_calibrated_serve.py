@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, LAYOUT, field_file
-from optodrive.device.field_file import read_field
-from optodrive.device.pixel_map import DEAD, MEASURED, PixelMap, write_map
+from hidden_field import CONFIG, LAYOUT, calibrate_hidden_field
+from optodrive.device.field_file import load_field
+from optodrive.device.pixel_map import DEAD, MEASURED, PixelMap, write_pixel_map
 from rig import Board, Daemon
 
 PIXELS = (0, 20, 218, 400, 436)
@@ -33,22 +33,22 @@ def shown(folder, *options):
 def test_a_frame_lands_where_the_field_and_the_map_lead_it(tmp_path, mapped):
     """Pixels 0 and 20 lie as planned in the map too: there the field alone leads the beam."""
     path, map_path, count = tmp_path / "field.toml", tmp_path / "pixels.toml", len(LAYOUT)
-    field_file(path, seed=3)
+    calibrate_hidden_field(path, seed=3)
     offset_m, gain, state = np.zeros((2, count)), np.ones(count), np.full(count, MEASURED)
     if mapped:
         offset_m[:, 200:] = np.random.default_rng(5).uniform(-1e-4, 1e-4, (2, count - 200))
         gain[LOW], state[DEAD_PIXEL] = 0.7, DEAD
     known = PixelMap(gain, gain * 0.01, *offset_m.copy(), *np.full((2, count), 1e-6), state, "surroundings")
-    write_map(map_path, known, CONFIG, {})
+    write_pixel_map(map_path, known, CONFIG, {})
 
     pulses, answer = shown(tmp_path, "--field", path, *(("--pixels-map", map_path) if mapped else ()))
     order = answer["pulses"]["pixel"]
     assert sorted(order) == [pixel for pixel in PIXELS if not known.dead[pixel]]
     places_m = np.array([LAYOUT.x_m, LAYOUT.y_m])[:, order]
-    codes = np.column_stack(read_field(path).codes(*(places_m + offset_m[:, order])))
+    codes = np.column_stack(load_field(path).codes(*(places_m + offset_m[:, order])))
     landed = np.array([[pulse["x"], pulse["y"]] for pulse in pulses])
     assert np.abs(landed - codes).max() <= 0.51
-    code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad
+    code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
     assert np.abs(codes - (32768 + places_m.T / code_m)).max() > 100  # without the field they would land far off
 
     assert answer["summary"]["dead"]["sentence"] == (f"pixel {DEAD_PIXEL} is dead: left out" if mapped else None)

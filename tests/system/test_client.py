@@ -136,7 +136,7 @@ def test_a_daemon_that_restarts_is_found_again_and_is_not_armed(make_board, make
     monkeypatch.delenv("OPTODRIVE_TOKEN", raising=False)
     first = make_daemon(board)
     port = first.client.base_url.port
-    with Display(first.url, patience_s=30.0) as display:
+    with Display(first.url, reconnect_timeout_s=30.0) as display:
         display.arm()
         with display.stream() as stream:
             assert stream.wait(stream.send({5: 60.0})).status == "done"

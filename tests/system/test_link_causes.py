@@ -6,7 +6,7 @@ import subprocess
 
 import pytest
 
-from optodrive.link.transport.link_capture import Tape
+from optodrive.link.transport.link_capture import LinkCapture
 from rig import OPTODRIVE, Board, long_train, wait_for
 
 
@@ -87,7 +87,7 @@ def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_
     assert cause in failed["error"]
     assert "FAULT (LINK: this computer" in failed["error"]
     daemon.stop()
-    assert Tape(tape).ignored == 0
+    assert LinkCapture(tape).ignored_bytes == 0
     run = subprocess.run([OPTODRIVE, "wire", "dump", tape, "--json"], capture_output=True, text=True, check=True)
     *lines, last = map(json.loads, run.stdout.splitlines())
     names = [line["message"] for line in lines if "message" in line]

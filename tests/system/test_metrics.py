@@ -3,7 +3,7 @@
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from optodrive.daemon.engine.metrics import PlanTally
+from optodrive.daemon.engine.metrics import PlanCounters
 from rig import ended, long_train, wait_for
 
 
@@ -12,7 +12,7 @@ def read(text):
     for family in text_string_to_metric_families(text):
         assert family.documentation.endswith(".")
         for sample in family.samples:
-            labels = tuple(value for _, value in sorted(sample.labels.items()))
+            labels = tuple(value for _, value in sorted(sample.hypothesis_labels.items()))
             key = (sample.name, *labels) if labels else sample.name
             assert key not in found
             found[key] = sample.value
@@ -61,7 +61,7 @@ def test_faults_are_counted_by_their_name_and_once(armed):
     engine._planner._pending = 1
     wait_for(lambda: engine.board_state == "FAULT", "the lease to lapse")
     for _ in range(3):
-        assert read(engine.metrics())["optodrive_board_faults_total", "LINK"] == 1
+        assert read(engine.render_metrics())["optodrive_board_faults_total", "LINK"] == 1
     engine._planner._pending = 0
 
 
@@ -70,7 +70,7 @@ def test_without_a_token_there_are_no_figures(daemon):
 
 
 def test_a_tally_starts_with_every_status_at_nought():
-    assert set(PlanTally().ended) == {"done", "superseded", "failed", "cancelled"}
+    assert set(PlanCounters().ended) == {"done", "superseded", "failed", "cancelled"}
 
 
 def _frames(engine):

@@ -20,10 +20,10 @@ from optodrive.client import AsyncDisplay, Display
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.web.access_policy import Door
-from optodrive.daemon.web.api import make_app
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.roles import ARM, ROLES, ROUTES, STOP
-from optodrive.daemon.web.static_files import LOGIN, is_page
+from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
@@ -33,11 +33,11 @@ from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
 LAST_LINE = "lease_s = 1.0"
 
 
-OF_THE_LOGIN = {f"GET {path}" for path in LOGIN}
+LOGIN_ROUTES = {f"GET {path}" for path in LOGIN_PATHS}
 """Entries of their own within the page's route."""
 
 
-def with_daemon(text):
+def build_daemon_replacement(text):
     """Replaces the configuration's last line by itself and a [daemon] section."""
     return ((LAST_LINE, f"{LAST_LINE}\n[daemon]\n{text}\n#"),)
 
@@ -52,7 +52,7 @@ def running(folder):
     board = Board(folder)
     text = f'socket = "{folder}/s"\naudit = "{folder}/audit.jsonl"\nrequests_per_s = 1e5\nrequests_burst = 100000'
     try:
-        daemon = Daemon(folder, board.port, replace=with_daemon(text))
+        daemon = Daemon(folder, board.port, replace=build_daemon_replacement(text))
         try:
             yield daemon
         finally:
@@ -64,11 +64,11 @@ def running(folder):
 @pytest.fixture(scope="module")
 def app():
     """The application, whose engine was never started."""
-    engine = Engine(pipeline.Display.of(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
-    return make_app(engine, Door(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+    engine = Engine(pipeline.DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
 
-def routes_of(application):
+def list_routes(application):
     """Every route of an application, as the table writes them."""
     found = set()
     for route in application.routes:
@@ -84,17 +84,17 @@ def routes_of(application):
     return found
 
 
-def tokens(daemon):
+def read_role_tokens(daemon):
     path = next((daemon.config.parent / "optodrive").glob("token-*"))
     entries = tomllib.loads(path.read_text())["token"]
     return {entry["role"]: entry["secret"] for entry in entries}
 
 
-def bearer(secret):
+def build_bearer_header(secret):
     return {"Authorization": f"Bearer {secret}"}
 
 
-def answer(daemon, key, headers):
+def request_route(daemon, key, headers):
     """Status and code that a route answers with."""
     method, _, template = key.partition(" ")
     path = template.replace("{plan_id}", "p1").replace("{name}", "pixel").replace("{path:path}", "x")
@@ -119,47 +119,47 @@ def answer(daemon, key, headers):
 
 
 def test_the_table_has_every_route_and_no_other(app):
-    assert routes_of(app) == set(ROUTES) - OF_THE_LOGIN
+    assert list_routes(app) == set(ROUTES) - LOGIN_ROUTES
 
 
 def test_what_the_login_needs_is_open_and_holds_no_secret(running):
-    for key in OF_THE_LOGIN:
+    for key in LOGIN_ROUTES:
         response = httpx.get(running.url + key.partition(" ")[2])
         assert response.status_code == 200
         assert TOKEN not in response.text
 
 
 def test_a_route_without_an_entry_is_not_answered_and_is_caught():
-    engine = Engine(pipeline.Display.of(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
-    mutant = make_app(engine, Door(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+    engine = Engine(pipeline.DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    mutant = build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
     @mutant.post("/v1/laser")
     async def laser():
         return {"on": True}
 
-    assert routes_of(mutant) - set(ROUTES) == {"POST /v1/laser"}
+    assert list_routes(mutant) - set(ROUTES) == {"POST /v1/laser"}
 
     async def call():
         async with httpx.AsyncClient(transport=httpx.ASGITransport(mutant), base_url="http://localhost") as client:
-            return await client.post("/v1/laser", headers=bearer(TOKEN))
+            return await client.post("/v1/laser", headers=build_bearer_header(TOKEN))
 
     response = asyncio.run(call())
     assert (response.status_code, response.json()["code"]) == (404, "no_such_route")
 
 
 def test_a_guard_that_is_forgotten_is_caught():
-    assert routes_of(FastAPI()) - set(ROUTES)
+    assert list_routes(FastAPI()) - set(ROUTES)
 
 
 REFUSALS = {
     "no token": ({}, (401, "bad_token")),
     "an empty token": ({"Authorization": "Bearer"}, (401, "bad_token")),
-    "a wrong token": (bearer("wrong" * 8), (401, "bad_token")),
+    "a wrong token": (build_bearer_header("wrong" * 8), (401, "bad_token")),
     "another scheme": ({"Authorization": f"Basic {TOKEN}"}, (401, "bad_token")),
-    "a foreign Host": ({**bearer(TOKEN), "Host": "evil.example"}, (421, "foreign_host")),
-    "a Host like ours": ({**bearer(TOKEN), "Host": "localhost.evil.example"}, (421, "foreign_host")),
-    "a foreign Origin": ({**bearer(TOKEN), "Origin": "https://evil.example"}, (403, "foreign_origin")),
-    "no page's Origin": ({**bearer(TOKEN), "Origin": "null"}, (403, "foreign_origin")),
+    "a foreign Host": ({**build_bearer_header(TOKEN), "Host": "evil.example"}, (421, "foreign_host")),
+    "a Host like ours": ({**build_bearer_header(TOKEN), "Host": "localhost.evil.example"}, (421, "foreign_host")),
+    "a foreign Origin": ({**build_bearer_header(TOKEN), "Origin": "https://evil.example"}, (403, "foreign_origin")),
+    "no page's Origin": ({**build_bearer_header(TOKEN), "Origin": "null"}, (403, "foreign_origin")),
 }
 
 
@@ -167,23 +167,31 @@ REFUSALS = {
 @pytest.mark.parametrize("key", sorted(ROUTES))
 def test_every_route_refuses(running, key, case):
     headers, expected = REFUSALS[case]
-    if expected[0] == 401 and is_page(*key.split(" ")):
+    if expected[0] == 401 and is_page_request(*key.split(" ")):
         expected = (401, None)  # the page that asks for the token
     if ROUTES[key] is None and expected[0] == 401:
         expected = (200, None)
-    assert answer(running, key, dict(headers)) == expected
+    assert request_route(running, key, dict(headers)) == expected
 
 
 @pytest.mark.parametrize("key", sorted(key for key, least in ROUTES.items() if least not in (None, ROLES[0])))
 def test_every_route_refuses_a_role_too_low(running, key):
     for role in ROLES[: ROLES.index(ROUTES[key])]:
-        assert answer(running, key, bearer(tokens(running)[role])) == (403, "role_too_low")
+        assert request_route(running, key, build_bearer_header(read_role_tokens(running)[role])) == (
+            403,
+            "role_too_low",
+        )
 
 
 @pytest.mark.parametrize("key", sorted(ROUTES.keys() - {ARM}))  # armed below
 def test_every_route_lets_its_role_pass(running, key):
     least = ROUTES[key] or ROLES[0]
-    assert answer(running, key, bearer(tokens(running)[least]))[0] not in (401, 403, 421, 429)
+    assert request_route(running, key, build_bearer_header(read_role_tokens(running)[least]))[0] not in (
+        401,
+        403,
+        421,
+        429,
+    )
 
 
 @pytest.mark.parametrize(
@@ -191,7 +199,7 @@ def test_every_route_lets_its_role_pass(running, key):
 )
 def test_what_is_not_there_asks_for_a_token_first(running, method, path, status):
     assert httpx.request(method, running.url + path).status_code == 401
-    response = httpx.request(method, running.url + path, headers=bearer(TOKEN))
+    response = httpx.request(method, running.url + path, headers=build_bearer_header(TOKEN))
     assert response.status_code == status
     assert (status == 405) == ("allow" in response.headers)
     assert "access-control-allow-origin" not in response.headers
@@ -202,8 +210,8 @@ def test_the_unix_socket_asks_for_the_token_too(running, folder):
     with httpx.Client(transport=httpx.HTTPTransport(uds=str(folder / "s")), base_url="http://localhost") as client:
         assert client.get("/v1/health").status_code == 200
         assert client.get("/v1/state").status_code == 401
-        assert client.get("/v1/state", headers=bearer(TOKEN)).status_code == 200
-        assert client.get("/v1/state", headers=bearer(TOKEN) | {"Host": "evil.example"}).status_code == 421
+        assert client.get("/v1/state", headers=build_bearer_header(TOKEN)).status_code == 200
+        assert client.get("/v1/state", headers=build_bearer_header(TOKEN) | {"Host": "evil.example"}).status_code == 421
 
 
 def test_command_line_and_client_reach_the_unix_socket(running, folder):
@@ -229,7 +237,7 @@ def test_command_line_and_client_reach_the_unix_socket(running, folder):
     assert place + "x" in gone.stderr
 
 
-def raw(daemon, request):
+def send_raw(daemon, request):
     host, port = daemon.url.removeprefix("http://").split(":")
     with socket.create_connection((host, int(port)), timeout=10) as link:
         link.sendall(request.encode())
@@ -241,27 +249,27 @@ def raw(daemon, request):
 )
 def test_stop_waits_for_no_body(running, body):
     path = STOP.partition(" ")[2]
-    secret = tokens(running)["viewer"]
-    given = raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
+    secret = read_role_tokens(running)["viewer"]
+    given = send_raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
     assert given.startswith("HTTP/1.1 200 ")
 
 
-def audit_lines(folder):
+def read_audit(folder):
     return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
 
 
 def test_the_audit_file_says_who_did_what(running, folder):
-    secrets = tokens(running)
+    secrets = read_role_tokens(running)
     running.arm()
     body = json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}}]})
-    plan = running.call("POST", "/v1/plans", content=body, headers=bearer(secrets["operator"]))["plan"]
-    running.call("POST", "/v1/arm", status=403, headers=bearer(secrets["viewer"]))
+    plan = running.call("POST", "/v1/plans", content=body, headers=build_bearer_header(secrets["operator"]))["plan"]
+    running.call("POST", "/v1/arm", status=403, headers=build_bearer_header(secrets["viewer"]))
     forged = {"X-Forwarded-For": "10.1.2.3", "X-Real-IP": "10.1.2.3"}
-    running.call("POST", "/v1/stop", headers=bearer(secrets["viewer"]) | forged)
+    running.call("POST", "/v1/stop", headers=build_bearer_header(secrets["viewer"]) | forged)
     running.call("GET", "/v1/state")
 
     def look():
-        lines = audit_lines(folder)
+        lines = read_audit(folder)
         begin = next(index for index, line in enumerate(lines) if line["event"] == "asked")
         return lines[begin:] if any(line["call"] == "POST /v1/stop" for line in lines[begin:]) else None
 
@@ -280,18 +288,18 @@ def test_the_audit_file_says_who_did_what(running, folder):
 
 
 def test_no_token_is_ever_written(running, folder):
-    running.call("GET", "/v1/state", status=401, headers=bearer("s3cret-that-is-wrong"))
+    running.call("GET", "/v1/state", status=401, headers=build_bearer_header("s3cret-that-is-wrong"))
     httpx.get(f"{running.url}/v1/state?token={TOKEN}")
-    secrets = [*tokens(running).values(), "s3cret-that-is-wrong"]
+    secrets = [*read_role_tokens(running).values(), "s3cret-that-is-wrong"]
     for path in (running.errors, folder / "audit.jsonl"):
         text = path.read_text()
         assert not [secret for secret in secrets if secret in text], path
 
 
 def test_a_caller_that_asks_too_often_waits_others_and_stop_do_not(make_daemon, board, tmp_path):
-    daemon = make_daemon(board, replace=with_daemon("requests_per_s = 1\nrequests_burst = 20"))
-    secrets = tokens(daemon)
-    with httpx.Client(base_url=daemon.url, headers=bearer(secrets["viewer"])) as viewer:
+    daemon = make_daemon(board, replace=build_daemon_replacement("requests_per_s = 1\nrequests_burst = 20"))
+    secrets = read_role_tokens(daemon)
+    with httpx.Client(base_url=daemon.url, headers=build_bearer_header(secrets["viewer"])) as viewer:
         given = [viewer.get("/v1/state") for _ in range(60)]
         late = [response for response in given if response.status_code == 429]
         assert 30 <= len(late) < 60
@@ -299,7 +307,7 @@ def test_a_caller_that_asks_too_often_waits_others_and_stop_do_not(make_daemon, 
         assert late[-1].json()["code"] == "too_many_requests"
         assert [viewer.post("/v1/stop").status_code for _ in range(50)] == [200] * 50
         assert 429 in {viewer.get("/v1/config").status_code for _ in range(20)}
-    assert httpx.get(f"{daemon.url}/v1/state", headers=bearer(secrets["operator"])).status_code == 200
+    assert httpx.get(f"{daemon.url}/v1/state", headers=build_bearer_header(secrets["operator"])).status_code == 200
     assert {httpx.get(f"{daemon.url}/v1/state").status_code for _ in range(40)} == {401, 429}
     assert httpx.post(f"{daemon.url}/v1/stop").status_code == 401
 
@@ -308,7 +316,7 @@ def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board,
     """A disk that is full: begun while there is room, then there is none."""
     board = make_board()
     audit = tmp_path / "audit.jsonl"
-    daemon = Daemon(tmp_path, board.port, replace=with_daemon(f'audit = "{audit}"'))
+    daemon = Daemon(tmp_path, board.port, replace=build_daemon_replacement(f'audit = "{audit}"'))
     try:
         daemon.arm()
         plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]

@@ -16,7 +16,7 @@ from locked_room import locked, why_not
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.kernels import code_folder
 from optodrive.daemon.notify import Notifier
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from rig import TOKEN, Daemon, long_train, wait_for
 
 TRANSPORTS = {
@@ -33,7 +33,7 @@ EXPOSURE_MAX = "15"
 def unit(request, tmp_path):
     """The unit as it is installed for a board."""
     config = tmp_path / "mine.toml"
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     config.write_text(text.replace('transport = "simulated"', TRANSPORTS[request.param]))
     command = [sys.executable, "-m", "optodrive.cli.main", "service", "install", "--program", "/usr/bin/true"]
     subprocess.run([*command, "--root", tmp_path / "root", "--config", config], check=True, capture_output=True)
@@ -110,10 +110,10 @@ def test_ready_when_it_answers_then_fed_then_stopping(manager, board, make_daemo
 def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
     """The web server's thread lives on: only the engine's loop may feed."""
     notifier = Notifier(MonotonicClock())
-    engine.on_turn = notifier.alive
+    engine.on_turn = notifier.feed_watchdog
     wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
     go_on = threading.Event()
-    standing = engine._in_loop(lambda: go_on.wait(30))
+    standing = engine._submit_to_loop(lambda: go_on.wait(30))
     try:
         time.sleep(0.1)
         before = len(manager.listen())

@@ -5,8 +5,8 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from optodrive.device.config import load_config, pixel_layout
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.device.config import build_pixel_layout, load_config
+from optodrive.link.session.board_requirements import BoardRequirements
 from rig import running
 
 PWM_S = 2e-4
@@ -67,9 +67,9 @@ def assert_logged(board, columns, executed_in_all):
 def cell_codes():
     """Codes of every pixel's centre, [p, 2]."""
     config = load_config()
-    layout, angle = pixel_layout(config.display), 1.0 / (2.0 * config.scanner.focal_length_m)
-    scale = Requirements.of(config).scale
-    return np.column_stack([scale.codes(layout.x_m * angle), scale.codes(layout.y_m * angle)])
+    layout, angle = build_pixel_layout(config.display), 1.0 / (2.0 * config.scanner.focal_length_m)
+    scale = BoardRequirements.from_config(config).scale
+    return np.column_stack([scale.to_codes(layout.x_m * angle), scale.to_codes(layout.y_m * angle)])
 
 
 def by_visit(pulses):

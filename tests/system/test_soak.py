@@ -15,7 +15,7 @@ PULSES = 3000
 
 
 def test_few_pulses_all_arrive():
-    rows, failed = bench_soak.soak(PULSES)
+    rows, failed = bench_soak.run_soak(PULSES)
     told = dict(rows)
     assert told["pulses in the board's log"] == told["pulses reported to the session"] == PULSES
     # A machine that is busy may let even this board run dry: no matter of this test.

@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import planner
-from optodrive.planning.pipeline import prepare
+from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
 
@@ -54,7 +54,7 @@ def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where
 
     def slowly(*arguments, **more):
         tries.append(time.sleep(next(naps_s)))
-        return prepare(*arguments, **more)
+        return plan_sequence(*arguments, **more)
 
     monkeypatch.setattr(planner, "prepare", slowly)
     second = stream(armed, frame(range(40, 60)))

@@ -16,7 +16,7 @@ import pytest
 
 from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import Display
+from optodrive.planning.pipeline import DisplayModel
 from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 
 
@@ -119,12 +119,12 @@ def test_what_is_shown_is_what_was_executed(daemon, reader):
     batches = executed(follower, answer["plan"])
     assert [(batch["plan"], batch["pixel"], batch["row"]) for batch in batches] == [(answer["plan"], [17], [0])]
     (batch,) = batches
-    heat = Display.of(load_config()).heat_at_rest()
-    heat.pulses(*(np.array(batch[key]) for key in ("pixel", "start_s", "width_s", "power_w")))
+    heat = DisplayModel.from_config(load_config()).build_cold_heat()
+    heat.apply_pulses(*(np.array(batch[key]) for key in ("pixel", "start_s", "width_s", "power_w")))
     told = [event for _, event in follower.of("display") if heights_um(event).any()]
     assert len(told) > 3
     for event in told:
-        expected = heat.at(event["board_s"])
+        expected = heat.state_at(event["board_s"])
         assert heights_um(event) == pytest.approx(expected.displacement_m * 1e6, abs=0.2)
         assert celsius(event) == pytest.approx(20.0 + expected.absorber_k, abs=0.2)
     assert max(heights_um(event)[17] for event in told) < done["simulated_max_um"] + 0.2

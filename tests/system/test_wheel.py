@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "scripts"))
 
-from wheel import build  # noqa: E402 - a script
+from wheel import build_wheel  # noqa: E402 - a script
 
 
 def made(tmp_path, *options):
@@ -23,7 +23,7 @@ def made(tmp_path, *options):
 
 @pytest.mark.timeout(300)
 def test_everything_is_inside(tmp_path):
-    with zipfile.ZipFile(build(tmp_path)) as wheel:
+    with zipfile.ZipFile(build_wheel(tmp_path)) as wheel:
         inside = set(wheel.namelist())
     shipped = {path.relative_to(ROOT).as_posix() for path in (ROOT / "configs").rglob("*") if path.is_file()}
     assert {f"optodrive/_shipped/{path}" for path in shipped} <= inside

@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from rig import TOKEN, running
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
@@ -213,7 +213,7 @@ CONFIGS = {
 @pytest.mark.parametrize("case", CONFIGS)
 def test_wrong_configurations(case, tmp_path):
     old, new, naming = CONFIGS[case]
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     assert old in text
     path = tmp_path / "config.toml"
     path.write_text(text.replace(old, new))
@@ -248,7 +248,7 @@ def test_a_picture_that_is_no_picture(armed, tmp_path):
 
 
 def test_a_missing_serial_port(tmp_path):
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     path = tmp_path / "config.toml"
     path.write_text(text.replace('transport = "simulated"', 'transport = "serial"\nport = "/dev/ttyNOWHERE"'))
     assert_one_line(["serve", "--config", path, "--port", "0"], "/dev/ttyNOWHERE", {"XDG_RUNTIME_DIR": str(tmp_path)})

@@ -103,7 +103,7 @@ class QemuCore:
         seed = int.from_bytes(os.urandom(4), "little")
         head = struct.pack("<II12sHHBB", seed, FIRMWARE, bytes.fromhex(settings.uid), settings.cell_codes,
                            settings.queue_points, settings.key_edge, self._inputs)  # fmt: skip
-        return head + settings.limits.body()
+        return head + settings.limits.encode_body()
 
     def _until(self, condition: Callable[[], bool]) -> None:
         """Look at the witness until something is so."""
@@ -203,11 +203,11 @@ class QemuCore:
         event: dict[str, Any] = {"t_us": at_us, "event": KINDS[kind]}
         if event["event"] == "gate":
             point = f"point {index}" if on else f"point {index} done"
-            return event | {"on": bool(on), "reason": point if is_point else m.REASONS[reason]}
+            return event | {"on": bool(on), "reason": point if is_point else m.EVENT_REASONS[reason]}
         if event["event"] == "state":
             self._states += 1
             self._state = m.STATES[state]
-            return event | {"state": m.STATES[state], "before": m.STATES[before], "reason": m.REASONS[reason]}
+            return event | {"state": m.STATES[state], "before": m.STATES[before], "reason": m.EVENT_REASONS[reason]}
         if event["event"] == "fault":
             return event | {"fault": m.FAULTS[fault]}
         if event["event"] == "pulse":

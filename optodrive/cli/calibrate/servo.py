@@ -7,7 +7,7 @@ from optodrive.cli.options import print_json
 from optodrive.core.errors import InputError
 
 
-def calibrated_mirrors(recording: Path, out: Path | None, config: str | None, json: bool) -> None:
+def calibrate_servo(recording: Path, out: Path | None, config: str | None, json: bool) -> None:
     """Identify both servos, write mirrors.toml where asked, and say what was found and against what is configured."""
     if find_spec("scipy") is None:
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
@@ -19,18 +19,18 @@ def calibrated_mirrors(recording: Path, out: Path | None, config: str | None, js
     from optodrive.lab.servo_identification.step_trace import trace_of
 
     # What the configuration itself states, so that a file of mirrors that is no good keeps no one from a new one.
-    loaded, where = load_config(config, measured=False), str(recording)
+    loaded, source = load_config(config, measured_servo=False), str(recording)
     measurement = read_recording(recording)
-    x_trace, y_trace = (trace_of(where, measurement, axis) for axis in range(2))
+    x_trace, y_trace = (trace_of(source, measurement, axis) for axis in range(2))
     slew = loaded.scanner.slew_rad_per_s
-    mirrors = identify(where, x_trace, slew), identify(where, y_trace, slew)
-    told = figures(mirrors, common_servo(mirrors, loaded), loaded)
+    servos = identify(source, x_trace, slew), identify(source, y_trace, slew)
+    stats = figures(servos, common_servo(servos, loaded), loaded)
     if out is not None:
-        write_mirrors(out, told, where)
+        write_mirrors(out, stats, source)
     if json:
-        print_json(told | ({} if out is None else {"mirrors": str(out)}))
+        print_json(stats | ({} if out is None else {"mirrors": str(out)}))
         return
-    for line in lines(told):
+    for line in lines(stats):
         print(line)
     if out is not None:
         print(f"written          {out}")

@@ -16,12 +16,12 @@ class Estimate:
 
 
 @dataclass(frozen=True)
-class Gain:
+class HeldOutGain:
     """RMSE on runs that were held out, by signal, SI; reduction: (before − after) / (before − floor), 95 % interval."""
 
-    before: dict[str, float]
-    after: dict[str, float]
-    floor: dict[str, float]
+    nominal: dict[str, float]
+    extended: dict[str, float]
+    noise_floor: dict[str, float]
     reduction: float
     low: float
     high: float
@@ -37,7 +37,7 @@ class CandidateCause:
     p_value: float
     heldout_gain: float | None
     verdict: str
-    smallest: str
+    detection_limit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,17 +47,17 @@ class NextExperiment:
     pulses: [n, 4]; pixel: the one to look at; repeats: how often; separation: χ² between rivals; seconds: of lab time
     """
 
-    why: str
+    rationale: str
     pulses: FloatArray
     pixel: int
     repeats: int
     signals: tuple[str, ...]
     separation: float
-    seconds: float
+    lab_time_s: float
 
 
 @dataclass(frozen=True, eq=False)
-class Course:
+class ResidualTrace:
     """One signal of one group: measured, and residuals before and after in units of sigma, one sample's noise; [m]."""
 
     group: str
@@ -65,8 +65,8 @@ class Course:
     sigma: float
     t_s: FloatArray
     measured: FloatArray
-    before: FloatArray
-    after: FloatArray
+    nominal: FloatArray
+    extended: FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,16 +78,16 @@ class Discrepancy:
 
     verdict: str
     causes: tuple[str, ...]
-    labels: tuple[str, ...]
+    hypothesis_labels: tuple[str, ...]
     parameters: dict[str, Estimate]
     base: dict[str, float]
     terms: dict[str, dict[str, float]]
-    gain: Gain | None
+    gain: HeldOutGain | None
     candidates: tuple[CandidateCause, ...]
     next_experiment: NextExperiment | None
-    fitted: tuple[str, ...]
-    held_out: tuple[str, ...]
-    courses: tuple[Course, ...]
+    fitted_runs: tuple[str, ...]
+    held_out_runs: tuple[str, ...]
+    residual_traces: tuple[ResidualTrace, ...]
     remarks: tuple[str, ...]
-    explained: float
-    seconds: float
+    explained_fraction: float
+    elapsed_s: float

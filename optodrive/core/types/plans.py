@@ -27,9 +27,9 @@ class PulsePlan:
     y_rad: FloatArray
     power_w: FloatArray
     pixel: IntArray
-    settle_s: FloatArray
+    settling_s: FloatArray
     target_m: FloatArray
-    nominal_s: FloatArray
+    requested_start_s: FloatArray
     source: IntArray
 
     def __post_init__(self) -> None:
@@ -50,9 +50,9 @@ EMPTY_PLAN = PulsePlan(
     y_rad=_NO_FLOATS,
     power_w=_NO_FLOATS,
     pixel=_NO_INTS,
-    settle_s=_NO_FLOATS,
+    settling_s=_NO_FLOATS,
     target_m=_NO_FLOATS,
-    nominal_s=_NO_FLOATS,
+    requested_start_s=_NO_FLOATS,
     source=_NO_INTS,
 )
 
@@ -89,19 +89,19 @@ class BudgetState:
     """
 
     at_s: float
-    dark_since_s: FloatArray
+    last_pulse_end_s: FloatArray
     rise_k: FloatArray
-    least_k: FloatArray
-    spot_j: FloatArray
-    on_s: FloatArray
+    lower_bound_k: FloatArray
+    bucket_j: FloatArray
+    merged_width_s: FloatArray
     wall_k: FloatArray
     touch_k: FloatArray
     nodes_at_s: FloatArray
     inflow_w: FloatArray
     exchanged_at_s: float
     mirror_rad: FloatArray
-    acceleration2: FloatArray
-    swing: FloatArray
+    galvo_mean_square: FloatArray
+    galvo_ringing: FloatArray
     mirror_at_s: float
     recent_start_s: FloatArray
     recent_width_s: FloatArray

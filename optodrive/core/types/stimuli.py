@@ -20,7 +20,7 @@ class TactileFrame:
     show_at_s: float
     duration_s: float
     target_m: FloatArray
-    together: bool = False
+    simultaneous: bool = False
     priority: int = 0
 
     def __post_init__(self) -> None:
@@ -45,7 +45,7 @@ class PulseTrain:
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""
-        return _cycle_starts_s(self.start_s, self.duration_s, self.pulse_width_s + self.gap_s)
+        return _compute_cycle_starts_s(self.start_s, self.duration_s, self.pulse_width_s + self.gap_s)
 
 
 @dataclass(frozen=True)
@@ -66,13 +66,13 @@ class HeightTrain:
 
     def pulse_starts_s(self) -> FloatArray:
         """Nominal start of each pulse, s: [n]."""
-        return _cycle_starts_s(self.start_s, self.duration_s, self.period_s)
+        return _compute_cycle_starts_s(self.start_s, self.duration_s, self.period_s)
 
 
 Train = PulseTrain | HeightTrain
 
 
-def _cycle_starts_s(start_s: float, duration_s: float, period_s: float) -> FloatArray:
+def _compute_cycle_starts_s(start_s: float, duration_s: float, period_s: float) -> FloatArray:
     count = max(1, int(np.ceil(duration_s / period_s - 1e-9)))
     return np.asarray(start_s + period_s * np.arange(count), dtype=np.float64)
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.progress import Progress
+from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
-from optodrive.physics.nominal_display import Heights
-from optodrive.planning.limiter.limiter import counted, shifted
-from optodrive.planning.limiter.usage import Usage, usage
-from optodrive.planning.pipeline import Display
+from optodrive.physics.nominal_display import DisplayState
+from optodrive.planning.limiter.limiter import commit_executed, shift_state
+from optodrive.planning.limiter.usage import Usage, compute_usage
+from optodrive.planning.pipeline import DisplayModel
 
 
-class Executed(NamedTuple):
+class ExecutedBatch(NamedTuple):
     """Pulses [n] of a plan as executed; row: of the plan; start_s: board time; also what the limiter may count."""
 
     record: PlanRecord
@@ -30,10 +30,10 @@ class Executed(NamedTuple):
     y_rad: FloatArray
 
     @classmethod
-    def of(cls, progress: Progress, scale: WireScale) -> "Executed":
+    def from_progress(cls, progress: PlanProgress, scale: WireScale) -> "ExecutedBatch":
         """What the board reported."""
         record, job = progress.run
-        plan, reported = record.prepared.plan, job.reported(progress.begin, progress.end)
+        plan, reported = record.planned.plan, job.read_reported(progress.begin, progress.end)
         row = reported.row
         return cls(
             record=record,
@@ -47,34 +47,34 @@ class Executed(NamedTuple):
         )
 
 
-class LiveHeat:
+class LiveThermalState:
     """Heat and budget as executed; from rest, because a daemon does not know what was before it.
 
     out_of_order: pulses that came with a time before one on their pixel already known, and were left out
     """
 
-    def __init__(self, display: Display) -> None:
+    def __init__(self, display: DisplayModel) -> None:
         self._display = display
-        self._heat, self._budget = display.at_rest()
+        self._heat, self._budget = display.build_cold_state()
         self.out_of_order = 0
 
-    def take(self, executed: Executed) -> None:
+    def apply(self, executed: ExecutedBatch) -> None:
         """Count pulses, in order of time."""
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
-            self._heat.pulses(*columns)
+            self._heat.apply_pulses(*columns)
         except ValueError:
             self.out_of_order += len(executed.row)
-        self._budget = counted(executed.pixel, executed, self._budget, self._display.budget)
+        self._budget = commit_executed(executed.pixel, executed, self._budget, self._display.budget)
 
-    def clock_moved(self, delay_s: float) -> None:
+    def shift_clock(self, delay_s: float) -> None:
         """Everything happened delay_s later on a clock set anew."""
-        self._heat, self._budget = self._heat.shifted(delay_s), shifted(self._budget, delay_s)
+        self._heat, self._budget = self._heat.copy_shifted(delay_s), shift_state(self._budget, delay_s)
 
-    def at(self, board_s: float) -> Heights:
+    def state_at(self, board_s: float) -> DisplayState:
         """Every pixel at a time of the board's, s."""
-        return self._heat.at(board_s)
+        return self._heat.state_at(board_s)
 
-    def usage(self, board_s: float) -> tuple[Usage, ...]:
+    def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
         """How near each cap is at a time of the board's, s."""
-        return usage(self._budget, self._display.budget, board_s)
+        return compute_usage(self._budget, self._display.budget, board_s)

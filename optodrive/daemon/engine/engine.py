@@ -14,29 +14,29 @@ from typing import TypeVar
 
 import numpy as np
 
-from optodrive.core.clock import Clock, claim_processor
+from optodrive.core.clock import Clock, request_realtime_scheduling
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.daemon.engine.metrics import PlanTally, metrics
-from optodrive.daemon.engine.plan_queue import Programme
-from optodrive.daemon.engine.plan_record import PlanBook, PlanRecord
-from optodrive.daemon.engine.planner import Order, Planner
-from optodrive.daemon.engine.progress import ClockMoved, Progress
-from optodrive.daemon.engine.state_waiters import Answer, Waits, promise
+from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
+from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
+from optodrive.daemon.engine.planner import Planner, PlanningRequest
+from optodrive.daemon.engine.progress import ClockShift, PlanProgress
+from optodrive.daemon.engine.state_waiters import JsonObject, StateWaiters, uncancellable_future
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.fault_hints import hint
-from optodrive.link.session.link_watch import Cause
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.link_watch import LinkCause
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
-from optodrive.planning.feasibility import Fit
+from optodrive.planning.feasibility import FitMode
 from optodrive.planning.limiter.limiter import Policy
-from optodrive.planning.pipeline import Display, warm_up
+from optodrive.planning.pipeline import DisplayModel, warm_up
 
-TURN_S = 0.002
-IDLE_TURN_S = 0.01
+LOOP_WAIT_S = 0.002
+IDLE_LOOP_WAIT_S = 0.01
 SWITCH_INTERVAL_S = 2e-4
-RECONNECT_S = 1.0
+RECONNECT_INTERVAL_S = 1.0
 QUEUE_MAX = 50
 LOOP_TIMEOUT_S = 5.0
 T = TypeVar("T")
@@ -49,25 +49,25 @@ class Engine:
     say: gets a line whenever the link goes wrong, for the log. on_turn: called at every turn of the loop; must be quick
     """
 
-    def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
+    def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
         self.display = display
         self.failure: BaseException | None = None
         self.on_failure: Callable[[], None] = lambda: None
-        self.say: Callable[[str], None] = lambda line: None
-        self.on_turn: Callable[[], None] = lambda: None
+        self.on_warning: Callable[[str], None] = lambda line: None
+        self.on_loop: Callable[[], None] = lambda: None
         self._clock = clock
-        self._session = Session(transport, clock, Requirements.of(display.config))
-        self._book = PlanBook()
-        self._tally = PlanTally()
-        self._book.on_end.append(self._tally.note)
-        self._bookkeeper = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
-        self._programme = Programme(display, self._session, self._book, self._bookkeeper)
+        self._session = BoardSession(transport, clock, BoardRequirements.from_config(display.config))
+        self._plan_store = PlanStore()
+        self._plan_counters = PlanCounters()
+        self._plan_store.end_callbacks.append(self._plan_counters.record_end)
+        self._simulation_executor = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
+        self._plan_queue = PlanQueue(display, self._session, self._plan_store, self._simulation_executor)
         self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
-        self._waits = Waits()
+        self._state_waiters = StateWaiters()
         self._closing = threading.Event()
-        self._planner = Planner(display, self._session, self._programme, clock, self._by_loop, self._require_armed)
+        self._planner = Planner(display, self._session, self._plan_queue, clock, self._run_in_loop, self._require_armed)
         self._link_error: str | None = None
-        self._told: Cause | None = None
+        self._published_cause: LinkCause | None = None
         self._retry_at_s = 0.0
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
@@ -93,18 +93,18 @@ class Engine:
             self._thread.join(timeout=5.0)
         self._session.close()
         self._planner.close()
-        self._bookkeeper.shutdown(wait=False, cancel_futures=True)
+        self._simulation_executor.shutdown(wait=False, cancel_futures=True)
 
     def _run(self) -> None:
-        claim_processor()
+        request_realtime_scheduling()
         try:
             while not self._closing.is_set():
                 try:
-                    self._turn()
+                    self._run_once()
                 except (LinkError, InputError) as error:
-                    self._link_lost(error)
-                self._tell_cause()
-                self.on_turn()
+                    self._on_link_lost(error)
+                self._publish_cause()
+                self.on_loop()
         except BaseException as error:
             self.failure = error
             raise
@@ -113,19 +113,19 @@ class Engine:
             if self.failure is not None:
                 self.on_failure()
 
-    def _turn(self) -> None:
-        self._obey()
+    def _run_once(self) -> None:
+        self._run_commands()
         if not self._session.connected:
             self._reconnect()
             return
-        busy = self._programme.busy or self._waits
-        self._session.step(TURN_S if busy else IDLE_TURN_S, lease=self._planner.alive)
-        refusal = self._session.take_refusal()
-        self._settle_waits(refusal)
-        self._programme.follow_jobs(refusal)
-        self._programme.start_next()
+        busy = self._plan_queue.is_busy or self._state_waiters
+        self._session.step(LOOP_WAIT_S if busy else IDLE_LOOP_WAIT_S, renew_lease=self._planner.is_alive)
+        refusal = self._session.pop_refusal()
+        self._resolve_waiters(refusal)
+        self._plan_queue.update_jobs(refusal)
+        self._plan_queue.start_next()
 
-    def _obey(self) -> None:
+    def _run_commands(self) -> None:
         while True:
             try:
                 command = self._commands.get_nowait()
@@ -135,71 +135,73 @@ class Engine:
 
     # --- the link -----------------------------------------------------------------------------------------------
 
-    def _link_lost(self, error: OptodriveError) -> None:
-        self._link_error = self._session.lost(error)
-        self._programme.fail_all(self._link_error)
-        self._retry_at_s = self._clock.now_s() + RECONNECT_S
+    def _on_link_lost(self, error: OptodriveError) -> None:
+        self._link_error = self._session.on_lost(error)
+        self._plan_queue.fail_all(self._link_error)
+        self._retry_at_s = self._clock.now_s() + RECONNECT_INTERVAL_S
 
     def _reconnect(self) -> None:
-        self._settle_waits(None)
+        self._resolve_waiters(None)
         if self._clock.now_s() < self._retry_at_s:
-            self._clock.sleep(IDLE_TURN_S)
+            self._clock.sleep(IDLE_LOOP_WAIT_S)
             return
-        before_s = self._session.board_s()
+        previous_board_s = self._session.board_s()
         try:
             self._session.connect()
         except (LinkError, InputError) as error:
             self._link_error = str(error)
-            self._retry_at_s = self._clock.now_s() + RECONNECT_S
+            self._retry_at_s = self._clock.now_s() + RECONNECT_INTERVAL_S
             return
         # The board may have restarted its clock: what is known of heat moves onto the new one.
-        self._programme.board_restarted(self._session.board_s() - before_s)
+        self._plan_queue.on_board_restarted(self._session.board_s() - previous_board_s)
         self._link_error = None
 
-    def _tell_cause(self) -> None:
+    def _publish_cause(self) -> None:
         cause = self._session.likely_cause
-        if cause is not self._told:
-            self._told = cause
+        if cause is not self._published_cause:
+            self._published_cause = cause
             if cause is not None:
-                self.say(f"board at {self._session.port}: {cause.sentence}")
+                self.on_warning(f"board at {self._session.port}: {cause.message}")
 
     # --- commands from any thread -------------------------------------------------------------------------------
 
-    def arm(self) -> "Future[Answer]":
+    def arm(self) -> "Future[JsonObject]":
         """Arm the board; done when it is ARMED."""
-        return self._command(self._session.arm, ("ARMED",), "arm")
+        return self._submit_command(self._session.arm, ("ARMED",), "arm")
 
-    def disarm(self) -> "Future[Answer]":
+    def disarm(self) -> "Future[JsonObject]":
         """Disarm, or acknowledge a fault; done when the board is DISARMED."""
-        return self._command(self._session.disarm, ("DISARMED",), "disarm")
+        return self._submit_command(self._session.disarm, ("DISARMED",), "disarm")
 
-    def stop(self) -> "Future[Answer]":
+    def stop(self) -> "Future[JsonObject]":
         """Abort: gate off, queue dropped; done when the board is dark for good."""
-        return self._command(self._session.abort, ("DISARMED", "FAULT"), "stop")
+        return self._submit_command(self._session.abort, ("DISARMED", "FAULT"), "stop")
 
-    def _command(self, action: Callable[[], None], states: tuple[str, ...], what: str) -> "Future[Answer]":
-        future: Future[Answer] = promise()
+    def _submit_command(
+        self, action: Callable[[], None], states: tuple[str, ...], command: str
+    ) -> "Future[JsonObject]":
+        future: Future[JsonObject] = uncancellable_future()
 
-        def obey() -> None:
+        def run_command() -> None:
             try:
                 self._require_link()
                 action()
             except OptodriveError as error:
                 future.set_exception(error)
                 return
-            if what != "arm":
-                self._programme.fail_all(f"ended by {what}")
-            self._waits.add(states, what, self._clock.now_s(), future)
+            if command != "arm":
+                self._plan_queue.fail_all(f"ended by {command}")
+            self._state_waiters.add(states, command, self._clock.now_s(), future)
 
-        self._commands.put(obey)
+        self._commands.put(run_command)
         return future
 
     def _require_link(self) -> None:
         if not self._session.connected:
             raise LinkError(self._link_error or "no link to the board")
 
-    def _settle_waits(self, refusal: str | None) -> None:
-        self._waits.settle(self._session, refusal, self._link_error, self._clock.now_s(), self.snapshot)
+    def _resolve_waiters(self, refusal: str | None) -> None:
+        self._state_waiters.resolve(self._session, refusal, self._link_error, self._clock.now_s(), self.snapshot)
 
     # --- plans --------------------------------------------------------------------------------------------------
 
@@ -209,10 +211,10 @@ class Engine:
         name: str,
         dry_run: bool = False,
         policy: Policy = "trim",
-        fit: Fit = "as_is",
+        fit: FitMode = "as_is",
         streamed: bool = False,
         arrived_s: float | None = None,
-    ) -> "Future[Answer]":
+    ) -> "Future[JsonObject]":
         """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when.
 
         streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
@@ -221,34 +223,36 @@ class Engine:
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is where the newest wins: a stream has no time to ask what else would fit")
         arrived_s = self.board_s() if arrived_s is None else arrived_s
-        return self._planner.submit(Order(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s))
+        return self._planner.submit(
+            PlanningRequest(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s)
+        )
 
     def _require_armed(self) -> None:
         self._require_link()
         board = self._session.board
         if board.state not in ("ARMED", "RUNNING", "HOLD"):
-            fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
+            fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
-        if len(self._programme.waiting) >= QUEUE_MAX:
+        if len(self._plan_queue.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
 
-    def _in_loop(self, action: Callable[[], T]) -> "Future[T]":
+    def _submit_to_loop(self, action: Callable[[], T]) -> "Future[T]":
         """Do something in the loop's thread, which owns the session."""
-        future: Future[T] = promise()
+        future: Future[T] = uncancellable_future()
 
-        def obey() -> None:
+        def run_command() -> None:
             try:
                 future.set_result(action())
             except OptodriveError as error:
                 future.set_exception(error)
 
-        self._commands.put(obey)
+        self._commands.put(run_command)
         return future
 
-    def _by_loop(self, action: Callable[[], T]) -> T:
+    def _run_in_loop(self, action: Callable[[], T]) -> T:
         """What comes of an action in the loop's thread; LinkError where the loop has ended."""
         try:
-            return self._in_loop(action).result(LOOP_TIMEOUT_S)
+            return self._submit_to_loop(action).result(LOOP_TIMEOUT_S)
         except TimeoutError:
             raise LinkError(f"the engine did not answer within {LOOP_TIMEOUT_S:g} s: {self.failure!r}") from None
 
@@ -256,32 +260,32 @@ class Engine:
         """The board's time now, s."""
         return self._session.board_s()
 
-    def ending(self, plan_id: str) -> "Future[None]":
+    def get_end_future(self, plan_id: str) -> "Future[None]":
         """Done when nothing more will happen to a plan; InputError (no_plan) where there is none."""
-        return self._book.find(plan_id).ending
+        return self._plan_store.find(plan_id).end_future
 
-    def end_stream(self) -> "Future[Answer]":
+    def end_stream(self) -> "Future[JsonObject]":
         """Let go what has not left of a stream's last plan: whoever sent it is gone."""
-        nothing = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
-        return self.submit(lambda: FrameSequence((nothing,)), "end of stream", streamed=True)
+        blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
+        return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True)
 
-    def plan(self, plan_id: str, pulses: bool = True) -> Answer:
+    def get_plan(self, plan_id: str, pulses: bool = True) -> JsonObject:
         """A plan by its id; InputError (no_plan) where there is none."""
-        return self._book.find(plan_id).answer(self._session.board_s(), pulses)
+        return self._plan_store.find(plan_id).to_json(self._session.board_s(), pulses)
 
-    def cancel(self, plan_id: str) -> "Future[Answer]":
+    def cancel(self, plan_id: str) -> "Future[JsonObject]":
         """Take a plan out of the queue, or end it dark; the board stays armed."""
 
-        def end() -> Answer:
-            record = self._book.find(plan_id)
-            self._programme.cancel(record)
-            return record.answer(self._session.board_s())
+        def end() -> JsonObject:
+            record = self._plan_store.find(plan_id)
+            self._plan_queue.cancel(record)
+            return record.to_json(self._session.board_s())
 
-        return self._in_loop(end)
+        return self._submit_to_loop(end)
 
-    def on_plan_end(self, tell: Callable[[PlanRecord], None]) -> None:
+    def add_plan_end_callback(self, callback: Callable[[PlanRecord], None]) -> None:
         """Have each plan told when it has ended, by whichever thread ended it; `tell` must not wait."""
-        self._book.on_end.append(tell)
+        self._plan_store.end_callbacks.append(callback)
 
     @property
     def tick_s(self) -> float:
@@ -296,7 +300,7 @@ class Engine:
         return self._session.port
 
     @property
-    def linked(self) -> bool:
+    def is_linked(self) -> bool:
         """Whether there is a link to the board, and its clock is known."""
         return self._session.connected
 
@@ -305,28 +309,28 @@ class Engine:
         """How SI becomes codes on this board."""
         return self._session.scale
 
-    def take_told(self) -> list[Progress | ClockMoved]:
+    def drain_events(self) -> list[PlanProgress | ClockShift]:
         """What was done since the last call, in order; for one reader."""
-        told, taken = self._programme.told, []
-        while told:
-            taken.append(told.popleft())
-        return taken
+        events, drained = self._plan_queue.events, []
+        while events:
+            drained.append(events.popleft())
+        return drained
 
-    def coming(self) -> list[PlanRecord]:
+    def list_upcoming(self) -> list[PlanRecord]:
         """The plans that run, and the first that waits."""
-        programme = self._programme
-        waiting = programme.waiting.copy()
-        return [run.record for run in programme.running.copy()] + ([waiting[0]] if waiting else [])
+        plan_queue = self._plan_queue
+        waiting = plan_queue.waiting.copy()
+        return [run.record for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
 
     @property
     def board_state(self) -> str:
         """The board's state, or the link's."""
         return self._session.board.state if self._session.connected else "no link"
 
-    def snapshot(self) -> Answer:
+    def snapshot(self) -> JsonObject:
         """Everything GET /v1/state answers."""
-        programme = self._programme
-        running = next(iter(programme.running.copy()), None)
+        plan_queue = self._plan_queue
+        running = next(iter(plan_queue.running.copy()), None)
         return {
             "display": self.display.config.name,
             "pixels": len(self.display.layout),
@@ -334,20 +338,21 @@ class Engine:
                 "port": self._session.port,
                 "state": "up" if self._session.connected else "down",
                 "error": self._link_error,
-                **self._session.link_figures(),
+                **self._session.collect_link_stats(),
             },
-            "board": self._session.board.figures(),
+            "board": self._session.board.to_dict(),
             "queue": {
-                "waiting": len(programme.waiting),
+                "waiting": len(plan_queue.waiting),
                 "running": None if running is None else running.record.plan_id,
                 "plans": [
-                    {"plan": item.plan_id, "name": item.name, "status": item.status} for item in self._book.recent()
+                    {"plan": item.plan_id, "name": item.name, "status": item.status}
+                    for item in self._plan_store.list_recent()
                 ],
             },
-            "totals": {**programme.totals, "timing_error": programme.timing.figures()},
-            "planner": {"busy": self._planner.busy, "alive": self._planner.alive},
+            "totals": {**plan_queue.totals, "timing_error": plan_queue.timing.to_dict()},
+            "planner": {"busy": self._planner.is_busy, "alive": self._planner.is_alive},
         }
 
-    def metrics(self) -> str:
+    def render_metrics(self) -> str:
         """Everything GET /metrics answers."""
-        return metrics(self.snapshot(), self._tally, self._session, self.display.config.board.lease_s)
+        return render_metrics(self.snapshot(), self._plan_counters, self._session, self.display.config.board.lease_s)

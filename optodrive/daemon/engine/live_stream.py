@@ -16,26 +16,26 @@ from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 OUTBOX_MAX = 1000
 """A caller that leaves so many answers unread is cut off."""
-SLOW_READER = 1013
-Answer = dict[str, Any]
-Problem = Callable[[OptodriveError], Answer]
+CLOSE_SLOW_READER = 1013
+JsonObject = dict[str, Any]
+ProblemFormatter = Callable[[OptodriveError], JsonObject]
 
 
 class LiveStream:
     """One caller's stream. A frame that waits for the planner gives way to the next; so does what has not left."""
 
-    def __init__(self, engine: Engine, socket: WebSocket, policy: Policy, problem_of: Problem) -> None:
+    def __init__(self, engine: Engine, socket: WebSocket, policy: Policy, to_problem: ProblemFormatter) -> None:
         self._engine = engine
         self._socket = socket
         self._policy = policy
-        self._problem_of = problem_of
+        self._to_problem = to_problem
         self._pixels = len(engine.display.layout)
-        self._number = 0
-        self._newest: tuple[int, FrameSequence, float] | None = None
+        self._next_number = 0
+        self._pending: tuple[int, FrameSequence, float] | None = None
         self._arrived = asyncio.Event()
-        self._outbox: asyncio.Queue[Answer] = asyncio.Queue(OUTBOX_MAX)
+        self._outbox: asyncio.Queue[JsonObject] = asyncio.Queue(OUTBOX_MAX)
         self._watchers: set[asyncio.Task[None]] = set()
-        self._last: Future[None] | None = None
+        self._last_end_future: Future[None] | None = None
 
     async def run(self) -> None:
         """Serve until the caller leaves; what has not left of the last frame is then dropped."""
@@ -44,7 +44,7 @@ class LiveStream:
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
-            if self._last is not None and not self._last.done():
+            if self._last_end_future is not None and not self._last_end_future.done():
                 self._engine.end_stream()  # first: this coroutine may be cancelled while it waits for others
             for task in (*tasks, *self._watchers):
                 task.cancel()
@@ -58,56 +58,60 @@ class LiveStream:
             data: str | bytes = message.get("text") or message.get("bytes") or b""
             arrived_s = self._engine.board_s()
             try:
-                number, sequence = parse_live_frame(data, self._number, self._pixels)
+                number, sequence = parse_live_frame(data, self._next_number, self._pixels)
             except OptodriveError as error:
-                self._tell({"frame": None, "status": "refused", "error": self._problem_of(error)})
+                self._publish({"frame": None, "status": "refused", "error": self._to_problem(error)})
                 continue
-            if self._newest is not None:
-                self._tell({"frame": self._newest[0], "status": "superseded", "by": number, "plan": None})
-            self._newest, self._number = (number, sequence, arrived_s), number + 1
+            if self._pending is not None:
+                self._publish({"frame": self._pending[0], "status": "superseded", "by": number, "plan": None})
+            self._pending, self._next_number = (number, sequence, arrived_s), number + 1
             self._arrived.set()
 
     async def _plan(self) -> None:
         while True:
             await self._arrived.wait()
             self._arrived.clear()
-            assert self._newest is not None  # noqa: S101 - set before the event
-            (number, sequence, arrived_s), self._newest = self._newest, None
+            assert self._pending is not None  # noqa: S101 - set before the event
+            (number, sequence, arrived_s), self._pending = self._pending, None
             future = self._engine.submit(
-                partial(_same, sequence), f"frame {number}", policy=self._policy, streamed=True, arrived_s=arrived_s
+                partial(_return_sequence, sequence),
+                f"frame {number}",
+                policy=self._policy,
+                streamed=True,
+                arrived_s=arrived_s,
             )
             try:
                 answer = await asyncio.wrap_future(future)
             except OptodriveError as error:
-                self._tell({"frame": number, "status": "refused", "error": self._problem_of(error)})
+                self._publish({"frame": number, "status": "refused", "error": self._to_problem(error)})
                 continue
-            self._last = self._engine.ending(answer["plan"])
-            self._tell({"frame": number, "status": "planned", **_planned(answer)})
-            watcher = asyncio.create_task(self._watch(number, answer["plan"], self._last))
+            self._last_end_future = self._engine.get_end_future(answer["plan"])
+            self._publish({"frame": number, "status": "planned", **_format_planned(answer)})
+            watcher = asyncio.create_task(self._watch(number, answer["plan"], self._last_end_future))
             self._watchers.add(watcher)
             watcher.add_done_callback(self._watchers.discard)
 
-    async def _watch(self, number: int, plan_id: str, ending: "Future[None]") -> None:
-        await asyncio.wrap_future(ending)
-        self._tell({"frame": number, **_ended(self._engine.plan(plan_id, pulses=False))})
+    async def _watch(self, number: int, plan_id: str, end_future: "Future[None]") -> None:
+        await asyncio.wrap_future(end_future)
+        self._publish({"frame": number, **_format_ended(self._engine.get_plan(plan_id, pulses=False))})
 
-    def _tell(self, answer: Answer) -> None:
+    def _publish(self, answer: JsonObject) -> None:
         try:
             self._outbox.put_nowait(answer)
         except asyncio.QueueFull:
             self._arrived.clear()
-            raise WebSocketDisconnect(SLOW_READER) from None
+            raise WebSocketDisconnect(CLOSE_SLOW_READER) from None
 
     async def _write(self) -> None:
         while True:
             await self._socket.send_json(await self._outbox.get())
 
 
-def _same(sequence: FrameSequence) -> FrameSequence:
+def _return_sequence(sequence: FrameSequence) -> FrameSequence:
     return sequence
 
 
-def _planned(answer: Answer) -> Answer:
+def _format_planned(answer: JsonObject) -> JsonObject:
     summary = answer["summary"]
     return {
         "plan": answer["plan"],
@@ -120,6 +124,6 @@ def _planned(answer: Answer) -> Answer:
     }
 
 
-def _ended(answer: Answer) -> Answer:
+def _format_ended(answer: JsonObject) -> JsonObject:
     keys = ("plan", "status", "error", "planned", "executed", "dropped", "simulated_max_um", "latency")
     return {key: answer[key] for key in keys}

@@ -12,18 +12,18 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.engine.state_waiters import promise
+from optodrive.daemon.engine.state_waiters import uncancellable_future
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session.timing_error import TimingError
-from optodrive.physics.thermal_state import Heat
-from optodrive.planning.feasibility import Admission
-from optodrive.planning.pipeline import Prepared
-from optodrive.planning.plan_summary import PULSES_LISTED_MAX, pulse_columns, summary
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.feasibility import FeasibilityReport
+from optodrive.planning.pipeline import PlannedSequence
+from optodrive.planning.plan_summary import PULSES_LISTED_MAX, list_pulse_columns, summarize_plan
 
-RECORDS_KEPT = 200
-PULSES_KEPT = 1_000_000
+RECORDS_MAX = 200
+PULSES_MAX = 1_000_000
 """Ended plans are forgotten beyond so many plans or pulses."""
-RECENT = 20
+RECENT_PLANS = 20
 
 Status = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
 
@@ -42,10 +42,10 @@ class PlanRecord:
 
     plan_id: str
     name: str
-    prepared: Prepared
-    admission: Admission | None
+    planned: PlannedSequence
+    feasibility: FeasibilityReport | None
     points: WirePoints
-    heat_before: Heat
+    heat_before: ThermalState
     budget_before: BudgetState
     start_s: float
     arrived_s: float
@@ -63,22 +63,22 @@ class PlanRecord:
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
-    seen: BoolArray | None = None
-    ending: "Future[None]" = field(default_factory=promise)
-    told_end: "Callable[[PlanRecord], None]" = field(default=lambda record: None)
+    refreshed: BoolArray | None = None
+    end_future: "Future[None]" = field(default_factory=uncancellable_future)
+    on_end: "Callable[[PlanRecord], None]" = field(default=lambda record: None)
 
     @property
-    def ended(self) -> bool:
+    def has_ended(self) -> bool:
         """Whether nothing more will happen to it."""
         return self.status in ("done", "superseded", "failed", "cancelled")
 
     def end(self, status: Status, error: str | None) -> None:
         """Nothing more will happen to it."""
         self.status, self.error = status, error
-        self.ending.set_result(None)
-        self.told_end(self)
+        self.end_future.set_result(None)
+        self.on_end(self)
 
-    def answer(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
+    def to_json(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
         """The plan as REST answers it; pulses: list them one by one."""
         answer: dict[str, Any] = {
             "plan": self.plan_id,
@@ -86,7 +86,7 @@ class PlanRecord:
             "status": self.status,
             "error": self.error,
             "starts_in_s": self.start_s + self.delay_s - board_now_s,
-            "planned": len(self.prepared.plan),
+            "planned": len(self.planned.plan),
             "sent": self.sent,
             "executed": self.executed_count,
             "dropped": self.dropped,
@@ -96,10 +96,10 @@ class PlanRecord:
                 "first_light_s": self.first_light_after_s,
             },
             "timing_error": None if self.timing_error is None else asdict(self.timing_error),
-            "summary": summary(self.prepared, self.admission),
-            "pulses": pulse_columns(self.prepared) if pulses else None,
+            "summary": summarize_plan(self.planned, self.feasibility),
+            "pulses": list_pulse_columns(self.planned) if pulses else None,
             "simulated_max_um": None,
-            "tallest_asked": self._tallest_asked(),
+            "tallest_asked": self._describe_max_target(),
             "executed_pulses": None,
         }
         if self.executed is not None:
@@ -108,27 +108,27 @@ class PlanRecord:
             if self.simulated_m is not None and len(self.simulated_m):
                 answer["simulated_max_um"] = m_to_um(float(self.simulated_m.max()))
             if pulses and len(self.executed) <= PULSES_LISTED_MAX:
-                answer["executed_pulses"] = self._executed_columns()
+                answer["executed_pulses"] = self._list_executed()
         return answer
 
-    def _tallest_asked(self) -> dict[str, Any] | None:
+    def _describe_max_target(self) -> dict[str, Any] | None:
         """The pulse asked to be the tallest: asked for, predicted, and simulated from what was executed."""
-        plan = self.prepared.plan
-        asked_m = np.nan_to_num(plan.target_m)
-        if not len(plan) or not asked_m.any():
+        plan = self.planned.plan
+        target_m = np.nan_to_num(plan.target_m)
+        if not len(plan) or not target_m.any():
             return None
-        row = int(asked_m.argmax())
+        row = int(target_m.argmax())
         simulated_um = None
         if self.simulated_m is not None and self.executed_rows is not None and row in self.executed_rows:
             simulated_um = m_to_um(float(self.simulated_m[self.executed_rows == row][0]))
         return {
             "pixel": int(plan.pixel[row]),
-            "asked_um": m_to_um(float(asked_m[row])),
-            "predicted_um": m_to_um(float(self.prepared.predicted_m[row])),
+            "asked_um": m_to_um(float(target_m[row])),
+            "predicted_um": m_to_um(float(self.planned.predicted_m[row])),
             "simulated_um": simulated_um,
         }
 
-    def _executed_columns(self) -> dict[str, list[Any]]:
+    def _list_executed(self) -> dict[str, list[Any]]:
         executed = self.executed
         assert executed is not None  # noqa: S101 - the only caller has just looked
         return {
@@ -140,42 +140,42 @@ class PlanRecord:
         }
 
 
-class PlanBook:
+class PlanStore:
     """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread.
 
     on_end: called with each plan when it has ended, by whichever thread ended it; must not wait
     """
 
     def __init__(self) -> None:
-        self.on_end: list[Callable[[PlanRecord], None]] = []
+        self.end_callbacks: list[Callable[[PlanRecord], None]] = []
         self._lock = threading.Lock()
         self._records: dict[str, PlanRecord] = {}
 
     def add(self, record: PlanRecord) -> None:
         """Keep a plan."""
-        record.told_end = self._tell_end
+        record.on_end = self._run_end_callbacks
         with self._lock:
             self._records[record.plan_id] = record
-            pulses = sum(len(kept.prepared.plan) for kept in self._records.values())
+            pulses = sum(len(kept.planned.plan) for kept in self._records.values())
             for plan_id, oldest in list(self._records.items()):
-                if not oldest.ended or (len(self._records) <= RECORDS_KEPT and pulses <= PULSES_KEPT):
+                if not oldest.has_ended or (len(self._records) <= RECORDS_MAX and pulses <= PULSES_MAX):
                     break
                 del self._records[plan_id]
-                pulses -= len(oldest.prepared.plan)
+                pulses -= len(oldest.planned.plan)
 
-    def _tell_end(self, record: PlanRecord) -> None:
-        for told in self.on_end:
-            told(record)
+    def _run_end_callbacks(self, record: PlanRecord) -> None:
+        for callback in self.end_callbacks:
+            callback(record)
 
     def find(self, plan_id: str) -> PlanRecord:
         """A plan by its id; InputError (no_plan) where there is none."""
         with self._lock:
             record = self._records.get(plan_id)
         if record is None:
-            raise InputError("plan", plan_id, f"one of the last {RECORDS_KEPT} plans", "no_plan")
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "no_plan")
         return record
 
-    def recent(self) -> list[PlanRecord]:
+    def list_recent(self) -> list[PlanRecord]:
         """The latest plans, oldest first."""
         with self._lock:
-            return list(self._records.values())[-RECENT:]
+            return list(self._records.values())[-RECENT_PLANS:]

@@ -9,41 +9,41 @@ from typing import NamedTuple, Protocol, TypeVar
 from optodrive.core.clock import Clock
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.daemon.engine.plan_queue import Basis, Programme
+from optodrive.daemon.engine.plan_queue import PlanningSnapshot, PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.state_waiters import Answer
+from optodrive.daemon.engine.state_waiters import JsonObject
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.session import Session
-from optodrive.planning.feasibility import Admission, Fit, admit
+from optodrive.link.session.session import BoardSession
+from optodrive.planning.feasibility import FeasibilityReport, FitMode, check_feasibility
 from optodrive.planning.limiter.limiter import Policy, verify
-from optodrive.planning.pipeline import Display, Prepared, prepare
-from optodrive.planning.stimuli.streamed_frame import may_be_split, unseen_first
+from optodrive.planning.pipeline import DisplayModel, PlannedSequence, plan_sequence
+from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
-STALL_S = 2.0
+STALL_TIMEOUT_S = 2.0
 """A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
-GUESS_S = 0.01
-ALLOWANCE = 1.5
+INITIAL_PLANNING_S = 0.01
+PLANNING_TIME_FACTOR = 1.5
 """A streamed plan is given so many times as long to be made as the last one took."""
-SEAMLESS_TRIES = 2
+SPLICE_TRIES = 2
 """A streamed plan that came too late so often waits for what runs to end, which then does so soon."""
 T = TypeVar("T")
 
 
-class ByLoop(Protocol):
+class LoopRunner(Protocol):
     """Does something in the loop's thread, which owns the session, and hands back what comes of it."""
 
     def __call__(self, action: Callable[[], T]) -> T:
         """Do it; LinkError where the loop has ended."""
 
 
-class Order(NamedTuple):
+class PlanningRequest(NamedTuple):
     """What a caller asks for; arrived_s: board time."""
 
     build: Callable[[], FrameSequence]
     name: str
     dry_run: bool
     policy: Policy
-    fit: Fit
+    fit: FitMode
     streamed: bool
     arrived_s: float
 
@@ -53,120 +53,124 @@ class Planner:
 
     def __init__(
         self,
-        display: Display,
-        session: Session,
-        programme: Programme,
+        display: DisplayModel,
+        session: BoardSession,
+        plan_queue: PlanQueue,
         clock: Clock,
-        by_loop: ByLoop,
-        may_show: Callable[[], None],
+        run_in_loop: LoopRunner,
+        require_armed: Callable[[], None],
     ) -> None:
         self._display = display
         self._session = session
-        self._programme = programme
+        self._plan_queue = plan_queue
         self._clock = clock
-        self._by_loop = by_loop
-        self._may_show = may_show
-        self._thread = ThreadPoolExecutor(1, thread_name_prefix="planner")
+        self._run_in_loop = run_in_loop
+        self._require_armed = require_armed
+        self._executor = ThreadPoolExecutor(1, thread_name_prefix="planner")
         self._lock = threading.Lock()
         self._ids = count(1)
-        self._pending = 0
+        self._pending_count = 0
         self._progress_at_s = clock.now_s()
-        self._planning_s = GUESS_S
+        self._last_planning_s = INITIAL_PLANNING_S
 
     @property
-    def busy(self) -> bool:
+    def is_busy(self) -> bool:
         """Whether plans are made or wait to be."""
-        return self._pending > 0
+        return self._pending_count > 0
 
     @property
-    def alive(self) -> bool:
+    def is_alive(self) -> bool:
         """Whether it is idle or making progress."""
         with self._lock:
-            return self._pending == 0 or self._clock.now_s() - self._progress_at_s < STALL_S
+            return self._pending_count == 0 or self._clock.now_s() - self._progress_at_s < STALL_TIMEOUT_S
 
     def close(self) -> None:
         """Make no more plans."""
-        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._executor.shutdown(wait=False, cancel_futures=True)
 
-    def submit(self, order: Order) -> "Future[Answer]":
+    def submit(self, request: PlanningRequest) -> "Future[JsonObject]":
         """Make a plan and have it shown; answers what will be shown when. Any thread."""
         with self._lock:
-            if self._pending == 0:
+            if self._pending_count == 0:
                 self._progress_at_s = self._clock.now_s()
-            self._pending += 1
-        return self._thread.submit(self._plan, order)
+            self._pending_count += 1
+        return self._executor.submit(self._process, request)
 
-    def _plan(self, order: Order) -> Answer:
+    def _process(self, request: PlanningRequest) -> JsonObject:
         try:
-            self._note_progress(0.0)
-            sequence = order.build()
-            allowance_s, late = ALLOWANCE * self._planning_s, 0
+            self._record_progress(0.0)
+            sequence = request.build()
+            planning_time_s, late_count = PLANNING_TIME_FACTOR * self._last_planning_s, 0
             while True:
-                if not order.dry_run:
-                    self._may_show()
-                if order.streamed and self._programme.in_the_way:
-                    self._by_loop(self._programme.make_way)
-                record = self._planned(sequence, order, allowance_s)
+                if not request.dry_run:
+                    self._require_armed()
+                if request.streamed and self._plan_queue.must_preempt:
+                    self._run_in_loop(self._plan_queue.preempt)
+                record = self._plan_once(sequence, request, planning_time_s)
                 if record is not None:
-                    return record.answer(self._session.board_s())
+                    return record.to_json(self._session.board_s())
                 # What runs went on beyond where this would have followed.
-                late += 1
-                allowance_s = ALLOWANCE * (1 + late) * self._planning_s
-                if order.streamed and late == SEAMLESS_TRIES:
-                    self._by_loop(self._programme.end_soon)
+                late_count += 1
+                planning_time_s = PLANNING_TIME_FACTOR * (1 + late_count) * self._last_planning_s
+                if request.streamed and late_count == SPLICE_TRIES:
+                    self._run_in_loop(self._plan_queue.truncate_stream)
         finally:
             with self._lock:
-                self._pending -= 1
-            self._note_progress(1.0)
+                self._pending_count -= 1
+            self._record_progress(1.0)
 
-    def _note_progress(self, _share: float) -> None:
+    def _record_progress(self, _share: float) -> None:
         self._progress_at_s = self._clock.now_s()
 
-    def _planned(self, sequence: FrameSequence, order: Order, allowance_s: float) -> PlanRecord | None:
+    def _plan_once(
+        self, sequence: FrameSequence, request: PlanningRequest, planning_time_s: float
+    ) -> PlanRecord | None:
         """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
         began_s = self._clock.now_s()
-        basis = self._programme.basis(order.streamed, allowance_s)
-        heat, budget = basis.heat, basis.budget
-        prepared, admission = self._prepared(sequence, order, basis)
-        points = quantise(prepared.plan, self._session.scale)
+        snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
+        heat, budget = snapshot.heat, snapshot.budget
+        planned, feasibility = self._make_plan(sequence, request, snapshot)
+        points = quantise(planned.plan, self._session.scale)
         record = PlanRecord(
             plan_id=f"p{next(self._ids)}",
-            name=order.name,
-            prepared=prepared,
-            admission=admission,
+            name=request.name,
+            planned=planned,
+            feasibility=feasibility,
             points=points,
             heat_before=heat,
             budget_before=budget,
-            start_s=basis.start_s,
-            arrived_s=order.arrived_s,
-            streamed=order.streamed,
-            seen=basis.seen,
+            start_s=snapshot.start_s,
+            arrived_s=request.arrived_s,
+            streamed=request.streamed,
+            refreshed=snapshot.refreshed,
         )
-        self._prove(record, budget)
-        self._planning_s = self._clock.now_s() - began_s
-        if order.dry_run:
+        self._verify_points(record, budget)
+        self._last_planning_s = self._clock.now_s() - began_s
+        if request.dry_run:
             return record
-        return record if self._by_loop(lambda: self._programme.take(record, basis)) else None
+        return record if self._run_in_loop(lambda: self._plan_queue.commit(record, snapshot)) else None
 
-    def _prepared(self, sequence: FrameSequence, order: Order, basis: Basis) -> tuple[Prepared, Admission | None]:
+    def _make_plan(
+        self, sequence: FrameSequence, request: PlanningRequest, snapshot: PlanningSnapshot
+    ) -> tuple[PlannedSequence, FeasibilityReport | None]:
         """The plan; a stream has no time to ask what else would fit."""
-        if not order.streamed:
-            told, from_where = self._note_progress, (basis.heat, basis.budget)
-            return admit(self._display, sequence, *from_where, order.policy, told, order.fit)
-        if basis.seen is not None and may_be_split(sequence):
-            sequence = unseen_first(sequence, basis.seen)
-        return prepare(
+        if not request.streamed:
+            on_progress, initial_state = self._record_progress, (snapshot.heat, snapshot.budget)
+            return check_feasibility(self._display, sequence, *initial_state, request.policy, on_progress, request.fit)
+        if snapshot.refreshed is not None and can_split(sequence):
+            sequence = stale_pixels_first(sequence, snapshot.refreshed)
+        return plan_sequence(
             self._display,
             sequence,
-            basis.heat,
-            basis.budget,
-            order.policy,
-            self._note_progress,
-            standing_on=basis.standing_on,
+            snapshot.heat,
+            snapshot.budget,
+            request.policy,
+            self._record_progress,
+            initial_pixel=snapshot.initial_pixel,
         ), None
 
-    def _prove(self, record: PlanRecord, budget: BudgetState) -> None:
+    def _verify_points(self, record: PlanRecord, budget: BudgetState) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
-        points, plan = record.points, record.prepared.plan
-        decoded = decode(points.payload(), self._session.scale)
+        points, plan = record.points, record.planned.plan
+        decoded = decode(points.encode_payload(), self._session.scale)
         verify(plan, points.row[decoded.index], decoded, budget, self._display.budget)

@@ -4,37 +4,37 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.link.session.job import Job
+from optodrive.link.session.job import PlanJob
 
 
-class Run(NamedTuple):
+class PlanRun(NamedTuple):
     """A plan, and its points on their way."""
 
     record: PlanRecord
-    job: Job
+    job: PlanJob
 
 
-class Progress(NamedTuple):
+class PlanProgress(NamedTuple):
     """Pulses begin to end of a run, in order of its points, are done, as far as they ever will be."""
 
-    run: Run
+    run: PlanRun
     begin: int
     end: int
 
 
-class ClockMoved(NamedTuple):
+class ClockShift(NamedTuple):
     """The board's clock was set anew: what was known happened so much later on it."""
 
     delay_s: float
 
 
-def joined(notes: Iterable[Progress | ClockMoved]) -> list[Progress | ClockMoved]:
+def merge_events(events: Iterable[PlanProgress | ClockShift]) -> list[PlanProgress | ClockShift]:
     """The same notes, one for all that went on with a run: what is reckoned of them costs by the note."""
-    whole: list[Progress | ClockMoved] = []
-    for note in notes:
-        last = whole[-1] if whole else None
-        if isinstance(note, Progress) and isinstance(last, Progress) and note.run.job is last.run.job:
-            whole[-1] = last._replace(end=note.end)
+    merged: list[PlanProgress | ClockShift] = []
+    for event in events:
+        last = merged[-1] if merged else None
+        if isinstance(event, PlanProgress) and isinstance(last, PlanProgress) and event.run.job is last.run.job:
+            merged[-1] = last._replace(end=event.end)
         else:
-            whole.append(note)
-    return whole
+            merged.append(event)
+    return merged

@@ -10,76 +10,78 @@ import numpy as np
 
 from optodrive import __version__
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.plan_queue import simulated_m
+from optodrive.daemon.engine.plan_queue import compute_simulated_m
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.log import Log
+from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session_recorder import SessionRecorder
-from optodrive.planning.effective_config import resolved_config
-from optodrive.planning.pipeline import Display
-from optodrive.planning.plan_summary import summary
+from optodrive.planning.effective_config import build_effective_config
+from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.train_json import train_to_json
 
-Note = tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]
+PlanEntry = tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]
 
 
-def session_path(folder: Path) -> Path:
+def build_session_path(folder: Path) -> Path:
     """A new name in a folder, by the time of day in UTC."""
     return folder / f"session-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.h5"
 
 
-def about_display(display: Display) -> dict[str, Any]:
+def describe_display(display: DisplayModel) -> dict[str, Any]:
     """What holds for the whole session."""
     return {
         "display": display.config.name,
         "optodrive": __version__,
         "ambient_K": display.ambient_k,
         "bridge_width_m": display.config.display.bridge_width_m,
-        "config": json.dumps(resolved_config(display)),
+        "config": json.dumps(build_effective_config(display)),
     }
 
 
-def note_of(record: PlanRecord, tick_s: float, board_now_s: float) -> Note:
+def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> PlanEntry:
     """A plan that has ended: asked (frames, trains), planned, executed on the board's time, heights reckoned."""
-    prepared, plan = record.prepared, record.prepared.plan
-    frames = prepared.sequence.frames
-    trains = [train_to_json(train) for train in prepared.sequence.trains]
-    about: dict[str, Any] = {
+    planned, plan = record.planned, record.planned.plan
+    frames = planned.sequence.frames
+    trains = [train_to_json(train) for train in planned.sequence.trains]
+    attributes: dict[str, Any] = {
         "plan": record.plan_id,
         "name": record.name,
         "status": record.status,
         "error": record.error,
         "start_s": record.start_s,
-        "summary": json.dumps(summary(prepared, record.admission)),
+        "summary": json.dumps(summarize_plan(planned, record.feasibility)),
         "trains": json.dumps(trains),
     }
     arrays = {
-        "asked_frames": np.array([(f.show_at_s, f.duration_s, f.together, f.priority) for f in frames]).reshape(-1, 4),
+        "asked_frames": np.array([(f.show_at_s, f.duration_s, f.simultaneous, f.priority) for f in frames]).reshape(
+            -1, 4
+        ),
         "asked_um": 1e6 * np.array([frame.target_m for frame in frames]),
         "planned": np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel, plan.trimmed_j]),
-        "predicted_m": prepared.predicted_m,
+        "predicted_m": planned.predicted_m,
     }
     executed = record.executed
     if executed is not None and len(executed):
         on_s = executed.on_tick * tick_s
         unix_s = time.time() - (board_now_s - float(on_s[0]))
-        about |= {"lit_unix_s": unix_s, "lit_at": datetime.fromtimestamp(unix_s, UTC).isoformat()}
+        attributes |= {"lit_unix_s": unix_s, "lit_at": datetime.fromtimestamp(unix_s, UTC).isoformat()}
         arrays["executed"] = np.column_stack([on_s, executed.width_s, executed.power_w, executed.pixel])
-        heights_m = record.simulated_m if record.simulated_m is not None else simulated_m(record)
+        heights_m = record.simulated_m if record.simulated_m is not None else compute_simulated_m(record)
         if heights_m is not None:
             arrays["simulated_m"] = heights_m
-    return about, arrays
+    return attributes, arrays
 
 
-def recorder_of(engine: Engine, path: Path | None, log: Log) -> SessionRecorder | None:
+def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) -> SessionRecorder | None:
     """Has every plan that ends noted in a file, where that is wanted."""
     folder = engine.display.config.daemon.record
     if path is None and not folder:
         return None
-    path = session_path(Path(folder)) if path is None else path
-    recorder = SessionRecorder(path, about_display(engine.display), log.warn)
+    path = build_session_path(Path(folder)) if path is None else path
+    recorder = SessionRecorder(path, describe_display(engine.display), log.warn)
 
-    def note(record: PlanRecord) -> None:
-        recorder.note(lambda: note_of(record, engine.tick_s, engine.board_s()))
+    def record_plan(record: PlanRecord) -> None:
+        recorder.record(lambda: build_plan_entry(record, engine.tick_s, engine.board_s()))
 
-    engine.on_plan_end(note)
+    engine.add_plan_end_callback(record_plan)
     return recorder

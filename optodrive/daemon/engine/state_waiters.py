@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
-from optodrive.link.session.fault_hints import hint
-from optodrive.link.session.session import Session
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.session import BoardSession
 
-Answer = dict[str, Any]
+JsonObject = dict[str, Any]
 TIMEOUT_S = 5.0
 
 
-def promise() -> "Future[Any]":
+def uncancellable_future() -> "Future[Any]":
     """A future that whoever waits for it cannot cancel: a caller that gives up must not stop whoever keeps the word."""
     future: Future[Any] = Future()
     future.set_running_or_notify_cancel()
@@ -21,49 +21,56 @@ def promise() -> "Future[Any]":
 
 
 @dataclass
-class _Wait:
+class _Waiter:
     states: tuple[str, ...]
-    what: str
-    until_s: float
-    future: "Future[Answer]"
+    command: str
+    deadline_s: float
+    future: "Future[JsonObject]"
 
 
-class Waits:
+class StateWaiters:
     """Futures that end when the board is in one of the states asked for, refuses, or takes too long."""
 
     def __init__(self) -> None:
-        self._waits: list[_Wait] = []
+        self._waiters: list[_Waiter] = []
 
     def __bool__(self) -> bool:
-        return bool(self._waits)
+        return bool(self._waiters)
 
-    def add(self, states: tuple[str, ...], what: str, now_s: float, future: "Future[Answer]") -> None:
+    def add(self, states: tuple[str, ...], command: str, now_s: float, future: "Future[JsonObject]") -> None:
         """Let a future wait. what: the order, as the error names it."""
-        self._waits.append(_Wait(states, what, now_s + TIMEOUT_S, future))
+        self._waiters.append(_Waiter(states, command, now_s + TIMEOUT_S, future))
 
-    def settle(
-        self, session: Session, refusal: str | None, link_error: str | None, now_s: float, answer: Callable[[], Answer]
+    def resolve(
+        self,
+        session: BoardSession,
+        refusal: str | None,
+        link_error: str | None,
+        now_s: float,
+        get_snapshot: Callable[[], JsonObject],
     ) -> None:
         """End the waits that are over. refusal: what the board refused since the last look."""
-        for wait in list(self._waits):
-            error = self._error(wait, session, refusal, link_error, now_s)
+        for waiter in list(self._waiters):
+            error = self._find_error(waiter, session, refusal, link_error, now_s)
             if error is not None:
-                wait.future.set_exception(error)
-            elif session.board.state in wait.states and (session.quiet or (wait.what == "stop" and session.aborted)):
-                wait.future.set_result(answer())
-            if wait.future.done():
-                self._waits.remove(wait)
+                waiter.future.set_exception(error)
+            elif session.board.state in waiter.states and (
+                session.is_acknowledged or (waiter.command == "stop" and session.abort_confirmed)
+            ):
+                waiter.future.set_result(get_snapshot())
+            if waiter.future.done():
+                self._waiters.remove(waiter)
 
-    def _error(
-        self, wait: _Wait, session: Session, refusal: str | None, link_error: str | None, now_s: float
+    def _find_error(
+        self, waiter: _Waiter, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float
     ) -> OptodriveError | None:
         board = session.board
         if not session.connected:
             return LinkError(link_error or "no link to the board")
         if refusal is not None:
-            return NotReadyError(f"the board refuses to {wait.what}: {refusal}")
-        if board.state == "FAULT" and wait.what == "arm":
-            return BoardFaultError(f"the board is in FAULT {board.fault}: {hint(board.fault)}")
-        if now_s > wait.until_s:
-            return NotReadyError(f"the board did not {wait.what} within {TIMEOUT_S:g} s: it is {board.state}")
+            return NotReadyError(f"the board refuses to {waiter.command}: {refusal}")
+        if board.state == "FAULT" and waiter.command == "arm":
+            return BoardFaultError(f"the board is in FAULT {board.fault}: {get_fault_hint(board.fault)}")
+        if now_s > waiter.deadline_s:
+            return NotReadyError(f"the board did not {waiter.command} within {TIMEOUT_S:g} s: it is {board.state}")
         return None

@@ -3,33 +3,33 @@
 from dataclasses import dataclass
 
 from optodrive.core.types.plans import BudgetState, ExecutedPulses
-from optodrive.physics.thermal_state import Heat
-from optodrive.planning.limiter.limiter import shifted
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.limiter.limiter import shift_state
 
 
 @dataclass(frozen=True, eq=False)
-class Thermal:
+class ThermalEstimate:
     """Heat and budget after everything planned so far; seconds of board time."""
 
-    heat: Heat
+    heat: ThermalState
     budget: BudgetState
 
-    def seen_from(self, start_s: float) -> tuple[Heat, BudgetState]:
+    def shift_to_plan(self, start_s: float) -> tuple[ThermalState, BudgetState]:
         """Both on the time line of a plan that starts at start_s."""
-        return self.heat.shifted(-start_s), shifted(self.budget, -start_s)
+        return self.heat.copy_shifted(-start_s), shift_state(self.budget, -start_s)
 
     @classmethod
-    def after_plan(cls, heat: Heat, budget: BudgetState, start_s: float) -> "Thermal":
+    def from_plan(cls, heat: ThermalState, budget: BudgetState, start_s: float) -> "ThermalEstimate":
         """What a plan leaves, given on its own time line, on the board's."""
-        return cls(heat.shifted(start_s), shifted(budget, start_s))
+        return cls(heat.copy_shifted(start_s), shift_state(budget, start_s))
 
-    def later(self, delay_s: float) -> "Thermal":
+    def with_delay(self, delay_s: float) -> "ThermalEstimate":
         """Everything happened delay_s later than assumed."""
-        return Thermal(self.heat.shifted(delay_s), shifted(self.budget, delay_s))
+        return ThermalEstimate(self.heat.copy_shifted(delay_s), shift_state(self.budget, delay_s))
 
 
-def heated(before: Heat, executed: ExecutedPulses) -> Heat:
+def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalState:
     """The heat of what was really executed, on the plan's time line as both arguments are."""
     heat = before.copy()
-    heat.pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    heat.apply_pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)
     return heat

@@ -13,60 +13,62 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Semaphore
 
-WAITING_MAX = 1000
-PATIENCE_S = 2.0
-Facts = Mapping[str, object]
+QUEUE_MAX = 1000
+WRITE_TIMEOUT_S = 2.0
+AuditFields = Mapping[str, object]
 
 
-class Audit:
+class AuditLog:
     """The file. say: gets a line when it cannot be written, and when it can again; now: wall clock, UTC."""
 
     def __init__(
         self,
         path: Path,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         now: Callable[[], datetime] = lambda: datetime.now(UTC),
     ) -> None:
         self._path = path
-        self._say = say
+        self._report = report
         self._now = now
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="audit")
-        self._room = Semaphore(WAITING_MAX)
-        self._torn = False
-        self._failed = False
+        self._free_slots = Semaphore(QUEUE_MAX)
+        self._has_partial_line = False
+        self._is_failing = False
 
-    def note(self, facts: Facts) -> None:
+    def record(self, fields: AuditFields) -> None:
         """Add a line soon; not where a thousand wait already."""
-        if self._room.acquire(blocking=False):
-            self._queue(facts, to_disk=False)
+        if self._free_slots.acquire(blocking=False):
+            self._enqueue(fields, to_disk=False)
 
-    async def must(self, facts: Facts) -> str | None:
+    async def record_durably(self, fields: AuditFields) -> str | None:
         """Add a line and wait until it is on the disk; what went wrong where it is not."""
-        if not self._room.acquire(blocking=False):
+        if not self._free_slots.acquire(blocking=False):
             return "too many lines wait to be written"
         try:
-            await asyncio.wait_for(asyncio.wrap_future(self._queue(facts, to_disk=True)), PATIENCE_S)
+            await asyncio.wait_for(asyncio.wrap_future(self._enqueue(fields, to_disk=True)), WRITE_TIMEOUT_S)
         except OSError as error:  # a TimeoutError is one
-            return error.strerror or f"not written within {PATIENCE_S:g} s"
+            return error.strerror or f"not written within {WRITE_TIMEOUT_S:g} s"
         return None
 
-    def _queue(self, facts: Facts, to_disk: bool) -> "Future[None]":
-        line = json.dumps({"at": self._now().isoformat(timespec="milliseconds"), **facts})
+    def _enqueue(self, fields: AuditFields, to_disk: bool) -> "Future[None]":
+        line = json.dumps({"at": self._now().isoformat(timespec="milliseconds"), **fields})
         future = self._writer.submit(self._write, line, to_disk)
-        future.add_done_callback(lambda _: self._room.release())
+        future.add_done_callback(lambda _: self._free_slots.release())
         return future
 
     def _write(self, line: str, to_disk: bool) -> None:
         try:
-            self._append(("\n" if self._torn else "") + line + "\n", to_disk)
+            self._append(("\n" if self._has_partial_line else "") + line + "\n", to_disk)
         except OSError as error:
-            if not self._failed:
-                self._say(f"audit: {self._path} cannot be written ({error.strerror}); arming is refused until it can")
-            self._failed = True
+            if not self._is_failing:
+                self._report(
+                    f"audit: {self._path} cannot be written ({error.strerror}); arming is refused until it can"
+                )
+            self._is_failing = True
             raise
-        if self._failed:
-            self._say(f"audit: {self._path} is written again")
-        self._failed = self._torn = False
+        if self._is_failing:
+            self._report(f"audit: {self._path} is written again")
+        self._is_failing = self._has_partial_line = False
 
     def _append(self, text: str, to_disk: bool) -> None:
         # Opened for each line: a file that was moved away is begun anew, and a lost disk is noticed.
@@ -75,9 +77,9 @@ class Audit:
             data = text.encode("ascii")
             written = os.write(handle, data)
             if written < len(data):
-                self._torn = True
+                self._has_partial_line = True
                 os.write(handle, data[written:])  # says why
-                self._torn = False
+                self._has_partial_line = False
             if to_disk:
                 os.fsync(handle)
         finally:
@@ -87,7 +89,7 @@ class Audit:
         """Write what waits, if that does not take long."""
         last = self._writer.submit(lambda: None)
         try:
-            last.result(PATIENCE_S)
+            last.result(WRITE_TIMEOUT_S)
         except TimeoutError:
-            self._say(f"audit: {self._path} takes too long; its last lines may be missing")
+            self._report(f"audit: {self._path} takes too long; its last lines may be missing")
         self._writer.shutdown(wait=False, cancel_futures=True)

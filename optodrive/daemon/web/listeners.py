@@ -10,7 +10,7 @@ from optodrive.core.errors import InputError
 SOCKET_MODE = 0o660
 
 
-def tcp_listener(host: str, port: int) -> socket.socket:
+def open_tcp_listener(host: str, port: int) -> socket.socket:
     """A socket that listens on a TCP port; InputError where it is taken."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     # With the protocol named, asyncio turns Nagle's delay off for each caller: it costs an answer 40 ms.
@@ -25,17 +25,17 @@ def tcp_listener(host: str, port: int) -> socket.socket:
     return listener
 
 
-def unix_listener(path: Path) -> socket.socket:
+def open_unix_listener(path: Path) -> socket.socket:
     """A socket that listens at a path, for its owner and group; one that a dead daemon left there is taken over."""
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
-        if _left_behind(path):
+        if _is_stale_socket(path):
             path.unlink()
-        before = os.umask(0o777 & ~SOCKET_MODE)  # never, not for a moment, open to others
+        previous_umask = os.umask(0o777 & ~SOCKET_MODE)  # never, not for a moment, open to others
         try:
             listener.bind(str(path))
         finally:
-            os.umask(before)
+            os.umask(previous_umask)
         listener.listen()
     except OSError as error:
         listener.close()
@@ -44,7 +44,7 @@ def unix_listener(path: Path) -> socket.socket:
     return listener
 
 
-def _left_behind(path: Path) -> bool:
+def _is_stale_socket(path: Path) -> bool:
     """Whether a socket is there that nobody answers at."""
     try:
         if not stat.S_ISSOCK(path.stat().st_mode):

@@ -6,7 +6,7 @@ from fastapi import FastAPI
 
 from optodrive.daemon.web.roles import ROUTES
 
-PROBLEM: dict[str, Any] = {
+PROBLEM_SCHEMA: dict[str, Any] = {
     "type": "object",
     "description": "RFC 9457, with a code that stays",
     "required": ["type", "title", "status", "detail", "code"],
@@ -18,8 +18,8 @@ PROBLEM: dict[str, Any] = {
         "code": {"type": "string"},
     },
 }
-ERRORS: dict[int | str, dict[str, Any]] = {
-    status: {"description": text, "content": {"application/problem+json": {"schema": PROBLEM}}}
+ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
+    status: {"description": text, "content": {"application/problem+json": {"schema": PROBLEM_SCHEMA}}}
     for status, text in {
         401: "no token, or a wrong one",
         403: "a foreign Origin, or a token whose role does not allow it",
@@ -33,12 +33,12 @@ ERRORS: dict[int | str, dict[str, Any]] = {
         503: "no link to the board",
     }.items()
 }
-ERRORS[429]["headers"] = {
+ERROR_RESPONSES[429]["headers"] = {
     "Retry-After": {"description": "whole seconds to wait", "schema": {"type": "integer", "minimum": 1}}
 }
 
 
-EVENTS: dict[int | str, dict[str, Any]] = {
+EVENT_RESPONSES: dict[int | str, dict[str, Any]] = {
     200: {
         "description": "Server-sent events until the caller leaves",
         "content": {
@@ -62,20 +62,20 @@ PLAN_LINKS: dict[str, Any] = {
 }
 
 
-def describe(app: FastAPI) -> None:
+def extend_openapi(app: FastAPI) -> None:
     """Let the document say which role a call needs at least, and where a plan is found once it is made."""
-    made = app.openapi
+    build_document = app.openapi
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema:
             return app.openapi_schema
-        document = made()
+        document = build_document()
         document.setdefault("components", {})["securitySchemes"] = {"token": {"type": "http", "scheme": "bearer"}}
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
-                least = ROUTES[f"{method.upper()} {path}"]
-                operation["security"] = [] if least is None else [{"token": []}]
-                operation["x-role"] = least
+                min_role = ROUTES[f"{method.upper()} {path}"]
+                operation["security"] = [] if min_role is None else [{"token": []}]
+                operation["x-role"] = min_role
                 if "201" in operation["responses"]:
                     operation["responses"]["201"]["links"] = PLAN_LINKS
         return document

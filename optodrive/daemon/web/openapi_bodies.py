@@ -10,7 +10,7 @@ from optodrive.planning.stimuli.sequence_file import FRAMES_MAX, TRAINS_MAX
 Schema = dict[str, Any]
 
 
-def _table(required: dict[str, Schema], optional: dict[str, Schema]) -> Schema:
+def _object_schema(required: dict[str, Schema], optional: dict[str, Schema]) -> Schema:
     return {
         "type": "object",
         "required": list(required),
@@ -19,19 +19,23 @@ def _table(required: dict[str, Schema], optional: dict[str, Schema]) -> Schema:
     }
 
 
-_HEIGHT: Schema = {"type": "number", "minimum": 0, "description": "µm"}
-_LONG: Schema = {"type": "number", "exclusiveMinimum": 0, "maximum": TIME_MAX_S, "description": "s"}
-_FROM: Schema = {"type": "number", "minimum": 0, "maximum": TIME_MAX_S, "description": "s"}
-_ABOVE: Schema = {"type": "number", "exclusiveMinimum": 0}
-_PRIORITY: Schema = {"type": "integer", "minimum": -PRIORITY_MAX, "maximum": PRIORITY_MAX}
-_FRAME = _table(
+_HEIGHT_SCHEMA: Schema = {"type": "number", "minimum": 0, "description": "µm"}
+_DURATION_SCHEMA: Schema = {"type": "number", "exclusiveMinimum": 0, "maximum": TIME_MAX_S, "description": "s"}
+_START_SCHEMA: Schema = {"type": "number", "minimum": 0, "maximum": TIME_MAX_S, "description": "s"}
+_POSITIVE_SCHEMA: Schema = {"type": "number", "exclusiveMinimum": 0}
+_PRIORITY_SCHEMA: Schema = {"type": "integer", "minimum": -PRIORITY_MAX, "maximum": PRIORITY_MAX}
+_FRAME_SCHEMA = _object_schema(
     {
-        "show_at_s": _FROM,
-        "duration_s": _LONG,
+        "show_at_s": _START_SCHEMA,
+        "duration_s": _DURATION_SCHEMA,
         "target_um": {
             "oneOf": [
-                {"type": "object", "additionalProperties": _HEIGHT, "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"}},
-                {"type": "array", "items": _HEIGHT},
+                {
+                    "type": "object",
+                    "additionalProperties": _HEIGHT_SCHEMA,
+                    "propertyNames": {"pattern": "^(0|[1-9][0-9]*)$"},
+                },
+                {"type": "array", "items": _HEIGHT_SCHEMA},
             ],
             "description": "heights by pixel, or a list of all",
         },
@@ -39,28 +43,37 @@ _FRAME = _table(
     {
         "id": {"type": "string", "minLength": 1, "maxLength": ID_MAX},
         "together": {"type": "boolean"},
-        "priority": _PRIORITY,
+        "priority": _PRIORITY_SCHEMA,
     },
 )
-_PLACE: dict[str, Schema] = {"pixel": {"type": "integer", "minimum": 0}, "start_s": _FROM, "duration_s": _LONG}
-_TRAIN_BY_PULSE = _table(
-    {**_PLACE, "pulse_width_s": _ABOVE, "gap_s": _FROM, "power_w": _ABOVE}, {"priority": _PRIORITY}
+_TRAIN_SCHEMAS: dict[str, Schema] = {
+    "pixel": {"type": "integer", "minimum": 0},
+    "start_s": _START_SCHEMA,
+    "duration_s": _DURATION_SCHEMA,
+}
+_PULSE_TRAIN_SCHEMA = _object_schema(
+    {**_TRAIN_SCHEMAS, "pulse_width_s": _POSITIVE_SCHEMA, "gap_s": _START_SCHEMA, "power_w": _POSITIVE_SCHEMA},
+    {"priority": _PRIORITY_SCHEMA},
 )
-_TRAIN_BY_HEIGHT = _table(
-    {**_PLACE, "period_s": _LONG, "target_um": _ABOVE},
-    {"peak_to_peak_um": _ABOVE, "priority": _PRIORITY},
+_HEIGHT_TRAIN_SCHEMA = _object_schema(
+    {**_TRAIN_SCHEMAS, "period_s": _DURATION_SCHEMA, "target_um": _POSITIVE_SCHEMA},
+    {"peak_to_peak_um": _POSITIVE_SCHEMA, "priority": _PRIORITY_SCHEMA},
 )
-_FRAMES: Schema = {"type": "array", "items": _FRAME, "maxItems": FRAMES_MAX}
-_TRAINS: Schema = {"type": "array", "items": {"oneOf": [_TRAIN_BY_PULSE, _TRAIN_BY_HEIGHT]}, "maxItems": TRAINS_MAX}
-SEQUENCE: Schema = {
-    **_table({}, {"frames": _FRAMES, "trains": _TRAINS}),
+_FRAMES_SCHEMA: Schema = {"type": "array", "items": _FRAME_SCHEMA, "maxItems": FRAMES_MAX}
+_TRAINS_SCHEMA: Schema = {
+    "type": "array",
+    "items": {"oneOf": [_PULSE_TRAIN_SCHEMA, _HEIGHT_TRAIN_SCHEMA]},
+    "maxItems": TRAINS_MAX,
+}
+SEQUENCE_SCHEMA: Schema = {
+    **_object_schema({}, {"frames": _FRAMES_SCHEMA, "trains": _TRAINS_SCHEMA}),
     "anyOf": [
         {"required": ["frames"], "properties": {"frames": {"minItems": 1}}},
         {"required": ["trains"], "properties": {"trains": {"minItems": 1}}},
     ],
 }
 """FRAMES.json."""
-SHOWN: Schema = {
+SEQUENCE_EXAMPLE: Schema = {
     "frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"0": 50}}],
     "trains": [
         {"pixel": 0, "start_s": 0.6, "duration_s": 0.2, "pulse_width_s": 0.02, "gap_s": 0.06, "power_w": 1.0},
@@ -68,11 +81,11 @@ SHOWN: Schema = {
     ],
 }
 """An example that every display can show."""
-PATTERN_NAMES: Schema = {"examples": [item["name"] for item in describe_patterns()]}
-PARAMETERS: Schema = {"type": "object", "description": "as GET /v1/patterns lists them; a file in base64"}
+PATTERN_NAME_EXAMPLES: Schema = {"examples": [item["name"] for item in describe_patterns()]}
+PARAMETERS_SCHEMA: Schema = {"type": "object", "description": "as GET /v1/patterns lists them; a file in base64"}
 
 
-def json_body(description: str, schema: Schema, example: Schema, required: bool) -> Schema:
+def build_request_body(description: str, schema: Schema, example: Schema, required: bool) -> Schema:
     """A body that the route reads by itself, for FastAPI's openapi_extra."""
     content = {"application/json": {"schema": schema, "example": example}}
     return {"requestBody": {"description": description, "required": required, "content": content}}

@@ -10,11 +10,11 @@ CALLERS_MAX = 1024
 
 @dataclass
 class _Bucket:
-    level: float
-    at_s: float
+    tokens: float
+    updated_s: float
 
 
-class Rates:
+class RateLimiter:
     """Requests of each caller, per_s for ever and burst at once."""
 
     def __init__(self, per_s: float, burst: float) -> None:
@@ -22,15 +22,15 @@ class Rates:
         self._burst = max(burst, 1.0)
         self._buckets: OrderedDict[Hashable, _Bucket] = OrderedDict()
 
-    def wait_s(self, caller: Hashable, now_s: float) -> float:
+    def acquire(self, caller: Hashable, now_s: float) -> float:
         """Count a request: 0 where it may be answered, else how long to wait before asking again, s."""
         bucket = self._buckets.pop(caller, None) or _Bucket(self._burst, now_s)
-        bucket.level = min(self._burst, bucket.level + (now_s - bucket.at_s) * self._per_s)
-        bucket.at_s = now_s
+        bucket.tokens = min(self._burst, bucket.tokens + (now_s - bucket.updated_s) * self._per_s)
+        bucket.updated_s = now_s
         self._buckets[caller] = bucket
         while len(self._buckets) > CALLERS_MAX:
             self._buckets.popitem(last=False)
-        if bucket.level < 1.0:
-            return (1.0 - bucket.level) / self._per_s
-        bucket.level -= 1.0
+        if bucket.tokens < 1.0:
+            return (1.0 - bucket.tokens) / self._per_s
+        bucket.tokens -= 1.0
         return 0.0

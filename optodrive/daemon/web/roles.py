@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 from starlette.routing import compile_path
 
-from optodrive.daemon.web.static_files import LOGIN
+from optodrive.daemon.web.static_files import LOGIN_PATHS
 
 Role = Literal["viewer", "operator", "armer"]
 """Each may do what those before it may: look and stop; show; arm."""
@@ -16,7 +16,7 @@ STOP = "POST /v1/stop"
 ARM = "POST /v1/arm"
 ROUTES: Mapping[str, Role | None] = {
     "GET /v1/health": None,
-    **{f"GET {path}": None for path in LOGIN},
+    **{f"GET {path}": None for path in LOGIN_PATHS},
     "GET /": "viewer",
     "GET /page/{name:path}": "viewer",
     "GET /openapi.json": "viewer",
@@ -37,9 +37,9 @@ ROUTES: Mapping[str, Role | None] = {
 """Method and path, as the application has them, → the least role; None: open to all."""
 
 
-def allows(role: Role, least: Role) -> bool:
+def is_role_sufficient(role: Role, min_role: Role) -> bool:
     """Whether a role may do what asks for at least another."""
-    return ROLES.index(role) >= ROLES.index(least)
+    return ROLES.index(role) >= ROLES.index(min_role)
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ class Route:
     """A line of the table. key: as it stands there."""
 
     key: str
-    least: Role | None
+    min_role: Role | None
     method: str
     path: Pattern[str]
 
     @property
-    def changes_something(self) -> bool:
+    def is_audited(self) -> bool:
         """Whether a call is worth a line in the audit file."""
         return self.method != "GET"
 
@@ -61,17 +61,17 @@ class RouteTable:
     """Finds the line of the table that a request belongs to."""
 
     def __init__(self, routes: Mapping[str, Role | None]) -> None:
-        self._routes = [_route(key, least) for key, least in routes.items()]
+        self._routes = [_build_route(key, min_role) for key, min_role in routes.items()]
 
     def find(self, method: str, path: str) -> Route | None:
         """The route of a request, None where there is none."""
         return next((route for route in self._routes if route.method == method and route.path.fullmatch(path)), None)
 
-    def methods(self, path: str) -> tuple[str, ...]:
+    def find_methods(self, path: str) -> tuple[str, ...]:
         """The methods that a path is answered for; none for a path that is not there."""
         return tuple(route.method for route in self._routes if route.path.fullmatch(path))
 
 
-def _route(key: str, least: Role | None) -> Route:
+def _build_route(key: str, min_role: Role | None) -> Route:
     method, _, path = key.partition(" ")
-    return Route(key, least, method, compile_path(path)[0])
+    return Route(key, min_role, method, compile_path(path)[0])

@@ -14,9 +14,9 @@ from fastapi import FastAPI
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
-LOGIN = ("/page/login.js", "/page/login.css", "/page/colours.css")
+LOGIN_PATHS = ("/page/login.js", "/page/login.css", "/page/colours.css")
 """What the page that asks for the token is made of; there is no secret in it."""
-HEADERS = {
+SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -27,63 +27,65 @@ HEADERS = {
     "Permissions-Policy": "camera=(), microphone=(), geolocation=()",
     "Cache-Control": "no-store",
 }
-TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
+MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html", ".svg": "image/svg+xml"}
 
 
-def is_page(method: str, path: str) -> bool:
+def is_page_request(method: str, path: str) -> bool:
     """Whether a request is for a part of the page."""
     return method == "GET" and (path == "/" or path.startswith("/page/"))
 
 
-def cookie_token(headers: dict[str, str]) -> str:
+def read_cookie_token(headers: dict[str, str]) -> str:
     """The token that a browser's cookie holds, '' without one."""
     try:
         cookies = SimpleCookie(headers.get("cookie", ""))
     except CookieError:
         return ""
-    found = cookies.get(f"optodrive-{_port(headers.get('host', ''))}")
+    found = cookies.get(f"optodrive-{_parse_port(headers.get('host', ''))}")
     return "" if found is None else found.value
 
 
-def _port(host: str) -> str:
+def _parse_port(host: str) -> str:
     port = host.rpartition(":")[2]
     return port if port.isdigit() else "80"
 
 
-def login_page() -> bytes:
+def load_login_page() -> bytes:
     """The page that asks for the token."""
-    return _folder().joinpath("login.html").read_bytes()
+    return _get_page_folder().joinpath("login.html").read_bytes()
 
 
-def _folder() -> Traversable:
+def _get_page_folder() -> Traversable:
     return files("optodrive.daemon").joinpath("page")
 
 
-def add_page(app: FastAPI) -> None:
+def add_page_routes(app: FastAPI) -> None:
     """Serve the page at `/`, and its files below `/page/`; all are read beforehand, so no path leads anywhere else."""
-    held = dict(_read(_folder(), ""))
+    contents = dict(_read_files(_get_page_folder(), ""))
 
     @app.get("/", include_in_schema=False)
-    async def index() -> Response:
-        return _answer("index.html", held["index.html"])
+    async def get_index() -> Response:
+        return _build_response("index.html", contents["index.html"])
 
     @app.get("/page/{name:path}", include_in_schema=False)
-    async def part(name: str) -> Response:
-        if name not in held:
+    async def get_file(name: str) -> Response:
+        if name not in contents:
             raise HTTPException(404)
-        return _answer(name, held[name])
+        return _build_response(name, contents[name])
 
 
-def _read(folder: Traversable, prefix: str) -> list[tuple[str, bytes]]:
-    held: list[tuple[str, bytes]] = []
+def _read_files(folder: Traversable, prefix: str) -> list[tuple[str, bytes]]:
+    contents: list[tuple[str, bytes]] = []
     for item in folder.iterdir():
         if item.is_dir():
-            held += _read(item, f"{prefix}{item.name}/")
+            contents += _read_files(item, f"{prefix}{item.name}/")
         else:
-            held.append((prefix + item.name, item.read_bytes()))
-    return held
+            contents.append((prefix + item.name, item.read_bytes()))
+    return contents
 
 
-def _answer(name: str, content: bytes) -> Response:
-    ending = "." + name.rpartition(".")[2]
-    return Response(content, media_type=TYPES.get(ending) or guess_type(name)[0] or "text/plain", headers=HEADERS)
+def _build_response(name: str, content: bytes) -> Response:
+    suffix = "." + name.rpartition(".")[2]
+    return Response(
+        content, media_type=MEDIA_TYPES.get(suffix) or guess_type(name)[0] or "text/plain", headers=SECURITY_HEADERS
+    )

@@ -17,9 +17,9 @@ from optodrive.core.files import read_toml
 from optodrive.daemon.web.roles import ROLES, Role
 from optodrive.device.config import Section, check_format
 
-VARIABLE = "OPTODRIVE_TOKEN"
-FILE_VARIABLE = "OPTODRIVE_TOKENS"
-ALLOWED = r"^[!-~]{16,200}$"
+TOKEN_VARIABLE = "OPTODRIVE_TOKEN"
+TOKENS_FILE_VARIABLE = "OPTODRIVE_TOKENS"
+SECRET_PATTERN = r"^[!-~]{16,200}$"
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1
@@ -43,32 +43,32 @@ class Tokens:
 
     def find(self, presented: str) -> Token | None:
         """The token that was presented, None where it is none of these; takes the same time for each of them."""
-        given = presented.encode()
+        presented_bytes = presented.encode()
         found = None
         for secret, token in self._secrets:
-            if secrets.compare_digest(given, secret):
+            if secrets.compare_digest(presented_bytes, secret):
                 found = token
         return found
 
     @property
-    def strongest(self) -> Token:
+    def most_privileged(self) -> Token:
         """The token that allows most."""
         return max(self.all, key=lambda token: ROLES.index(token.role))
 
 
-class _Entry(Section):
+class _TokenEntry(Section):
     name: Annotated[str, Field(pattern=r"^[\w.@ -]{1,40}$")]
     role: Role
-    secret: Annotated[str, Field(pattern=ALLOWED)]
+    secret: Annotated[str, Field(pattern=SECRET_PATTERN)]
 
 
-class _File(Section):
+class _TokensFile(Section):
     format: Literal["optodrive-tokens"]
     version: Literal[1]
-    token: Annotated[tuple[_Entry, ...], Field(min_length=1)]
+    token: Annotated[tuple[_TokenEntry, ...], Field(min_length=1)]
 
 
-def token_path(port: int) -> Path:
+def build_tokens_path(port: int) -> Path:
     """Where the daemon on this TCP port keeps its tokens, unless its configuration says otherwise."""
     runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
     return Path(runtime) / "optodrive" / f"token-{port}"
@@ -79,7 +79,7 @@ def read_tokens(path: Path) -> Tokens:
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
     try:
-        entries = _File.model_validate(table).token
+        entries = _TokensFile.model_validate(table).token
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"])
@@ -90,7 +90,7 @@ def read_tokens(path: Path) -> Tokens:
     return Tokens(Token(entry.name, entry.role, entry.secret) for entry in entries)
 
 
-def private_tokens(path: Path) -> Tokens:
+def read_private_tokens(path: Path) -> Tokens:
     """The tokens of a daemon's own file; InputError where others than its owner may read it."""
     tokens = read_tokens(path)
     mode = stat.S_IMODE(path.stat().st_mode)
@@ -99,15 +99,16 @@ def private_tokens(path: Path) -> Tokens:
     return tokens
 
 
-def make_tokens(path: Path, armer: str | None = None) -> Tokens:
+def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
     """A fresh token for each role, in a new file of mode 0600. armer: the armer's, if not a fresh one.
 
     InputError where that is no token (its text is not shown), or the file cannot be made.
     """
-    if armer and not re.fullmatch(ALLOWED, armer):
-        raise InputError(VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces")
+    if armer_secret and not re.fullmatch(SECRET_PATTERN, armer_secret):
+        raise InputError(TOKEN_VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces")
     tokens = Tokens(
-        Token(role, role, armer if armer and role == "armer" else secrets.token_urlsafe(32)) for role in ROLES
+        Token(role, role, armer_secret if armer_secret and role == "armer" else secrets.token_urlsafe(32))
+        for role in ROLES
     )
     lines = [f'format = "{FORMAT}"\nversion = {VERSION}\n']
     lines += [
@@ -123,13 +124,13 @@ def make_tokens(path: Path, armer: str | None = None) -> Tokens:
     return tokens
 
 
-def daemon_tokens(kept: str, port: int) -> tuple[Tokens, Path]:
+def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
     """A daemon's tokens and their file. kept: a file that outlives it, made where there is none; else fresh ones."""
-    if kept:
-        path = Path(kept)
-        return (private_tokens(path) if path.exists() else make_tokens(path)), path
-    path = token_path(port)
-    return make_tokens(path, os.environ.get(VARIABLE)), path
+    if tokens_file:
+        path = Path(tokens_file)
+        return (read_private_tokens(path) if path.exists() else create_tokens(path)), path
+    path = build_tokens_path(port)
+    return create_tokens(path, os.environ.get(TOKEN_VARIABLE)), path
 
 
 def read_token(port: int | None) -> str:
@@ -137,14 +138,14 @@ def read_token(port: int | None) -> str:
 
     port: None for one that is reached otherwise
     """
-    given = os.environ.get(VARIABLE)
-    if given:
-        return given
-    named = os.environ.get(FILE_VARIABLE)
-    own = [] if port is None else [token_path(port)]
-    places = [Path(named)] if named else [*own, SERVICE_TOKENS]
-    for path in places:
+    secret = os.environ.get(TOKEN_VARIABLE)
+    if secret:
+        return secret
+    file_name = os.environ.get(TOKENS_FILE_VARIABLE)
+    own_paths = [] if port is None else [build_tokens_path(port)]
+    candidates = [Path(file_name)] if file_name else [*own_paths, SERVICE_TOKENS]
+    for path in candidates:
         if os.access(path, os.R_OK):
-            return read_tokens(path).strongest.secret
-    listed = " or ".join(str(path) for path in places)
-    raise InputError(VARIABLE, None, f"a token: set it, or {listed} to be readable")
+            return read_tokens(path).most_privileged.secret
+    listed = " or ".join(str(path) for path in candidates)
+    raise InputError(TOKEN_VARIABLE, None, f"a token: set it, or {listed} to be readable")

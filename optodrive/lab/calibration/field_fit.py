@@ -9,26 +9,26 @@ from math import log, pi
 import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.device.calibrated_field import Field
-from optodrive.device.field_geometry import CENTRE_CODE, Geometry, by_parameters, lands_m
-from optodrive.device.field_surface import ORDER, TERMS, spread, terms
-from optodrive.lab.calibration.field_prior import Prior
-from optodrive.lab.calibration.spots import Spots
+from optodrive.device.calibrated_field import CalibratedField
+from optodrive.device.field_geometry import CENTRE_CODE, FieldGeometry, beam_position_m, compute_parameter_derivatives
+from optodrive.device.field_surface import ORDER, TERM_COUNT, compute_prior_widths, evaluate_terms
+from optodrive.lab.calibration.field_prior import FieldPrior
+from optodrive.lab.calibration.spots import MeasuredSpots
 
-PHYSICAL = len(Geometry._fields)
-UNKNOWNS = PHYSICAL + 2 * TERMS
-START_M = (3e-3, 1e-3, 0.3e-3, 0.1e-3, 0.05e-3)
+GEOMETRY_COUNT = len(FieldGeometry._fields)
+PARAMETER_COUNT = GEOMETRY_COUNT + 2 * TERM_COUNT
+ANNEALING_NOISE_M = (3e-3, 1e-3, 0.3e-3, 0.1e-3, 0.05e-3)
 """A spot counts for as much as a noise of this width lets it, ever narrower: first all may be wrong, then few are."""
-STEPS = 4
-ROUNDS = 6
-EXPECTED_FALSE = 0.02
-CAUTION = 10.0
+GAUSS_NEWTON_STEPS = 4
+OUTER_ITERATIONS = 6
+OUTLIER_FRACTION_PRIOR = 0.02
+OUTLIER_PRIOR_SPOTS = 10.0
 """The expected share of false detections counts as so many spots seen before."""
-TRIED: list[float] = np.geomspace(1.0 / 8.0, 8.0, 13).tolist()
+SCALE_FACTORS: list[float] = np.geomspace(1.0 / 8.0, 8.0, 13).tolist()
 """Noise and surface are looked for at these multiples of what is expected."""
-NOISE_SPREAD, SURFACE_SPREAD = 0.7, 0.5
+NOISE_LOG_SIGMA, SURFACE_LOG_SIGMA = 0.7, 0.5
 """Natural logarithms by which noise and surface may be off what is expected, one sigma."""
-SIGMA_GRID = 17
+SIGMA_GRID_NODES = 17
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,15 +39,15 @@ class FieldFit:
     covariance: [u, u] of all unknowns in units of `width` [u]
     """
 
-    field: Field
-    spots: Spots
-    prior: Prior
+    field: CalibratedField
+    spots: MeasuredSpots
+    prior: FieldPrior
     outlier: BoolArray
     residual_m: FloatArray
     noise_m: float
     surface_m: float
     surface_order: int
-    width: FloatArray
+    parameter_sigma: FloatArray
     covariance: FloatArray
 
     def __post_init__(self) -> None:
@@ -56,12 +56,12 @@ class FieldFit:
     @property
     def rms_m(self) -> float:
         """Root mean square of the residuals' lengths, false detections left out; NaN without spots."""
-        kept = self.residual_m[~self.outlier]
-        return float(np.sqrt((kept**2).sum(axis=1).mean())) if len(kept) else float("nan")
+        inlier_m = self.residual_m[~self.outlier]
+        return float(np.sqrt((inlier_m**2).sum(axis=1).mean())) if len(inlier_m) else float("nan")
 
-    def derivatives_m(self, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
+    def jacobian_m(self, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
         """How places at codes [n] move with each unknown, [2, n, u]."""
-        return _derivatives(self.field.geometry, self.prior, self.width, x_code, y_code)
+        return _jacobian(self.field.geometry, self.prior, self.parameter_sigma, x_code, y_code)
 
 
 @dataclass(frozen=True)
@@ -71,47 +71,49 @@ class _Scales:
     noise_m: float
     surface_m: float
 
-    def width(self, prior: Prior) -> FloatArray:
-        return np.concatenate([prior.width, np.tile(self.surface_m * spread(), 2)])
+    def parameter_sigma(self, prior: FieldPrior) -> FloatArray:
+        return np.concatenate([prior.sigma, np.tile(self.surface_m * compute_prior_widths(), 2)])
 
 
-def fit_field(spots: Spots, prior: Prior, noise_m: float | None = None) -> FieldFit:
+def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = None) -> FieldFit:
     """The most probable field of spots, few or many or none; noise_m: of a spot on an axis, fitted where not given."""
-    fitted = _Fit(spots, prior, noise_m)
-    fitted.start()
-    for _ in range(ROUNDS):
-        before = fitted.weight.copy()
-        fitted.settle()
-        fitted.weigh_scales()
-        fitted.judge()
-        if np.array_equal(before, fitted.weight):
+    fitter = _FieldFitter(spots, prior, noise_m)
+    fitter.anneal()
+    for _ in range(OUTER_ITERATIONS):
+        previous_weight = fitter.weight.copy()
+        fitter.converge()
+        fitter.estimate_scales()
+        fitter.classify_outliers()
+        if np.array_equal(previous_weight, fitter.weight):
             break
-    fitted.settle()
-    return fitted.result()
+    fitter.converge()
+    return fitter.build_result()
 
 
-class _Fit:
+class _FieldFitter:
     """z: [u] the unknowns in units of their width; weight: [n] of each spot, 0 to 1."""
 
-    def __init__(self, spots: Spots, prior: Prior, noise_m: float | None) -> None:
-        self.spots, self.prior, self.given_m = spots, prior, noise_m
+    def __init__(self, spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None) -> None:
+        self.spots, self.prior, self.known_noise_m = spots, prior, noise_m
         self.scales = _Scales(noise_m or prior.noise_m, prior.surface_m)
-        self.z = np.zeros(UNKNOWNS)
+        self.z = np.zeros(PARAMETER_COUNT)
         self.weight = np.ones(len(spots))
-        self.false_share = EXPECTED_FALSE
-        self.terms = terms(prior.extent, spots.x_code, spots.y_code)
+        self.outlier_fraction = OUTLIER_FRACTION_PRIOR
+        self.surface_terms = evaluate_terms(prior.extent, spots.x_code, spots.y_code)
         self.measured_m = np.stack([spots.x_m, spots.y_m])
 
     @property
-    def width(self) -> FloatArray:
-        return self.scales.width(self.prior)
+    def parameter_sigma(self) -> FloatArray:
+        return self.scales.parameter_sigma(self.prior)
 
     @property
-    def geometry(self) -> Geometry:
-        return Geometry(*(np.array(self.prior.mean) + self.z[:PHYSICAL] * self.prior.width).tolist())
+    def geometry(self) -> FieldGeometry:
+        return FieldGeometry(*(np.array(self.prior.mean) + self.z[:GEOMETRY_COUNT] * self.prior.sigma).tolist())
 
-    def surface_m(self) -> FloatArray:
-        coefficients: FloatArray = (self.z[PHYSICAL:] * self.width[PHYSICAL:]).reshape(2, TERMS)
+    def surface_coefficients_m(self) -> FloatArray:
+        coefficients: FloatArray = (self.z[GEOMETRY_COUNT:] * self.parameter_sigma[GEOMETRY_COUNT:]).reshape(
+            2, TERM_COUNT
+        )
         return coefficients
 
     def angles_rad(self) -> FloatArray:
@@ -120,96 +122,100 @@ class _Fit:
 
     def residual_m(self) -> FloatArray:
         """Measured less fitted, [2, n]."""
-        left: FloatArray = (
-            self.measured_m - np.stack(lands_m(self.geometry, *self.angles_rad())) - self.surface_m() @ self.terms.T
+        residual: FloatArray = (
+            self.measured_m
+            - np.stack(beam_position_m(self.geometry, *self.angles_rad()))
+            - self.surface_coefficients_m() @ self.surface_terms.T
         )
-        return left
+        return residual
 
-    def _normal(self, noise_m: float) -> tuple[FloatArray, FloatArray]:
+    def _normal_equations(self, noise_m: float) -> tuple[FloatArray, FloatArray]:
         """Of the linearised problem without its prior: [u, u] and [u]."""
-        slope = _derivatives(self.geometry, self.prior, self.width, self.spots.x_code, self.spots.y_code)
-        weighted = slope * (self.weight / noise_m**2)[None, :, None]
-        return np.tensordot(weighted, slope, ([0, 1], [0, 1])), np.tensordot(
+        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, self.spots.x_code, self.spots.y_code)
+        weighted = jacobian * (self.weight / noise_m**2)[None, :, None]
+        return np.tensordot(weighted, jacobian, ([0, 1], [0, 1])), np.tensordot(
             weighted, self.residual_m(), ([0, 1], [0, 1])
         )
 
-    def step(self, noise_m: float) -> None:
+    def gauss_newton_step(self, noise_m: float) -> None:
         """One of Gauss and Newton; the problem is so nearly linear that none is too long."""
-        matrix, vector = self._normal(noise_m)
-        step = np.linalg.solve(matrix + np.eye(UNKNOWNS), vector - self.z)
+        matrix, vector = self._normal_equations(noise_m)
+        step = np.linalg.solve(matrix + np.eye(PARAMETER_COUNT), vector - self.z)
         self.z = np.asarray(self.z + step, dtype=np.float64)
 
-    def start(self) -> None:
+    def anneal(self) -> None:
         """From the nominal geometry, first with all spots under suspicion."""
-        for scale_m in START_M:
-            for _ in range(STEPS):
-                self.weight = self._true_share(scale_m)
-                self.step(scale_m)
-        self.judge()
+        for scale_m in ANNEALING_NOISE_M:
+            for _ in range(GAUSS_NEWTON_STEPS):
+                self.weight = self._inlier_probability(scale_m)
+                self.gauss_newton_step(scale_m)
+        self.classify_outliers()
 
-    def settle(self) -> None:
+    def converge(self) -> None:
         """To the most probable unknowns for weights and scales as they are."""
-        for _ in range(STEPS):
-            self.step(self.scales.noise_m)
+        for _ in range(GAUSS_NEWTON_STEPS):
+            self.gauss_newton_step(self.scales.noise_m)
 
-    def _true_share(self, scale_m: float | FloatArray) -> FloatArray:
+    def _inlier_probability(self, scale_m: float | FloatArray) -> FloatArray:
         """How probably each spot is a true one, with a noise so wide."""
         distance2 = (self.residual_m() ** 2).sum(axis=0)
-        true = (1.0 - self.false_share) * np.exp(-0.5 * distance2 / scale_m**2) / (2.0 * pi * scale_m**2)
-        share: FloatArray = true / (true + self.false_share / self.prior.field_m2)
-        return share
+        inlier_density = (1.0 - self.outlier_fraction) * np.exp(-0.5 * distance2 / scale_m**2) / (2.0 * pi * scale_m**2)
+        probability: FloatArray = inlier_density / (inlier_density + self.outlier_fraction / self.prior.field_area_m2)
+        return probability
 
-    def judge(self) -> None:
+    def classify_outliers(self) -> None:
         """Each spot true or false, by what is left of it and by how sure the field is there."""
         scale_m = np.hypot(self.scales.noise_m, self._sigma_m())
-        self.weight = (self._true_share(scale_m) > 0.5).astype(np.float64)
-        false = len(self.weight) - self.weight.sum()
-        self.false_share = float((false + CAUTION * EXPECTED_FALSE) / (len(self.weight) + CAUTION))
+        self.weight = (self._inlier_probability(scale_m) > 0.5).astype(np.float64)
+        outlier_count = len(self.weight) - self.weight.sum()
+        self.outlier_fraction = float(
+            (outlier_count + OUTLIER_PRIOR_SPOTS * OUTLIER_FRACTION_PRIOR) / (len(self.weight) + OUTLIER_PRIOR_SPOTS)
+        )
 
     def _covariance(self) -> FloatArray:
-        matrix, _ = self._normal(self.scales.noise_m)
-        return np.asarray(np.linalg.inv(matrix + np.eye(UNKNOWNS)), dtype=np.float64)
+        matrix, _ = self._normal_equations(self.scales.noise_m)
+        return np.asarray(np.linalg.inv(matrix + np.eye(PARAMETER_COUNT)), dtype=np.float64)
 
     def _sigma_m(self) -> FloatArray:
-        slope = _derivatives(self.geometry, self.prior, self.width, self.spots.x_code, self.spots.y_code)
-        return _sigma_m(slope, self._covariance())
+        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, self.spots.x_code, self.spots.y_code)
+        return _sigma_m(jacobian, self._covariance())
 
-    def weigh_scales(self) -> None:
+    def estimate_scales(self) -> None:
         """Noise and surface as the spots make them probable together, whatever the unknowns."""
-        matrix, vector = self._normal(1.0)
-        left = self.residual_m()
-        square, count = float((self.weight * left**2).sum()), 2.0 * float(self.weight.sum())
+        matrix, vector = self._normal_equations(1.0)
+        residual_m = self.residual_m()
+        square, count = float((self.weight * residual_m**2).sum()), 2.0 * float(self.weight.sum())
         best, chosen = -np.inf, self.scales
-        for noise in TRIED if self.given_m is None else [self.given_m / self.prior.noise_m]:
-            for surface in TRIED:
+        for noise in SCALE_FACTORS if self.known_noise_m is None else [self.known_noise_m / self.prior.noise_m]:
+            for surface in SCALE_FACTORS:
                 scales = _Scales(noise * self.prior.noise_m, surface * self.prior.surface_m)
                 # Unknowns whose prior is wider move the place by as much more.
-                by = scales.width(self.prior) / self.width
-                precision = matrix * np.outer(by, by) / scales.noise_m**2 + np.eye(UNKNOWNS)
-                z = self.z / by
-                pull = vector * by / scales.noise_m**2 - z
+                scale_ratio = scales.parameter_sigma(self.prior) / self.parameter_sigma
+                precision = matrix * np.outer(scale_ratio, scale_ratio) / scales.noise_m**2 + np.eye(PARAMETER_COUNT)
+                z = self.z / scale_ratio
+                gradient = vector * scale_ratio / scales.noise_m**2 - z
                 root = np.linalg.cholesky(precision)
-                gain = np.linalg.solve(root, pull)
-                probable = -0.5 * (square / scales.noise_m**2 + z @ z - gain @ gain)
-                probable -= count * log(scales.noise_m) + float(np.log(np.diag(root)).sum())
-                probable -= 0.5 * (log(surface) / SURFACE_SPREAD) ** 2
-                probable -= 0.5 * (log(noise) / NOISE_SPREAD) ** 2
-                if probable > best:
-                    best, chosen = probable, scales
-        self.z = self.z * self.width / chosen.width(self.prior)
+                gain = np.linalg.solve(root, gradient)
+                log_probability = -0.5 * (square / scales.noise_m**2 + z @ z - gain @ gain)
+                log_probability -= count * log(scales.noise_m) + float(np.log(np.diag(root)).sum())
+                log_probability -= 0.5 * (log(surface) / SURFACE_LOG_SIGMA) ** 2
+                log_probability -= 0.5 * (log(noise) / NOISE_LOG_SIGMA) ** 2
+                if log_probability > best:
+                    best, chosen = log_probability, scales
+        self.z = self.z * self.parameter_sigma / chosen.parameter_sigma(self.prior)
         self.scales = chosen
 
-    def result(self) -> FieldFit:
+    def build_result(self) -> FieldFit:
         """The fit; its field with its own uncertainty."""
         covariance, extent = self._covariance(), self.prior.extent
-        slope = _derivatives(self.geometry, self.prior, self.width, *extent.grid(SIGMA_GRID))
-        field = Field(
+        jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, *extent.build_grid(SIGMA_GRID_NODES))
+        field = CalibratedField(
             geometry=self.geometry,
-            surface_m=self.surface_m(),
+            surface_m=self.surface_coefficients_m(),
             extent=extent,
             rad_per_code=self.prior.rad_per_code,
             focal_length_m=self.prior.focal_length_m,
-            sigma_grid_m=_sigma_m(slope, covariance).reshape(SIGMA_GRID, SIGMA_GRID),
+            sigma_grid_m=_sigma_m(jacobian, covariance).reshape(SIGMA_GRID_NODES, SIGMA_GRID_NODES),
         )
         return FieldFit(
             field=field,
@@ -220,26 +226,28 @@ class _Fit:
             noise_m=self.scales.noise_m,
             surface_m=self.scales.surface_m,
             surface_order=ORDER,
-            width=self.width,
+            parameter_sigma=self.parameter_sigma,
             covariance=covariance,
         )
 
 
-def _derivatives(
-    geometry: Geometry, prior: Prior, width: FloatArray, x_code: FloatArray, y_code: FloatArray
+def _jacobian(
+    geometry: FieldGeometry, prior: FieldPrior, parameter_sigma: FloatArray, x_code: FloatArray, y_code: FloatArray
 ) -> FloatArray:
     """How places at codes [n] move with each unknown, [2, n, u]."""
-    out = np.zeros((2, len(x_code), UNKNOWNS))
+    jacobian = np.zeros((2, len(x_code), PARAMETER_COUNT))
     x_rad, y_rad = ((code - CENTRE_CODE) * prior.rad_per_code for code in (x_code, y_code))
-    out[:, :, :PHYSICAL] = by_parameters(geometry, prior.width, x_rad, y_rad)
-    own = terms(prior.extent, x_code, y_code)
-    out[0, :, PHYSICAL : PHYSICAL + TERMS] = own * width[PHYSICAL : PHYSICAL + TERMS]
-    out[1, :, PHYSICAL + TERMS :] = own * width[PHYSICAL + TERMS :]
-    return out
+    jacobian[:, :, :GEOMETRY_COUNT] = compute_parameter_derivatives(geometry, prior.sigma, x_rad, y_rad)
+    surface = evaluate_terms(prior.extent, x_code, y_code)
+    jacobian[0, :, GEOMETRY_COUNT : GEOMETRY_COUNT + TERM_COUNT] = (
+        surface * parameter_sigma[GEOMETRY_COUNT : GEOMETRY_COUNT + TERM_COUNT]
+    )
+    jacobian[1, :, GEOMETRY_COUNT + TERM_COUNT :] = surface * parameter_sigma[GEOMETRY_COUNT + TERM_COUNT :]
+    return jacobian
 
 
-def _sigma_m(slope: FloatArray, covariance: FloatArray) -> FloatArray:
+def _sigma_m(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """One sigma on an axis, of both together, [n]."""
-    variance = np.einsum("anu,uv,anv->n", slope, covariance, slope, optimize=True) / 2.0
+    variance = np.einsum("anu,uv,anv->n", jacobian, covariance, jacobian, optimize=True) / 2.0
     sigma_m: FloatArray = np.sqrt(variance)
     return sigma_m

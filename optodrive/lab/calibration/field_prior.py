@@ -6,21 +6,21 @@ from typing import Self
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.config import Config, pixel_layout
-from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, Geometry
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry
 from optodrive.device.field_surface import Extent
 
 MARGIN_M = 5e-3
 """A field is made for so much more than the pixels to every side: uncorrected codes miss by millimetres."""
-LEAST_M = 1e-3
+HALF_EXTENT_MIN_M = 1e-3
 """Half of a display that is hardly more than a pixel."""
-NOISE_M = 10e-6
-SURFACE_M = 12e-6
+SPOT_NOISE_M = 10e-6
+SURFACE_RMS_M = 12e-6
 """What one expects of a spot's noise and of the surface, rms on an axis; both are fitted where spots suffice."""
 
 
 @dataclass(frozen=True, eq=False)
-class Prior:
+class FieldPrior:
     """What a fit starts from.
 
     mean, width: of each parameter of the geometry; extent: the codes to make the field for; pixels: those nominally of
@@ -29,28 +29,28 @@ class Prior:
     field_m2: the area over which a false detection may lie
     """
 
-    mean: Geometry
-    width: FloatArray
+    mean: FieldGeometry
+    sigma: FloatArray
     rad_per_code: float
     focal_length_m: float
     extent: Extent
-    pixels: Extent
-    field_m2: float
-    noise_m: float = NOISE_M
-    surface_m: float = SURFACE_M
+    display_extent: Extent
+    field_area_m2: float
+    noise_m: float = SPOT_NOISE_M
+    surface_m: float = SURFACE_RMS_M
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
     @classmethod
-    def of(cls, config: Config) -> Self:
+    def from_config(cls, config: Config) -> Self:
         """Nominal numbers of a configuration, with the tolerances of an ordinary laboratory."""
-        scanner, layout = config.scanner, pixel_layout(config.display)
+        scanner, layout = config.scanner, build_pixel_layout(config.display)
         focal_m, range_rad = scanner.focal_length_m, scanner.range_rad
-        display_m = [max(LEAST_M, float(np.abs(axis).max())) for axis in (layout.x_m, layout.y_m)]
+        display_m = [max(HALF_EXTENT_MIN_M, float(np.abs(axis).max())) for axis in (layout.x_m, layout.y_m)]
         half_m = [half + MARGIN_M for half in display_m]
         edge_rad = float(np.hypot(half_m[0], half_m[1])) / focal_m
-        code_m = 2.0 * focal_m * scanner.code_rad
+        code_m = 2.0 * focal_m * scanner.rad_per_code
         x_half, y_half = (min(half / code_m, float(CODE_MAX - CENTRE_CODE)) for half in half_m)
         tolerances = {
             "gain_x": (1.0, 0.01),
@@ -61,11 +61,11 @@ class Prior:
             "cross_y": (0.0, 5e-3),
             "cubic_x_per_rad2": (0.0, 2e-3 / range_rad**2),
             "cubic_y_per_rad2": (0.0, 2e-3 / range_rad**2),
-            "apart_m": (14e-3, 4e-3),
-            "lens_at_m": (45e-3, 12e-3),
-            "focal_m": (focal_m, 0.005 * focal_m),
-            "bend3_per_rad2": (0.0, 3e-3 / edge_rad**2),
-            "bend5_per_rad4": (0.0, 1e-3 / edge_rad**4),
+            "mirror_distance_m": (14e-3, 4e-3),
+            "lens_distance_m": (45e-3, 12e-3),
+            "focal_length_m": (focal_m, 0.005 * focal_m),
+            "distortion3_per_rad2": (0.0, 3e-3 / edge_rad**2),
+            "distortion5_per_rad4": (0.0, 1e-3 / edge_rad**4),
             "shift_x_m": (0.0, 2e-3),
             "shift_y_m": (0.0, 2e-3),
             "turn_rad": (0.0, 0.03),
@@ -73,11 +73,11 @@ class Prior:
             "tilt_y_rad": (0.0, 0.015),
         }
         return cls(
-            mean=Geometry(**{name: mean for name, (mean, _) in tolerances.items()}),
-            width=np.array([tolerances[name][1] for name in Geometry._fields]),
-            rad_per_code=scanner.code_rad,
+            mean=FieldGeometry(**{name: mean for name, (mean, _) in tolerances.items()}),
+            sigma=np.array([tolerances[name][1] for name in FieldGeometry._fields]),
+            rad_per_code=scanner.rad_per_code,
             focal_length_m=focal_m,
             extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), x_half, y_half),
-            pixels=Extent(float(CENTRE_CODE), float(CENTRE_CODE), display_m[0] / code_m, display_m[1] / code_m),
-            field_m2=4.0 * half_m[0] * half_m[1],
+            display_extent=Extent(float(CENTRE_CODE), float(CENTRE_CODE), display_m[0] / code_m, display_m[1] / code_m),
+            field_area_m2=4.0 * half_m[0] * half_m[1],
         )

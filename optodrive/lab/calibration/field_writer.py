@@ -4,20 +4,20 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.files import written_whole
-from optodrive.device.field_file import field_toml, plain
+from optodrive.core.files import atomic_write
+from optodrive.device.field_file import format_field, strip_toml_specials
 from optodrive.lab.calibration.field_fit import FieldFit
 
 
 def write_field(path: Path, fit: FieldFit, source: str = "") -> None:
     """Write the field of a fit, whole or not at all. source: what it was measured from, in words."""
-    about: dict[str, str | float | int] = {
-        "source": plain(source),
+    metadata: dict[str, str | float | int] = {
+        "source": strip_toml_specials(source),
         "spots": len(fit.spots),
         "outliers": int(fit.outlier.sum()),
         "rms_um": round(1e6 * fit.rms_m, 3) if np.isfinite(fit.rms_m) else 0.0,
         "noise_um": round(1e6 * fit.noise_m, 3),
         "surface_um": round(1e6 * fit.surface_m, 3),
     }
-    with written_whole(path) as temporary:
-        temporary.write_text(field_toml(fit.field, about), encoding="utf-8")
+    with atomic_write(path) as temporary:
+        temporary.write_text(format_field(fit.field, metadata), encoding="utf-8")

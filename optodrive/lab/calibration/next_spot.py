@@ -5,19 +5,23 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.calibration.field_fit import FieldFit
 
-PLACES = 9
+SAMPLES_PER_SIDE = 9
 """The display is looked at in so many places a side."""
 
 
-def next_spot(fit: FieldFit, candidates: FloatArray) -> int:
+def select_next_spot(fit: FieldFit, candidates: FloatArray) -> int:
     """The row of candidates [k, 2], x_code and y_code, that most lowers the mean variance over the display."""
-    looked_at = fit.derivatives_m(*fit.prior.pixels.grid(PLACES))
-    width = looked_at.shape[-1]
-    looked_at = looked_at.reshape(-1, width)
-    asked = fit.derivatives_m(candidates[:, 0], candidates[:, 1]).transpose(1, 0, 2)
+    display_jacobian = fit.jacobian_m(*fit.prior.display_extent.build_grid(SAMPLES_PER_SIDE))
+    parameter_count = display_jacobian.shape[-1]
+    display_jacobian = display_jacobian.reshape(-1, parameter_count)
+    candidate_jacobian = fit.jacobian_m(candidates[:, 0], candidates[:, 1]).transpose(1, 0, 2)
     # One more spot takes C Aᵀ (A C Aᵀ + σ²)⁻¹ A C from the covariance C.
-    reached = asked @ fit.covariance
-    seen = reached @ looked_at.T
-    own = reached @ asked.transpose(0, 2, 1) + fit.noise_m**2 * np.eye(2)
-    gained = np.trace(np.linalg.solve(own, seen @ seen.transpose(0, 2, 1)), axis1=1, axis2=2)
-    return int(np.argmax(gained))
+    candidate_covariance = candidate_jacobian @ fit.covariance
+    cross_covariance = candidate_covariance @ display_jacobian.T
+    measurement_covariance = candidate_covariance @ candidate_jacobian.transpose(0, 2, 1) + fit.noise_m**2 * np.eye(2)
+    variance_reduction = np.trace(
+        np.linalg.solve(measurement_covariance, cross_covariance @ cross_covariance.transpose(0, 2, 1)),
+        axis1=1,
+        axis2=2,
+    )
+    return int(np.argmax(variance_reduction))

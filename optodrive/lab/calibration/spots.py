@@ -15,7 +15,7 @@ COLUMNS = ("x_code", "y_code", "x_m", "y_m")
 
 
 @dataclass(frozen=True, eq=False)
-class Spots:
+class MeasuredSpots:
     """Codes of the converter, and where the beam landed on the display, m; all [n]."""
 
     x_code: FloatArray
@@ -30,17 +30,17 @@ class Spots:
         return len(self.x_code)
 
     @classmethod
-    def of(cls, table: FloatArray) -> Self:
+    def from_table(cls, table: FloatArray) -> Self:
         """From rows of x_code, y_code, x_m, y_m, [n, 4]."""
         x_code, y_code, x_m, y_m = np.array(table, dtype=np.float64).reshape(-1, 4).T.copy()
         return cls(x_code, y_code, x_m, y_m)
 
-    def table(self) -> FloatArray:
+    def to_table(self) -> FloatArray:
         """Rows of x_code, y_code, x_m, y_m, [n, 4]."""
         return np.column_stack([self.x_code, self.y_code, self.x_m, self.y_m])
 
 
-def read_spots(path: Path) -> Spots:
+def read_spots(path: Path) -> MeasuredSpots:
     """Read spots.csv; InputError names file, row, column, value and what was expected."""
     table = read_columns(path, COLUMNS)
     if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
@@ -55,9 +55,9 @@ def read_spots(path: Path) -> Spots:
     if len(bad):
         row, column = bad[0].tolist()
         raise InputError(f"{path}: row {row + 2}: {COLUMNS[column]}", float(table[row, column]), f"0 to {CODE_MAX}")
-    return Spots.of(table)
+    return MeasuredSpots.from_table(table)
 
 
-def write_spots(path: Path, spots: Spots) -> None:
+def write_spots(path: Path, spots: MeasuredSpots) -> None:
     """Write spots.csv, whole or not at all."""
-    write_columns(path, COLUMNS, spots.table(), ("%.17g", "%.17g", "%.9g", "%.9g"))
+    write_columns(path, COLUMNS, spots.to_table(), ("%.17g", "%.17g", "%.9g", "%.9g"))

@@ -13,7 +13,7 @@ from typing import Self
 
 import numpy as np
 
-from optodrive.core.clock import Clock, claim_processor
+from optodrive.core.clock import Clock, request_realtime_scheduling
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
@@ -26,12 +26,12 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
 from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.fault_hints import hint
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
-from optodrive.planning.limiter.limiter import limit, shifted, verify
-from optodrive.planning.pipeline import Display
+from optodrive.planning.limiter.limiter import limit, shift_state, verify
+from optodrive.planning.pipeline import DisplayModel
 
 TURN_S = 0.002
 SWITCH_INTERVAL_S = 2e-4
@@ -54,14 +54,14 @@ FAULT_NAMED_S = 0.5
 class HeldBoard:
     """A board and its session. Methods raise LinkError, BoardFaultError, NotReadyError for what ends the task."""
 
-    def __init__(self, display: Display, transport: Transport, clock: Clock) -> None:
+    def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
         self._display, self._clock = display, clock
         config = display.config
-        code_m = 2.0 * config.scanner.focal_length_m * config.scanner.code_rad
-        self.requirements = Requirements.of(config, ceil(BEYOND_M / code_m))
-        self._limits = self.requirements.limits()
-        self.session = Session(transport, clock, self.requirements)
-        self._state = display.at_rest()[1]
+        code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
+        self.requirements = BoardRequirements.from_config(config, ceil(BEYOND_M / code_m))
+        self._limits = self.requirements.build_limits()
+        self.session = BoardSession(transport, clock, self.requirements)
+        self._state = display.build_cold_state()[1]
         self._zero_s: float | None = None
         self._pixel = weakest_pixel(display)
         self._settle_s, self._width_s = settle_s(config), spot_width_s(config)
@@ -83,13 +83,13 @@ class HeldBoard:
     def connect(self) -> None:
         """Open the link and shake hands; kernels are loaded first, for whoever compiles renews no lease."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        claim_processor()
+        request_realtime_scheduling()
         limit(self._plan(0.0, 0.0, self._dark_w), self._state, self._display.budget)
         gc.collect()
         gc.freeze()
         self.session.connect()
         while self.session.board.temperature_c is None:  # until a STATUS tells of faults and inputs
-            self.session.step(TURN_S, lease=False)
+            self.session.step(TURN_S, renew_lease=False)
 
     def close(self) -> None:
         """Abort, and close the link for good."""
@@ -98,22 +98,22 @@ class HeldBoard:
 
     def step(self) -> None:
         """Keep the lease and listen, for a moment; raises where the board ended the task by itself."""
-        self.session.step(TURN_S, lease=True)
-        board, refusal = self.session.board, self.session.take_refusal()
+        self.session.step(TURN_S, renew_lease=True)
+        board, refusal = self.session.board, self.session.pop_refusal()
         if board.state == "FAULT" and self._in_use:
             raise self._fault()
         if refusal is not None:
             raise NotReadyError(f"the board refuses: {refusal}")
         if self._armed and board.state in ("DISARMED", "ARMING"):
-            raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_reason}")
+            raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_event_reason}")
 
     def _fault(self) -> BoardFaultError:
         """The fault by its name, which a STATUS tells soon after an ACK told of FAULT."""
         until_s = self._clock.now_s() + FAULT_NAMED_S
         while not self.session.board.fault and self._clock.now_s() < until_s:
-            self.session.step(TURN_S, lease=False)
+            self.session.step(TURN_S, renew_lease=False)
         fault = self.session.board.fault
-        return BoardFaultError(f"the board went to FAULT {fault}: {hint(fault)}")
+        return BoardFaultError(f"the board went to FAULT {fault}: {get_fault_hint(fault)}")
 
     def wait(self, duration_s: float) -> None:
         """Let time pass, the lease kept."""
@@ -139,8 +139,8 @@ class HeldBoard:
         self.session.disarm()
         until_s = self._clock.now_s() + ARM_TIMEOUT_S
         while self.session.board.state != "DISARMED":
-            self.session.step(TURN_S, lease=False)
-            refusal = self.session.take_refusal()
+            self.session.step(TURN_S, renew_lease=False)
+            refusal = self.session.pop_refusal()
             if refusal is not None:
                 raise NotReadyError(f"the board refuses to disarm: {refusal}")
             if self._clock.now_s() > until_s:
@@ -182,10 +182,10 @@ class HeldBoard:
         self.check_range(x_code, y_code)
         if not self._armed:
             raise NotReadyError(f"the board is not armed: {self.session.board.state}")
-        while not self.session.ready:
+        while not self.session.is_ready:
             self.step()
         scale = self.session.scale
-        x_rad, y_rad = scale.angles(np.array([x_code, y_code]))
+        x_rad, y_rad = scale.to_angles_rad(np.array([x_code, y_code]))
         plan = self._plan(x_rad, y_rad, power_w)
         limited, before, after, start_s = self._passed(plan)
         points = quantise(limited, scale)
@@ -210,7 +210,7 @@ class HeldBoard:
         """The plan as the limiter lets it pass, the state before and after, and when it begins; waits where it must."""
         while True:
             start_s = self.session.board_s() + START_LEAD_S
-            before = shifted(self._state, (start_s if self._zero_s is None else self._zero_s) - start_s)
+            before = shift_state(self._state, (start_s if self._zero_s is None else self._zero_s) - start_s)
             try:
                 limited, after = limit(plan, before, self._display.budget, "refuse")
             except OverBudgetError as error:
@@ -222,7 +222,7 @@ class HeldBoard:
 
     def _prove(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, lit: bool) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
-        decoded = decode(points.payload(), self.session.scale)
+        decoded = decode(points.encode_payload(), self.session.scale)
         if len(decoded.index) != int(lit):
             raise LocalProtocolError(f"{len(decoded.index)} lit points where {int(lit)} is meant")
         verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
@@ -231,18 +231,18 @@ class HeldBoard:
         """Stream points and hear them through; by how much they came late, s."""
         job = self.session.begin(points, start_s)
         until_s = self._clock.now_s() + POINT_TIMEOUT_S
-        while not job.finished:
+        while not job.is_finished:
             self.step()
             if self._clock.now_s() > until_s:
                 raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
-        done = job.executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
+        done = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
         if lit and not np.allclose(done.width_s, plan.width_s):
             raise BoardFaultError(f"the board lit a spot for {done.width_s.sum():g} s, asked for {plan.width_s[0]:g} s")
         ended_s = float(done.start_s[-1] + done.width_s[-1])
         return max(0.0, ended_s - float(plan.start_s[0] + plan.width_s[0]))
 
 
-def weakest_pixel(display: Display) -> int:
+def weakest_pixel(display: DisplayModel) -> int:
     """The pixel whose absorber steady light warms most."""
     heat = display.budget.heat
     return int(np.argmax(heat.epsilon * heat.r_k_per_w))

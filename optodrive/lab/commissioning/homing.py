@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.errors import RefusedError
-from optodrive.device.config import pixel_layout
+from optodrive.device.config import build_pixel_layout
 from optodrive.lab.commissioning.exclusive_board import HeldBoard
 from optodrive.lab.commissioning.spot_reader import Eyes
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
-from optodrive.link.session.fault_hints import hint
+from optodrive.link.session.fault_hints import get_fault_hint
 
 INDICATOR_S = 2.0
 READINGS = 3
@@ -61,7 +61,7 @@ class Homing:
 
     def __init__(self, held: HeldBoard, eyes: Eyes | None, power_w: float, acknowledge: bool = False) -> None:
         self._held, self._eyes, self._power_w, self._acknowledge = held, eyes, power_w, acknowledge
-        self._code_rad = held.config.scanner.code_rad
+        self._code_rad = held.config.scanner.rad_per_code
         self._zero: Place | None = None
         self._ends: dict[int, tuple[Place, Place]] = {}
 
@@ -87,7 +87,7 @@ class Homing:
         if board.state == "FAULT" and self._acknowledge:
             self._held.disarm()
         if board.state != "DISARMED":
-            fault = f" {board.fault}: {hint(board.fault)}" if board.fault else ""
+            fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise _refused(name, "board", f"{board.state}{fault}", "DISARMED; --acknowledge once the cause is gone")
         return Done(name, f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c})
 
@@ -187,7 +187,7 @@ class Homing:
         return Done(name, words, {"plus": _figures(high), "minus": _figures(low)})
 
     def _end(self, axis: int, sign: int) -> tuple[int, int]:
-        layout = pixel_layout(self._held.config.display)
+        layout = build_pixel_layout(self._held.config.display)
         reach_m = max(float(np.abs((layout.x_m, layout.y_m)[axis]).max()), TRAVEL_LEAST_M)
         way = round(reach_m / (2.0 * self._held.config.scanner.focal_length_m * self._code_rad))
         codes = [CENTRE_CODE, CENTRE_CODE]

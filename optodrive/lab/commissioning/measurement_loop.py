@@ -14,10 +14,10 @@ from optodrive.core.errors import NotReadyError, RefusedError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.units import m_to_um
 from optodrive.lab.calibration.field_fit import FieldFit, fit_field
-from optodrive.lab.calibration.field_prior import Prior
-from optodrive.lab.calibration.next_spot import next_spot
+from optodrive.lab.calibration.field_prior import FieldPrior
+from optodrive.lab.calibration.next_spot import select_next_spot
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.exclusive_board import HeldBoard
 from optodrive.lab.commissioning.predicted_error import predicted_rms_m
 from optodrive.lab.commissioning.session_file import Row, SessionFile, save
@@ -56,7 +56,7 @@ class Look(Protocol):
     def start(self) -> list[int]:
         """Candidates to begin with: corners, edges and the middle."""
 
-    def places(self, spots: Spots) -> IntArray:
+    def places(self, spots: MeasuredSpots) -> IntArray:
         """Which candidate each spot is of, -1 for none, [n]."""
 
     def measure(self, place: int, x_code: int, y_code: int) -> Row | None:
@@ -86,7 +86,7 @@ class Measured:
     goal_reached: bool
 
 
-def fitted(spots: Spots, prior: Prior) -> FieldFit:
+def fitted(spots: MeasuredSpots, prior: FieldPrior) -> FieldFit:
     """As `fit_field`, and ready to be asked for codes: what that takes once would cost the lease."""
     fit = fit_field(spots, prior)
     fit.field.codes(np.zeros(1), np.zeros(1))
@@ -108,7 +108,7 @@ class Measuring:
     ) -> None:
         self._held, self._look, self._session, self._aside, self._clock = held, look, session, aside, clock
         self._goal_m, self._spots_max = goal_m, spots_max
-        self._prior = Prior.of(held.config)
+        self._prior = FieldPrior.from_config(held.config)
         self._unseen: set[int] = set()
 
     def run(self, tell: Callable[[Progress], None]) -> Measured:
@@ -197,5 +197,5 @@ class Measuring:
             raise RefusedError(
                 f"calibrate: all {len(codes)} places are measured, expected more of them or a lesser goal"
             )
-        row: int = self._meanwhile(next_spot, fit, codes[free])
+        row: int = self._meanwhile(select_next_spot, fit, codes[free])
         return free[row]

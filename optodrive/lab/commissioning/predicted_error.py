@@ -3,7 +3,7 @@
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.config import Config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 
@@ -13,8 +13,8 @@ LOOKED_AT = 15
 
 def display_codes(config: Config, beyond_m: float, side: int) -> FloatArray:
     """A grid of nominal codes over the display and a little more, [side², 2], by rows from the bottom."""
-    layout = pixel_layout(config.display)
-    code_m = 2.0 * config.scanner.focal_length_m * config.scanner.code_rad
+    layout = build_pixel_layout(config.display)
+    code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
     x, y = (
         CENTRE_CODE + np.linspace(-1.0, 1.0, side) * (float(np.abs(axis).max()) + beyond_m) / code_m
         for axis in (layout.x_m, layout.y_m)

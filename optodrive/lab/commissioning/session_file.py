@@ -8,9 +8,9 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.device.config import Config
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.spots import MeasuredSpots
 
 FORMAT = "optodrive-calibration-session"
 VERSION = 1
@@ -41,14 +41,14 @@ class SessionFile:
             "version": VERSION,
             "display": config.name,
             "focal_length_m": config.scanner.focal_length_m,
-            "rad_per_code": config.scanner.code_rad,
+            "rad_per_code": config.scanner.rad_per_code,
         }
         return cls(path, about, _read(path, about) if path.exists() else [])
 
     @property
-    def spots(self) -> Spots:
+    def spots(self) -> MeasuredSpots:
         """All rows, in order."""
-        return Spots.of(np.array(self.rows, dtype=np.float64))
+        return MeasuredSpots.from_table(np.array(self.rows, dtype=np.float64))
 
     def text(self) -> str:
         """All of it, as the file holds it."""
@@ -62,7 +62,7 @@ def session_path(out: Path) -> Path:
 
 def save(path: Path, text: str) -> None:
     """Replace the file, on disk when this returns."""
-    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
         os.fsync(file.fileno())

@@ -8,9 +8,9 @@ import numpy as np
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.units import um_to_m
-from optodrive.device.config import pixel_layout
+from optodrive.device.config import build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.lab.commissioning.exclusive_board import HeldBoard
 from optodrive.lab.commissioning.predicted_error import display_codes
 from optodrive.lab.commissioning.session_file import Row
@@ -43,7 +43,7 @@ class SensorLook:
         ends = (0, SIDE // 2, SIDE - 1)
         return [row * SIDE + column for row in ends for column in ends]
 
-    def places(self, spots: Spots) -> IntArray:
+    def places(self, spots: MeasuredSpots) -> IntArray:
         """By the codes they were sent to."""
         return _same(self._codes, np.column_stack([spots.x_code, spots.y_code]))
 
@@ -66,9 +66,9 @@ class NudgeLook:
         self, held: HeldBoard, power_w: float, lines: "SimpleQueue[str | None]", say: Callable[[str], None]
     ) -> None:
         self._held, self._power_w, self._lines, self._say = held, power_w, lines, say
-        self._layout = pixel_layout(held.config.display)
+        self._layout = build_pixel_layout(held.config.display)
         scanner = held.config.scanner
-        self._code_m = 2.0 * scanner.focal_length_m * scanner.code_rad
+        self._code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
 
     def candidates(self, fit: FieldFit) -> FloatArray:
         """The middle of every pixel, where the field so far leads the beam to it; no farther than the board goes."""
@@ -84,7 +84,7 @@ class NudgeLook:
         ]
         return list(dict.fromkeys(places))
 
-    def places(self, spots: Spots) -> IntArray:
+    def places(self, spots: MeasuredSpots) -> IntArray:
         """By the pixels they lie on."""
         return _same(np.column_stack([self._layout.x_m, self._layout.y_m]), np.column_stack([spots.x_m, spots.y_m]))
 

@@ -15,11 +15,11 @@ from optodrive.core.errors import InputError, OptodriveError
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
-ANSWER_S = 3.0
+SCHEDULER_TIMEOUT_S = 3.0
 """A scheduler that has not answered by then is not there."""
-JOIN_S = 30.0
+WORKER_TIMEOUT_S = 30.0
 """A scheduler to which no worker has come by then has none."""
-SETTINGS = {
+DASK_SETTINGS = {
     # A task whose worker was lost comes back at once, to be done alone: only so is it known whose fault it was.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.scheduler.worker-saturation": 1.0,
@@ -34,7 +34,9 @@ SETTINGS = {
 
 
 @contextmanager
-def crew(address: str | None = None, workers: int | None = None, most: int | None = None) -> Iterator[Any]:
+def open_client(
+    address: str | None = None, workers: int | None = None, max_workers: int | None = None
+) -> Iterator[Any]:
     """A Dask client: of the scheduler at an address, or of as many processes here, by default one a core.
 
     most: so many processes can be used at all. They listen on loopback only. InputError where the address is none, or
@@ -50,14 +52,14 @@ def crew(address: str | None = None, workers: int | None = None, most: int | Non
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
         if address is not None:
-            yield stack.enter_context(_remote(distributed, address))
+            yield stack.enter_context(_connect(distributed, address))
             return
-        stack.enter_context(dask.config.set(SETTINGS))
+        stack.enter_context(dask.config.set(DASK_SETTINGS))
         count = workers or dask.system.CPU_COUNT
         scratch = stack.enter_context(TemporaryDirectory(prefix="optodrive-"))
-        with _deaf():
+        with _block_sigint():
             cluster = distributed.LocalCluster(
-                n_workers=min(count, most or count),
+                n_workers=min(count, max_workers or count),
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
@@ -71,7 +73,7 @@ def crew(address: str | None = None, workers: int | None = None, most: int | Non
 
 
 @contextmanager
-def _deaf() -> Iterator[None]:
+def _block_sigint() -> Iterator[None]:
     """Processes begun here, now or later, do not hear Ctrl-C: ending them is this process's task."""
     resource_tracker.ensure_running()  # else it begins later, and opens the ears of the thread that begins it
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -81,7 +83,7 @@ def _deaf() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _remote(distributed: Any, address: str) -> Any:
+def _connect(distributed: Any, address: str) -> Any:
     expected = "a Dask scheduler's address, as tcp://host:8786"
     if not re.fullmatch(r"(tcp|tls)://([^\s/:\[\]]+|\[[0-9a-fA-F:]+\]):[0-9]{1,5}", address):
         raise InputError("--dask", address, expected)
@@ -89,18 +91,20 @@ def _remote(distributed: Any, address: str) -> Any:
     if address.startswith("tls:") and not secured:
         raise InputError("--dask", address, "certificates in Dask's configuration: distributed.comm.tls")
     try:
-        client = distributed.Client(address, timeout=ANSWER_S, set_as_default=False)
+        client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, OverflowError):
-        raise InputError("--dask", address, f"{expected}, at which one answers within {ANSWER_S:g} s") from None
+        raise InputError(
+            "--dask", address, f"{expected}, at which one answers within {SCHEDULER_TIMEOUT_S:g} s"
+        ) from None
     try:
-        client.wait_for_workers(1, timeout=JOIN_S)
+        client.wait_for_workers(1, timeout=WORKER_TIMEOUT_S)
     except TimeoutError:
         client.close()
-        raise InputError("--dask", address, f"a scheduler with a worker within {JOIN_S:g} s") from None
+        raise InputError("--dask", address, f"a scheduler with a worker within {WORKER_TIMEOUT_S:g} s") from None
     return client
 
 
-def done(
+def run_tasks(
     client: Any, function: Callable[[Task], Result], tasks: list[Task]
 ) -> Iterator[tuple[Task, Result | None, str]]:
     """Each task with its result, or with one line that says why it has none; in the order in which they end.
@@ -116,26 +120,26 @@ def done(
     try:
         for future in as_completed(list(futures), loop=client.loop):
             task = futures.pop(future)
-            error = _error(future)
+            error = _wait_for_error(future)
             if isinstance(error, KilledWorker):
                 lost.append(task)
             else:
-                yield (task, future.result(), "") if error is None else (task, None, _line(error))
+                yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
         for place, task in enumerate(lost):
             future = client.submit(function, task, key=f"{run}-again-{place}")
             futures[future] = task
-            error = _error(future)
+            error = _wait_for_error(future)
             del futures[future]
             if isinstance(error, KilledWorker):
                 yield task, None, "the worker died each time, the last time with nothing else to do: out of memory?"
             else:
-                yield (task, future.result(), "") if error is None else (task, None, _line(error))
+                yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
     finally:
         if futures:
             client.cancel(list(futures), force=True)
 
 
-def _error(future: Any) -> Exception | None:
+def _wait_for_error(future: Any) -> Exception | None:
     """How a future ended; OptodriveError where the scheduler is gone and it never will."""
     error: Exception | None = future.exception()
     if future.status in ("cancelled", "lost"):
@@ -143,5 +147,5 @@ def _error(future: Any) -> Exception | None:
     return error
 
 
-def _line(error: Exception) -> str:
+def _format_error(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())

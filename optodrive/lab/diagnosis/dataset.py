@@ -9,14 +9,14 @@ from numpy.typing import NDArray
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import Measurement, Run
-from optodrive.physics.pixel_ode import Scene
+from optodrive.physics.pixel_ode import PixelExperiment
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
 """Kinds of signals, by number; the first three are a pixel's."""
 BoolArray = NDArray[np.bool_]
 PIXEL_KINDS, MIRROR_KINDS = (0, 1, 2), (3, 4)
-FULL_W = 2.45
-CORNER_S = 6e-5
+FULL_POWER_W = 2.45
+EDGE_EXCLUSION_S = 6e-5
 """Temperature has a corner at each edge of the light: samples so near to one depend on jitter in no linear way."""
 
 
@@ -43,11 +43,11 @@ class RunInfo:
 
 
 @dataclass(frozen=True, eq=False)
-class Alike:
+class DriveGroup:
     """Scenes under the same drive: one with all their samples' times, and where each block finds its own."""
 
-    scene: Scene
-    rows: tuple[tuple[int, int, IntArray], ...]
+    experiment: PixelExperiment
+    block_rows: tuple[tuple[int, int, IntArray], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,8 @@ class Dataset:
 
     runs: tuple[RunInfo, ...]
     blocks: tuple[Block, ...]
-    scenes: tuple[tuple[Scene, tuple[int, int, int]], ...]
-    alike: tuple["Alike", ...]
+    experiments: tuple[tuple[PixelExperiment, tuple[int, int, int]], ...]
+    drive_groups: tuple["DriveGroup", ...]
     value: FloatArray
 
     def kinds(self) -> list[int]:
@@ -71,112 +71,118 @@ class Dataset:
         """Pixels measured."""
         return sorted({block.pixel for block in self.blocks if block.kind in PIXEL_KINDS})
 
-    def halves(self) -> list["Dataset"]:
+    def split_subsystems(self) -> list["Dataset"]:
         """What pixels do and what mirrors do, as far as there is any: they share nothing but the clock."""
-        found = []
+        subsystems = []
         for kinds in (PIXEL_KINDS, MIRROR_KINDS):
             runs = sorted({block.run for block in self.blocks if block.kind in kinds})
             if runs:
-                found.append(self.only(runs, kinds))
-        return found
+                subsystems.append(self.select(runs, kinds))
+        return subsystems
 
     def groups(self) -> dict[str, list[int]]:
         """Runs of each group, by number."""
-        found: dict[str, list[int]] = {}
+        by_group: dict[str, list[int]] = {}
         for number, run in enumerate(self.runs):
-            found.setdefault(run.group, []).append(number)
-        return found
+            by_group.setdefault(run.group, []).append(number)
+        return by_group
 
-    def contrasts(self) -> int:
+    def contrast_count(self) -> int:
         """So many runs repeat an earlier one: what the noise model is estimated from."""
         return len(self.runs) - len(self.groups())
 
-    def only(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
+    def select(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
         """The same with these runs, and kinds of signals, alone; doses and session times stay as they were."""
-        new = {old: number for number, old in enumerate(runs)}
+        new_numbers = {old: number for number, old in enumerate(runs)}
         blocks: list[Block] = []
         values: list[FloatArray] = []
-        moved: dict[int, int] = {}
-        at = 0
+        new_blocks: dict[int, int] = {}
+        offset = 0
         for number, block in enumerate(self.blocks):
-            if block.run not in new or block.kind not in kinds:
+            if block.run not in new_numbers or block.kind not in kinds:
                 continue
             count = block.part.stop - block.part.start
-            moved[number] = len(blocks)
-            blocks.append(Block(new[block.run], block.kind, block.pixel, slice(at, at + count), block.t_s))
+            new_blocks[number] = len(blocks)
+            blocks.append(
+                Block(new_numbers[block.run], block.kind, block.pixel, slice(offset, offset + count), block.t_s)
+            )
             values.append(self.value[block.part])
-            at += count
-        scenes = []
-        for scene, places in self.scenes:
-            if any(place in moved for place in places):
-                first, second, third = (moved.get(place, -1) for place in places)
-                scenes.append((scene, (first, second, third)))
+            offset += count
+        experiments = []
+        for scene, places in self.experiments:
+            if any(place in new_blocks for place in places):
+                first, second, third = (new_blocks.get(place, -1) for place in places)
+                experiments.append((scene, (first, second, third)))
         return Dataset(
             tuple(self.runs[old] for old in runs),
             tuple(blocks),
-            tuple(scenes),
-            _alike(scenes),
+            tuple(experiments),
+            _group_by_drive(experiments),
             np.concatenate(values) if values else np.zeros(0),
         )
 
 
-def dataset(measurement: Measurement) -> Dataset:
+def build_dataset(measurement: Measurement) -> Dataset:
     """Lay out a recording; InputError where nothing in it can be compared with the model."""
     runs = measurement.runs
-    clock = _clock(runs)
-    order = np.argsort(clock, kind="stable")
-    span = max(float(clock.max() - clock.min()), 1e-9)
-    full_w = max([FULL_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
-    total_j, before_j = _doses(runs, order)
-    whole_j = max([1e-12, *total_j.values()])  # a joule wears one pixel as it wears another
+    start_times_s = _compute_start_times_s(runs)
+    order = np.argsort(start_times_s, kind="stable")
+    session_span_s = max(float(start_times_s.max() - start_times_s.min()), 1e-9)
+    full_power_w = max([FULL_POWER_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
+    total_doses_j, doses_before_j = _compute_doses_j(runs, order)
+    max_total_j = max([1e-12, *total_doses_j.values()])  # a joule wears one pixel as it wears another
     blocks: list[Block] = []
-    scenes: list[tuple[Scene, tuple[int, int, int]]] = []
+    experiments: list[tuple[PixelExperiment, tuple[int, int, int]]] = []
     values: list[FloatArray] = []
-    timed = all("started_at" in run.attributes for run in runs)
-    at = 0
+    has_start_times = all("started_at" in run.attributes for run in runs)
+    offset = 0
     for number, run in enumerate(runs):
         by_pixel: dict[int, dict[int, int]] = {}
         for name, signal in run.signals.items():
             kind = SIGNALS.index(name)
-            good = np.isfinite(signal.value)
+            is_used = np.isfinite(signal.value)
             if kind == 0:
-                good &= _off_corners(signal.t_s, run.pulses)
-            value = signal.value[good] - (run.ambient_k if kind == 0 else 0.0)
+                is_used &= _is_off_edges(signal.t_s, run.pulses)
+            value = signal.value[is_used] - (run.ambient_k if kind == 0 else 0.0)
             if not len(value):
                 continue
             if kind in PIXEL_KINDS:
                 by_pixel.setdefault(signal.pixel, {})[kind] = len(blocks)
-            blocks.append(Block(number, kind, signal.pixel, slice(at, at + len(value)), signal.t_s[good]))
+            blocks.append(Block(number, kind, signal.pixel, slice(offset, offset + len(value)), signal.t_s[is_used]))
             values.append(value)
-            at += len(value)
+            offset += len(value)
         for pixel, places in by_pixel.items():
-            spots = (places.get(0, -1), places.get(1, -1), places.get(2, -1))
-            times = tuple(blocks[place].t_s if place >= 0 else np.zeros(0) for place in spots)
-            scene = Scene(
+            block_numbers = (places.get(0, -1), places.get(1, -1), places.get(2, -1))
+            times = tuple(blocks[place].t_s if place >= 0 else np.zeros(0) for place in block_numbers)
+            experiment = PixelExperiment(
                 pulses=run.pulses[np.argsort(run.pulses[:, 0], kind="stable")],
                 pixel=pixel,
                 ambient_k=run.ambient_k,
                 t_s=(times[0], times[1], times[2]),
-                dose_before=before_j[number].get(pixel, 0.0) / whole_j,
-                dose_per_j=1.0 / whole_j,
-                session=float(2.0 * (clock[number] - clock.min()) / span - 1.0),
-                session_per_s=2.0 / span if timed else 0.0,
-                full_w=full_w,
+                dose_before=doses_before_j[number].get(pixel, 0.0) / max_total_j,
+                dose_per_j=1.0 / max_total_j,
+                session_time=float(2.0 * (start_times_s[number] - start_times_s.min()) / session_span_s - 1.0),
+                session_time_per_s=2.0 / session_span_s if has_start_times else 0.0,
+                full_w=full_power_w,
             )
-            scenes.append((scene, spots))
+            experiments.append((experiment, block_numbers))
     if not blocks:
         raise InputError("recording", "no finite sample", "signals to compare with the model")
     return Dataset(
-        tuple(_info(run) for run in runs), tuple(blocks), tuple(scenes), _alike(scenes), np.concatenate(values)
+        tuple(_build_run_info(run) for run in runs),
+        tuple(blocks),
+        tuple(experiments),
+        _group_by_drive(experiments),
+        np.concatenate(values),
     )
 
 
-def _alike(scenes: list[tuple[Scene, tuple[int, int, int]]]) -> tuple[Alike, ...]:
-    together: dict[tuple[bytes, int], list[tuple[Scene, tuple[int, int, int]]]] = {}
-    for scene, places in scenes:
-        together.setdefault((scene.pulses.tobytes(), scene.pixel), []).append((scene, places))
-    found = []
-    for members in together.values():
+def _group_by_drive(experiments: list[tuple[PixelExperiment, tuple[int, int, int]]]) -> tuple[DriveGroup, ...]:
+    by_drive: dict[tuple[bytes, int], list[tuple[PixelExperiment, tuple[int, int, int]]]] = {}
+    for scene, places in experiments:
+        by_drive.setdefault((scene.pulses.tobytes(), scene.pixel), []).append((scene, places))
+    groups = []
+    for members in by_drive.values():
         times = [np.unique(np.concatenate([scene.t_s[kind] for scene, _ in members])) for kind in PIXEL_KINDS]
         rows = tuple(
             (kind, places[kind], np.searchsorted(times[kind], scene.t_s[kind]))
@@ -184,38 +190,38 @@ def _alike(scenes: list[tuple[Scene, tuple[int, int, int]]]) -> tuple[Alike, ...
             for kind in PIXEL_KINDS
             if places[kind] >= 0
         )
-        found.append(Alike(replace(members[0][0], t_s=(times[0], times[1], times[2])), rows))
-    return tuple(found)
+        groups.append(DriveGroup(replace(members[0][0], t_s=(times[0], times[1], times[2])), rows))
+    return tuple(groups)
 
 
-def _off_corners(t_s: FloatArray, pulses: FloatArray) -> BoolArray:
+def _is_off_edges(t_s: FloatArray, pulses: FloatArray) -> BoolArray:
     edges_s = np.sort(np.concatenate([[-np.inf], pulses[:, 0], pulses[:, 0] + pulses[:, 1], [np.inf]]))
     row = np.searchsorted(edges_s, t_s)
-    return np.asarray(np.minimum(t_s - edges_s[row - 1], edges_s[row] - t_s) > CORNER_S)
+    return np.asarray(np.minimum(t_s - edges_s[row - 1], edges_s[row] - t_s) > EDGE_EXCLUSION_S)
 
 
-def _info(run: Run) -> RunInfo:
+def _build_run_info(run: Run) -> RunInfo:
     group = str(run.attributes.get("group", run.name))
     return RunInfo(run.name, group, run.ambient_k, run.pulses, run.commands)
 
 
-def _clock(runs: tuple[Run, ...]) -> FloatArray:
+def _compute_start_times_s(runs: tuple[Run, ...]) -> FloatArray:
     """Start of each run, s: as stated, else one after the other."""
-    stated = [run.attributes.get("started_at") for run in runs]
-    if all(isinstance(word, str) for word in stated):
+    timestamps = [run.attributes.get("started_at") for run in runs]
+    if all(isinstance(word, str) for word in timestamps):
         try:
-            return np.array([datetime.fromisoformat(str(word)).timestamp() for word in stated])
+            return np.array([datetime.fromisoformat(str(word)).timestamp() for word in timestamps])
         except ValueError:
             pass
     return np.arange(float(len(runs)))
 
 
-def _doses(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, float], list[dict[int, float]]]:
+def _compute_doses_j(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, float], list[dict[int, float]]]:
     """Energy on each pixel in all, and before each run, J."""
-    so_far: dict[int, float] = {}
-    before: list[dict[int, float]] = [{} for _ in runs]
+    accumulated_j: dict[int, float] = {}
+    before_j: list[dict[int, float]] = [{} for _ in runs]
     for number in order.tolist():
-        before[number] = dict(so_far)
+        before_j[number] = dict(accumulated_j)
         for _, width_s, power_w, pixel in runs[number].pulses.tolist():
-            so_far[int(pixel)] = so_far.get(int(pixel), 0.0) + width_s * power_w
-    return so_far, before
+            accumulated_j[int(pixel)] = accumulated_j.get(int(pixel), 0.0) + width_s * power_w
+    return accumulated_j, before_j

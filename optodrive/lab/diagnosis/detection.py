@@ -14,14 +14,14 @@ from scipy.stats import f as fisher
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
-from optodrive.lab.diagnosis.fitting import Fit, Problem, jitter, slopes
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
 from optodrive.lab.diagnosis.hypotheses import Hypothesis
-from optodrive.lab.diagnosis.normal_equations import normal, projected, solve
-from optodrive.lab.diagnosis.omnibus_test import binned
-from optodrive.lab.diagnosis.prediction import BASE, Point, predict
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
+from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
 
 DRAWS = 4000
-PRIOR, SURE = 6, 10_000
+NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000
 """What is known of a lab's noise beforehand counts as so many contrasts; degrees where there is nothing to learn."""
 
 
@@ -37,8 +37,8 @@ class Score:
     ratio: float
     amplitude: tuple[float, ...]
     columns: tuple[int, ...]
-    seen: float
-    own: float
+    start_ratio: float
+    independent_fraction: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,107 +50,113 @@ class Detection:
 
     scores: tuple[Score, ...]
     p_score: float
-    omnibus: float
-    bins: int
+    omnibus_chi2: float
+    omnibus_degrees: int
     p_omnibus: float
-    left: float
+    residual_chi2: float
 
 
 def detect(
-    problem: Problem, base: Fit, found: list[Hypothesis], seed: int, beside: FloatArray | None = None
+    problem: FitProblem,
+    base: ModelFit,
+    hypotheses: list[Hypothesis],
+    seed: int,
+    extra_columns: FloatArray | None = None,
 ) -> Detection:
     """Score every hypothesis beside a fit (nominal, or with terms already in it), and beside more columns [m, k]."""
     data = problem.data
-    shared = jitter(data, base.point, problem.epsilon, base.prediction)
-    known = slopes(problem, base.point, base.free, base.prediction)
-    if beside is not None:
-        known = np.column_stack([known, beside / np.abs(beside).max(axis=0, initial=1e-300)])
-    trials = [(item, start) for item in found for start in _tried(item)]
+    sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
+    known = compute_jacobian(problem, base.point, base.free, base.prediction)
+    if extra_columns is not None:
+        known = np.column_stack([known, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)])
+    trials = [(item, start) for item in hypotheses for start in _select_starts(item)]
     terms = [{**base.point.terms, item.key: start} for item, start in trials]
-    extra = [predict(data, Point(base.point.base, own), problem.epsilon) - base.prediction for own in terms]
-    candidates = np.stack(extra, axis=1) if extra else np.zeros((len(data.value), 0))
+    effects = [predict(data, ParameterPoint(base.point.base, own), problem.epsilon) - base.prediction for own in terms]
+    candidates = np.stack(effects, axis=1) if effects else np.zeros((len(data.value), 0))
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([known, candidates / scale, residual])
-    total = normal(data, columns, problem.noise, shared.power, shared.timing).total()
+    total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total()
     width = known.shape[1]
-    total[range(len(BASE)), range(len(BASE))] += 1.0 / np.square(problem.prior.sigma)
-    left = projected(total, list(range(width)), list(range(width, len(total))))
-    own = np.diag(left) / np.maximum(np.diag(total)[width:], 1e-300)
-    found_bins = binned(problem, np.column_stack([known, residual]), shared)
-    scores, p_score = _scores(trials, left, scale, own, seed, sureness(data))
-    rest = float(left[-1, -1])
-    return Detection(tuple(scores), p_score, found_bins.chi2, found_bins.degrees, found_bins.p_value(), rest)
+    total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)
+    projected = project_out(total, list(range(width)), list(range(width, len(total))))
+    independent = np.diag(projected) / np.maximum(np.diag(total)[width:], 1e-300)
+    omnibus = compute_omnibus(problem, np.column_stack([known, residual]), sensitivity)
+    scores, p_score = _compute_scores(trials, projected, scale, independent, seed, count_noise_degrees(data))
+    residual_chi2 = float(projected[-1, -1])
+    return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value(), residual_chi2)
 
 
-def sureness(data: Dataset) -> int:
+def count_noise_degrees(data: Dataset) -> int:
     """Degrees of freedom of the noise model; a mirror's is held above what repeats show, and thus sure."""
     mirrors = all(kind in MIRROR_KINDS for kind in data.kinds())
-    return SURE if mirrors or not data.contrasts() else PRIOR + data.contrasts()
+    return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count() else NOISE_PRIOR_DEGREES + data.contrast_count()
 
 
-def _tried(item: Hypothesis) -> tuple[dict[str, float], ...]:
-    return item.starts[:1] if item.every else item.starts
+def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:
+    return item.starts[:1] if item.fit_every_start else item.starts
 
 
-def _scores(
+def _compute_scores(
     trials: list[tuple[Hypothesis, dict[str, float]]],
-    left: FloatArray,
+    projected: FloatArray,
     scale: FloatArray,
-    own: FloatArray,
+    independent: FloatArray,
     seed: int,
-    contrasts: int,
+    noise_degrees: int,
 ) -> tuple[list[Score], float]:
-    sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
+    column_sets: list[tuple[Hypothesis, dict[str, float], tuple[int, ...]]] = []
     joint: dict[str, list[int]] = {}
     for column, (item, start) in enumerate(trials):
-        if item.linear and item.degrees > 1:
+        if item.is_linear and item.degrees > 1:
             joint.setdefault(item.label, []).append(column)
             if len(joint[item.label]) == len(item.starts):
-                sets.append((item, item.starts[0], tuple(joint[item.label])))
+                column_sets.append((item, item.starts[0], tuple(joint[item.label])))
         else:
-            sets.append((item, start, (column,)))
-    if not sets:
+            column_sets.append((item, start, (column,)))
+    if not column_sets:
         return [], 1.0
-    gram, right = left[:-1, :-1], left[:-1, -1]
+    gram, right = projected[:-1, :-1], projected[:-1, -1]
     best: dict[str, Score] = {}
-    for item, start, places in sets:
-        ratio, amplitude = _ratio(gram, right, list(places), item.linear)
+    for item, start, places in column_sets:
+        ratio, amplitude = _compute_likelihood_ratio(gram, right, list(places), item.is_linear)
         last = places[-1]
-        seen = float(gram[last, last] * scale[last] ** 2)
+        start_ratio = float(gram[last, last] * scale[last] ** 2)
         amplitudes = tuple((amplitude / scale[list(places)]).tolist())
-        score = Score(item, start, ratio, amplitudes, places, seen, float(own[last]))
+        score = Score(item, start, ratio, amplitudes, places, start_ratio, float(independent[last]))
         if item.label not in best or ratio > best[item.label].ratio:
             best[item.label] = score
-    observed = max(_surprise(score.ratio, len(score.columns), contrasts) for score in best.values())
+    observed = max(_compute_surprisal(score.ratio, len(score.columns), noise_degrees) for score in best.values())
     generator = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     draws = root @ generator.standard_normal((len(gram), DRAWS))
-    least = np.zeros(DRAWS)
-    for item, _, places in sets:
+    max_surprisal = np.zeros(DRAWS)
+    for item, _, places in column_sets:
         rows = list(places)
         solved = solve(gram[np.ix_(rows, rows)], draws[rows])
         ratio_drawn = (draws[rows] * solved).sum(axis=0)
-        if not item.linear:
+        if not item.is_linear:
             ratio_drawn = np.where(solved[0] > 0.0, ratio_drawn, 0.0)
-        least = np.maximum(least, -chi_squared.logsf(ratio_drawn, len(rows)))
-    level = float(np.quantile(least, 0.99))
+        max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, len(rows)))
+    level = float(np.quantile(max_surprisal, 0.99))
     # Beyond the draws, the best of so many looks as if it were the best of e^(level) × 1 % independent ones.
-    drawn = float((least >= observed).mean())
+    exceedance = float((max_surprisal >= observed).mean())
     p = (
-        max(drawn, 1.0 / DRAWS)
+        max(exceedance, 1.0 / DRAWS)
         if observed < level
-        else min(drawn if drawn > 0 else 1.0, 0.01 * np.exp(level - observed))
+        else min(exceedance if exceedance > 0 else 1.0, 0.01 * np.exp(level - observed))
     )
     return sorted(best.values(), key=lambda score: -score.ratio), float(p)
 
 
-def _surprise(ratio: float, degrees: int, contrasts: int) -> float:
-    return float(-fisher.logsf(ratio / degrees, degrees, contrasts))
+def _compute_surprisal(ratio: float, degrees: int, noise_degrees: int) -> float:
+    return float(-fisher.logsf(ratio / degrees, degrees, noise_degrees))
 
 
-def _ratio(gram: FloatArray, right: FloatArray, places: list[int], either_sign: bool) -> tuple[float, FloatArray]:
+def _compute_likelihood_ratio(
+    gram: FloatArray, right: FloatArray, places: list[int], either_sign: bool
+) -> tuple[float, FloatArray]:
     inner = gram[np.ix_(places, places)]
     amplitude = solve(inner, right[places])
     if not either_sign and amplitude[0] <= 0.0:

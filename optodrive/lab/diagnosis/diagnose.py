@@ -10,166 +10,187 @@ from scipy.stats import chi2 as chi_squared
 from scipy.stats import t as student
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.discrepancy import CandidateCause, Course, Discrepancy, Estimate, Gain, NextExperiment
-from optodrive.core.types.measurements import Measurement
-from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS, Dataset, dataset
-from optodrive.lab.diagnosis.detection import Score, sureness
-from optodrive.lab.diagnosis.discrepancy_basis import covariance
-from optodrive.lab.diagnosis.fitting import Fit, Prior, Problem, fit
-from optodrive.lab.diagnosis.held_out_gain import heldout, split
-from optodrive.lab.diagnosis.hypotheses import Free, Hypothesis, hypotheses
-from optodrive.lab.diagnosis.model_selection import (
-    ALIKE,
-    UNEVEN,
-    UNSTEADY,
-    Candidate,
-    Verdict,
-    leading,
-    select,
-    unrepeated,
+from optodrive.core.types.discrepancy import (
+    CandidateCause,
+    Discrepancy,
+    Estimate,
+    HeldOutGain,
+    NextExperiment,
+    ResidualTrace,
 )
-from optodrive.lab.diagnosis.next_experiment import next_experiment
-from optodrive.lab.diagnosis.nominal_fit import BROAD, EPSILON, prepare, with_noise
-from optodrive.lab.diagnosis.power_fluctuation import unsteadiness
-from optodrive.lab.diagnosis.prediction import BASE, UNITS, predict
+from optodrive.core.types.measurements import Measurement
+from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, SIGNALS, Dataset, build_dataset
+from optodrive.lab.diagnosis.detection import Score, count_noise_degrees
+from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
+from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
+from optodrive.lab.diagnosis.held_out_gain import compute_held_out_gain, split_runs
+from optodrive.lab.diagnosis.hypotheses import FreeParameter, Hypothesis, build_hypotheses
+from optodrive.lab.diagnosis.model_selection import (
+    BIC_INDISTINGUISHABLE,
+    MAX_INTRA_PULSE_POWER_EXCESS,
+    MAX_REPLICATE_EXCESS,
+    RefittedCandidate,
+    Verdict,
+    find_best_candidate,
+    has_replicate_excess,
+    select_causes,
+)
+from optodrive.lab.diagnosis.next_experiment import propose_experiment
+from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
+from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, predict
 
-VISIBLE = 30.0
+DETECTABLE_RATIO = 30.0
 """A likelihood ratio that is found nine times in ten."""
-OWN = 1e-4
+MIN_INDEPENDENT_FRACTION = 1e-4
 """Less of its effect than this left beside the nominal numbers: this data cannot show it."""
-COURSE = 300
+TRACE_POINTS = 300
 
-Tick = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class _Half:
+class _SubsystemFit:
     """Pixels or mirrors: everything found about them. covariance: of the final numbers, other forms allowed."""
 
     data: Dataset
-    held: Dataset
-    problem: Problem
-    base: Fit
+    held_out: Dataset
+    problem: FitProblem
+    base: ModelFit
     verdict: Verdict
-    final: Fit
+    final: ModelFit
     covariance: FloatArray
-    gain: Gain | None
+    gain: HeldOutGain | None
     candidates: tuple[CandidateCause, ...]
-    ask: NextExperiment | None
+    next_experiment: NextExperiment | None
 
 
 def diagnose(
     measurement: Measurement,
     seed: int = 0,
-    prior: Prior = BROAD,
-    epsilon: float = EPSILON,
-    tick: Tick = lambda what: None,
+    prior: BaseParameterPrior = BROAD_PRIOR,
+    epsilon: float = DEFAULT_EPSILON,
+    on_progress: ProgressCallback = lambda what: None,
 ) -> Discrepancy:
     """What the recording says; raises InputError where it holds nothing to compare."""
     began_s = perf_counter()
-    halves: list[_Half] = []
-    for part in dataset(measurement).halves():
-        timing_s = max((item.problem.noise.timing_s for item in halves), default=0.0)
-        known = hypotheses(part)
-        if halves:
+    subsystems: list[_SubsystemFit] = []
+    for part in build_dataset(measurement).split_subsystems():
+        timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)
+        candidates = build_hypotheses(part)
+        if subsystems:
             # One clock for all: what the pixels say of it holds, and a late mirror is a mirror that lags.
-            known = [item for item in known if item.key != "clock_offset"]
-        halves.append(_study(part, known, seed, prior, epsilon, timing_s, _late_s(halves), tick))
-    verdict, causes = _joined(halves)
-    main = halves[0]
+            candidates = [item for item in candidates if item.key != "clock_offset"]
+        subsystems.append(
+            _diagnose_subsystem(
+                part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems), on_progress
+            )
+        )
+    verdict, causes = _combine_verdicts(subsystems)
+    main = subsystems[0]
     parameters: dict[str, Estimate] = {}
     terms: dict[str, dict[str, float]] = {}
-    for half in halves:
-        parameters |= _estimates(half)
-        terms |= {key: dict(own) for key, own in half.final.point.terms.items()}
-    heats = any(kind < 3 for kind in main.data.kinds())
-    base = dict(zip(BASE, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if heats else {}
-    held = tuple(sorted({run.name for half in halves for run in half.held.runs}))
-    fitted = tuple(sorted({run.name for half in halves for run in half.data.runs}.difference(held)))
-    explained = [half.verdict.explained for half in halves if half.verdict.verdict != "none"]
+    for subsystem in subsystems:
+        parameters |= _compute_estimates(subsystem)
+        terms |= {key: dict(own) for key, own in subsystem.final.point.terms.items()}
+    has_pixels = any(kind < 3 for kind in main.data.kinds())
+    base = (
+        dict(zip(BASE_PARAMETERS, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if has_pixels else {}
+    )
+    held_out = tuple(sorted({run.name for half in subsystems for run in half.held_out.runs}))
+    fitted = tuple(sorted({run.name for half in subsystems for run in half.data.runs}.difference(held_out)))
+    explained_fractions = [half.verdict.explained_fraction for half in subsystems if half.verdict.verdict != "none"]
     return Discrepancy(
         verdict=verdict,
         causes=causes,
-        labels=tuple(
-            item.label for half in halves if half.verdict.chosen is not None for item in half.verdict.chosen.hypotheses
+        hypothesis_labels=tuple(
+            item.label
+            for half in subsystems
+            if half.verdict.chosen is not None
+            for item in half.verdict.chosen.hypotheses
         ),
         parameters=parameters,
         base=base,
         terms=terms if verdict == "cause" or verdict == "ambiguous" else {},
-        gain=next((half.gain for half in halves if half.verdict.chosen is not None), None),
-        candidates=tuple(item for half in halves for item in half.candidates),
-        next_experiment=next((half.ask for half in halves if half.ask is not None), None),
-        fitted=fitted,
-        held_out=held,
-        courses=tuple(course for half in halves for course in _courses(half)),
-        remarks=_remarks(halves),
-        explained=min(explained, default=0.0),
-        seconds=perf_counter() - began_s,
+        gain=next((half.gain for half in subsystems if half.verdict.chosen is not None), None),
+        candidates=tuple(item for half in subsystems for item in half.candidates),
+        next_experiment=next((half.next_experiment for half in subsystems if half.next_experiment is not None), None),
+        fitted_runs=fitted,
+        held_out_runs=held_out,
+        residual_traces=tuple(course for half in subsystems for course in _compute_residual_traces(half)),
+        remarks=_build_remarks(subsystems),
+        explained_fraction=min(explained_fractions, default=0.0),
+        elapsed_s=perf_counter() - began_s,
     )
 
 
-def _study(
+def _diagnose_subsystem(
     data: Dataset,
     known: list[Hypothesis],
     seed: int,
-    prior: Prior,
+    prior: BaseParameterPrior,
     epsilon: float,
-    timing_s: float,
-    late_s: float,
-    tick: Tick,
-) -> _Half:
-    fitted, held_runs = split(data)
-    here, held = data.only(fitted), data.only(held_runs)
-    tick("noise and nominal model")
-    problem, base = prepare(here, prior, epsilon, timing_s, late_s)
-    if unrepeated(problem):
+    min_timing_sigma_s: float,
+    clock_offset_s: float,
+    on_progress: ProgressCallback,
+) -> _SubsystemFit:
+    fitted, held_out_runs = split_runs(data)
+    fitted_data, held_out = data.select(fitted), data.select(held_out_runs)
+    on_progress("noise and nominal model")
+    problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
+    if has_replicate_excess(problem):
         # A jitter acts along the slopes of the true model: a large cause moves them, and repeats seem to differ.
-        lead = leading(problem, base, known, seed, tick)
-        if lead is not None:
-            other = with_noise(problem, lead.fit, timing_s)
-            other = replace(other, noise=replace(other.noise, unsteady=unsteadiness(other, lead.fit)))
-            if not unrepeated(other):
+        best = find_best_candidate(problem, base, known, seed, on_progress)
+        if best is not None:
+            other = update_noise(problem, best.fit, min_timing_sigma_s)
+            other = replace(
+                other,
+                noise=replace(other.noise, intra_pulse_power_excess=compute_intra_pulse_power_excess(other, best.fit)),
+            )
+            if not has_replicate_excess(other):
                 problem, base = other, fit(other, base.point)
-    verdict = select(problem, base, known, seed, tick)
+    verdict = select_causes(problem, base, known, seed, on_progress)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
-        told = heldout(problem, held, base.point, candidate.fit.point, seed)
-        if told is not None:
-            gains[candidate.label] = told.reduction
-    everything = Problem(data, problem.noise, prior, epsilon)
-    tick("all runs together")
+        candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
+        if candidate_gain is not None:
+            gains[candidate.label] = candidate_gain.reduction
+    everything = FitProblem(data, problem.noise, prior, epsilon)
+    on_progress("all runs together")
     chosen = verdict.chosen
-    gain = None if chosen is None else heldout(problem, held, base.point, chosen.fit.point, seed)
+    gain = None if chosen is None else compute_held_out_gain(problem, held_out, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
     final = fit(everything, start.point, start.free, iterations=6)
     if all(kind in MIRROR_KINDS for kind in data.kinds()):  # jitters may lead astray: each place by its own slopes
-        places = (start.point, final.point)
-        final = min((fit(everything, place, start.free, iterations=1) for place in places), key=lambda one: one.chi2)
-    if verdict.verdict == "none" and held_runs:
+        points = (start.point, final.point)
+        final = min((fit(everything, place, start.free, iterations=1) for place in points), key=lambda one: one.chi2)
+    if verdict.verdict == "none" and held_out_runs:
         # What only the hottest runs show is seen with them alone: nothing is held out then.
-        wider = select(everything, final, known, seed, tick)
+        wider = select_causes(everything, final, known, seed, on_progress)
         if wider.verdict != "none":
-            problem, base, held, verdict = everything, final, data.only([]), wider
+            problem, base, held_out, verdict = everything, final, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
-    ask = _asked(problem, verdict, tick)
+    experiment = _propose_experiment(problem, verdict, on_progress)
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
-    unsure = covariance(everything, final, named, known)
-    return _Half(data, held, problem, base, verdict, final, unsure, gain, _candidates(verdict, gains), ask)
+    covariance = compute_covariance(everything, final, named, known)
+    return _SubsystemFit(
+        data, held_out, problem, base, verdict, final, covariance, gain, _judge_candidates(verdict, gains), experiment
+    )
 
 
-def _late_s(halves: list[_Half]) -> float:
+def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
     """By how much all clocks are late, as far as is known."""
-    for half in halves:
-        clock = half.final.point.terms.get("clock_offset")
-        if "clock_offset" in half.verdict.causes and clock is not None and clock["mirrors"] != 0.0:
+    for subsystem in subsystems:
+        clock = subsystem.final.point.terms.get("clock_offset")
+        if "clock_offset" in subsystem.verdict.causes and clock is not None and clock["mirrors"] != 0.0:
             return clock["mirrors"]
     return 0.0
 
 
-def _joined(halves: list[_Half]) -> tuple[str, tuple[str, ...]]:
+def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, ...]]:
     """The verdict on all: as weak as its weakest part; a part without anything to explain does not weaken it."""
-    verdicts = [half.verdict for half in halves if half.verdict.verdict != "none"]
+    verdicts = [half.verdict for half in subsystems if half.verdict.verdict != "none"]
     if not verdicts:
         return "none", ()
     causes = tuple(dict.fromkeys(cause for item in verdicts for cause in item.causes))
@@ -179,17 +200,17 @@ def _joined(halves: list[_Half]) -> tuple[str, tuple[str, ...]]:
     return "cause", causes
 
 
-def _estimates(half: _Half) -> dict[str, Estimate]:
-    final = half.final
-    sigma = np.sqrt(np.maximum(np.diag(half.covariance), 0.0))
+def _compute_estimates(subsystem: _SubsystemFit) -> dict[str, Estimate]:
+    final = subsystem.final
+    sigma = np.sqrt(np.maximum(np.diag(subsystem.covariance), 0.0))
     out: dict[str, Estimate] = {}
-    reach = float(student.ppf(0.975, sureness(half.data)))
-    if any(kind < 3 for kind in half.data.kinds()):
-        for row, name in enumerate(BASE):
-            log_value, width = final.point.base[row], reach * float(sigma[row])
-            out[name] = Estimate(exp(log_value), UNITS[name], exp(log_value - width), exp(log_value + width))
-    for row, free in enumerate(final.free, start=len(BASE)):
-        number, width = free.read(final.point.terms), reach * float(min(sigma[row], 50.0))
+    t_quantile = float(student.ppf(0.975, count_noise_degrees(subsystem.data)))
+    if any(kind < 3 for kind in subsystem.data.kinds()):
+        for row, name in enumerate(BASE_PARAMETERS):
+            log_value, width = final.point.base[row], t_quantile * float(sigma[row])
+            out[name] = Estimate(exp(log_value), BASE_UNITS[name], exp(log_value - width), exp(log_value + width))
+    for row, free in enumerate(final.free, start=len(BASE_PARAMETERS)):
+        number, width = free.read_value(final.point.terms), t_quantile * float(min(sigma[row], 50.0))
         ends = (number - width, number + width)
         value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
         low, high = max(low, free.parameter.low), min(high, free.parameter.high)
@@ -198,62 +219,70 @@ def _estimates(half: _Half) -> dict[str, Estimate]:
     return out
 
 
-def _candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
+def _judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[CandidateCause, ...]:
     chosen = verdict.chosen
-    tests = max(len(verdict.first.scores), 1)
+    tests = max(len(verdict.nominal_detection.scores), 1)
     out = []
-    for score in verdict.first.scores:
+    for score in verdict.nominal_detection.scores:
         item = score.hypothesis
         if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
-            word = "named" if verdict.verdict == "cause" else "cannot be told apart"
+            judgement = "named" if verdict.verdict == "cause" else "cannot be told apart"
         elif item.key in verdict.causes:
-            word = "cannot be told apart" if verdict.verdict == "ambiguous" else "another form of a named cause"
-        elif score.own < OWN:
-            word = "this data cannot show it"
+            judgement = "cannot be told apart" if verdict.verdict == "ambiguous" else "another form of a named cause"
+        elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
+            judgement = "this data cannot show it"
         else:
-            word = "nothing of it seen" if score.ratio < VISIBLE else "ruled out"
+            judgement = "nothing of it seen" if score.ratio < DETECTABLE_RATIO else "ruled out"
         p_value = min(1.0, tests * float(chi_squared.sf(score.ratio, len(score.columns))))
         out.append(
-            CandidateCause(item.key, item.label, score.ratio, p_value, gains.get(item.label), word, _smallest(score))
+            CandidateCause(
+                item.key,
+                item.label,
+                score.ratio,
+                p_value,
+                gains.get(item.label),
+                judgement,
+                _describe_detection_limit(score),
+            )
         )
     return tuple(out)
 
 
-def _smallest(score: Score) -> str:
+def _describe_detection_limit(score: Score) -> str:
     """The size that would have been seen, in words."""
     if score.hypothesis.key == "mirror_lag":
         return "any lag of the mirrors beyond half a sample"
-    free = score.hypothesis.free[-1 if score.hypothesis.linear else 0]
+    free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
     start = score.start.get(free.names[0], 0.0) or 1.0
-    if score.seen <= 0.0 or score.own < OWN:
+    if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:
         return "not visible in this data"
-    size = abs(start) * float(np.sqrt(VISIBLE / score.seen))
+    size = abs(start) * float(np.sqrt(DETECTABLE_RATIO / score.start_ratio))
     if size > 3.0 * free.parameter.high:
         return f"more than {free.parameter.high:g} {free.parameter.unit}"
     return f"{'all' if len(free.names) > 1 else free.names[0]} {size:.2g} {free.parameter.unit}".removesuffix(" 1")
 
 
-def _asked(problem: Problem, verdict: Verdict, tick: Tick) -> NextExperiment | None:
+def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: ProgressCallback) -> NextExperiment | None:
     """For rivals that this data cannot tell apart: what would."""
     if verdict.verdict != "ambiguous" or not verdict.candidates:
         return None
     best = verdict.candidates[0]
-    rivals: list[Candidate] = [
+    rivals: list[RefittedCandidate] = [
         item
         for item in verdict.candidates[1:]
-        if item.bic - best.bic < ALIKE and frozenset(item.causes) != frozenset(best.causes)
+        if item.bic - best.bic < BIC_INDISTINGUISHABLE and frozenset(item.causes) != frozenset(best.causes)
     ]
     if not rivals:
         return None
-    tick("the next experiment")
-    return next_experiment(problem, best.fit, rivals[0].fit, (best.label, rivals[0].label))
+    on_progress("the next experiment")
+    return propose_experiment(problem, best.fit, rivals[0].fit, (best.label, rivals[0].label))
 
 
-def _courses(half: _Half) -> list[Course]:
+def _compute_residual_traces(subsystem: _SubsystemFit) -> list[ResidualTrace]:
     """Each group's mean residuals per signal, thinned, in units of the white noise."""
-    data = half.data
-    nominal = predict(data, half.base.point, half.problem.epsilon)
-    extended = predict(data, half.final.point, half.problem.epsilon)
+    data = subsystem.data
+    nominal = predict(data, subsystem.base.point, subsystem.problem.epsilon)
+    extended = predict(data, subsystem.final.point, subsystem.problem.epsilon)
     seen: set[tuple[str, int]] = set()
     out = []
     for block in data.blocks:
@@ -261,51 +290,51 @@ def _courses(half: _Half) -> list[Course]:
         if (group, block.kind) in seen:
             continue
         seen.add((group, block.kind))
-        thin = max(1, len(block.t_s) // COURSE)
-        edges = np.arange(0, len(block.t_s), thin)
+        stride = max(1, len(block.t_s) // TRACE_POINTS)
+        edges = np.arange(0, len(block.t_s), stride)
         count = np.diff(np.append(edges, len(block.t_s)))
-        parts = [np.add.reduceat(values[block.part], edges) / count for values in (data.value, nominal, extended)]
+        means = [np.add.reduceat(values[block.part], edges) / count for values in (data.value, nominal, extended)]
         t_s = np.add.reduceat(block.t_s, edges) / count
-        scale = half.problem.noise.coloured[block.kind].white
-        before, after = ((parts[0] - part) / scale for part in parts[1:])
-        out.append(Course(group, SIGNALS[block.kind], scale, t_s, parts[0], before, after))
+        scale = subsystem.problem.noise.coloured[block.kind].white
+        nominal_residual, extended_residual = ((means[0] - part) / scale for part in means[1:])
+        out.append(ResidualTrace(group, SIGNALS[block.kind], scale, t_s, means[0], nominal_residual, extended_residual))
     return out
 
 
-def _remarks(halves: list[_Half]) -> tuple[str, ...]:
+def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
     out = []
-    for half in halves:
-        if half.problem.noise.uneven > UNEVEN:
+    for subsystem in subsystems:
+        if subsystem.problem.noise.replicate_excess > MAX_REPLICATE_EXCESS:
             out.append(
                 "Runs that should repeat one experiment differ by far more than noise and jitter: something "
                 "changes from run to run."
             )
-        if half.problem.noise.unsteady > UNSTEADY:
+        if subsystem.problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS:
             out.append("Repeats differ more while lit: the power is unsteady within pulses.")
-        if not half.problem.noise.measured:
+        if not subsystem.problem.noise.from_replicates:
             out.append("No run repeats another: the noise is a guess, so nothing is named for certain.")
-        if half.verdict.chosen is not None and half.verdict.rest is not None:
-            rest = half.verdict.rest
-            if half.verdict.verdict == "cause" and rest.p_omnibus < 1e-3:
-                causes = " and ".join(half.verdict.causes)
+        if subsystem.verdict.chosen is not None and subsystem.verdict.residual_detection is not None:
+            detection = subsystem.verdict.residual_detection
+            if subsystem.verdict.verdict == "cause" and detection.p_omnibus < 1e-3:
+                causes = " and ".join(subsystem.verdict.causes)
                 out.append(
-                    f"{causes}: {1 - half.verdict.explained:.1%} of what was wrong stays, for the cause acts in a form "
+                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of what was wrong stays, for the cause acts in a form "
                     "a little other than the term's."
                 )
-        out += _at_an_end(half.final)
+        out += _describe_range_limits(subsystem.final)
     return tuple(dict.fromkeys(out))
 
 
-def _at_an_end(final: Fit) -> list[str]:
+def _describe_range_limits(final: ModelFit) -> list[str]:
     out = []
     for free in final.free:
         value = final.point.terms[free.key][free.names[0]]
-        if _shape(free):
+        if _is_shape_parameter(free):
             continue
         if value >= 0.999 * free.parameter.high or (free.parameter.low > 0 and value <= 1.001 * free.parameter.low):
             out.append(f"{free.label} came out at the end of its plausible range, {value:g} {free.parameter.unit}.")
     return out
 
 
-def _shape(free: Free) -> bool:
+def _is_shape_parameter(free: FreeParameter) -> bool:
     return free.names[0] in ("spread", "order", "delay_share", "damping", "slew", "delay")

@@ -10,12 +10,12 @@ from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.core.types.measurements import Measurement
 from optodrive.device.config import Config
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.noise_model import Coloured, whiten
-from optodrive.lab.diagnosis.priors import TABLE, prior_of
+from optodrive.lab.diagnosis.noise_model import ColouredNoise, whiten
+from optodrive.lab.diagnosis.priors import DEFAULT_PARAMETER_SET, build_prior
 from optodrive.physics.parameters import load_parameters
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
-TOGETHER = 4
+MAX_JOINT_PIXELS = 4
 """So many pixels are fitted together, as one set of numbers; of more, each for itself."""
 
 
@@ -34,13 +34,13 @@ class PixelAnswer:
     """What was found, without courses; or why nothing was. width_m: the bridge's, where it is known."""
 
     pixel: int | None
-    found: Discrepancy | None
+    discrepancy: Discrepancy | None
     error: str = ""
     width_m: float | None = None
 
 
 @dataclass(frozen=True)
-class Spread:
+class PixelSpread:
     """A number over pixels."""
 
     median: float
@@ -49,20 +49,20 @@ class Spread:
     unit: str
 
     @classmethod
-    def of(cls, values: list[float], unit: str) -> "Spread":
+    def from_values(cls, values: list[float], unit: str) -> "PixelSpread":
         """Median and range."""
         return cls(float(np.median(values)), min(values), max(values), unit)
 
 
 @dataclass(frozen=True, eq=False)
-class Group:
+class PixelGroup:
     """Pixels with the same verdict and causes. parameters: of named causes; gain: reductions on held-out runs."""
 
     verdict: str
     causes: tuple[str, ...]
     answers: tuple[PixelAnswer, ...]
-    parameters: dict[str, Spread]
-    gain: Spread | None
+    parameters: dict[str, PixelSpread]
+    gain: PixelSpread | None
 
     @property
     def pixels(self) -> list[int]:
@@ -76,79 +76,83 @@ class DisplayAnswer:
 
     pixels: tuple[PixelAnswer, ...]
     mirrors: PixelAnswer | None
-    seconds: float
+    elapsed_s: float
 
     @property
     def failed(self) -> list[PixelAnswer]:
         """Pixels without an answer."""
-        return [item for item in self.pixels if item.found is None]
+        return [item for item in self.pixels if item.discrepancy is None]
 
-    def groups(self) -> list[Group]:
+    def groups(self) -> list[PixelGroup]:
         """Pixels that suffer from the same, most pixels first; nothing found is a group too."""
-        found: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
+        by_causes: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
         for item in self.pixels:
-            if item.found is not None:
-                found.setdefault((item.found.verdict, tuple(sorted(item.found.causes))), []).append(item)
-        groups = [_group(*key, tuple(members)) for key, members in found.items()]
+            if item.discrepancy is not None:
+                by_causes.setdefault((item.discrepancy.verdict, tuple(sorted(item.discrepancy.causes))), []).append(
+                    item
+                )
+        groups = [_build_group(*key, tuple(members)) for key, members in by_causes.items()]
         return sorted(groups, key=lambda item: (-len(item.answers), item.verdict, item.causes))
 
-    def model(self) -> tuple[Discrepancy | None, float | None, str]:
+    def build_model(self) -> tuple[Discrepancy | None, float | None, str]:
         """One pixel model for the display, its bridge width, and what it stands for; or None and why there is none.
 
         Medians over the pixels of the largest group, if that is more than half of all and has a definite verdict.
         """
         groups = self.groups()
-        most = groups[0] if groups else None
-        if most is None or 2 * len(most.answers) <= len(self.pixels):
+        largest = groups[0] if groups else None
+        if largest is None or 2 * len(largest.answers) <= len(self.pixels):
             return None, None, "no one set of causes holds for most pixels"
-        if most.verdict not in ("none", "cause"):
-            return None, None, f"most pixels are {most.verdict}"
-        widths = {item.width_m for item in most.answers}
-        if len(widths) > 1:
+        if largest.verdict not in ("none", "cause"):
+            return None, None, f"most pixels are {largest.verdict}"
+        widths_m = {item.width_m for item in largest.answers}
+        if len(widths_m) > 1:
             return None, None, "the pixels' bridges differ in width"
-        each = [item.found for item in most.answers if item.found is not None and item.found.base]
-        first = each[0]
-        base = {name: _median(item.base[name] for item in each) for name in first.base}
+        discrepancies = [
+            item.discrepancy for item in largest.answers if item.discrepancy is not None and item.discrepancy.base
+        ]
+        first = discrepancies[0]
+        base = {name: _compute_median(item.base[name] for item in discrepancies) for name in first.base}
         terms = {
-            key: {name: _median(item.terms[key][name] for item in each) for name in own}
+            key: {name: _compute_median(item.terms[key][name] for item in discrepancies) for name in own}
             for key, own in first.terms.items()
         }
-        what = f"medians over {len(each)} of {len(self.pixels)} pixels"
-        return replace(first, base=base, terms=terms), widths.pop(), what
+        estimator = f"medians over {len(discrepancies)} of {len(self.pixels)} pixels"
+        return replace(first, base=base, terms=terms), widths_m.pop(), estimator
 
 
 def diagnose_pixel(task: PixelTask) -> PixelAnswer:
     """One task done; bad data become its error."""
     try:
         measurement = task.read()
-        prior, epsilon, width_m = prior_of(measurement, task.config)
-        found = diagnose(measurement, task.seed, prior, epsilon)
+        prior, epsilon, width_m = build_prior(measurement, task.config)
+        discrepancy = diagnose(measurement, task.seed, prior, epsilon)
     except InputError as error:
         return PixelAnswer(task.pixel, None, str(error))
-    return PixelAnswer(task.pixel, replace(found, courses=()), width_m=width_m)
+    return PixelAnswer(task.pixel, replace(discrepancy, residual_traces=()), width_m=width_m)
 
 
-def warm() -> None:
+def compile_kernels() -> None:
     """Compile what a diagnosis needs, so that workers find it compiled."""
     t_s = np.array([0.01, 0.02])
-    scene = Scene(np.array([[0.0, 0.01, 1.0, 0.0]]), 0, 293.15, (t_s, t_s, t_s))
-    observe(scene, load_parameters(TABLE).pixel(4e-4), Active.of({}))
-    whiten(t_s, np.ones((2, 1)), Coloured(1.0, (1.0, 1.0), (0.01, 1.0)))
+    experiment = PixelExperiment(np.array([[0.0, 0.01, 1.0, 0.0]]), 0, 293.15, (t_s, t_s, t_s))
+    simulate_signals(experiment, load_parameters(DEFAULT_PARAMETER_SET).build_pixel(4e-4), ActiveTerms.from_values({}))
+    whiten(t_s, np.ones((2, 1)), ColouredNoise(1.0, (1.0, 1.0), (0.01, 1.0)))
 
 
-def _group(verdict: str, causes: tuple[str, ...], answers: tuple[PixelAnswer, ...]) -> Group:
-    each = [item.found for item in answers if item.found is not None]
+def _build_group(verdict: str, causes: tuple[str, ...], answers: tuple[PixelAnswer, ...]) -> PixelGroup:
+    discrepancies = [item.discrepancy for item in answers if item.discrepancy is not None]
     values: dict[str, list[float]] = {}
     units: dict[str, str] = {}
-    for found in each if verdict == "cause" else ():
-        for name, item in found.parameters.items():
+    for discrepancy in discrepancies if verdict == "cause" else ():
+        for name, item in discrepancy.parameters.items():
             if "." in name:
                 values.setdefault(name, []).append(item.value)
                 units[name] = item.unit
-    gains = [found.gain.reduction for found in each if found.gain is not None]
-    parameters = {name: Spread.of(own, units[name]) for name, own in values.items()}
-    return Group(verdict, causes, answers, parameters, Spread.of(gains, "1") if gains else None)
+    gains = [found.gain.reduction for found in discrepancies if found.gain is not None]
+    parameters = {name: PixelSpread.from_values(own, units[name]) for name, own in values.items()}
+    return PixelGroup(verdict, causes, answers, parameters, PixelSpread.from_values(gains, "1") if gains else None)
 
 
-def _median(values: Iterable[float]) -> float:
+def _compute_median(values: Iterable[float]) -> float:
     return float(np.median(list(values)))

@@ -4,57 +4,63 @@ from importlib.metadata import version
 from itertools import pairwise
 from typing import Any
 
-from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, Group, PixelAnswer, Spread
-from optodrive.lab.diagnosis.narrative import WORDS, answer, quantity, story
+from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelGroup, PixelSpread
+from optodrive.lab.diagnosis.narrative import CAUSE_PHRASES, build_answer, build_narrative, format_quantity
 
-ERRORS = 6
+MAX_ERRORS = 6
 """So many errors are told one by one."""
 
 
-def display_story(found: DisplayAnswer) -> list[str]:
+def build_display_narrative(answer: DisplayAnswer) -> list[str]:
     """How many pixels suffer from what, which, how much, what mending gains; then what has no answer."""
-    groups = found.groups()
-    lines = [headline(found), ""]
+    groups = answer.groups()
+    lines = [build_headline(answer), ""]
     for group in groups:
-        lines.append(f"- {counted(len(group.answers))}: {meaning(group)}: {ranges(group.pixels)}.")
-        lines += [f"  {name}: {_spread(item)}" for name, item in group.parameters.items()]
+        lines.append(
+            f"- {format_pixel_count(len(group.answers))}: {describe_group(group)}: {format_ranges(group.pixels)}."
+        )
+        lines += [f"  {name}: {_format_spread(item)}" for name, item in group.parameters.items()]
         if group.gain is not None:
             gain = group.gain
             lines.append(
                 f"  Of the avoidable error on held-out runs, {gain.median:.0%} goes "
                 f"(median; from {gain.low:.0%} to {gain.high:.0%})."
             )
-    failed = found.failed
+    failed = answer.failed
     if failed:
-        lines.append(f"- {counted(len(failed))} without an answer: {ranges(_indices(failed))}.")
-        lines += [f"  pixel {item.pixel}: {item.error}" for item in failed[:ERRORS]]
-        lines += [f"  and {len(failed) - ERRORS} more"] if len(failed) > ERRORS else []
-    if found.mirrors is not None:
-        told = found.mirrors
-        lines.append(f"Mirrors: {told.error if told.found is None else story(told.found)[0]}")
-    model, _, why = found.model()
-    lines.append(f"No model for the whole display: {why}." if model is None else f"Model of the display: {why}.")
+        lines.append(f"- {format_pixel_count(len(failed))} without an answer: {format_ranges(_list_indices(failed))}.")
+        lines += [f"  pixel {item.pixel}: {item.error}" for item in failed[:MAX_ERRORS]]
+        lines += [f"  and {len(failed) - MAX_ERRORS} more"] if len(failed) > MAX_ERRORS else []
+    if answer.mirrors is not None:
+        mirrors = answer.mirrors
+        lines.append(
+            f"Mirrors: {mirrors.error if mirrors.discrepancy is None else build_narrative(mirrors.discrepancy)[0]}"
+        )
+    model, _, reason = answer.build_model()
+    lines.append(f"No model for the whole display: {reason}." if model is None else f"Model of the display: {reason}.")
     return lines
 
 
-def headline(found: DisplayAnswer) -> str:
+def build_headline(answer: DisplayAnswer) -> str:
     """One sentence."""
-    counts = [(sum(item.verdict == word for item in _founds(found)), word) for word in ("cause", "ambiguous")]
+    counts = [
+        (sum(item.verdict == word for item in _list_discrepancies(answer)), word) for word in ("cause", "ambiguous")
+    ]
     wrong = [
         f"{count} with {'a named cause' if word == 'cause' else 'rival causes'}" for count, word in counts if count
     ]
-    unexplained = sum(item.verdict == "unexplained" for item in _founds(found))
+    unexplained = sum(item.verdict == "unexplained" for item in _list_discrepancies(answer))
     wrong += [f"{unexplained} with no known cause"] if unexplained else []
-    total = sum(item.verdict != "none" for item in _founds(found))
-    of = f"Of {counted(len(found.pixels))}, each diagnosed for itself,"
+    total = sum(item.verdict != "none" for item in _list_discrepancies(answer))
+    of = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed for itself,"
     if not total:
         return f"{of} none shows anything that the nominal model gets wrong."
     return f"{of} {total} show that the nominal model is wrong: {', '.join(wrong)}."
 
 
-def meaning(group: Group) -> str:
+def describe_group(group: PixelGroup) -> str:
     """What a group suffers from, in words and keys."""
-    named = [f"{WORDS.get(key, key)} ({key})" for key in group.causes]
+    named = [f"{CAUSE_PHRASES.get(key, key)} ({key})" for key in group.causes]
     if group.verdict == "none":
         return "nothing found"
     if group.verdict == "cause":
@@ -64,12 +70,12 @@ def meaning(group: Group) -> str:
     return "something is wrong, and none of the known causes explains it"
 
 
-def counted(pixels: int) -> str:
+def format_pixel_count(pixels: int) -> str:
     """As words."""
     return f"{pixels:,} pixel{'s' if pixels != 1 else ''}"
 
 
-def ranges(pixels: list[int]) -> str:
+def format_ranges(pixels: list[int]) -> str:
     """3, 7, 12 to 15."""
     breaks = [at for at, (one, two) in enumerate(pairwise(pixels), start=1) if two != one + 1]
     runs = [pixels[a:b] for a, b in pairwise([0, *breaks, len(pixels)])]
@@ -78,53 +84,53 @@ def ranges(pixels: list[int]) -> str:
     )
 
 
-def display_answer(found: DisplayAnswer) -> dict[str, Any]:
+def build_display_answer(found: DisplayAnswer) -> dict[str, Any]:
     """JSON: a summary, and under each pixel's index what a recording of it alone would have as its answer."""
-    model, _, why = found.model()
-    words = ("none", "cause", "ambiguous", "unexplained")
+    model, _, reason = found.build_model()
+    verdicts = ("none", "cause", "ambiguous", "unexplained")
     return {
         "summary": {
             "pixels": len(found.pixels),
-            "verdicts": {word: sum(item.verdict == word for item in _founds(found)) for word in words},
-            "errors": _indices(found.failed),
+            "verdicts": {word: sum(item.verdict == word for item in _list_discrepancies(found)) for word in verdicts},
+            "errors": _list_indices(found.failed),
             "groups": [
                 {
                     "verdict": group.verdict,
                     "causes": list(group.causes),
                     "pixels": group.pixels,
-                    "parameters": {name: _spread_json(item) for name, item in group.parameters.items()},
-                    "gain": None if group.gain is None else _spread_json(group.gain),
+                    "parameters": {name: _spread_to_json(item) for name, item in group.parameters.items()},
+                    "gain": None if group.gain is None else _spread_to_json(group.gain),
                 }
                 for group in found.groups()
             ],
-            "model": {"written": model is not None, "why": why},
+            "model": {"written": model is not None, "why": reason},
         },
-        "pixels": {str(item.pixel): _entry(item) for item in found.pixels},
-        "mirrors": None if found.mirrors is None else _entry(found.mirrors),
-        "seconds": found.seconds,
+        "pixels": {str(item.pixel): _build_entry(item) for item in found.pixels},
+        "mirrors": None if found.mirrors is None else _build_entry(found.mirrors),
+        "seconds": found.elapsed_s,
         "version": version("optodrive"),
     }
 
 
-def _entry(item: PixelAnswer) -> dict[str, Any]:
-    if item.found is None:
+def _build_entry(item: PixelAnswer) -> dict[str, Any]:
+    if item.discrepancy is None:
         nothing: dict[str, Any] = {"verdict": None, "causes": [], "parameters": {}, "gain": None}
         return {**nothing, "error": item.error}
-    return {**answer(item.found), "error": None}
+    return {**build_answer(item.discrepancy), "error": None}
 
 
-def _founds(found: DisplayAnswer) -> list[Any]:
-    return [item.found for item in found.pixels if item.found is not None]
+def _list_discrepancies(found: DisplayAnswer) -> list[Any]:
+    return [item.discrepancy for item in found.pixels if item.discrepancy is not None]
 
 
-def _indices(answers: list[PixelAnswer]) -> list[int]:
+def _list_indices(answers: list[PixelAnswer]) -> list[int]:
     return [item.pixel for item in answers if item.pixel is not None]
 
 
-def _spread(item: Spread) -> str:
-    low, high = quantity(item.low, item.unit), quantity(item.high, item.unit)
-    return f"median {quantity(item.median, item.unit)}, from {low} to {high}"
+def _format_spread(item: PixelSpread) -> str:
+    low, high = format_quantity(item.low, item.unit), format_quantity(item.high, item.unit)
+    return f"median {format_quantity(item.median, item.unit)}, from {low} to {high}"
 
 
-def _spread_json(item: Spread) -> dict[str, Any]:
+def _spread_to_json(item: PixelSpread) -> dict[str, Any]:
     return {"median": item.median, "range": [item.low, item.high], "unit": item.unit}

@@ -5,27 +5,27 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.core.types.discrepancy import Gain
+from optodrive.core.types.discrepancy import HeldOutGain
 from optodrive.lab.diagnosis.dataset import SIGNALS, Dataset
-from optodrive.lab.diagnosis.fitting import Problem, jitter
-from optodrive.lab.diagnosis.omnibus_test import by_group
-from optodrive.lab.diagnosis.prediction import Point, predict
+from optodrive.lab.diagnosis.fitting import FitProblem, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.omnibus_test import compute_omnibus_by_group
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 
-DRAWS = 400
-VISIBLE = 4.0
+BOOTSTRAP_DRAWS = 400
+MIN_EXCESS_SIGMA = 4.0
 """Less excess than so many σ in held-out runs says nothing of any gain."""
 
 
-def split(data: Dataset) -> tuple[list[int], list[int]]:
+def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
     """Runs to fit, and runs held out: whole groups, of each kind of experiment one in four, the hottest first.
 
     Kinds: a neighbour lit, mirrors, trains, single pulses. A kind with fewer than three groups is fitted whole.
     """
     kinds: dict[str, list[tuple[float, str]]] = {}
-    lonely: dict[bytes, int] = {}
+    drive_counts: dict[bytes, int] = {}
     for name, runs in data.groups().items():
         pulses = data.runs[runs[0]].pulses
-        lonely[pulses.tobytes()] = lonely.get(pulses.tobytes(), 0) + 1
+        drive_counts[pulses.tobytes()] = drive_counts.get(pulses.tobytes(), 0) + 1
         measured = {block.pixel for block in data.blocks if block.run in runs}
         energy_j = float((pulses[:, 1] * pulses[:, 2]).sum())
         kind = "train" if len(pulses) > 2 else "pulse"
@@ -34,22 +34,24 @@ def split(data: Dataset) -> tuple[list[int], list[int]]:
         if any(block.kind > 2 for block in data.blocks if block.run in runs):
             kind = "mirrors"
         kinds.setdefault(f"{kind} {sorted(measured)}", []).append((energy_j, name))
-    held: list[str] = []
+    held_out: list[str] = []
     for members in kinds.values():
         # The same drive early and late shows what ages: neither is spared.
-        free = [
+        eligible = [
             (energy_j, name)
             for energy_j, name in sorted(members, reverse=True)
-            if lonely[data.runs[data.groups()[name][0]].pulses.tobytes()] == 1
+            if drive_counts[data.runs[data.groups()[name][0]].pulses.tobytes()] == 1
         ]
         if len(members) >= 3:
-            held += [name for _, name in free[::3][: max(1, len(members) // 4)]]
+            held_out += [name for _, name in eligible[::3][: max(1, len(members) // 4)]]
     groups = data.groups()
-    out = sorted(run for name in held for run in groups[name])
-    return [run for run in range(len(data.runs)) if run not in out], out
+    held_out_runs = sorted(run for name in held_out for run in groups[name])
+    return [run for run in range(len(data.runs)) if run not in held_out_runs], held_out_runs
 
 
-def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: int) -> Gain | None:
+def compute_held_out_gain(
+    problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint, seed: int
+) -> HeldOutGain | None:
     """Both models on held-out runs; None where there are none, or where they show nothing of what is wrong.
 
     The reduction is of residuals averaged over repeats in bins of time: what a model misses is far below the noise of
@@ -58,14 +60,16 @@ def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: 
     if not len(data.value):
         return None
     problem = replace(problem, data=data)
-    shared = jitter(data, before, problem.epsilon, predict(data, before, problem.epsilon))
-    binned_before = by_group(problem, data.value - predict(data, before, problem.epsilon), shared)
-    binned_after = by_group(problem, data.value - predict(data, after, problem.epsilon), shared)
-    excess = binned_before[:, 0] - binned_before[:, 1]
-    if excess.sum() < VISIBLE * np.sqrt(2.0 * binned_before[:, 1].sum()):
+    sensitivity = compute_jitter_sensitivity(data, nominal, problem.epsilon, predict(data, nominal, problem.epsilon))
+    nominal_chi2 = compute_omnibus_by_group(problem, data.value - predict(data, nominal, problem.epsilon), sensitivity)
+    extended_chi2 = compute_omnibus_by_group(
+        problem, data.value - predict(data, extended, problem.epsilon), sensitivity
+    )
+    excess = nominal_chi2[:, 0] - nominal_chi2[:, 1]
+    if excess.sum() < MIN_EXCESS_SIGMA * np.sqrt(2.0 * nominal_chi2[:, 1].sum()):
         return None
-    floor2 = _floor(problem, after)
-    residuals = [data.value - predict(data, point, problem.epsilon) for point in (before, after)]
+    floor2 = _compute_noise_floor2(problem, extended)
+    residuals = [data.value - predict(data, point, problem.epsilon) for point in (nominal, extended)]
     kinds = data.kinds()
     sums = np.zeros((len(kinds), 4))
     for block in data.blocks:
@@ -77,28 +81,33 @@ def heldout(problem: Problem, data: Dataset, before: Point, after: Point, seed: 
         ]
     rmse = np.sqrt(sums[:, 1:] / sums[:, :1])
     generator = np.random.default_rng(seed)
-    both = np.stack([binned_before, binned_after])[:, binned_before[:, 1] > 0]
-    count = both.shape[1]
-    drawn = [max(-1.0, _reduction(both[:, generator.integers(0, count, count)])) for _ in range(DRAWS)]
-    low, high = np.quantile(drawn, [0.025, 0.975])
+    chi2_pairs = np.stack([nominal_chi2, extended_chi2])[:, nominal_chi2[:, 1] > 0]
+    count = chi2_pairs.shape[1]
+    reductions = [
+        max(-1.0, _compute_reduction(chi2_pairs[:, generator.integers(0, count, count)]))
+        for _ in range(BOOTSTRAP_DRAWS)
+    ]
+    low, high = np.quantile(reductions, [0.025, 0.975])
     names = [SIGNALS[kind] for kind in kinds]
     columns = [dict(zip(names, rmse[:, column].tolist(), strict=True)) for column in range(3)]
-    return Gain(columns[0], columns[1], columns[2], _reduction(both), float(low), float(high))
+    return HeldOutGain(columns[0], columns[1], columns[2], _compute_reduction(chi2_pairs), float(low), float(high))
 
 
-def _reduction(both: FloatArray) -> float:
+def _compute_reduction(chi2_pairs: FloatArray) -> float:
     """From [before and after, groups, 2] χ² and degrees; the floor is χ² = degrees."""
-    (before, degrees), (after, _) = both.sum(axis=1)
-    rms_before, rms_after = np.sqrt(before / degrees), np.sqrt(max(after, degrees) / degrees)
-    return float((rms_before - rms_after) / max(rms_before - 1.0, 1e-9))
+    (nominal, degrees), (extended, _) = chi2_pairs.sum(axis=1)
+    rms_nominal, rms_extended = np.sqrt(nominal / degrees), np.sqrt(max(extended, degrees) / degrees)
+    return float((rms_nominal - rms_extended) / max(rms_nominal - 1.0, 1e-9))
 
 
-def _floor(problem: Problem, point: Point) -> FloatArray:
+def _compute_noise_floor2(problem: FitProblem, point: ParameterPoint) -> FloatArray:
     """Expected square of a residual of the true model: [m]."""
     data, noise = problem.data, problem.noise
-    shared = jitter(data, point, problem.epsilon, predict(data, point, problem.epsilon))
-    out = (noise.power * shared.power) ** 2 + (noise.timing_s * shared.timing) ** 2
+    sensitivity = compute_jitter_sensitivity(data, point, problem.epsilon, predict(data, point, problem.epsilon))
+    out = (noise.power_sigma * sensitivity.power) ** 2 + (noise.timing_sigma_s * sensitivity.timing) ** 2
     for block in data.blocks:
-        own = noise.coloured[block.kind]
-        out[block.part] += own.white**2 + own.sigma[0] ** 2 + own.sigma[1] ** 2 + noise.baseline[block.kind] ** 2
+        coloured = noise.coloured[block.kind]
+        out[block.part] += (
+            coloured.white**2 + coloured.sigma[0] ** 2 + coloured.sigma[1] ** 2 + noise.baseline_sigma[block.kind] ** 2
+        )
     return np.asarray(out)

@@ -9,14 +9,14 @@ import numpy as np
 
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 from optodrive.physics.term import TermParameter
-from optodrive.physics.terms import known_terms
+from optodrive.physics.terms import discover_terms
 
-CATALOGUE = tuple(key for key, term in known_terms().items() if term.suspect)
+CAUSE_KEYS = tuple(key for key, term in discover_terms().items() if term.signature)
 """Every cause that can be named."""
 
 
 @dataclass(frozen=True)
-class Free:
+class FreeParameter:
     """One number to be fitted: the parameters of a term that take it (more than one where they are tied)."""
 
     key: str
@@ -25,7 +25,7 @@ class Free:
     @property
     def parameter(self) -> TermParameter:
         """Of the first name."""
-        return next(item for item in known_terms()[self.key].parameters if item.name == self.names[0])
+        return next(item for item in discover_terms()[self.key].parameters if item.name == self.names[0])
 
     @property
     def label(self) -> str:
@@ -37,12 +37,12 @@ class Free:
         """Fitted by its logarithm: what cannot be zero."""
         return self.parameter.low > 0.0
 
-    def read(self, terms: Mapping[str, Mapping[str, float]]) -> float:
+    def read_value(self, terms: Mapping[str, Mapping[str, float]]) -> float:
         """The fitted number."""
         value = terms[self.key][self.names[0]]
         return log(value) if self.logarithmic else value
 
-    def written(self, terms: Mapping[str, Mapping[str, float]], number: float) -> dict[str, dict[str, float]]:
+    def with_value(self, terms: Mapping[str, Mapping[str, float]], number: float) -> dict[str, dict[str, float]]:
         """Terms with another fitted number, held to its plausible range."""
         value = exp(min(number, 700.0)) if self.logarithmic else number
         value = float(np.clip(value, self.parameter.low, self.parameter.high))
@@ -67,9 +67,9 @@ class Hypothesis:
     key: str
     label: str
     starts: tuple[dict[str, float], ...]
-    free: tuple[Free, ...]
-    linear: bool = False
-    every: bool = False
+    free: tuple[FreeParameter, ...]
+    is_linear: bool = False
+    fit_every_start: bool = False
 
     @property
     def degrees(self) -> int:
@@ -77,7 +77,7 @@ class Hypothesis:
         return len(self.free)
 
 
-GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
+SEARCH_GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
     "wall_heating": {"resistance": (8.0,), "capacity": (0.02, 0.08, 0.3, 1.0)},
     "neighbour_crosstalk": {"share": (0.02,), "lag": (0.003, 0.03, 0.2)},
     "laser_turn_on": {"time": (1e-4, 4e-4, 1.5e-3)},
@@ -96,68 +96,72 @@ GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
 """Where a search begins; a time constant that vanishes with its effect needs several."""
 
 
-def hypotheses(data: Dataset) -> list[Hypothesis]:
+def build_hypotheses(data: Dataset) -> list[Hypothesis]:
     """Every hypothesis that this data could show at all."""
     found: list[Hypothesis] = []
     measured = data.pixels()
-    lit = {int(pixel) for run in data.runs for pixel in run.pulses[:, 3]}
+    pulsed = {int(pixel) for run in data.runs for pixel in run.pulses[:, 3]}
     mirrors = all(kind in MIRROR_KINDS for kind in data.kinds())
     powers = {round(float(power), 3) for run in data.runs for power in run.pulses[:, 2]}
-    for key in CATALOGUE:
-        names = [item.name for item in known_terms()[key].parameters]
+    for key in CAUSE_KEYS:
+        names = [item.name for item in discover_terms()[key].parameters]
         if key == "neighbour_crosstalk" and not any(
-            (scene.pulses[:, 3] != scene.pixel).any() for scene, _ in data.scenes
+            (scene.pulses[:, 3] != scene.pixel).any() for scene, _ in data.experiments
         ):
             continue
         if key not in ("mirror_lag", "clock_offset") if mirrors else key == "mirror_lag":
             continue
         if key == "clock_offset":
-            found += _clock(data)
+            found += _build_clock_hypotheses(data)
         elif key == "beam_misalignment":
-            for pixel in [item for item in measured if item in lit] if len(measured) > 1 else []:
+            for pixel in [item for item in measured if item in pulsed] if len(measured) > 1 else []:
                 start = {"share": 0.1, "pixel": float(pixel), "resistance": 4.0, "time": 0.5}
-                own = tuple(Free(key, (name,)) for name in ("share", "resistance", "time"))
-                found.append(Hypothesis(key, f"{key} of pixel {pixel}", (start,), own))
+                parameters = tuple(FreeParameter(key, (name,)) for name in ("share", "resistance", "time"))
+                found.append(Hypothesis(key, f"{key} of pixel {pixel}", (start,), parameters))
         elif key == "power_nonlinearity":
             for name, size in (("threshold", 0.1), ("curvature", 0.1)) if len(powers) > 1 else ():
                 start = dict.fromkeys(names, 0.0) | {name: size}
-                found.append(Hypothesis(key, f"{key}: {name}", (start,), (Free(key, (name,)),), name == "curvature"))
+                found.append(
+                    Hypothesis(key, f"{key}: {name}", (start,), (FreeParameter(key, (name,)),), name == "curvature")
+                )
         elif key == "sensor_scale":
             # Its gain is R, C and kappa together: without a reference temperature no data shows it.
             start = {"gain": 1.0, "offset": 1.0}
-            found.append(Hypothesis(key, f"{key}: offset", (start,), (Free(key, ("offset",)),), True))
+            found.append(Hypothesis(key, f"{key}: offset", (start,), (FreeParameter(key, ("offset",)),), True))
         elif key == "ambient_drift":
             for free in (("offset",), ("offset", "ramp", "bend"), ("offset", "ramp", "bend", "rate"), ("rate",)):
                 starts = tuple(dict.fromkeys(names, 0.0) | {name: 1.0} for name in free)
-                found.append(Hypothesis(key, f"{key}: {free[-1]}", starts, tuple(Free(key, (n,)) for n in free), True))
+                found.append(
+                    Hypothesis(key, f"{key}: {free[-1]}", starts, tuple(FreeParameter(key, (n,)) for n in free), True)
+                )
         else:
-            defaults = {item.name: (item.default,) for item in known_terms()[key].parameters}
-            grid = defaults | GRIDS.get(key, {})
+            defaults = {item.name: (item.default,) for item in discover_terms()[key].parameters}
+            grid = defaults | SEARCH_GRIDS.get(key, {})
             starts = tuple(dict(zip(grid, values, strict=True)) for values in product(*grid.values()))
             found.append(
                 Hypothesis(
                     key,
                     key,
                     starts,
-                    tuple(Free(key, (name,)) for name in names),
-                    linear=key == "absorber_ageing",
-                    every=key == "mirror_lag",
+                    tuple(FreeParameter(key, (name,)) for name in names),
+                    is_linear=key == "absorber_ageing",
+                    fit_every_start=key == "mirror_lag",
                 )
             )
     return found
 
 
-def _clock(data: Dataset) -> list[Hypothesis]:
+def _build_clock_hypotheses(data: Dataset) -> list[Hypothesis]:
     key, signals = "clock_offset", ("temperature", "displacement", "force", "mirrors")
-    there = list(dict.fromkeys(signals[min(kind, 3)] for kind in data.kinds()))
+    present = list(dict.fromkeys(signals[min(kind, 3)] for kind in data.kinds()))
     zero = dict.fromkeys(signals, 0.0)
-    tied = [signals, *((name,) for name in there if len(there) > 1)]
+    tied = [signals, *((name,) for name in present if len(present) > 1)]
     return [
         Hypothesis(
             key,
             f"{key} of {'all signals' if len(names) > 1 else names[0]}",
             (zero | dict.fromkeys(names, 2e-4),),
-            (Free(key, names),),
+            (FreeParameter(key, names),),
             True,
         )
         for names in tied

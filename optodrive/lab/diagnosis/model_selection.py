@@ -6,47 +6,47 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.lab.diagnosis.detection import Detection, Score, detect
-from optodrive.lab.diagnosis.discrepancy_basis import bent
-from optodrive.lab.diagnosis.fitting import Fit, Problem, fit, jitter
-from optodrive.lab.diagnosis.hypotheses import Free, Hypothesis
-from optodrive.lab.diagnosis.normal_equations import normal
-from optodrive.lab.diagnosis.prediction import Point, predict
+from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
+from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity, fit
+from optodrive.lab.diagnosis.hypotheses import FreeParameter, Hypothesis
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 
-ALPHA = 0.001
+FAMILY_ALPHA = 0.001
 """Level of the whole family. False alarms are to stay below 1 %, and the noise model is itself an estimate."""
-UNEVEN = 6.0
+MAX_REPLICATE_EXCESS = 6.0
 """Repeats that differ by more than this do not repeat one experiment."""
-UNSTEADY = 25.0
+MAX_INTRA_PULSE_POWER_EXCESS = 25.0
 """Likewise, as if the power changed within pulses."""
-HOPELESS = 300.0
+CHI2_ABANDON = 300.0
 """A fit that does not promise to come within so much χ² of the best one is given up."""
-MOST = 9
+MAX_REFITS = 9
 """So many of the strongest hypotheses are refitted."""
-ALIKE = 10.0
+BIC_INDISTINGUISHABLE = 10.0
 """Rivals whose BIC is within this of the best one's cannot be told apart: odds of less than about 150.
 
 No more, or a rival that only imitates the best one with a number more, which costs ln samples, would stay for ever.
 """
-SAME = 9.0
+CHI2_EQUIVALENT = 9.0
 """Predictions that differ by less χ² than this are one prediction."""
-EXPLAINED, MAINLY = 0.9, 0.5
+MIN_EXPLAINED, MIN_EXPLAINED_BY_TERM = 0.9, 0.5
 """A cause is named for so much of the excess; for less, if other forms of it take the rest."""
-FORM = 0.985
+MIN_EXPLAINED_OTHER_FORM = 0.985
 """A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
-NEAREST, AGAIN = 6, 6
+MAX_STARTS, MAX_RESTARTS = 6, 6
 """So many starts are tried of a hypothesis with many, each fitted again so often at most."""
-PAIRS, BEGIN = 4, 2
+MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
 """So many second causes are refitted beside each of so many best first ones."""
 
-Tick = Callable[[str], None]
+ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
-class Candidate:
+class RefittedCandidate:
     """One or two hypotheses, refitted. bic: χ² and the price of the free numbers."""
 
     hypotheses: tuple[Hypothesis, ...]
-    fit: Fit
+    fit: ModelFit
     bic: float
 
     @property
@@ -69,197 +69,254 @@ class Verdict:
 
     verdict: str
     causes: tuple[str, ...]
-    chosen: Candidate | None
-    candidates: tuple[Candidate, ...]
-    first: Detection
-    rest: Detection | None
-    explained: float
+    chosen: RefittedCandidate | None
+    candidates: tuple[RefittedCandidate, ...]
+    nominal_detection: Detection
+    residual_detection: Detection | None
+    explained_fraction: float
 
 
-def alarmed(found: Detection) -> bool:
+def is_rejected(detection: Detection) -> bool:
     """Whether the family rejects what was fitted: the better of two tests, at half the level each."""
-    return min(found.p_score, found.p_omnibus) < 0.5 * ALPHA
+    return min(detection.p_score, detection.p_omnibus) < 0.5 * FAMILY_ALPHA
 
 
-def unrepeated(problem: Problem) -> bool:
+def has_replicate_excess(problem: FitProblem) -> bool:
     """Whether repeats differ by more than noise and jitters."""
-    return problem.noise.uneven > UNEVEN or problem.noise.unsteady > UNSTEADY
+    return (
+        problem.noise.replicate_excess > MAX_REPLICATE_EXCESS
+        or problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS
+    )
 
 
-def leading(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick: Tick) -> Candidate | None:
+def find_best_candidate(
+    problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
+) -> RefittedCandidate | None:
     """The best of the strongest, refitted; None where none is worth it."""
-    return next(iter(_refitted(problem, base, (), detect(problem, base, known, seed).scores, tick)), None)
+    return next(iter(_refit(problem, base, (), detect(problem, base, known, seed).scores, on_progress)), None)
 
 
-def select(problem: Problem, base: Fit, known: list[Hypothesis], seed: int, tick: Tick) -> Verdict:
+def select_causes(
+    problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
+) -> Verdict:
     """The verdict on one recording."""
-    tick("looking for anything to explain")
+    on_progress("looking for anything to explain")
     first = detect(problem, base, known, seed)
-    if unrepeated(problem):
+    if has_replicate_excess(problem):
         return Verdict("unexplained", (), None, (), first, None, 0.0)
-    if not alarmed(first):
+    if not is_rejected(first):
         return Verdict("none", (), None, (), first, None, 0.0)
-    singles = _refitted(problem, base, (), first.scores, tick)
+    singles = _refit(problem, base, (), first.scores, on_progress)
     if not singles:
         return Verdict("unexplained", (), None, (), first, None, 0.0)
     best = singles[0]
-    tick(f"what {best.label} leaves")
+    on_progress(f"what {best.label} leaves")
     others = [item for item in known if item.key not in best.causes]
-    rest = detect(problem, best.fit, others, seed)
-    alone = _explained(rest, base, best)
-    if not alarmed(rest) and alone >= EXPLAINED:
-        return _named(problem, singles, first, rest, alone)
-    shape = bent(problem, best.fit, best.hypotheses, known)
-    formed = detect(problem, best.fit, others, seed, shape)
-    if not alarmed(formed) and alone >= MAINLY and max(alone, _explained(formed, base, best)) >= EXPLAINED:
-        return _named(problem, singles, first, rest, alone)
-    price = rest.left - formed.left - shape.shape[1] * np.log(len(problem.data.value))
-    found = _pairs(problem, base, known, singles, rest, seed, tick)
-    pairs = [item for item in found if _needed(item, singles, price)]
+    residual_detection = detect(problem, best.fit, others, seed)
+    single_explained = _compute_explained_fraction(residual_detection, base, best)
+    if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
+        return _build_verdict(problem, singles, first, residual_detection, single_explained)
+    basis = compute_discrepancy_basis(problem, best.fit, best.hypotheses, known)
+    basis_detection = detect(problem, best.fit, others, seed, basis)
+    if (
+        not is_rejected(basis_detection)
+        and single_explained >= MIN_EXPLAINED_BY_TERM
+        and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= MIN_EXPLAINED
+    ):
+        return _build_verdict(problem, singles, first, residual_detection, single_explained)
+    form_gain = (
+        residual_detection.residual_chi2
+        - basis_detection.residual_chi2
+        - basis.shape[1] * np.log(len(problem.data.value))
+    )
+    candidates = _refit_pairs(problem, base, known, singles, residual_detection, seed, on_progress)
+    pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
     if pairs:
-        both = pairs[0]
-        tick(f"what {both.label} leave")
-        others = [item for item in known if item.key not in both.causes]
-        after = detect(problem, both.fit, others, seed)
-        together = _explained(after, base, both)
+        pair = pairs[0]
+        on_progress(f"what {pair.label} leave")
+        others = [item for item in known if item.key not in pair.causes]
+        pair_detection = detect(problem, pair.fit, others, seed)
+        pair_explained = _compute_explained_fraction(pair_detection, base, pair)
         # Beside a cause in another form than its term's, a second one patches: it must leave nothing to be believed.
-        if not alarmed(after) or (together >= FORM > alone):
-            return _named(problem, pairs, first, after, together)
-        if together >= EXPLAINED and not alarmed(
-            detect(problem, both.fit, others, seed, bent(problem, both.fit, both.hypotheses, known))
+        if not is_rejected(pair_detection) or (pair_explained >= MIN_EXPLAINED_OTHER_FORM > single_explained):
+            return _build_verdict(problem, pairs, first, pair_detection, pair_explained)
+        if pair_explained >= MIN_EXPLAINED and not is_rejected(
+            detect(
+                problem, pair.fit, others, seed, compute_discrepancy_basis(problem, pair.fit, pair.hypotheses, known)
+            )
         ):
-            return _named(problem, pairs, first, after, together)
+            return _build_verdict(problem, pairs, first, pair_detection, pair_explained)
     # Where only one cause is known at all, no other can be taken for it.
-    enough = FORM if len({item.key for item in known}) > 1 else EXPLAINED
-    if alone >= EXPLAINED and max(alone, _explained(formed, base, best)) >= enough:
-        return _named(problem, singles, first, rest, alone)
-    return Verdict("unexplained", (), None, (*pairs, *singles), first, rest, alone)
+    min_explained = MIN_EXPLAINED_OTHER_FORM if len({item.key for item in known}) > 1 else MIN_EXPLAINED
+    if (
+        single_explained >= MIN_EXPLAINED
+        and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= min_explained
+    ):
+        return _build_verdict(problem, singles, first, residual_detection, single_explained)
+    return Verdict("unexplained", (), None, (*pairs, *singles), first, residual_detection, single_explained)
 
 
-def _start(point: Point, score: Score) -> Point:
+def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
     """Terms as the score found them, at the amplitude it found, within their ranges."""
     item = score.hypothesis
     terms = {**point.terms, item.key: dict(score.start)}
-    if item.linear and item.degrees > 1:
+    if item.is_linear and item.degrees > 1:
         own = dict.fromkeys(score.start, 0.0)
         for free, amplitude, start in zip(item.free, score.amplitude, item.starts, strict=True):
             own[free.names[0]] = amplitude * start[free.names[0]]
-        return Point(point.base, {**point.terms, item.key: own})
+        return ParameterPoint(point.base, {**point.terms, item.key: own})
     free = item.free[0]
     scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))
     value = score.start[free.names[0]] * scale
-    return Point(point.base, free.written(terms, float(np.log(value)) if free.logarithmic else value))
+    return ParameterPoint(point.base, free.with_value(terms, float(np.log(value)) if free.logarithmic else value))
 
 
-def _refitted(
-    problem: Problem, base: Fit, before: tuple[Hypothesis, ...], scores: Sequence[Score], tick: Tick
-) -> list[Candidate]:
+def _refit(
+    problem: FitProblem,
+    base: ModelFit,
+    given: tuple[Hypothesis, ...],
+    scores: Sequence[Score],
+    on_progress: ProgressCallback,
+) -> list[RefittedCandidate]:
     """The strongest scores as full fits, best first."""
     samples = len(problem.data.value)
-    found: list[Candidate] = []
-    worth = [score for score in scores[:MOST] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
-    hopeless = np.inf
-    for score in worth:
-        tick(f"fitting {score.hypothesis.label}")
+    candidates: list[RefittedCandidate] = []
+    promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
+    chi2_abandon = np.inf
+    for score in promising:
+        on_progress(f"fitting {score.hypothesis.label}")
         free = (*base.free, *score.hypothesis.free)
-        start = _start(base.point, score)
-        if score.hypothesis.every:
-            result = _settled(problem, base, score.hypothesis, free)
+        start = _build_start(base.point, score)
+        if score.hypothesis.fit_every_start:
+            result = _refit_every_start(problem, base, score.hypothesis, free)
         else:
-            result = fit(problem, start, free, hopeless=hopeless)
-        hopeless = min(hopeless, result.chi2 + HOPELESS)
-        found.append(Candidate((*before, score.hypothesis), result, result.chi2 + len(free) * np.log(samples)))
-    return sorted(found, key=lambda item: item.bic)
+            result = fit(problem, start, free, chi2_abandon=chi2_abandon)
+        chi2_abandon = min(chi2_abandon, result.chi2 + CHI2_ABANDON)
+        candidates.append(
+            RefittedCandidate((*given, score.hypothesis), result, result.chi2 + len(free) * np.log(samples))
+        )
+    return sorted(candidates, key=lambda item: item.bic)
 
 
-def _settled(problem: Problem, base: Fit, item: Hypothesis, free: Sequence[Free]) -> Fit:
+def _refit_every_start(
+    problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
+) -> ModelFit:
     """The best place that fits from the nearest starts come to, each begun again where it ended until it stays.
 
     Jitters act along the slopes of where a fit began: a place is judged by a fit that begins there.
     """
-    found: list[Fit] = []
-    for point in _nearest(problem, base, item):
-        for _ in range(AGAIN):
-            came = fit(problem, point, free)
-            there = fit(problem, came.point, free, iterations=1)
-            found.append(there)
-            if abs(there.chi2 - came.chi2) < 1.0:
+    fits: list[ModelFit] = []
+    for point in _select_nearest_starts(problem, base, item):
+        for _ in range(MAX_RESTARTS):
+            first = fit(problem, point, free)
+            second = fit(problem, first.point, free, iterations=1)
+            fits.append(second)
+            if abs(second.chi2 - first.chi2) < 1.0:
                 break
-            point = there.point
-    return min(found, key=lambda one: one.chi2)
+            point = second.point
+    return min(fits, key=lambda one: one.chi2)
 
 
-def _nearest(problem: Problem, base: Fit, item: Hypothesis) -> list[Point]:
+def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis) -> list[ParameterPoint]:
     """The starts that come nearest to the data as it is."""
-    still = np.zeros(len(problem.data.value))
+    zero = np.zeros(len(problem.data.value))
 
-    def cost(point: Point) -> float:
+    def cost(point: ParameterPoint) -> float:
         residual = problem.data.value - predict(problem.data, point, problem.epsilon)
-        return float(normal(problem.data, residual[:, None], problem.noise, still, still).total()[0, 0])
+        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total()[0, 0])
 
-    points = (Point(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts)
-    return sorted(points, key=cost)[:NEAREST]
-
-
-def _excess(found: Detection) -> float:
-    return max(0.0, found.omnibus - found.bins)
+    points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts)
+    return sorted(points, key=cost)[:MAX_STARTS]
 
 
-def _explained(rest: Detection, base: Fit, best: Candidate) -> float:
+def _compute_excess(detection: Detection) -> float:
+    return max(0.0, detection.omnibus_chi2 - detection.omnibus_degrees)
+
+
+def _compute_explained_fraction(residual_detection: Detection, base: ModelFit, best: RefittedCandidate) -> float:
     """Share of the excess that a candidate took: of what it gained, and what is clearly left."""
-    gained = base.chi2 - best.fit.chi2
-    score = rest.scores[0].ratio if rest.scores else 0.0
-    left = max(0.0, _excess(rest) - 2.5 * np.sqrt(2.0 * rest.bins), score - 12.0)
-    return float(gained / max(gained + left, 1e-9))
+    reduction = base.chi2 - best.fit.chi2
+    score = residual_detection.scores[0].ratio if residual_detection.scores else 0.0
+    remaining = max(
+        0.0, _compute_excess(residual_detection) - 2.5 * np.sqrt(2.0 * residual_detection.omnibus_degrees), score - 12.0
+    )
+    return float(reduction / max(reduction + remaining, 1e-9))
 
 
-def _pairs(
-    problem: Problem,
-    base: Fit,
+def _refit_pairs(
+    problem: FitProblem,
+    base: ModelFit,
     known: list[Hypothesis],
-    singles: list[Candidate],
-    rest: Detection,
+    singles: list[RefittedCandidate],
+    residual_detection: Detection,
     seed: int,
-    tick: Tick,
-) -> list[Candidate]:
+    on_progress: ProgressCallback,
+) -> list[RefittedCandidate]:
     """Best pairs: the second beside each of the best few first ones."""
-    found: list[Candidate] = []
-    for row, first in enumerate(singles[:BEGIN]):
+    candidates: list[RefittedCandidate] = []
+    for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in known if item.key not in first.causes]
-        beside = rest if row == 0 else detect(problem, first.fit, others, seed)
-        found += _refitted(problem, first.fit, first.hypotheses, beside.scores[:PAIRS], tick)
-    unique: dict[frozenset[str], Candidate] = {}
-    for item in sorted(found, key=lambda candidate: candidate.bic):
+        detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed)
+        candidates += _refit(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], on_progress)
+    unique: dict[frozenset[str], RefittedCandidate] = {}
+    for item in sorted(candidates, key=lambda candidate: candidate.bic):
         unique.setdefault(frozenset(part.label for part in item.hypotheses), item)
     return list(unique.values())
 
 
-def _needed(both: Candidate, singles: list[Candidate], bending: float) -> bool:
+def _is_pair_needed(pair: RefittedCandidate, singles: list[RefittedCandidate], form_gain: float) -> bool:
     """Whether the pair beats every single one by more than chance among so many pairs, and by more than its price.
 
     bending: what the best single cause would gain by another form, its price paid; a second cause must do better.
     """
-    return singles[0].bic - both.bic > ALIKE + max(0.0, bending)
+    return singles[0].bic - pair.bic > BIC_INDISTINGUISHABLE + max(0.0, form_gain)
 
 
-def _imitates(problem: Problem, rival: Candidate, best: Candidate) -> bool:
+def _is_imitation(problem: FitProblem, rival: RefittedCandidate, best: RefittedCandidate) -> bool:
     """Whether a rival of more numbers, one of them at its end, says what the best one says."""
     terms = rival.fit.point.terms
     if len(rival.fit.free) <= len(best.fit.free) or not any(
         not item.parameter.low < terms[item.key][item.names[0]] < item.parameter.high for item in rival.fit.free
     ):
         return False
-    shared = jitter(problem.data, best.fit.point, problem.epsilon, best.fit.prediction)
-    apart = (rival.fit.prediction - best.fit.prediction)[:, None]
-    return float(normal(problem.data, apart, problem.noise, shared.power, shared.timing).total()[0, 0]) < SAME
+    sensitivity = compute_jitter_sensitivity(problem.data, best.fit.point, problem.epsilon, best.fit.prediction)
+    difference = (rival.fit.prediction - best.fit.prediction)[:, None]
+    return (
+        float(
+            compute_normal_equations(
+                problem.data, difference, problem.noise, sensitivity.power, sensitivity.timing
+            ).total()[0, 0]
+        )
+        < CHI2_EQUIVALENT
+    )
 
 
-def _named(problem: Problem, ranked: list[Candidate], first: Detection, rest: Detection, explained: float) -> Verdict:
+def _build_verdict(
+    problem: FitProblem,
+    ranked: list[RefittedCandidate],
+    nominal_detection: Detection,
+    residual_detection: Detection,
+    explained_fraction: float,
+) -> Verdict:
     best = ranked[0]
-    rivals = [item for item in ranked if item.bic - best.bic < ALIKE and not _imitates(problem, item, best)]
+    rivals = [
+        item
+        for item in ranked
+        if item.bic - best.bic < BIC_INDISTINGUISHABLE and not _is_imitation(problem, item, best)
+    ]
     keys = list(dict.fromkeys(key for item in rivals for key in item.causes))
     if len({frozenset(item.causes) for item in rivals}) > 1:
-        return Verdict("ambiguous", tuple(keys), best, tuple(ranked), first, rest, explained)
-    if not problem.noise.measured:
-        return Verdict("ambiguous", tuple(best.causes), best, tuple(ranked), first, rest, explained)
-    return Verdict("cause", best.causes, best, tuple(ranked), first, rest, explained)
+        return Verdict(
+            "ambiguous", tuple(keys), best, tuple(ranked), nominal_detection, residual_detection, explained_fraction
+        )
+    if not problem.noise.from_replicates:
+        return Verdict(
+            "ambiguous",
+            tuple(best.causes),
+            best,
+            tuple(ranked),
+            nominal_detection,
+            residual_detection,
+            explained_fraction,
+        )
+    return Verdict("cause", best.causes, best, tuple(ranked), nominal_detection, residual_detection, explained_fraction)

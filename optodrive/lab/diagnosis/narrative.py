@@ -5,9 +5,9 @@ from math import isfinite
 from typing import Any
 
 from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate
-from optodrive.physics.terms import known_terms
+from optodrive.physics.terms import discover_terms
 
-WORDS = {
+CAUSE_PHRASES = {
     "bridge_conductivity": "the bridges conduct worse when hot",
     "heat_capacity": "the absorber stores more heat when hot",
     "radiation": "the hot absorber radiates",
@@ -27,110 +27,115 @@ WORDS = {
     "clock_offset": "an instrument's clock is offset",
     "mirror_lag": "the mirrors follow late",
 }
-SCALES = ((1e-6, 1e6, "µ"), (1e-3, 1e3, "m"), (1.0, 1.0, ""))
-PLAIN = ("", "1", "1/K", "1/s", "m^2", "Hz", "K", "K/W")
-SHOWN = 6
+UNIT_PREFIXES = ((1e-6, 1e6, "µ"), (1e-3, 1e3, "m"), (1.0, 1.0, ""))
+UNPREFIXED_UNITS = ("", "1", "1/K", "1/s", "m^2", "Hz", "K", "K/W")
+MAX_RULED_OUT = 6
 
 
-def quantity(value: float, unit: str) -> str:
+def format_quantity(value: float, unit: str) -> str:
     """With a prefix where the unit takes one."""
-    if unit in PLAIN or value == 0.0:
+    if unit in UNPREFIXED_UNITS or value == 0.0:
         return f"{value:.3g} {unit}".removesuffix(" 1").rstrip()
-    for limit, scale, prefix in SCALES:
+    for limit, scale, prefix in UNIT_PREFIXES:
         if abs(value) < 1e3 * limit:
             return f"{value * scale:.3g} {prefix}{unit}"
     return f"{value:.3g} {unit}"
 
 
-def _between(item: Estimate) -> str:
-    return (
-        f"{quantity(item.value, item.unit)} (95 %: {quantity(item.low, item.unit)} to {quantity(item.high, item.unit)})"
-    )
+def _format_interval(item: Estimate) -> str:
+    return f"{format_quantity(item.value, item.unit)} (95 %: {format_quantity(item.low, item.unit)} to {format_quantity(item.high, item.unit)})"
 
 
-def story(found: Discrepancy) -> list[str]:
+def build_narrative(discrepancy: Discrepancy) -> list[str]:
     """What was wrong, where it shows, what causes it, how sure, what was ruled out, what it gains, what to measure."""
-    lines = [_headline(found), ""]
-    if found.causes and found.verdict != "none":
-        lines += [f"- {WORDS.get(key, key)} ({key}); it shows in {known_terms()[key].suspect}." for key in found.causes]
-        lines += [f"  {name} = {_between(item)}" for name, item in found.parameters.items() if "." in name]
+    lines = [_build_headline(discrepancy), ""]
+    if discrepancy.causes and discrepancy.verdict != "none":
+        lines += [
+            f"- {CAUSE_PHRASES.get(key, key)} ({key}); it shows in {discover_terms()[key].signature}."
+            for key in discrepancy.causes
+        ]
+        lines += [
+            f"  {name} = {_format_interval(item)}" for name, item in discrepancy.parameters.items() if "." in name
+        ]
         lines.append("")
-    if found.verdict in ("cause", "ambiguous"):
-        lines.append(f"It explains {found.explained:.1%} of what the nominal model gets wrong.")
-    lines += _where(found)
-    lines += _gained(found)
-    if found.verdict == "none":
+    if discrepancy.verdict in ("cause", "ambiguous"):
+        lines.append(f"It explains {discrepancy.explained_fraction:.1%} of what the nominal model gets wrong.")
+    lines += _describe_locations(discrepancy)
+    lines += _describe_gain(discrepancy)
+    if discrepancy.verdict == "none":
         lines += ["The smallest effect of each kind that would have been seen:"]
-        lines += [f"- {item.label}: {item.smallest}" for item in _once(found.candidates)]
+        lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
     else:
-        out = [item for item in found.candidates if item.verdict == "ruled out"]
-        if out:
+        ruled_out = [item for item in discrepancy.candidates if item.verdict == "ruled out"]
+        if ruled_out:
             lines += ["Ruled out, because with it the residuals stay:"]
-            lines += [f"- {item.label} (it alone would explain χ² {item.statistic:.0f})" for item in out[:SHOWN]]
-        unseen = [item.label for item in found.candidates if item.verdict == "this data cannot show it"]
-        if unseen:
-            lines.append(f"This data cannot show: {', '.join(unseen)}.")
-    if found.verdict == "ambiguous" and found.next_experiment is None:
+            lines += [
+                f"- {item.label} (it alone would explain χ² {item.statistic:.0f})" for item in ruled_out[:MAX_RULED_OUT]
+            ]
+        not_observable = [item.label for item in discrepancy.candidates if item.verdict == "this data cannot show it"]
+        if not_observable:
+            lines.append(f"This data cannot show: {', '.join(not_observable)}.")
+    if discrepancy.verdict == "ambiguous" and discrepancy.next_experiment is None:
         lines.append("No pulse or train on a pixel, repeated up to 30 times, would tell them apart at this noise.")
-    if found.next_experiment is not None:
-        ask = found.next_experiment
+    if discrepancy.next_experiment is not None:
+        experiment = discrepancy.next_experiment
         lines += [
             "",
-            f"Measure next: {ask.why}; about {ask.seconds:.0f} s in the lab, χ² {ask.separation:.0f} between them.",
+            f"Measure next: {experiment.rationale}; about {experiment.lab_time_s:.0f} s in the lab, χ² {experiment.separation:.0f} between them.",
         ]
-    lines += list(found.remarks)
+    lines += list(discrepancy.remarks)
     return lines
 
 
-def _headline(found: Discrepancy) -> str:
-    names = [WORDS.get(key, key) for key in found.causes]
-    if found.verdict == "none":
+def _build_headline(discrepancy: Discrepancy) -> str:
+    names = [CAUSE_PHRASES.get(key, key) for key in discrepancy.causes]
+    if discrepancy.verdict == "none":
         return "Nothing found: the nominal model, refitted, agrees with this recording within its noise."
-    if found.verdict == "cause":
+    if discrepancy.verdict == "cause":
         return f"The nominal model is wrong because {' and '.join(names)}."
-    if found.verdict == "ambiguous" and names:
+    if discrepancy.verdict == "ambiguous" and names:
         return f"Something is wrong, and this data cannot tell which of these it is: {'; or '.join(names)}."
     return "Something is wrong, and none of the known causes explains it."
 
 
-def _where(found: Discrepancy) -> list[str]:
+def _describe_locations(discrepancy: Discrepancy) -> list[str]:
     """The groups in which residuals fell, or stay, the most."""
-    if found.verdict == "none":
+    if discrepancy.verdict == "none":
         return []
     rows = []
-    for course in found.courses:
-        before, after = float((course.before**2).mean()), float((course.after**2).mean())
-        rows.append((before if found.verdict == "unexplained" else before - after, before, after, course))
+    for trace in discrepancy.residual_traces:
+        nominal, extended = float((trace.nominal**2).mean()), float((trace.extended**2).mean())
+        rows.append((nominal if discrepancy.verdict == "unexplained" else nominal - extended, nominal, extended, trace))
     rows.sort(key=lambda row: -row[0])
     return [
         f"It shows in {course.signal} of {course.group}: residuals of {before**0.5:.1f} σ a sample"
-        + (f", {after**0.5:.1f} σ with the cause." if found.causes else ".")
+        + (f", {after**0.5:.1f} σ with the cause." if discrepancy.causes else ".")
         for _, before, after, course in rows[:2]
         if before > 0
     ]
 
 
-def _gained(found: Discrepancy) -> list[str]:
-    gain = found.gain
+def _describe_gain(discrepancy: Discrepancy) -> list[str]:
+    gain = discrepancy.gain
     if gain is None:
-        if found.verdict in ("cause", "ambiguous"):
+        if discrepancy.verdict in ("cause", "ambiguous"):
             return ["What it gains cannot be measured: no held-out run shows the effect."]
         return []
     lines = [
-        f"On {len(found.held_out)} runs held out before naming, {gain.reduction:.0%} of the avoidable error goes "
+        f"On {len(discrepancy.held_out_runs)} runs held out before naming, {gain.reduction:.0%} of the avoidable error goes "
         f"(95 %: {gain.low:.0%} to {gain.high:.0%})."
     ]
-    for name, before in gain.before.items():
+    for name, nominal in gain.nominal.items():
         unit = name.rsplit("_", 1)[1]
-        after, floor = gain.after[name], gain.floor[name]
+        extended, floor = gain.extended[name], gain.noise_floor[name]
         lines.append(
-            f"  {name}: RMSE {quantity(before, unit)} before, {quantity(after, unit)} after, "
-            f"noise {quantity(floor, unit)}"
+            f"  {name}: RMSE {format_quantity(nominal, unit)} before, {format_quantity(extended, unit)} after, "
+            f"noise {format_quantity(floor, unit)}"
         )
     return lines
 
 
-def _once(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
+def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
     """By label, each once: what pixels and mirrors both show is said of the pixels."""
     first: dict[str, CandidateCause] = {}
     for item in candidates:
@@ -138,23 +143,23 @@ def _once(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
     return [first[label] for label in sorted(first)]
 
 
-def answer(found: Discrepancy) -> dict[str, Any]:
+def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
     """The JSON of the format."""
-    gain, ask = found.gain, found.next_experiment
+    gain, experiment = discrepancy.gain, discrepancy.next_experiment
     return {
-        "verdict": found.verdict,
-        "causes": list(found.causes),
+        "verdict": discrepancy.verdict,
+        "causes": list(discrepancy.causes),
         "parameters": {
             name: {"value": item.value, "unit": item.unit, "ci95": [item.low, item.high]}
-            for name, item in found.parameters.items()
+            for name, item in discrepancy.parameters.items()
         },
-        "explained": found.explained,
+        "explained": discrepancy.explained_fraction,
         "gain": None
         if gain is None
         else {
-            "heldout_rmse_before": gain.before,
-            "heldout_rmse_after": gain.after,
-            "noise_floor": gain.floor,
+            "heldout_rmse_before": gain.nominal,
+            "heldout_rmse_after": gain.extended,
+            "noise_floor": gain.noise_floor,
             "reduction": gain.reduction,
             "ci95": [gain.low, gain.high],
         },
@@ -166,23 +171,23 @@ def answer(found: Discrepancy) -> dict[str, Any]:
                 "p_value": item.p_value,
                 "heldout_gain": item.heldout_gain,
                 "verdict": item.verdict,
-                "smallest_detectable": item.smallest,
+                "smallest_detectable": item.detection_limit,
             }
-            for item in found.candidates
+            for item in discrepancy.candidates
         ],
         "next_experiment": None
-        if ask is None
+        if experiment is None
         else {
-            "why": ask.why,
-            "pulses": ask.pulses.tolist(),
-            "pixel": ask.pixel,
-            "repeats": ask.repeats,
-            "signals": list(ask.signals),
-            "expected_separation": ask.separation,
-            "seconds": ask.seconds,
+            "why": experiment.rationale,
+            "pulses": experiment.pulses.tolist(),
+            "pixel": experiment.pixel,
+            "repeats": experiment.repeats,
+            "signals": list(experiment.signals),
+            "expected_separation": experiment.separation,
+            "seconds": experiment.lab_time_s,
         },
-        "runs": {"fitted": list(found.fitted), "held_out": list(found.held_out)},
-        "remarks": list(found.remarks),
-        "seconds": found.seconds,
+        "runs": {"fitted": list(discrepancy.fitted_runs), "held_out": list(discrepancy.held_out_runs)},
+        "remarks": list(discrepancy.remarks),
+        "seconds": discrepancy.elapsed_s,
         "version": version("optodrive"),
     }

@@ -15,19 +15,19 @@ from scipy.optimize import minimize
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
-from optodrive.lab.diagnosis.replicate_contrasts import Contrast, as_contrasts, contrasts
+from optodrive.lab.diagnosis.replicate_contrasts import Contrast, build_residual_contrasts, compute_contrasts
 
 EPS = 1e-12
 
 
 @dataclass(frozen=True)
-class Coloured:
+class ColouredNoise:
     """white: σ; two parts: σ and correlation time, s; swing_per_s: angular frequency of the second part."""
 
     white: float
     sigma: tuple[float, float]
     tau_s: tuple[float, float]
-    swing_per_s: float = 0.0
+    omega_rad_per_s: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -38,13 +38,13 @@ class NoiseModel:
     what repeats differ by as if the power changed within pulses
     """
 
-    coloured: dict[int, Coloured]
-    power: float
-    timing_s: float
-    baseline: dict[int, float]
-    measured: bool
-    uneven: float = 0.0
-    unsteady: float = 0.0
+    coloured: dict[int, ColouredNoise]
+    power_sigma: float
+    timing_sigma_s: float
+    baseline_sigma: dict[int, float]
+    from_replicates: bool
+    replicate_excess: float = 0.0
+    intra_pulse_power_excess: float = 0.0
 
 
 @kernel
@@ -56,7 +56,7 @@ def _whiten(
     tau_1: float,
     sigma_2: float,
     tau_2: float,
-    swing: float,
+    omega: float,
     out: FloatArray,
 ) -> float:
     """Whitened columns [n, k] into out; returns ln |Σ|. States: the first part, the second and its quadrature."""
@@ -71,7 +71,7 @@ def _whiten(
             dt = t_s[row] - t_s[row - 1]
             if abs(dt - known_s) > 1e-9 * dt:
                 a1, a2, known_s = exp(-dt / tau_1), exp(-dt / tau_2), dt
-                co, si = a2 * cos(swing * dt), a2 * sin(swing * dt)
+                co, si = a2 * cos(omega * dt), a2 * sin(omega * dt)
             # P ← F P Fᵀ + Q with F = diag(a1, rotation × a2).
             n01, n02 = a1 * (co * p01 - si * p02), a1 * (si * p01 + co * p02)
             r11, r12 = co * p11 - si * p12, co * p12 - si * p22
@@ -101,7 +101,7 @@ def _whiten(
     return float(total)
 
 
-def whiten(t_s: FloatArray, columns: FloatArray, noise: Coloured) -> tuple[FloatArray, float]:
+def whiten(t_s: FloatArray, columns: FloatArray, noise: ColouredNoise) -> tuple[FloatArray, float]:
     """Columns [n, k] of one block with unit white noise, and ln |Σ|."""
     out = np.empty_like(columns, order="C")
     logdet = _whiten(
@@ -112,36 +112,39 @@ def whiten(t_s: FloatArray, columns: FloatArray, noise: Coloured) -> tuple[Float
         noise.tau_s[0],
         noise.sigma[1],
         noise.tau_s[1],
-        noise.swing_per_s,
+        noise.omega_rad_per_s,
         out,
     )
     return out, logdet
 
 
-def estimate(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
+def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
     """The noise model by maximum likelihood of the contrasts; without repeats, of the residuals themselves.
 
     power, timing: [m] the prediction's change with the logarithm of the power, and with a delay, per second.
     """
-    found = contrasts(data, residual, power, timing)
-    coloured: dict[int, Coloured] = {}
+    found = compute_contrasts(data, residual, power, timing)
+    coloured: dict[int, ColouredNoise] = {}
     for kind in data.kinds():
-        own = [item for item in found if item.kind == kind]
-        if not own:
-            own = as_contrasts(data, residual, power, timing, kind)
-        coloured[kind] = _fit_coloured(own)
+        members = [item for item in found if item.kind == kind]
+        if not members:
+            members = build_residual_contrasts(data, residual, power, timing, kind)
+        coloured[kind] = _fit_coloured(members)
     if not found:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
-    power_sigma, timing_s, baseline = _fit_jitter(found, coloured, data.kinds())
-    model = NoiseModel(coloured, power_sigma, timing_s, baseline, True)
+    power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(found, coloured, data.kinds())
+    model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True)
     return replace(
-        model, uneven=max((_unevenness(item, model) for item in found if item.kind in PIXEL_KINDS), default=0.0)
+        model,
+        replicate_excess=max(
+            (_compute_replicate_excess(item, model) for item in found if item.kind in PIXEL_KINDS), default=0.0
+        ),
     )
 
 
-def _unevenness(contrast: Contrast, model: NoiseModel) -> float:
+def _compute_replicate_excess(contrast: Contrast, model: NoiseModel) -> float:
     """χ² of a contrast, its jitters allowed for, in σ above what it should be."""
-    size = np.array([model.power, model.timing_s, model.baseline[contrast.kind]])
+    size = np.array([model.power_sigma, model.timing_sigma_s, model.baseline_sigma[contrast.kind]])
     columns = np.column_stack([contrast.value, contrast.jitter * size])
     whitened, _ = whiten(contrast.t_s, columns, model.coloured[contrast.kind])
     gram, count = whitened.T @ whitened, len(contrast.value)
@@ -149,27 +152,29 @@ def _unevenness(contrast: Contrast, model: NoiseModel) -> float:
     return float((gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:]) - count) / sqrt(2.0 * count))
 
 
-def _minimise(function: Callable[[FloatArray], float], start: FloatArray, step: float, evaluations: int) -> FloatArray:
+def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: float, evaluations: int) -> FloatArray:
     simplex = np.vstack([start, *(start + step * row for row in np.eye(len(start)))])
     options = {"maxfev": evaluations, "initial_simplex": simplex, "xatol": 0.01, "fatol": 0.05}
     return np.asarray(minimize(function, start, method="Nelder-Mead", options=options).x)
 
 
-def _fit_coloured(contrasts: list[Contrast]) -> Coloured:
+def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
     """One kind's noise, each contrast's jitters projected out."""
-    steps = np.concatenate([np.diff(item.value) for item in contrasts])
-    spread = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
-    white = min(spread, float(1.4826 * np.median(np.abs(steps)) / sqrt(2.0)) + 1e-3 * spread)
+    differences = np.concatenate([np.diff(item.value) for item in contrasts])
+    std = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
+    white = min(std, float(1.4826 * np.median(np.abs(differences)) / sqrt(2.0)) + 1e-3 * std)
     dt_s = float(np.median(np.concatenate([np.diff(item.t_s) for item in contrasts])))
-    stacked = [(item.t_s, np.column_stack([item.value, _scaled(item.jitter)])) for item in contrasts]
+    stacked = [(item.t_s, np.column_stack([item.value, _normalize_columns(item.jitter)])) for item in contrasts]
 
-    def read(x: FloatArray) -> Coloured:
+    def decode(x: FloatArray) -> ColouredNoise:
         first, second = dt_s * exp(x[3]), dt_s * exp(x[4])
-        swing = exp(x[5]) if len(x) > 5 else 0.0
-        return Coloured(white * exp(x[0]), (white * exp(x[1]), white * exp(x[2])), (first, second), swing)
+        omega_rad_per_s = exp(x[5]) if len(x) > 5 else 0.0
+        return ColouredNoise(
+            white * exp(x[0]), (white * exp(x[1]), white * exp(x[2])), (first, second), omega_rad_per_s
+        )
 
     def cost(x: FloatArray) -> float:
-        noise, total = read(x), 0.0
+        noise, total = decode(x), 0.0
         for t_s, columns in stacked:
             whitened, logdet = whiten(t_s, columns, noise)
             gram = whitened.T @ whitened
@@ -179,33 +184,33 @@ def _fit_coloured(contrasts: list[Contrast]) -> Coloured:
         # Weak priors keep parts that the data does not show from wandering off.
         return total + 0.02 * float((x[:5] ** 2).sum()) + 1e3 * float(np.maximum(0.0, np.abs(x[:5]) - 8.0).sum())
 
-    plain = np.array([-0.1, -0.7, -1.0, 1.0, 3.0])
-    best = _minimise(cost, plain, 0.7, 220)
-    swinging = np.array([-0.1, -1.5, -0.7, 2.0, 2.5, log(_swing(contrasts, dt_s))])
-    other = _minimise(cost, swinging, 0.4, 260)
-    return read(other) if cost(other) < cost(best) - 6.0 else read(best)
+    smooth_start = np.array([-0.1, -0.7, -1.0, 1.0, 3.0])
+    smooth = _minimize(cost, smooth_start, 0.7, 220)
+    oscillatory_start = np.array([-0.1, -1.5, -0.7, 2.0, 2.5, log(_find_dominant_omega(contrasts, dt_s))])
+    oscillatory = _minimize(cost, oscillatory_start, 0.4, 260)
+    return decode(oscillatory) if cost(oscillatory) < cost(smooth) - 6.0 else decode(smooth)
 
 
-def _swing(contrasts: list[Contrast], dt_s: float) -> float:
+def _find_dominant_omega(contrasts: list[Contrast], dt_s: float) -> float:
     """Angular frequency of the strongest swing: the peak of the mean spectrum over its own smooth course."""
     count, power = 256, np.zeros(129)
     for item in contrasts:
         for start in range(0, len(item.value) - count + 1, count):
-            piece = item.value[start : start + count]
-            power += np.abs(np.fft.rfft((piece - piece.mean()) * np.hanning(count))) ** 2
+            segment = item.value[start : start + count]
+            power += np.abs(np.fft.rfft((segment - segment.mean()) * np.hanning(count))) ** 2
     if not power.any():
         return 0.2 * pi / dt_s
     smooth = np.convolve(np.log(power[2:] + EPS * power.max()), np.ones(5) / 5, mode="same")
     return float((2 + int(np.argmax(smooth[2:-2])) + 2) * 2.0 * pi / (count * dt_s))
 
 
-def _scaled(jitter: FloatArray) -> FloatArray:
+def _normalize_columns(jitter: FloatArray) -> FloatArray:
     size = np.sqrt((jitter**2).sum(axis=0))
     return np.asarray(jitter[:, size > 0] / size[size > 0])
 
 
 def _fit_jitter(
-    contrasts: list[Contrast], coloured: dict[int, Coloured], kinds: list[int]
+    contrasts: list[Contrast], coloured: dict[int, ColouredNoise], kinds: list[int]
 ) -> tuple[float, float, dict[int, float]]:
     """σ of power (relative), timing (s) and baselines, by the likelihood of what each contrast shows of them."""
     pairs: dict[int, list[Contrast]] = {}
@@ -234,5 +239,5 @@ def _fit_jitter(
             total += float(np.linalg.slogdet(inner)[1]) - float(scaled @ np.linalg.solve(inner, scaled))
         return total
 
-    best = np.exp(_minimise(cost, np.zeros(len(start)), 0.5, 400) + start)
+    best = np.exp(_minimize(cost, np.zeros(len(start)), 0.5, 400) + start)
     return float(best[0]), float(best[1]), {kind: float(best[2 + row]) for row, kind in enumerate(kinds)}

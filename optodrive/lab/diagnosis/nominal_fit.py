@@ -5,62 +5,77 @@ from dataclasses import replace
 import numpy as np
 
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
-from optodrive.lab.diagnosis.fitting import Fit, Prior, Problem, fit, jitter
-from optodrive.lab.diagnosis.noise_model import Coloured, NoiseModel, estimate
-from optodrive.lab.diagnosis.power_fluctuation import unsteadiness
-from optodrive.lab.diagnosis.prediction import Point
+from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, compute_jitter_sensitivity, fit
+from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, estimate_noise_model
+from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
+from optodrive.lab.diagnosis.prediction import ParameterPoint
 
-EPSILON = 0.66
-BROAD = Prior((np.log(150.0), np.log(101e-6), np.log(3e-3), np.log(4e-6), np.log(2.3e-4)), (0.7, 0.16, 0.5, 0.5, 0.5))
+DEFAULT_EPSILON = 0.66
+BROAD_PRIOR = BaseParameterPrior(
+    (np.log(150.0), np.log(101e-6), np.log(3e-3), np.log(4e-6), np.log(2.3e-4)), (0.7, 0.16, 0.5, 0.5, 0.5)
+)
 """The whole of Table S3; gas and membrane as the paper's peaks have them."""
-MIRROR_SHARE = 1e-3
-STARTS_R = (100.0, 180.0, 320.0)
+MIRROR_NOISE_FRACTION = 1e-3
+R_STARTS_K_PER_W = (100.0, 180.0, 320.0)
 
 
-def prepare(
-    data: Dataset, prior: Prior = BROAD, epsilon: float = EPSILON, timing_s: float = 0.0, late_s: float = 0.0
-) -> tuple[Problem, Fit]:
+def fit_nominal(
+    data: Dataset,
+    prior: BaseParameterPrior = BROAD_PRIOR,
+    epsilon: float = DEFAULT_EPSILON,
+    min_timing_sigma_s: float = 0.0,
+    clock_offset_s: float = 0.0,
+) -> tuple[FitProblem, ModelFit]:
     """Noise model and base fit.
 
     timing_s: the runs' timing jitter at least, known from other signals; late_s: all clocks late, likewise
     """
-    crude = _crude(data)
+    crude_noise = _estimate_crude_noise(data)
     clocks = ("temperature", "displacement", "force", "mirrors")
-    known = {"clock_offset": dict.fromkeys(clocks, late_s)} if late_s else {}
-    problem = Problem(data, crude, prior, epsilon)
-    tries = [fit(problem, Point((float(np.log(r)), *prior.mean[1:]), known), iterations=3) for r in STARTS_R]
-    base = fit(problem, min(tries, key=lambda item: item.chi2).point, iterations=10)
-    problem = with_noise(problem, base, timing_s)
+    fixed_terms = {"clock_offset": dict.fromkeys(clocks, clock_offset_s)} if clock_offset_s else {}
+    problem = FitProblem(data, crude_noise, prior, epsilon)
+    trials = [
+        fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), fixed_terms), iterations=3)
+        for r in R_STARTS_K_PER_W
+    ]
+    base = fit(problem, min(trials, key=lambda item: item.chi2).point, iterations=10)
+    problem = update_noise(problem, base, min_timing_sigma_s)
     base = fit(problem, base.point)
-    return replace(problem, noise=replace(problem.noise, unsteady=unsteadiness(problem, base))), base
+    return replace(
+        problem, noise=replace(problem.noise, intra_pulse_power_excess=compute_intra_pulse_power_excess(problem, base))
+    ), base
 
 
-def with_noise(problem: Problem, fitted: Fit, timing_s: float) -> Problem:
+def update_noise(problem: FitProblem, fitted: ModelFit, min_timing_sigma_s: float) -> FitProblem:
     """The same with the noise that repeats show, jitters acting along the slopes of this fit."""
     data = problem.data
-    shared = jitter(data, fitted.point, problem.epsilon, fitted.prediction)
-    noise = estimate(data, data.value - fitted.prediction, shared.power, shared.timing)
-    noise = replace(noise, timing_s=max(noise.timing_s, timing_s), coloured=_believable(data, noise.coloured))
+    sensitivity = compute_jitter_sensitivity(data, fitted.point, problem.epsilon, fitted.prediction)
+    noise = estimate_noise_model(data, data.value - fitted.prediction, sensitivity.power, sensitivity.timing)
+    noise = replace(
+        noise,
+        timing_sigma_s=max(noise.timing_sigma_s, min_timing_sigma_s),
+        coloured=_raise_mirror_noise(data, noise.coloured),
+    )
     return replace(problem, noise=noise)
 
 
-def _believable(data: Dataset, coloured: dict[int, Coloured]) -> dict[int, Coloured]:
+def _raise_mirror_noise(data: Dataset, coloured: dict[int, ColouredNoise]) -> dict[int, ColouredNoise]:
     """Mirrors are read so finely that jitter bends their steps: no servo is believed beyond a share of its range."""
     out = dict(coloured)
     for kind in MIRROR_KINDS:
         if kind in out:
             span = float(np.ptp(np.concatenate([data.value[b.part] for b in data.blocks if b.kind == kind])))
-            out[kind] = replace(out[kind], white=float(np.hypot(out[kind].white, MIRROR_SHARE * span)))
+            out[kind] = replace(out[kind], white=float(np.hypot(out[kind].white, MIRROR_NOISE_FRACTION * span)))
     return out
 
 
-def _crude(data: Dataset) -> NoiseModel:
+def _estimate_crude_noise(data: Dataset) -> NoiseModel:
     coloured, baseline = {}, {}
     for kind in data.kinds():
         blocks = [block for block in data.blocks if block.kind == kind]
         steps = np.concatenate([np.diff(data.value[block.part]) for block in blocks])
         span = float(np.ptp(np.concatenate([data.value[block.part] for block in blocks])))
         white = float(np.median(np.abs(steps))) + 1e-3 * span + 1e-15
-        coloured[kind] = Coloured(white, (white, white), (1e-2, 1.0))
+        coloured[kind] = ColouredNoise(white, (white, white), (1e-2, 1.0))
         baseline[kind] = 3.0 * white
     return NoiseModel(coloured, 0.01, 5e-5, baseline, False)

@@ -12,20 +12,20 @@ from scipy.stats import f as fisher
 
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.fitting import Jitter, Problem
+from optodrive.lab.diagnosis.fitting import FitProblem, JitterSensitivity
 from optodrive.lab.diagnosis.noise_model import whiten
-from optodrive.lab.diagnosis.normal_equations import projected
-from optodrive.lab.diagnosis.prediction import BASE
+from optodrive.lab.diagnosis.normal_equations import project_out
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
 
-AFTER_S = np.geomspace(5e-4, 1.0, 9)
+EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
 """Edges of the bins: time after an edge of the light."""
-SPAN = 4
+RUN_BINS = 4
 """Bins over a whole run, for what is slower."""
 RIDGE = 1e-4
 
 
 @dataclass(frozen=True)
-class Binned:
+class OmnibusStatistic:
     """χ² in bins and its degrees; the same of the differences between repeats, which hold noise alone."""
 
     chi2: float
@@ -43,113 +43,121 @@ class Binned:
         return float(fisher.sf(self.chi2 / self.degrees / scale, self.degrees, self.noise_degrees))
 
 
-def binned(problem: Problem, columns: FloatArray, shared: Jitter) -> Binned:
+def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
     """Of the last of columns [m, k] in the omnibus' bins, beside the others."""
     data, noise, kinds = problem.data, problem.noise, problem.data.kinds()
-    labels, width = bins(data), columns.shape[1]
+    labels, width = assign_bins(data), columns.shape[1]
     count = int(labels.max()) + 1
     total = np.zeros((width + count, width + count))
-    if width > len(BASE):
-        total[range(len(BASE)), range(len(BASE))] = 1.0 / np.square(problem.prior.sigma)
+    if width > len(BASE_PARAMETERS):
+        total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] = 1.0 / np.square(problem.prior.sigma)
     noise_chi2, noise_degrees = 0.0, 0
     groups: dict[str, tuple[FloatArray, FloatArray]] = {}
     by_run: dict[int, list[int]] = {}
     for place, block in enumerate(data.blocks):
         by_run.setdefault(block.run, []).append(place)
     for run, places in by_run.items():
-        own = _binned_rows(np.concatenate([labels[data.blocks[place].part] for place in places]))
+        run_bins = _list_bins(np.concatenate([labels[data.blocks[place].part] for place in places]))
         size = 2 + len(kinds)
-        gram = np.zeros((width + len(own) + size, width + len(own) + size))
+        gram = np.zeros((width + len(run_bins) + size, width + len(run_bins) + size))
         for place in places:
             block = data.blocks[place]
             part, kind = block.part, kinds.index(block.kind)
-            local = _binned_rows(labels[part])
-            indicators = (labels[part][:, None] == local).astype(np.float64)
+            block_bins = _list_bins(labels[part])
+            indicators = (labels[part][:, None] == block_bins).astype(np.float64)
             jitters = np.column_stack(
                 [
-                    noise.power * shared.power[part],
-                    noise.timing_s * shared.timing[part],
-                    np.full(part.stop - part.start, noise.baseline[block.kind]),
+                    noise.power_sigma * sensitivity.power[part],
+                    noise.timing_sigma_s * sensitivity.timing[part],
+                    np.full(part.stop - part.start, noise.baseline_sigma[block.kind]),
                 ]
             )
             whitened, _ = whiten(block.t_s, np.hstack([columns[part], indicators, jitters]), noise.coloured[block.kind])
-            where = np.concatenate(
+            indices = np.concatenate(
                 [
                     np.arange(width),
-                    width + np.searchsorted(own, local),
-                    width + len(own) + np.array([0, 1, 2 + kind]),
+                    width + np.searchsorted(run_bins, block_bins),
+                    width + len(run_bins) + np.array([0, 1, 2 + kind]),
                 ]
             )
-            gram[np.ix_(where, where)] += whitened.T @ whitened
-        kept = width + len(own)
-        inner = gram[kept:, kept:] + np.eye(size)
-        reduced = gram[:kept, :kept] - gram[:kept, kept:] @ np.linalg.solve(inner, gram[kept:, :kept])
-        where = np.concatenate([np.arange(width), width + own])
-        total[np.ix_(where, where)] += reduced
-        here, one = reduced[width:, width:], reduced[width:, width - 1]
-        chi2, degrees = _quadratic(here, one)
+            gram[np.ix_(indices, indices)] += whitened.T @ whitened
+        kept_size = width + len(run_bins)
+        inner = gram[kept_size:, kept_size:] + np.eye(size)
+        reduced = gram[:kept_size, :kept_size] - gram[:kept_size, kept_size:] @ np.linalg.solve(
+            inner, gram[kept_size:, :kept_size]
+        )
+        indices = np.concatenate([np.arange(width), width + run_bins])
+        total[np.ix_(indices, indices)] += reduced
+        bin_gram, bin_right = reduced[width:, width:], reduced[width:, width - 1]
+        chi2, degrees = _compute_quadratic_form(bin_gram, bin_right)
         noise_chi2, noise_degrees = noise_chi2 + chi2, noise_degrees + degrees
         gram_sum, one_sum = groups.setdefault(data.runs[run].group, (np.zeros((count, count)), np.zeros(count)))
-        gram_sum[np.ix_(own, own)] += here
-        one_sum[own] += one
+        gram_sum[np.ix_(run_bins, run_bins)] += bin_gram
+        one_sum[run_bins] += bin_right
     for gram_sum, one_sum in groups.values():
-        chi2, degrees = _quadratic(gram_sum, one_sum)
+        chi2, degrees = _compute_quadratic_form(gram_sum, one_sum)
         noise_chi2, noise_degrees = noise_chi2 - chi2, noise_degrees - degrees
-    out, last = list(range(width - 1)), width - 1
-    left = projected(total, out, [*range(width, width + count), last])
-    chi2, degrees = _quadratic(left[:-1, :-1], left[:-1, -1])
-    return Binned(chi2, degrees, noise_chi2, noise_degrees)
+    removed, last = list(range(width - 1)), width - 1
+    projected = project_out(total, removed, [*range(width, width + count), last])
+    chi2, degrees = _compute_quadratic_form(projected[:-1, :-1], projected[:-1, -1])
+    return OmnibusStatistic(chi2, degrees, noise_chi2, noise_degrees)
 
 
-def _quadratic(among: FloatArray, right: FloatArray) -> tuple[float, int]:
+def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float, int]:
     """rightᵀ among⁻¹ right, and over how many bins that say anything."""
-    spread = np.sqrt(np.diag(among))
-    seen = spread > 1e-9 * spread.max(initial=0.0)
-    kept = np.flatnonzero(seen)
-    alike = among[np.ix_(kept, kept)] / spread[kept] / spread[kept][:, None] + RIDGE * np.eye(len(kept))
-    parts = right[kept] / spread[kept]
-    return float(parts @ cho_solve(cho_factor(alike), parts)), len(kept)
+    scale = np.sqrt(np.diag(gram))
+    is_informative = scale > 1e-9 * scale.max(initial=0.0)
+    kept = np.flatnonzero(is_informative)
+    correlation = gram[np.ix_(kept, kept)] / scale[kept] / scale[kept][:, None] + RIDGE * np.eye(len(kept))
+    scaled = right[kept] / scale[kept]
+    return float(scaled @ cho_solve(cho_factor(correlation), scaled)), len(kept)
 
 
-def by_group(problem: Problem, residual: FloatArray, shared: Jitter) -> FloatArray:
+def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitivity: JitterSensitivity) -> FloatArray:
     """χ² of a residual in each group's bins, and its degrees: [groups, 2]."""
     data = problem.data
     out = []
     for runs in data.groups().values():
-        own = data.only(runs)
+        group_data = data.select(runs)
         part = np.concatenate([np.arange(b.part.start, b.part.stop) for b in data.blocks if b.run in runs])
-        here = Jitter(shared.power[part], shared.timing[part])
-        found = binned(replace(problem, data=own), residual[part][:, None], here)
-        out.append((found.chi2, found.degrees))
+        group_sensitivity = JitterSensitivity(sensitivity.power[part], sensitivity.timing[part])
+        statistic = compute_omnibus(replace(problem, data=group_data), residual[part][:, None], group_sensitivity)
+        out.append((statistic.chi2, statistic.degrees))
     return np.array(out, dtype=np.float64)
 
 
-def _binned_rows(labels: IntArray) -> IntArray:
+def _list_bins(labels: IntArray) -> IntArray:
     return np.asarray(np.unique(labels[labels >= 0]))
 
 
-def bins(data: Dataset) -> IntArray:
+def assign_bins(data: Dataset) -> IntArray:
     """[m] the omnibus' bin of each sample, −1 for none: group × signal × pixel × (log time after an edge, time)."""
     names: dict[tuple[object, ...], int] = {}
     label = np.full(len(data.value), -1, dtype=np.int64)
     for block in data.blocks:
         run = data.runs[block.run]
-        edges_s, rising = _edges(run.pulses, run.commands if block.kind >= 3 else None)
+        edges_s, rising = _find_edges(run.pulses, run.commands if block.kind >= 3 else None)
         row = np.searchsorted(edges_s, block.t_s, side="right") - 1
         after_s = block.t_s - edges_s[np.maximum(row, 0)]
-        slot = np.searchsorted(AFTER_S, after_s)
-        long = len(run.pulses) > 2
+        edge_bin = np.searchsorted(EDGE_BINS_S, after_s)
+        is_train = len(run.pulses) > 2
         span_s = max(float(block.t_s[-1] - block.t_s[0]), 1e-9)
-        piece = ((block.t_s - block.t_s[0]) / span_s * SPAN).astype(int).clip(0, SPAN - 1) if long else 0 * slot
-        order = np.where(row < 0, -1, np.where(rising[np.maximum(row, 0)], 0, 1) + 2 * (0 if long else 1) * (row // 2))
-        keys = zip(order.tolist(), slot.tolist(), piece.tolist(), strict=True)
+        run_bin = (
+            ((block.t_s - block.t_s[0]) / span_s * RUN_BINS).astype(int).clip(0, RUN_BINS - 1)
+            if is_train
+            else 0 * edge_bin
+        )
+        order = np.where(
+            row < 0, -1, np.where(rising[np.maximum(row, 0)], 0, 1) + 2 * (0 if is_train else 1) * (row // 2)
+        )
+        keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), strict=True)
         for at, key in enumerate(keys, start=block.part.start):
             whole = (run.group, block.kind, block.pixel, *key)
             label[at] = names.setdefault(whole, len(names))
     return label
 
 
-def _edges(pulses: FloatArray, commands: FloatArray | None) -> tuple[FloatArray, np.ndarray]:
+def _find_edges(pulses: FloatArray, commands: FloatArray | None) -> tuple[FloatArray, np.ndarray]:
     if commands is not None:
         return commands[:, 0], np.arange(len(commands)) % 2 == 0
     edges_s = np.concatenate([pulses[:, 0], pulses[:, 0] + pulses[:, 1]])

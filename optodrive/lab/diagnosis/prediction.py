@@ -6,24 +6,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.servo import Servo, follow
+from optodrive.device.servo import Servo, simulate_servo
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, observe
-from optodrive.physics.term import Values
-from optodrive.physics.terms import known_terms
+from optodrive.physics.pixel_ode import ActiveTerms, simulate_signals
+from optodrive.physics.term import TermValues
+from optodrive.physics.terms import discover_terms
 
-BASE = ("R", "C", "tau_g", "kappa", "phi")
+BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
 """The nominal parameters that are fitted, all by their logarithms."""
-UNITS = {"R": "K/W", "C": "J/K", "tau_g": "s", "kappa": "m/K", "phi": "N/K"}
+BASE_UNITS = {"R": "K/W", "C": "J/K", "tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
 @dataclass(frozen=True)
-class Point:
+class ParameterPoint:
     """A model: logarithms of the base parameters, and terms with their values."""
 
     base: tuple[float, ...]
-    terms: Mapping[str, Values]
+    terms: Mapping[str, TermValues]
 
     def pixel(self, epsilon: float) -> Pixel:
         """As the physics takes it."""
@@ -31,30 +31,34 @@ class Point:
         return Pixel(r, c, epsilon, tau_g, kappa, phi)
 
 
-def predict(data: Dataset, point: Point, epsilon: float = 0.66, power: float = 1.0, late_s: float = 0.0) -> FloatArray:
+def predict(
+    data: Dataset, point: ParameterPoint, epsilon: float = 0.66, power_factor: float = 1.0, delay_s: float = 0.0
+) -> FloatArray:
     """[m]; power: all light so much stronger; late_s: all signals so much later."""
     out = np.zeros(len(data.value))
-    pixel = point.pixel(epsilon * power)
+    pixel = point.pixel(epsilon * power_factor)
     clock = point.terms.get("clock_offset", {})
     lag = point.terms.get("sensor_lag", {})
-    late = [late_s + clock.get(name, 0.0) for name in ("temperature", "displacement", "force", "mirrors")]
-    late[0] += lag.get("time", 0.0) * lag.get("delay_share", 0.0)
-    active = Active.of({key: own for key, own in point.terms.items() if key not in ("clock_offset", "mirror_lag")})
-    if any(known_terms()[key].by_run for key in point.terms):
-        for scene, places in data.scenes:
-            told = observe(scene, pixel, active, (late[0], late[1], late[2]))
+    delays_s = [delay_s + clock.get(name, 0.0) for name in ("temperature", "displacement", "force", "mirrors")]
+    delays_s[0] += lag.get("time", 0.0) * lag.get("delay_share", 0.0)
+    active = ActiveTerms.from_values(
+        {key: own for key, own in point.terms.items() if key not in ("clock_offset", "mirror_lag")}
+    )
+    if any(discover_terms()[key].varies_between_runs for key in point.terms):
+        for scene, places in data.experiments:
+            signals = simulate_signals(scene, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
             for kind in PIXEL_KINDS:
                 if places[kind] >= 0:
-                    out[data.blocks[places[kind]].part] = told[kind]
+                    out[data.blocks[places[kind]].part] = signals[kind]
     else:
-        for item in data.alike:
-            told = observe(item.scene, pixel, active, (late[0], late[1], late[2]))
-            for kind, place, rows in item.rows:
-                out[data.blocks[place].part] = told[kind][rows]
+        for item in data.drive_groups:
+            signals = simulate_signals(item.experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
+            for kind, place, rows in item.block_rows:
+                out[data.blocks[place].part] = signals[kind][rows]
     servo = Servo(**point.terms["mirror_lag"]) if "mirror_lag" in point.terms else None
     for block in data.blocks:
         commands = data.runs[block.run].commands
         if block.kind in MIRROR_KINDS and commands is not None:
             column = commands[:, 1 + MIRROR_KINDS.index(block.kind)]
-            out[block.part] = follow(commands[:, 0], column, block.t_s - late[3], servo)
+            out[block.part] = simulate_servo(commands[:, 0], column, block.t_s - delays_s[3], servo)
     return out

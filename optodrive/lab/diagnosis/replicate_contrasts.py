@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 
-ARRIVED_S = 4e-3
+MIRROR_SETTLED_S = 4e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Contrast:
     jitter: FloatArray
 
 
-def contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
+def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
     """Helmert contrasts between the runs of each group, on the samples that all of them have."""
     found: list[Contrast] = []
     blocks: dict[tuple[int, int, int], int] = {
@@ -43,12 +43,12 @@ def contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: Fl
                 if any(place is None for place in places):
                     continue
                 members = [data.blocks[place] for place in places if place is not None]
-                common = _common(members[0].t_s, [member.t_s for member in members[1:]])
+                common = _find_common_rows(members[0].t_s, [member.t_s for member in members[1:]])
                 if common is None:
                     continue
                 commands = data.runs[number].commands
                 if kind in MIRROR_KINDS and commands is not None:
-                    common = _at_rest(members[0].t_s, common, commands[:, 0])
+                    common = _select_settled(members[0].t_s, common, commands[:, 0])
                 scale = sqrt(later / (later + 1.0))
                 weights = [*([scale / later] * later), -scale]
                 rows = [member.part.start + picked for member, picked in zip(members, common, strict=True)]
@@ -61,15 +61,15 @@ def contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: Fl
     return found
 
 
-def _at_rest(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
+def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
     """Rows at which mirrors have long arrived: what a lag makes of jitter is no noise of the instrument."""
     times = t_s[common[0]]
     row = np.searchsorted(steps_s, times, side="right") - 1
-    kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > ARRIVED_S)
+    kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > MIRROR_SETTLED_S)
     return [rows[kept] for rows in common] if kept.sum() >= 16 else common
 
 
-def _common(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
+def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
     """Rows of each time axis that all of them share, to 0.1 µs; None for fewer than 16."""
     keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
     shared = keys[0]
@@ -80,7 +80,7 @@ def _common(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | Non
     return [np.searchsorted(key, shared).astype(np.int64) for key in keys]
 
 
-def as_contrasts(
+def build_residual_contrasts(
     data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
 ) -> list[Contrast]:
     """The residuals themselves, where nothing repeats."""

@@ -2,32 +2,32 @@
 
 import numpy as np
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import (
     COMMANDS,
     FORMAT,
-    MEMBERS,
-    MIRRORS,
+    MIRROR_SIGNALS,
     PULSES,
+    RUN_MEMBERS,
     SIGNALS,
-    TABLES,
+    TABLE_COLUMNS,
     UNITS,
     VERSION,
     Attributes,
-    Words,
-    shown,
+    Unquoted,
+    format_name,
 )
 
 AMBIENT_MIN_K, AMBIENT_MAX_K = 150.0, 600.0
 PIXEL_MAX = 10**6
 OVERLAP_MAX_S = 1e-9
 """Rounding of the times of abutting pulses."""
-MODEL_PARAMETERS = 6
+MODEL_PARAMETER_COUNT = 6
 """Parameters of the nominal model of a pixel; fewer samples than that say nothing about it."""
 
 
-def check_head(where: str, head: Attributes) -> None:
+def check_format(where: str, head: Attributes) -> None:
     """Format and version."""
     for field, expected in (("format", FORMAT), ("version", VERSION)):
         if field not in head:
@@ -36,12 +36,12 @@ def check_head(where: str, head: Attributes) -> None:
             raise InputError(f"{where}: {field}", head[field], f"{expected!r}, the one this release reads")
 
 
-def take_ambient_k(where: str, attributes: Attributes) -> float:
+def pop_ambient_k(where: str, attributes: Attributes) -> float:
     """The ambient temperature, taken out of a run's attributes."""
     value = attributes.pop("ambient_K", None)
     if value is None:
         near = [name for name in attributes if name.lower().startswith("ambient")]
-        hint = f" (there is {shown(near[0])!r})" if near else ""
+        hint = f" (there is {format_name(near[0])!r})" if near else ""
         raise InputError(f"{where}: ambient_K", None, f"the ambient temperature in K{hint}")
     if isinstance(value, str) or not AMBIENT_MIN_K <= value <= AMBIENT_MAX_K:
         raise InputError(
@@ -50,35 +50,39 @@ def take_ambient_k(where: str, attributes: Attributes) -> float:
     return float(value)
 
 
-def signals_among(where: str, members: list[str]) -> list[str]:
+def select_signals(where: str, members: list[str]) -> list[str]:
     """The signals of a run in the format's order, once it is sure that all it needs is there and nothing unknown."""
     for member in members:
-        if member not in MEMBERS:
+        if member not in RUN_MEMBERS:
             raise InputError(
-                f"{where}/{shown(member)}", Words("an unknown name or unit"), nearest(member, list(MEMBERS))
+                f"{where}/{format_name(member)}",
+                Unquoted("an unknown name or unit"),
+                suggest_nearest(member, list(RUN_MEMBERS)),
             )
     if PULSES not in members:
-        raise InputError(f"{where}/{PULSES}", None, f"one row a pulse: {', '.join(TABLES[PULSES])}")
+        raise InputError(f"{where}/{PULSES}", None, f"one row a pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
     signals = [name for name in SIGNALS if name in members]
     if not signals:
-        raise InputError(where, Words("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
-    if COMMANDS not in members and set(signals) & set(MIRRORS):
-        raise InputError(f"{where}/{COMMANDS}", None, f"what the mirrors were told: {', '.join(TABLES[COMMANDS])}")
+        raise InputError(where, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
+    if COMMANDS not in members and set(signals) & set(MIRROR_SIGNALS):
+        raise InputError(
+            f"{where}/{COMMANDS}", None, f"what the mirrors were told: {', '.join(TABLE_COLUMNS[COMMANDS])}"
+        )
     return signals
 
 
 def check_pulses(where: str, pulses: FloatArray) -> None:
     """Finite entries, nothing negative, whole pixels, one beam. pulses: [n, 4]."""
-    _check_finite(where, pulses, TABLES[PULSES])
+    _check_finite(where, pulses, TABLE_COLUMNS[PULSES])
     for column, name in ((1, "width_s"), (2, "power_W")):
         _check_rows(f"{where}: {name}", pulses[:, column], pulses[:, column] >= 0, "no negative number")
     pixel = pulses[:, 3]
     whole = (pixel >= 0) & (pixel <= PIXEL_MAX) & (pixel == np.floor(pixel))
     _check_rows(f"{where}: pixel", pixel, whole, f"a whole number from 0 to {PIXEL_MAX}")
-    _check_one_beam(where, pulses)
+    _check_no_overlap(where, pulses)
 
 
-def _check_one_beam(where: str, pulses: FloatArray) -> None:
+def _check_no_overlap(where: str, pulses: FloatArray) -> None:
     order = np.argsort(pulses[:, 0], kind="stable")
     start_s = pulses[order, 0]
     # The longest reach of all pulses before, as a long pulse may still be on when the next but one begins.
@@ -95,25 +99,27 @@ def _check_one_beam(where: str, pulses: FloatArray) -> None:
 
 def check_commands(where: str, commands: FloatArray) -> None:
     """Finite entries at increasing times. commands: [n, 3]."""
-    _check_finite(where, commands, TABLES[COMMANDS])
+    _check_finite(where, commands, TABLE_COLUMNS[COMMANDS])
     _check_increasing(f"{where}: t_s", commands[:, 0])
 
 
 def check_samples(where: str, t_s: FloatArray, value: FloatArray) -> None:
     """Times that increase; values that are finite or missing, not all of them missing."""
     if not t_s.size:
-        raise InputError(where, Words("no samples"), "at least one")
+        raise InputError(where, Unquoted("no samples"), "at least one")
     _check_rows(f"{where}/t_s", t_s, np.isfinite(t_s), "a finite time in s")
     _check_increasing(f"{where}/t_s", t_s)
     _check_rows(f"{where}/value", value, ~np.isinf(value), "a finite value, or NaN where a sample is missing")
     if np.all(np.isnan(value)):
-        raise InputError(f"{where}/value", Words(f"{value.size} times NaN"), "at least one value that is not missing")
+        raise InputError(
+            f"{where}/value", Unquoted(f"{value.size} times NaN"), "at least one value that is not missing"
+        )
 
 
-def pixel_measured(where: str, signal: str, attributes: Attributes) -> int:
+def parse_pixel(where: str, signal: str, attributes: Attributes) -> int:
     """The index of the pixel measured."""
     value = attributes.get("pixel")
-    if value is None and signal in MIRRORS:
+    if value is None and signal in MIRROR_SIGNALS:
         return 0
     if value is None or isinstance(value, str) or not (0 <= value <= PIXEL_MAX and value == int(value)):
         raise InputError(
@@ -122,7 +128,7 @@ def pixel_measured(where: str, signal: str, attributes: Attributes) -> int:
     return int(value)
 
 
-def stated_sigma(where: str, attributes: Attributes) -> float | None:
+def parse_sigma(where: str, attributes: Attributes) -> float | None:
     """The instrument's stated noise; None where none is stated, which 0 says as well."""
     value = attributes.get("sigma")
     if value is None or value == 0:
@@ -139,13 +145,13 @@ def check_unit(where: str, signal: str, attributes: Attributes) -> None:
             raise InputError(f"{where}: {field}", attributes[field], f"'{UNITS[signal]}', as the signal's name says")
 
 
-def check_enough(where: str, finite: int) -> None:
+def check_sample_count(where: str, finite: int) -> None:
     """At least as many samples as the nominal model has parameters."""
-    if finite < MODEL_PARAMETERS:
+    if finite < MODEL_PARAMETER_COUNT:
         raise InputError(
             where,
-            Words(f"{finite} samples that are not missing"),
-            f"at least {MODEL_PARAMETERS}, as many as the model has parameters",
+            Unquoted(f"{finite} samples that are not missing"),
+            f"at least {MODEL_PARAMETER_COUNT}, as many as the model has parameters",
         )
 
 
@@ -162,7 +168,7 @@ def _check_increasing(where: str, t_s: FloatArray) -> None:
         raise InputError(f"{where}[{row}]", float(t_s[row]), expected)
 
 
-def _check_rows(where: str, values: FloatArray, good: np.ndarray, expected: str) -> None:
-    if not np.all(good):
-        row = int(np.argmin(good))
+def _check_rows(where: str, values: FloatArray, is_valid: np.ndarray, expected: str) -> None:
+    if not np.all(is_valid):
+        row = int(np.argmin(is_valid))
         raise InputError(f"{where}[{row}]", float(values[row]), expected)

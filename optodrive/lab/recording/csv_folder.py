@@ -20,20 +20,20 @@ from optodrive.lab.recording.storage import (
     COMMANDS,
     FORMAT,
     PULSES,
-    SAMPLES,
+    SAMPLE_COLUMNS,
     SIGNALS,
-    TABLES,
-    TEXT_MAX,
+    TABLE_COLUMNS,
+    TEXT_BYTES_MAX,
     VERSION,
     Attributes,
-    Room,
-    Words,
-    plain_attributes,
-    refusing,
+    MemoryBudget,
+    Unquoted,
+    convert_errors,
+    normalize_attributes,
 )
 
 TOML_NAME = "recording.toml"
-TOML_MAX = 64 * TEXT_MAX
+TOML_BYTES_MAX = 64 * TEXT_BYTES_MAX
 
 
 class CsvTree:
@@ -42,7 +42,7 @@ class CsvTree:
     def __init__(self, path: Path) -> None:
         """Read `recording.toml`."""
         self._path = path
-        self._room = Room()
+        self._budget = MemoryBudget()
         self._toml = _read_toml(path / TOML_NAME)
 
     def __enter__(self) -> Self:
@@ -51,102 +51,102 @@ class CsvTree:
     def __exit__(self, *details: object) -> None:
         """Nothing is kept open."""
 
-    def where(self, *names: str) -> str:
+    def format_place(self, *names: str) -> str:
         """The place in words."""
         return f"{self._path}: /{'/'.join(('runs', *names))}"
 
-    def head(self) -> Attributes:
+    def read_root_attributes(self) -> Attributes:
         """Attributes of the whole."""
-        return plain_attributes(self._toml)
+        return normalize_attributes(self._toml)
 
-    def runs(self) -> list[str]:
+    def list_runs(self) -> list[str]:
         """Names of the runs: of tables, and of folders that somebody forgot to describe."""
-        with refusing(str(self._path), "a readable folder"):
+        with convert_errors(str(self._path), "a readable folder"):
             folders = [entry.name for entry in self._path.iterdir() if (entry / f"{PULSES}.csv").is_file()]
-            seen = sorted(name for name in folders if not name.startswith("."))
-        return list(dict.fromkeys([*self._tables(), *seen]))
+            folder_names = sorted(name for name in folders if not name.startswith("."))
+        return list(dict.fromkeys([*self._get_run_tables(), *folder_names]))
 
-    def attributes(self, run: str) -> Attributes:
+    def read_run_attributes(self, run: str) -> Attributes:
         """Attributes of a run."""
-        return plain_attributes(self._described(run))
+        return normalize_attributes(self._get_run_table(run))
 
-    def members(self, run: str) -> list[str]:
+    def list_members(self, run: str) -> list[str]:
         """Names of a run's tables and signals: described, or there as a file."""
-        tables = [name for name, value in self._described(run).items() if isinstance(value, dict)]
-        return list(dict.fromkeys([*tables, *self._files(run)]))
+        tables = [name for name, value in self._get_run_table(run).items() if isinstance(value, dict)]
+        return list(dict.fromkeys([*tables, *self._list_files(run)]))
 
-    def signal_attributes(self, run: str, signal: str) -> Attributes:
+    def read_signal_attributes(self, run: str, signal: str) -> Attributes:
         """Attributes of a signal."""
-        described = self._described(run).get(signal, {})
-        return plain_attributes(described) if isinstance(described, dict) else {}
+        described = self._get_run_table(run).get(signal, {})
+        return normalize_attributes(described) if isinstance(described, dict) else {}
 
-    def table(self, run: str, name: str) -> FloatArray:
+    def read_table(self, run: str, name: str) -> FloatArray:
         """A table of a run, [n, columns]."""
-        return self._read(run, name, TABLES[name], missing=False)
+        return self._read_csv(run, name, TABLE_COLUMNS[name], missing=False)
 
-    def samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
+    def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
         """Times and values of a signal."""
-        columns = self._read(run, signal, SAMPLES, missing=True)
+        columns = self._read_csv(run, signal, SAMPLE_COLUMNS, missing=True)
         return columns[:, 0].copy(), columns[:, 1].copy()
 
-    def sample_count(self, run: str, signal: str) -> int:
+    def count_samples(self, run: str, signal: str) -> int:
         """How many samples a signal has: lines are counted, not read."""
-        path = self._file(run, signal)
-        with refusing(str(path), "a readable CSV file"), path.open("rb") as file:
+        path = self._find_file(run, signal)
+        with convert_errors(str(path), "a readable CSV file"), path.open("rb") as file:
             return max(0, sum(1 for line in file if line.strip()) - 1)
 
-    def _described(self, run: str) -> dict[str, Any]:
-        return self._tables().get(run, {})
+    def _get_run_table(self, run: str) -> dict[str, Any]:
+        return self._get_run_tables().get(run, {})
 
-    def _tables(self) -> dict[str, dict[str, Any]]:
+    def _get_run_tables(self) -> dict[str, dict[str, Any]]:
         runs = self._toml.get("runs")
         if not isinstance(runs, dict) or not all(isinstance(run, dict) for run in runs.values()):
             raise InputError(f"{self._path / TOML_NAME}: runs", runs, "a table a run: [runs.NAME]")
         return runs
 
-    def _files(self, run: str) -> list[str]:
+    def _list_files(self, run: str) -> list[str]:
         folder = self._path / run
-        with refusing(self.where(run), "a readable folder"):
+        with convert_errors(self.format_place(run), "a readable folder"):
             files = sorted(folder.glob("*.csv")) if folder.is_dir() else []
             return [file.stem for file in files if not file.name.startswith(".")]
 
-    def _file(self, run: str, name: str) -> Path:
+    def _find_file(self, run: str, name: str) -> Path:
         path = self._path / run / f"{name}.csv"
-        with refusing(self.where(run, name), "a readable file"):
+        with convert_errors(self.format_place(run, name), "a readable file"):
             if not path.is_file():
-                raise InputError(self.where(run, name), None, f"the file {run}/{name}.csv")
+                raise InputError(self.format_place(run, name), None, f"the file {run}/{name}.csv")
         return path
 
-    def _read(self, run: str, name: str, columns: tuple[str, ...], missing: bool) -> FloatArray:
-        path = self._file(run, name)
-        where = self.where(run, name)
+    def _read_csv(self, run: str, name: str, columns: tuple[str, ...], missing: bool) -> FloatArray:
+        path = self._find_file(run, name)
+        where = self.format_place(run, name)
         numbers = array("d")
-        with refusing(where, f"CSV: {','.join(columns)}"), path.open(newline="", encoding="utf-8-sig") as file:
+        with convert_errors(where, f"CSV: {','.join(columns)}"), path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)
             _check_header(where, next(lines, []), columns)
             for row in lines:
                 if not row:
                     continue
-                self._room.take(where, len(columns))
+                self._budget.reserve(where, len(columns))
                 if len(row) == len(columns):
                     with suppress(ValueError):  # what is not all numbers is looked at cell by cell
                         numbers.extend([float(cell) for cell in row])
                         continue
-                numbers.extend(_row(f"{where}, line {lines.line_num}", row, columns, missing))
+                numbers.extend(_parse_row(f"{where}, line {lines.line_num}", row, columns, missing))
         return np.array(numbers, dtype=np.float64).reshape(-1, len(columns))
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
-    with refusing(str(path), "a TOML file that describes the recording"):
+    with convert_errors(str(path), "a TOML file that describes the recording"):
         if not path.is_file():
             raise InputError(str(path), None, "a TOML file that describes the recording")
-        if path.stat().st_size > TOML_MAX:
-            raise InputError(str(path), f"{path.stat().st_size} bytes", f"at most {TOML_MAX}")
+        if path.stat().st_size > TOML_BYTES_MAX:
+            raise InputError(str(path), f"{path.stat().st_size} bytes", f"at most {TOML_BYTES_MAX}")
         try:
             return tomllib.loads(path.read_text(encoding="utf-8-sig"))
         except tomllib.TOMLDecodeError as error:
             message, _, place = str(error).partition(" (at ")
-            raise InputError(f"{path}, {place.rstrip(')')}", Words(message), "valid TOML") from None
+            raise InputError(f"{path}, {place.rstrip(')')}", Unquoted(message), "valid TOML") from None
 
 
 def _check_header(where: str, header: list[str], columns: tuple[str, ...]) -> None:
@@ -154,9 +154,9 @@ def _check_header(where: str, header: list[str], columns: tuple[str, ...]) -> No
         raise InputError(f"{where}, line 1", ",".join(header), f"the header {','.join(columns)}")
 
 
-def _row(where: str, row: list[str], columns: tuple[str, ...], missing: bool) -> list[float]:
+def _parse_row(where: str, row: list[str], columns: tuple[str, ...], missing: bool) -> list[float]:
     if len(row) != len(columns):
-        raise InputError(where, Words(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
+        raise InputError(where, Unquoted(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
     numbers = []
     for cell, column in zip(row, columns, strict=True):
         # Only a value may be missing; nothing else has a meaning when it is not there.
@@ -169,7 +169,7 @@ def _row(where: str, row: list[str], columns: tuple[str, ...], missing: bool) ->
 
 
 @contextmanager
-def folder_whole(path: Path) -> Iterator[Path]:
+def atomic_folder(path: Path) -> Iterator[Path]:
     """Give a temporary folder beside `path` that takes its place if the block ends well, and is gone if it does not.
 
     InputError where it cannot be written, or where something is there already: a folder may hold more than a recording.
@@ -177,7 +177,7 @@ def folder_whole(path: Path) -> Iterator[Path]:
     temporary: Path | None = None
     try:
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
-            raise InputError(str(path), Words("something that is there already"), "a folder that is new or empty")
+            raise InputError(str(path), Unquoted("something that is there already"), "a folder that is new or empty")
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
         yield temporary
         temporary.chmod(0o755)
@@ -189,56 +189,56 @@ def folder_whole(path: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
-def fill(folder: Path, runs: tuple[Run, ...], instrument_notes: str) -> None:
+def write_folder(folder: Path, runs: tuple[Run, ...], instrument_notes: str) -> None:
     """Write runs, known to fit, into an empty folder."""
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}"]
     if instrument_notes:
-        lines.append(f"instrument_notes = {_toml_value(instrument_notes)}")
+        lines.append(f"instrument_notes = {_format_value(instrument_notes)}")
     for run in runs:
-        lines += _describe(run)
-        _fill_run(folder / run.name, run)
+        lines += _format_run(run)
+        _write_run(folder / run.name, run)
     (folder / TOML_NAME).write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def _describe(run: Run) -> list[str]:
-    table = f"runs.{_toml_key(run.name)}"
+def _format_run(run: Run) -> list[str]:
+    table = f"runs.{_format_key(run.name)}"
     attributes = {**run.attributes, "ambient_K": run.ambient_k}
-    lines = ["", f"[{table}]"] + [f"{_toml_key(key)} = {_toml_value(value)}" for key, value in attributes.items()]
+    lines = ["", f"[{table}]"] + [f"{_format_key(key)} = {_format_value(value)}" for key, value in attributes.items()]
     for name in SIGNALS:
         if name in run.signals:
-            lines += _describe_signal(f"{table}.{name}", run.signals[name])
+            lines += _format_signal(f"{table}.{name}", run.signals[name])
     return lines
 
 
-def _describe_signal(table: str, signal: Signal) -> list[str]:
+def _format_signal(table: str, signal: Signal) -> list[str]:
     lines = ["", f"[{table}]", f"pixel = {signal.pixel}"]
-    return lines if signal.sigma is None else [*lines, f"sigma = {_toml_value(signal.sigma)}"]
+    return lines if signal.sigma is None else [*lines, f"sigma = {_format_value(signal.sigma)}"]
 
 
-def _toml_key(key: str) -> str:
+def _format_key(key: str) -> str:
     bare = key.isascii() and key.replace("_", "").replace("-", "").isalnum()
-    return key if bare else _toml_value(key)
+    return key if bare else _format_value(key)
 
 
-def _toml_value(value: str | float) -> str:
+def _format_value(value: str | float) -> str:
     if isinstance(value, str):
         # JSON's escapes are TOML's, but for the one control character that JSON lets stand.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
 
-def _fill_run(folder: Path, run: Run) -> None:
+def _write_run(folder: Path, run: Run) -> None:
     folder.mkdir()
-    _write(folder / f"{PULSES}.csv", TABLES[PULSES], run.pulses)
+    _write_csv(folder / f"{PULSES}.csv", TABLE_COLUMNS[PULSES], run.pulses)
     if run.commands is not None:
-        _write(folder / f"{COMMANDS}.csv", TABLES[COMMANDS], run.commands)
+        _write_csv(folder / f"{COMMANDS}.csv", TABLE_COLUMNS[COMMANDS], run.commands)
     for name, signal in run.signals.items():
-        _write(folder / f"{name}.csv", SAMPLES, np.column_stack([signal.t_s, signal.value]))
+        _write_csv(folder / f"{name}.csv", SAMPLE_COLUMNS, np.column_stack([signal.t_s, signal.value]))
 
 
-def _write(path: Path, columns: tuple[str, ...], rows: FloatArray) -> None:
+def _write_csv(path: Path, columns: tuple[str, ...], rows: FloatArray) -> None:
     with path.open("w", encoding="ascii", newline="") as file:
         file.write(",".join(columns) + "\n")
         # `repr` gives the shortest digits that read back as the same number; the last column is the pixel or a value.
-        rest = "nan" if columns == SAMPLES else ".0"
+        rest = "nan" if columns == SAMPLE_COLUMNS else ".0"
         file.writelines(f"{','.join(map(repr, row)).removesuffix(rest)}\n" for row in rows.tolist())

@@ -14,19 +14,19 @@ from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.index import RecordingIndex
 from optodrive.lab.recording.reader import read_runs
-from optodrive.lab.recording.storage import MIRRORS, Words
+from optodrive.lab.recording.storage import MIRROR_SIGNALS, Unquoted
 
-Stamp = tuple[int, int]
+FileStamp = tuple[int, int]
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingPart:
     """Runs of one recording. prefix: before their names, where several are joined; stamp: of the file as tried out."""
 
     path: Path
     prefix: str
     names: tuple[str, ...]
-    stamp: Stamp | None
+    stamp: FileStamp | None
 
 
 @dataclass(frozen=True)
@@ -34,21 +34,27 @@ class PixelRuns:
     """Where one pixel's runs lie; pixel: None for what mirrors did. Small: it travels to whoever reads them."""
 
     pixel: int | None
-    parts: tuple[Part, ...]
+    parts: tuple[RecordingPart, ...]
 
     def read(self) -> Measurement:
         """These runs, with this pixel's signals and no others; InputError where the data are bad."""
-        runs = [self._own(part, run) for part in self.parts for run in _read(part)]
+        runs = [self._select_signals(part, run) for part in self.parts for run in _read_part(part)]
         values = [signal.value for run in runs for signal in run.signals.values()]
-        what = "mirrors" if self.pixel is None else f"pixel {self.pixel}"
-        checks.check_enough(f"{self.parts[0].path}: {what}", sum(int(np.isfinite(value).sum()) for value in values))
+        subject = "mirrors" if self.pixel is None else f"pixel {self.pixel}"
+        checks.check_sample_count(
+            f"{self.parts[0].path}: {subject}", sum(int(np.isfinite(value).sum()) for value in values)
+        )
         return Measurement(tuple(runs))
 
-    def _own(self, part: Part, run: Run) -> Run:
+    def _select_signals(self, part: RecordingPart, run: Run) -> Run:
         own = {
             name: signal
             for name, signal in run.signals.items()
-            if (name in MIRRORS if self.pixel is None else name not in MIRRORS and signal.pixel == self.pixel)
+            if (
+                name in MIRROR_SIGNALS
+                if self.pixel is None
+                else name not in MIRROR_SIGNALS and signal.pixel == self.pixel
+            )
         }
         return replace(run, name=f"{part.prefix}{run.name}", signals=own)
 
@@ -63,31 +69,31 @@ class DisplayRuns:
     @classmethod
     def open(cls, paths: list[Path]) -> "DisplayRuns":
         """Look into recordings, without their samples; InputError where one is none."""
-        pixels: dict[int, list[Part]] = {}
-        mirrors: list[Part] = []
+        pixels: dict[int, list[RecordingPart]] = {}
+        mirrors: list[RecordingPart] = []
         for path in paths:
-            stamp = _stamp(path)
+            stamp = _stat_file(path)
             index = RecordingIndex.open(path)
             prefix = f"{path.stem}/" if len(paths) > 1 else ""
-            for pixel, names in index.by_pixel().items():
-                pixels.setdefault(pixel, []).append(Part(path.absolute(), prefix, names, stamp))
-            turned = tuple(run.name for run in index.runs if not set(MIRRORS).isdisjoint(run.signals))
-            if turned:
-                mirrors.append(Part(path.absolute(), prefix, turned, stamp))
+            for pixel, names in index.group_runs_by_pixel().items():
+                pixels.setdefault(pixel, []).append(RecordingPart(path.absolute(), prefix, names, stamp))
+            mirror_runs = tuple(run.name for run in index.runs if not set(MIRROR_SIGNALS).isdisjoint(run.signals))
+            if mirror_runs:
+                mirrors.append(RecordingPart(path.absolute(), prefix, mirror_runs, stamp))
         return cls(
             tuple(PixelRuns(pixel, tuple(pixels[pixel])) for pixel in sorted(pixels)),
             PixelRuns(None, tuple(mirrors)) if mirrors else None,
         )
 
 
-def _read(part: Part) -> tuple[Run, ...]:
+def _read_part(part: RecordingPart) -> tuple[Run, ...]:
     """What was tried out once when the recording was opened is trusted for as long as the file stays as it was."""
-    if part.stamp is not None and part.path.is_file() and _stamp(part.path) != part.stamp:
-        raise InputError(str(part.path), Words("another file"), "the file that was there when the diagnosis began")
+    if part.stamp is not None and part.path.is_file() and _stat_file(part.path) != part.stamp:
+        raise InputError(str(part.path), Unquoted("another file"), "the file that was there when the diagnosis began")
     return read_runs(part.path, list(part.names), trusted=part.stamp is not None).runs
 
 
-def _stamp(path: Path) -> Stamp | None:
+def _stat_file(path: Path) -> FileStamp | None:
     """Size and time of a file; None for a folder, which needs no trial."""
     if not path.is_file():
         return None

@@ -8,8 +8,8 @@ import numpy as np
 
 from optodrive.core.types.measurements import Measurement
 from optodrive.lab.recording import checks
-from optodrive.lab.recording.reader import open_head, open_tree, read_pulses, read_runs, read_signal_attributes
-from optodrive.lab.recording.storage import COMMANDS, MIRRORS, Attributes, Tree, refusing
+from optodrive.lab.recording.reader import open_tree, read_header, read_pulses, read_runs, read_signal_attributes
+from optodrive.lab.recording.storage import COMMANDS, MIRROR_SIGNALS, Attributes, RecordingTree, convert_errors
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,7 @@ class SignalIndex:
     """One signal of a run. samples: how many, missing ones counted; sigma: stated noise."""
 
     pixel: int
-    samples: int
+    sample_count: int
     sigma: float | None
 
 
@@ -28,15 +28,15 @@ class RunIndex:
     name: str
     ambient_k: float
     attributes: Attributes
-    lit: tuple[int, ...]
-    pulses: int
+    pulsed_pixels: tuple[int, ...]
+    pulse_count: int
     has_commands: bool
     signals: dict[str, SignalIndex]
 
     @property
-    def measured(self) -> tuple[int, ...]:
+    def measured_pixels(self) -> tuple[int, ...]:
         """Pixels measured in this run, sorted."""
-        return tuple(sorted({signal.pixel for name, signal in self.signals.items() if name not in MIRRORS}))
+        return tuple(sorted({signal.pixel for name, signal in self.signals.items() if name not in MIRROR_SIGNALS}))
 
 
 @dataclass(frozen=True)
@@ -50,34 +50,34 @@ class RecordingIndex:
     @classmethod
     def open(cls, path: Path) -> Self:
         """Look into a recording; InputError where it is not one, as far as that shows without its samples."""
-        with open_tree(path) as tree, refusing(str(path), "a recording that can be read"):
-            names, notes = open_head(tree)
-            return cls(path, notes, tuple(_run_index(tree, name) for name in names))
+        with open_tree(path) as tree, convert_errors(str(path), "a recording that can be read"):
+            names, notes = read_header(tree)
+            return cls(path, notes, tuple(_build_run_index(tree, name) for name in names))
 
-    def by_pixel(self) -> dict[int, tuple[str, ...]]:
+    def group_runs_by_pixel(self) -> dict[int, tuple[str, ...]]:
         """Names of the runs that measured each pixel, in their order; pixels sorted."""
-        found: dict[int, list[str]] = {}
+        by_pixel: dict[int, list[str]] = {}
         for run in self.runs:
-            for pixel in run.measured:
-                found.setdefault(pixel, []).append(run.name)
-        return {pixel: tuple(found[pixel]) for pixel in sorted(found)}
+            for pixel in run.measured_pixels:
+                by_pixel.setdefault(pixel, []).append(run.name)
+        return {pixel: tuple(by_pixel[pixel]) for pixel in sorted(by_pixel)}
 
     def read(self, names: list[str]) -> Measurement:
         """Read these runs."""
         return read_runs(self.path, names)
 
 
-def _run_index(tree: Tree, name: str) -> RunIndex:
-    where = tree.where(name)
-    attributes = tree.attributes(name)
-    ambient_k = checks.take_ambient_k(where, attributes)
-    members = tree.members(name)
-    signals = {signal: _signal_index(tree, name, signal) for signal in checks.signals_among(where, members)}
+def _build_run_index(tree: RecordingTree, name: str) -> RunIndex:
+    where = tree.format_place(name)
+    attributes = tree.read_run_attributes(name)
+    ambient_k = checks.pop_ambient_k(where, attributes)
+    members = tree.list_members(name)
+    signals = {signal: _build_signal_index(tree, name, signal) for signal in checks.select_signals(where, members)}
     pulses = read_pulses(tree, name)
-    lit = tuple(int(pixel) for pixel in np.unique(pulses[:, 3]))
-    return RunIndex(name, ambient_k, attributes, lit, len(pulses), COMMANDS in members, signals)
+    pulsed_pixels = tuple(int(pixel) for pixel in np.unique(pulses[:, 3]))
+    return RunIndex(name, ambient_k, attributes, pulsed_pixels, len(pulses), COMMANDS in members, signals)
 
 
-def _signal_index(tree: Tree, run: str, signal: str) -> SignalIndex:
+def _build_signal_index(tree: RecordingTree, run: str, signal: str) -> SignalIndex:
     pixel, sigma = read_signal_attributes(tree, run, signal)
-    return SignalIndex(pixel, tree.sample_count(run, signal), sigma)
+    return SignalIndex(pixel, tree.count_samples(run, signal), sigma)

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
-from optodrive.lab.recording.reader import open_head, open_tree, read_pulses, read_recording
-from optodrive.lab.recording.storage import PULSES, Words, refusing
+from optodrive.lab.recording.reader import open_tree, read_header, read_pulses, read_recording
+from optodrive.lab.recording.storage import PULSES, Unquoted, convert_errors
 
 
 def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measurement:
@@ -18,33 +18,35 @@ def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measur
     measured: a recording whose runs have no pulses of their own; shift_s is added to its times. Runs that were not
     measured are left out. InputError, naming run and file, where the two do not belong together.
     """
-    driven = _driven(session)
+    session_runs = _read_session_runs(session)
     measurement = read_recording(measured)
-    return Measurement(tuple(_joined(run, driven, session, measured, shift_s) for run in measurement.runs))
+    return Measurement(tuple(_merge_run(run, session_runs, session, measured, shift_s) for run in measurement.runs))
 
 
-def _driven(session: Path) -> dict[str, Run]:
+def _read_session_runs(session: Path) -> dict[str, Run]:
     """A session's runs, which have no signals."""
-    with open_tree(session) as tree, refusing(str(session), "a session's recording"):
-        names, _ = open_head(tree)
-        found = {}
+    with open_tree(session) as tree, convert_errors(str(session), "a session's recording"):
+        names, _ = read_header(tree)
+        runs = {}
         for name in names:
-            attributes = tree.attributes(name)
-            ambient_k = checks.take_ambient_k(tree.where(name), attributes)
-            found[name] = Run(name, ambient_k, read_pulses(tree, name), {}, attributes)
-        return found
+            attributes = tree.read_run_attributes(name)
+            ambient_k = checks.pop_ambient_k(tree.format_place(name), attributes)
+            runs[name] = Run(name, ambient_k, read_pulses(tree, name), {}, attributes)
+        return runs
 
 
-def _joined(run: Run, driven: dict[str, Run], session: Path, measured: Path, shift_s: float) -> Run:
+def _merge_run(run: Run, session_runs: dict[str, Run], session: Path, measured: Path, shift_s: float) -> Run:
     where = f"{measured}: /runs/{run.name}"
-    own = driven.get(run.name)
-    if own is None:
-        raise InputError(where, run.name, f"a run of {session}, {nearest(run.name, list(driven))}")
+    session_run = session_runs.get(run.name)
+    if session_run is None:
+        raise InputError(where, run.name, f"a run of {session}, {suggest_nearest(run.name, list(session_runs))}")
     if len(run.pulses):
         expected = f"none: those of {session} are taken"
-        raise InputError(f"{where}/{PULSES}", Words(f"{len(run.pulses)} pulses"), expected)
+        raise InputError(f"{where}/{PULSES}", Unquoted(f"{len(run.pulses)} pulses"), expected)
     signals = {
         name: Signal(signal.pixel, np.asarray(signal.t_s + shift_s), signal.value, signal.sigma)
         for name, signal in run.signals.items()
     }
-    return replace(run, pulses=own.pulses, signals=signals, attributes={**run.attributes, **own.attributes})
+    return replace(
+        run, pulses=session_run.pulses, signals=signals, attributes={**run.attributes, **session_run.attributes}
+    )

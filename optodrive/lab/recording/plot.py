@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording.storage import SIGNALS
@@ -17,17 +17,24 @@ if TYPE_CHECKING:
 RUNS_MAX = 400
 """Runs drawn; a taller picture than theirs is opened by few programs."""
 NAME_WIDTH, LABEL_WIDTH, PANEL_WIDTH, GAP, HEAD_HEIGHT = 170, 70, 360, 14, 30
-HEIGHT_MIN, HEIGHT_MAX, HEIGHT_ALL = 44, 150, 8000
-PAPER, INK, FAINT, LIGHT, CURVE, MISSING = "#ffffff", "#222222", "#888888", "#ffe3b0", "#1f5fa8", "#c02020"
+HEIGHT_MIN, HEIGHT_MAX, TOTAL_HEIGHT = 44, 150, 8000
+BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSING_COLOUR = (
+    "#ffffff",
+    "#222222",
+    "#888888",
+    "#ffe3b0",
+    "#1f5fa8",
+    "#c02020",
+)
 
 
-def write_picture(path: Path, measurement: Measurement) -> int:
+def write_plot(path: Path, measurement: Measurement) -> int:
     """Write the picture, a PNG, whole or not at all; how many runs it shows, the first `RUNS_MAX` at most."""
     if path.suffix.lower() != ".png":
         raise InputError(str(path), path.suffix, "a name that ends in .png")
     with np.errstate(over="ignore"):  # a pulse may end beyond the largest number
         image, count = _draw(measurement)
-    with written_whole(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path) as temporary, temporary.open("wb") as file:
         image.save(file, format="PNG")
     return count
 
@@ -37,74 +44,74 @@ def _draw(measurement: Measurement) -> tuple[Any, int]:
 
     runs = measurement.runs[:RUNS_MAX]
     columns = [name for name in SIGNALS if any(name in run.signals for run in runs)]
-    height = int(np.clip(HEIGHT_ALL // len(runs), HEIGHT_MIN, HEIGHT_MAX))
-    size = (_panel_left(len(columns)), HEAD_HEIGHT + len(runs) * height)
-    image = Image.new("RGB", size, PAPER)
-    pen = ImageDraw.Draw(image)
-    pen.text((GAP, 8), _title(len(runs), len(measurement.runs)), fill=FAINT)
+    height = int(np.clip(TOTAL_HEIGHT // len(runs), HEIGHT_MIN, HEIGHT_MAX))
+    size = (_compute_panel_left(len(columns)), HEAD_HEIGHT + len(runs) * height)
+    image = Image.new("RGB", size, BACKGROUND_COLOUR)
+    draw = ImageDraw.Draw(image)
+    draw.text((GAP, 8), _format_title(len(runs), len(measurement.runs)), fill=FRAME_COLOUR)
     for column, name in enumerate(columns):
-        pen.text((_panel_left(column), 8), name, fill=INK)
+        draw.text((_compute_panel_left(column), 8), name, fill=TEXT_COLOUR)
     for row, run in enumerate(runs):
-        _draw_run(pen, run, columns, HEAD_HEIGHT + row * height, height - GAP)
+        _draw_run(draw, run, columns, HEAD_HEIGHT + row * height, height - GAP)
     return image, len(runs)
 
 
-def _panel_left(column: int) -> int:
+def _compute_panel_left(column: int) -> int:
     return NAME_WIDTH + LABEL_WIDTH + column * (PANEL_WIDTH + GAP + LABEL_WIDTH)
 
 
-def _title(drawn: int, count: int) -> str:
+def _format_title(drawn: int, count: int) -> str:
     return f"{count} runs" if drawn == count else f"{drawn} of {count} runs"
 
 
-def _draw_run(pen: "ImageDraw", run: Run, columns: list[str], top: int, height: int) -> None:
-    pen.text((GAP, top), _short(run.name), fill=INK)
-    pen.text((GAP, top + 14), _short(str(run.attributes.get("group", ""))), fill=FAINT)
+def _draw_run(draw: "ImageDraw", run: Run, columns: list[str], top: int, height: int) -> None:
+    draw.text((GAP, top), _abbreviate(run.name), fill=TEXT_COLOUR)
+    draw.text((GAP, top + 14), _abbreviate(str(run.attributes.get("group", ""))), fill=FRAME_COLOUR)
     for column, name in enumerate(columns):
         if name in run.signals:
-            left = _panel_left(column)
-            _draw_panel(pen, run.signals[name], run.pulses, (left, top, left + PANEL_WIDTH, top + height))
+            left = _compute_panel_left(column)
+            _draw_panel(draw, run.signals[name], run.pulses, (left, top, left + PANEL_WIDTH, top + height))
 
 
-def _short(text: str) -> str:
+def _abbreviate(text: str) -> str:
     # The font that Pillow brings has Latin letters only; a run of another script keeps its place in the order.
     text = text.encode("latin-1", "replace").decode("latin-1")
     return text if len(text) <= 24 else f"{text[:23]}~"
 
 
-def _draw_panel(pen: "ImageDraw", signal: Signal, pulses: FloatArray, box: tuple[int, int, int, int]) -> None:
+def _draw_panel(draw: "ImageDraw", signal: Signal, pulses: FloatArray, box: tuple[int, int, int, int]) -> None:
     left, top, right, bottom = box
     on_s, off_s = pulses[:, 0], pulses[:, 0] + pulses[:, 1]
-    lit = (pulses[:, 3] == signal.pixel) & (off_s >= signal.t_s[0]) & (on_s <= signal.t_s[-1])
-    edges = left + (right - left) * _share(np.column_stack([on_s, off_s])[lit], signal.t_s[0], signal.t_s[-1])
+    is_shown = (pulses[:, 3] == signal.pixel) & (off_s >= signal.t_s[0]) & (on_s <= signal.t_s[-1])
+    edges = left + (right - left) * _normalize(np.column_stack([on_s, off_s])[is_shown], signal.t_s[0], signal.t_s[-1])
     for x_on, x_off in edges.tolist():
-        pen.rectangle((x_on, top, max(x_off, x_on + 1), bottom), fill=LIGHT)
-    pen.rectangle(box, outline=FAINT)
-    there = np.isfinite(signal.value)
-    least, most = signal.value[there].min(), signal.value[there].max()
-    x = np.round(left + (right - left) * _share(signal.t_s, signal.t_s[0], signal.t_s[-1])).astype(np.int64)
-    y = bottom - 1 - (bottom - top - 2) * _share(signal.value, least, most)
-    _draw_curve(pen, x, y, there)
-    for gone in np.unique(x[~there]).tolist():
-        pen.line((gone, bottom - 3, gone, bottom), fill=MISSING)
-    pen.text((left - 4, top), f"{most:.4g}", fill=FAINT, anchor="ra")
-    pen.text((left - 4, bottom - 11), f"{least:.4g}", fill=FAINT, anchor="ra")
-    pen.text((right - 3, top + 1), f"{signal.t_s[-1]:.4g} s", fill=FAINT, anchor="ra")
+        draw.rectangle((x_on, top, max(x_off, x_on + 1), bottom), fill=PULSE_COLOUR)
+    draw.rectangle(box, outline=FRAME_COLOUR)
+    is_finite = np.isfinite(signal.value)
+    low, high = signal.value[is_finite].min(), signal.value[is_finite].max()
+    x = np.round(left + (right - left) * _normalize(signal.t_s, signal.t_s[0], signal.t_s[-1])).astype(np.int64)
+    y = bottom - 1 - (bottom - top - 2) * _normalize(signal.value, low, high)
+    _draw_curve(draw, x, y, is_finite)
+    for missing_x in np.unique(x[~is_finite]).tolist():
+        draw.line((missing_x, bottom - 3, missing_x, bottom), fill=MISSING_COLOUR)
+    draw.text((left - 4, top), f"{high:.4g}", fill=FRAME_COLOUR, anchor="ra")
+    draw.text((left - 4, bottom - 11), f"{low:.4g}", fill=FRAME_COLOUR, anchor="ra")
+    draw.text((right - 3, top + 1), f"{signal.t_s[-1]:.4g} s", fill=FRAME_COLOUR, anchor="ra")
 
 
-def _share(values: FloatArray, least: float, most: float) -> FloatArray:
+def _normalize(values: FloatArray, low: float, high: float) -> FloatArray:
     """Where values lie between two others, 0 to 1. Halves, as a difference of the largest numbers is none."""
-    span = most / 2 - least / 2
+    span = high / 2 - low / 2
     if not span > 0:
         return np.full(values.shape, 0.5)
-    return np.asarray(np.clip((values / 2 - least / 2) / span, 0.0, 1.0))
+    return np.asarray(np.clip((values / 2 - low / 2) / span, 0.0, 1.0))
 
 
-def _draw_curve(pen: "ImageDraw", x: Any, y: FloatArray, there: Any) -> None:
+def _draw_curve(draw: "ImageDraw", x: Any, y: FloatArray, is_finite: Any) -> None:
     """A line through the samples, broken where one is missing: for each column of the picture first, extremes, last."""
-    edges = np.flatnonzero(np.diff(there.astype(np.int8))) + 1
+    edges = np.flatnonzero(np.diff(is_finite.astype(np.int8))) + 1
     for part in np.split(np.arange(len(x)), edges):
-        if not there[part[0]]:
+        if not is_finite[part[0]]:
             continue
         starts = np.flatnonzero(np.diff(x[part], prepend=-1))
         ends = np.append(starts[1:], len(part)) - 1
@@ -112,6 +119,6 @@ def _draw_curve(pen: "ImageDraw", x: Any, y: FloatArray, there: Any) -> None:
         levels = np.column_stack([y[part][starts], lowest, highest, y[part][ends]])
         points = np.column_stack([np.repeat(x[part][starts], 4), levels.reshape(-1)])
         if len(part) == 1:
-            pen.point(tuple(points[0]), fill=CURVE)
+            draw.point(tuple(points[0]), fill=CURVE_COLOUR)
         else:
-            pen.line([tuple(point) for point in points.tolist()], fill=CURVE)
+            draw.line([tuple(point) for point in points.tolist()], fill=CURVE_COLOUR)

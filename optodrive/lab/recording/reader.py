@@ -4,13 +4,21 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.csv_folder import CsvTree
 from optodrive.lab.recording.hdf5 import Hdf5Tree
-from optodrive.lab.recording.storage import COMMANDS, PULSES, Tree, Words, check_run_name, naturally, refusing
+from optodrive.lab.recording.storage import (
+    COMMANDS,
+    PULSES,
+    RecordingTree,
+    Unquoted,
+    check_run_name,
+    convert_errors,
+    natural_sort_key,
+)
 
 
 def read_recording(path: Path) -> Measurement:
@@ -20,83 +28,85 @@ def read_recording(path: Path) -> Measurement:
 
 def read_with_notes(path: Path) -> tuple[Measurement, str]:
     """A recording, and what it notes of the instruments."""
-    with open_tree(path) as tree, refusing(str(path), "a recording that can be read"):
-        names, notes = open_head(tree)
+    with open_tree(path) as tree, convert_errors(str(path), "a recording that can be read"):
+        names, instrument_notes = read_header(tree)
         measurement = Measurement(tuple(_read_run(tree, name) for name in names))
         values = [signal.value for run in measurement.runs for signal in run.signals.values()]
-        checks.check_enough(tree.where(), sum(int(np.count_nonzero(np.isfinite(value))) for value in values))
-        return measurement, notes
+        checks.check_sample_count(
+            tree.format_place(), sum(int(np.count_nonzero(np.isfinite(value))) for value in values)
+        )
+        return measurement, instrument_notes
 
 
 def read_runs(path: Path, names: list[str], trusted: bool = False) -> Measurement:
     """Read only these runs of a recording, in this order. trusted: a file that has been tried out already."""
-    with open_tree(path, trusted) as tree, refusing(str(path), "a recording that can be read"):
-        known, _ = open_head(tree)
+    with open_tree(path, trusted) as tree, convert_errors(str(path), "a recording that can be read"):
+        known, _ = read_header(tree)
         for name in names:
             if name not in known:
-                raise InputError(tree.where(), name, f"a run of this recording, {nearest(name, known)}")
+                raise InputError(tree.format_place(), name, f"a run of this recording, {suggest_nearest(name, known)}")
         return Measurement(tuple(_read_run(tree, name) for name in names))
 
 
-def open_tree(path: Path, trusted: bool = False) -> Tree:
+def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
     """Open a recording in whichever form it is. trusted: without trying a file out in a process of its own before."""
     path = Path(path)
-    with refusing(str(path), "a recording: an HDF5 file or a folder"):
+    with convert_errors(str(path), "a recording: an HDF5 file or a folder"):
         if path.is_dir():
             return CsvTree(path)
         if path.is_file():
             return Hdf5Tree(path, trusted)
-        found = "something that is no file" if path.exists() else "nothing of this name"
-        raise InputError(str(path), Words(found), "a recording: an HDF5 file or a folder")
+        description = "something that is no file" if path.exists() else "nothing of this name"
+        raise InputError(str(path), Unquoted(description), "a recording: an HDF5 file or a folder")
 
 
-def open_head(tree: Tree) -> tuple[list[str], str]:
+def read_header(tree: RecordingTree) -> tuple[list[str], str]:
     """The runs of a recording in their natural order, and its notes, once format and version are known to be right."""
-    head = tree.head()
-    checks.check_head(tree.where(), head)
-    names = tree.runs()
+    head = tree.read_root_attributes()
+    checks.check_format(tree.format_place(), head)
+    names = tree.list_runs()
     if not names:
-        raise InputError(tree.where(), Words("no runs"), "at least one")
+        raise InputError(tree.format_place(), Unquoted("no runs"), "at least one")
     for name in names:
-        check_run_name(tree.where(), name)
-    return sorted(names, key=naturally), str(head.get("instrument_notes", ""))
+        check_run_name(tree.format_place(), name)
+    return sorted(names, key=natural_sort_key), str(head.get("instrument_notes", ""))
 
 
-def read_pulses(tree: Tree, run: str) -> FloatArray:
+def read_pulses(tree: RecordingTree, run: str) -> FloatArray:
     """The drive of a run, checked."""
-    pulses = tree.table(run, PULSES)
-    checks.check_pulses(tree.where(run, PULSES), pulses)
+    pulses = tree.read_table(run, PULSES)
+    checks.check_pulses(tree.format_place(run, PULSES), pulses)
     return pulses
 
 
-def _read_run(tree: Tree, name: str) -> Run:
-    where = tree.where(name)
-    attributes = tree.attributes(name)
-    ambient_k = checks.take_ambient_k(where, attributes)
-    members = tree.members(name)
-    wanted = checks.signals_among(where, members)
+def _read_run(tree: RecordingTree, name: str) -> Run:
+    where = tree.format_place(name)
+    attributes = tree.read_run_attributes(name)
+    ambient_k = checks.pop_ambient_k(where, attributes)
+    members = tree.list_members(name)
+    signal_names = checks.select_signals(where, members)
     pulses = read_pulses(tree, name)
     commands = _read_commands(tree, name) if COMMANDS in members else None
-    signals = {signal: _read_signal(tree, name, signal) for signal in wanted}
+    signals = {signal: _read_signal(tree, name, signal) for signal in signal_names}
     return Run(name, ambient_k, pulses, signals, attributes, commands)
 
 
-def _read_commands(tree: Tree, run: str) -> FloatArray:
-    commands = tree.table(run, COMMANDS)
-    checks.check_commands(tree.where(run, COMMANDS), commands)
+def _read_commands(tree: RecordingTree, run: str) -> FloatArray:
+    commands = tree.read_table(run, COMMANDS)
+    checks.check_commands(tree.format_place(run, COMMANDS), commands)
     return commands
 
 
-def read_signal_attributes(tree: Tree, run: str, signal: str) -> tuple[int, float | None]:
+def read_signal_attributes(tree: RecordingTree, run: str, signal: str) -> tuple[int, float | None]:
     """Pixel and stated noise of a signal, checked."""
-    where = tree.where(run, signal)
-    attributes = tree.signal_attributes(run, signal)
+    where = tree.format_place(run, signal)
+    attributes = tree.read_signal_attributes(run, signal)
     checks.check_unit(where, signal, attributes)
-    return checks.pixel_measured(where, signal, attributes), checks.stated_sigma(where, attributes)
+    return checks.parse_pixel(where, signal, attributes), checks.parse_sigma(where, attributes)
 
 
-def _read_signal(tree: Tree, run: str, signal: str) -> Signal:
+def _read_signal(tree: RecordingTree, run: str, signal: str) -> Signal:
     pixel, sigma = read_signal_attributes(tree, run, signal)
-    t_s, value = tree.samples(run, signal)
-    checks.check_samples(tree.where(run, signal), t_s, value)
+    t_s, value = tree.read_samples(run, signal)
+    checks.check_samples(tree.format_place(run, signal), t_s, value)
     return Signal(pixel, t_s, value, sigma)

@@ -15,86 +15,86 @@ from time import process_time
 from typing import TYPE_CHECKING
 
 from optodrive.core.errors import InputError
-from optodrive.lab.recording.storage import SIGNALS, TABLES, Words
+from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS, Unquoted
 
 if TYPE_CHECKING:
     from optodrive.lab.recording.hdf5 import Hdf5Tree
 
-CPU_S = 5
-BYTES_PER_CPU_S = 20_000_000
+CPU_LIMIT_S = 5
+RUN_BYTES_PER_CPU_S = 20_000_000
 """A run may take `CPU_S`, and a second more for so many bytes of the file; even compressed data is read faster."""
-BYTES_PER_CPU_S_ALL = 200_000
+FILE_BYTES_PER_CPU_S = 200_000
 """The whole may take `CPU_S`, and a second more for so many bytes: a run takes milliseconds, however small it is."""
 MEMORY_BYTES = 2**32
 _PROGRAM = "from optodrive.lab.recording.sandboxed_probe import main; main()"
-_SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
-_passed: set[tuple[str, int, int, int, int]] = set()
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
+_probed_files: set[tuple[str, int, int, int, int]] = set()
 
 
-def try_out(path: Path) -> None:
+def probe_in_sandbox(path: Path) -> None:
     """Read the file in a process of its own; InputError where that process comes to grief. Once a file and process."""
     status = path.stat()
     identity = (str(path.resolve()), status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
-    if identity in _passed:
+    if identity in _probed_files:
         return
-    each_s = CPU_S + status.st_size // BYTES_PER_CPU_S
-    all_s = CPU_S + status.st_size // BYTES_PER_CPU_S_ALL
+    run_limit_s = CPU_LIMIT_S + status.st_size // RUN_BYTES_PER_CPU_S
+    file_limit_s = CPU_LIMIT_S + status.st_size // FILE_BYTES_PER_CPU_S
     try:
-        finished = subprocess.run(
-            [sys.executable, "-P", "-c", _PROGRAM, str(path.absolute()), str(each_s), str(all_s)],
+        process = subprocess.run(
+            [sys.executable, "-P", "-c", _PROGRAM, str(path.absolute()), str(run_limit_s), str(file_limit_s)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, **_SETTINGS, "PYTHONPATH": os.pathsep.join(sys.path)},
-            timeout=20 * all_s,
+            env={**os.environ, **_ENVIRONMENT, "PYTHONPATH": os.pathsep.join(sys.path)},
+            timeout=20 * file_limit_s,
             check=False,
         )
-        ended_well = finished.returncode == 0
+        has_succeeded = process.returncode == 0
     except subprocess.TimeoutExpired:
-        ended_well = False
-    if not ended_well:
-        raise InputError(str(path), Words("damage on which the HDF5 library hangs or crashes"), "an undamaged file")
-    _passed.add(identity)
+        has_succeeded = False
+    if not has_succeeded:
+        raise InputError(str(path), Unquoted("damage on which the HDF5 library hangs or crashes"), "an undamaged file")
+    _probed_files.add(identity)
 
 
-def _confine(all_s: int) -> None:
+def _limit_resources(file_limit_s: int) -> None:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CPU, (all_s, all_s))
+    resource.setrlimit(resource.RLIMIT_CPU, (file_limit_s, file_limit_s))
     _, hard = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(
         resource.RLIMIT_AS, (MEMORY_BYTES if hard == resource.RLIM_INFINITY else min(hard, MEMORY_BYTES), hard)
     )
 
 
-def _more(each_s: int) -> None:
+def _extend_cpu_limit(run_limit_s: int) -> None:
     """Let the process run for so many seconds from now on, and then be killed, for then it makes no headway."""
     _, hard_s = resource.getrlimit(resource.RLIMIT_CPU)
-    resource.setrlimit(resource.RLIMIT_CPU, (min(ceil(process_time()) + each_s, hard_s), hard_s))
+    resource.setrlimit(resource.RLIMIT_CPU, (min(ceil(process_time()) + run_limit_s, hard_s), hard_s))
 
 
-def _read_all(path: Path, each_s: int) -> None:
+def _read_all(path: Path, run_limit_s: int) -> None:
     from optodrive.lab.recording.hdf5 import Hdf5Tree
 
     runs: list[str] = []
-    _more(each_s)
+    _extend_cpu_limit(run_limit_s)
     with suppress(InputError), Hdf5Tree(path, trusted=True) as tree:
-        tree.head()
-        runs = tree.runs()
+        tree.read_root_attributes()
+        runs = tree.list_runs()
     for run in runs:
-        _more(each_s)
+        _extend_cpu_limit(run_limit_s)
         with suppress(InputError), Hdf5Tree(path, trusted=True) as tree:
-            tree.attributes(run)
-            _read_members(tree, run, tree.members(run))
+            tree.read_run_attributes(run)
+            _read_members(tree, run, tree.list_members(run))
 
 
 def _read_members(tree: "Hdf5Tree", run: str, members: list[str]) -> None:
     for name in members:
         with suppress(InputError):
-            if name in TABLES:
-                tree.table(run, name)
+            if name in TABLE_COLUMNS:
+                tree.read_table(run, name)
             elif name in SIGNALS:
-                tree.signal_attributes(run, name)
-                tree.samples(run, name)
+                tree.read_signal_attributes(run, name)
+                tree.read_samples(run, name)
 
 
 def main() -> None:
@@ -102,5 +102,5 @@ def main() -> None:
 
     What is merely wrong is passed over.
     """
-    _confine(int(sys.argv[3]))
+    _limit_resources(int(sys.argv[3]))
     _read_all(Path(sys.argv[1]), int(sys.argv[2]))

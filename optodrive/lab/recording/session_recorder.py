@@ -22,38 +22,38 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.lab.recording.hdf5 import h5py_module
+from optodrive.lab.recording.hdf5 import import_h5py
 
-WAITING_MAX = 200
+QUEUE_MAX = 200
 """Plans that may wait for the disk."""
-CLOSING_S = 10.0
-LENGTH = struct.Struct("<Q")
-WRITTEN = b"."
+CLOSE_TIMEOUT_S = 10.0
+LENGTH_PREFIX = struct.Struct("<Q")
+ACKNOWLEDGEMENT = b"."
 Arrays = Mapping[str, np.ndarray[Any, Any]]
-Note = tuple[dict[str, Any], Arrays]
+SessionEntry = tuple[dict[str, Any], Arrays]
 """What is known of a plan in plain words and numbers, and its arrays."""
 
 
-def pack(about: Mapping[str, Any], arrays: Arrays) -> bytes:
+def encode_entry(metadata: Mapping[str, Any], arrays: Arrays) -> bytes:
     """A note as the writer takes it."""
     body = io.BytesIO()
-    text = np.frombuffer(json.dumps(about).encode(), dtype=np.uint8)
+    text = np.frombuffer(json.dumps(metadata).encode(), dtype=np.uint8)
     np.savez(body, about_=text, **arrays)  # type: ignore[arg-type]
-    return LENGTH.pack(body.tell()) + body.getvalue()
+    return LENGTH_PREFIX.pack(body.tell()) + body.getvalue()
 
 
 class SessionRecorder:
     """The daemon's side. say: gets the one line when recording ends early; `note` never waits and never raises."""
 
-    def __init__(self, path: Path, about: Mapping[str, Any], say: Callable[[str], None]) -> None:
+    def __init__(self, path: Path, metadata: Mapping[str, Any], on_failure: Callable[[str], None]) -> None:
         """Begin a new file; InputError where there is one already, or it cannot be written."""
-        h5py_module()
+        import_h5py()
         if path.exists():
             raise InputError("--record-session", str(path), "a name that is free: nothing is overwritten")
         self.path = path
-        self.recording = True
-        self._say = say
-        self._waiting: Queue[Callable[[], Note] | None] = Queue(WAITING_MAX)
+        self.is_recording = True
+        self._on_failure = on_failure
+        self._queue: Queue[Callable[[], SessionEntry] | None] = Queue(QUEUE_MAX)
         self._writer = subprocess.Popen(
             [sys.executable, "-P", "-m", "optodrive.lab.recording.session_writer", str(path)],
             stdin=subprocess.PIPE,
@@ -63,58 +63,60 @@ class SessionRecorder:
             start_new_session=True,  # a Ctrl-C meant for the daemon is not meant for it: it ends when its pipe does
         )
         try:
-            self._hand_over(pack(about, {}))
+            self._send(encode_entry(metadata, {}))
         except OSError:
-            raise InputError("--record-session", str(path), f"a file that can be written ({self._why()})") from None
-        self._thread = threading.Thread(target=self._feed, name="session recorder", daemon=True)
+            raise InputError(
+                "--record-session", str(path), f"a file that can be written ({self._read_failure()})"
+            ) from None
+        self._thread = threading.Thread(target=self._run_feeder, name="session recorder", daemon=True)
         self._thread.start()
 
-    def note(self, make: Callable[[], Note]) -> None:
+    def record(self, build_entry: Callable[[], SessionEntry]) -> None:
         """Have a plan written; what is to be written is made in the recorder's own thread."""
-        if not self.recording:
+        if not self.is_recording:
             return
         try:
-            self._waiting.put_nowait(make)
+            self._queue.put_nowait(build_entry)
         except Full:
-            self._stop(f"the disk is too slow, {WAITING_MAX} plans wait")
+            self._stop(f"the disk is too slow, {QUEUE_MAX} plans wait")
 
     def close(self) -> None:
         """Write what waits, and end."""
         try:
-            self._waiting.put(None, timeout=1.0)
+            self._queue.put(None, timeout=1.0)
         except Full:
             return
-        self._thread.join(timeout=CLOSING_S)
+        self._thread.join(timeout=CLOSE_TIMEOUT_S)
 
-    def _feed(self) -> None:
+    def _run_feeder(self) -> None:
         try:
-            while (make := self._waiting.get()) is not None:
-                self._hand_over(pack(*make()))
+            while (make := self._queue.get()) is not None:
+                self._send(encode_entry(*make()))
         except OSError:
-            self._stop(self._why())
+            self._stop(self._read_failure())
         except Exception as error:  # a note that cannot be made must not end the recording in silence
             self._stop(repr(error))
         finally:
-            self._end_writer()
+            self._close_writer()
 
-    def _hand_over(self, packed: bytes) -> None:
+    def _send(self, packed: bytes) -> None:
         assert self._writer.stdin is not None  # noqa: S101 - as it was started
         assert self._writer.stdout is not None  # noqa: S101
         self._writer.stdin.write(packed)
         self._writer.stdin.flush()
-        if self._writer.stdout.read(1) != WRITTEN:
+        if self._writer.stdout.read(1) != ACKNOWLEDGEMENT:
             raise BrokenPipeError
 
-    def _why(self) -> str:
+    def _read_failure(self) -> str:
         """The writer's own line; it has ended, or is about to."""
         try:
-            _, told = self._writer.communicate(timeout=CLOSING_S)
+            _, message = self._writer.communicate(timeout=CLOSE_TIMEOUT_S)
         except (subprocess.TimeoutExpired, OSError, ValueError):
             self._writer.kill()
             return "its writer hangs"
-        return told.decode("utf-8", "replace").strip().rpartition("\n")[2] or f"status {self._writer.returncode}"
+        return message.decode("utf-8", "replace").strip().rpartition("\n")[2] or f"status {self._writer.returncode}"
 
-    def _end_writer(self) -> None:
+    def _close_writer(self) -> None:
         for pipe in (self._writer.stdin, self._writer.stdout, self._writer.stderr):
             if pipe is not None:
                 try:
@@ -122,11 +124,13 @@ class SessionRecorder:
                 except OSError:
                     continue  # what could not be written is what was told
         try:
-            self._writer.wait(timeout=CLOSING_S)
+            self._writer.wait(timeout=CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:
             self._writer.kill()
 
-    def _stop(self, why: str) -> None:
-        was_recording, self.recording = self.recording, False
+    def _stop(self, reason: str) -> None:
+        was_recording, self.is_recording = self.is_recording, False
         if was_recording:
-            self._say(f"recording to {self.path} stopped: {why}; what was written stays, and the display goes on")
+            self._on_failure(
+                f"recording to {self.path} stopped: {reason}; what was written stays, and the display goes on"
+            )

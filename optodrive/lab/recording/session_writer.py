@@ -13,70 +13,70 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from optodrive.lab.recording.hdf5 import h5py_module
-from optodrive.lab.recording.session_recorder import LENGTH, WRITTEN, Arrays
-from optodrive.lab.recording.storage import FORMAT, PULSES, TABLES, VERSION
+from optodrive.lab.recording.hdf5 import import_h5py
+from optodrive.lab.recording.session_recorder import ACKNOWLEDGEMENT, LENGTH_PREFIX, Arrays
+from optodrive.lab.recording.storage import FORMAT, PULSES, TABLE_COLUMNS, VERSION
 
 SESSION_VERSION = 1
-REST_S = 10.0
+COLD_AFTER_S = 10.0
 """A display that was dark for so long begins a new run: its absorbers are cold again, though its walls need minutes."""
-ROOM_BYTES = 1 << 18
+RESERVED_BYTES = 1 << 18
 """More than HDF5 takes for a plan beside its arrays."""
-NOTES = "executed pulses of a session of the driver; signals are merged in afterwards"
+INSTRUMENT_NOTES = "executed pulses of a session of the driver; signals are merged in afterwards"
 
 
-class SessionFile:
+class SessionRecordingFile:
     """A session's file, open only while it is written."""
 
-    def __init__(self, path: Path, about: dict[str, Any]) -> None:
+    def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
         """Begin it; OSError where it cannot be written."""
         self._path = path
-        self._about = about
-        self._run = 0
-        self._zero_s = self._end_s = 0.0
+        self._metadata = metadata
+        self._run_number = 0
+        self._run_start_s = self._end_s = 0.0
         path.touch(exist_ok=False)
-        take_room(path, ROOM_BYTES)
-        with h5py_module().File(path, "w") as file:
+        reserve_disk_space(path, RESERVED_BYTES)
+        with import_h5py().File(path, "w") as file:
             file.attrs["format"], file.attrs["version"] = FORMAT, VERSION
-            file.attrs["instrument_notes"] = NOTES
+            file.attrs["instrument_notes"] = INSTRUMENT_NOTES
             file.attrs["session_version"] = SESSION_VERSION
-            file.attrs["display"], file.attrs["optodrive"] = about["display"], about["optodrive"]
+            file.attrs["display"], file.attrs["optodrive"] = metadata["display"], metadata["optodrive"]
             file.create_group("runs")
-            file.create_group("plans").create_dataset("config", data=about["config"])
+            file.create_group("plans").create_dataset("config", data=metadata["config"])
 
-    def add(self, about: dict[str, Any], arrays: Arrays) -> None:
+    def add_plan(self, metadata: dict[str, Any], arrays: Arrays) -> None:
         """A plan; OSError where there is no room for it, and then the file is as before."""
-        take_room(self._path, 2 * sum(array.nbytes for array in arrays.values()) + ROOM_BYTES)
-        with h5py_module().File(self._path, "r+") as file:
+        reserve_disk_space(self._path, 2 * sum(array.nbytes for array in arrays.values()) + RESERVED_BYTES)
+        with import_h5py().File(self._path, "r+") as file:
             executed = arrays.get("executed")
             if executed is not None and len(executed):
-                self._choose_run(file, about, executed)
-                about["run"], about["run_zero_s"] = f"run{self._run}", self._zero_s
-            self._write_plan(file["plans"].create_group(about["plan"]), about, arrays)
+                self._append_to_run(file, metadata, executed)
+                metadata["run"], metadata["run_zero_s"] = f"run{self._run_number}", self._run_start_s
+            self._write_plan(file["plans"].create_group(metadata["plan"]), metadata, arrays)
 
-    def _choose_run(self, file: Any, about: dict[str, Any], executed: np.ndarray[Any, Any]) -> None:
+    def _append_to_run(self, file: Any, metadata: dict[str, Any], executed: np.ndarray[Any, Any]) -> None:
         """Append pulses to the last run, or to a new one after a rest, or where the board's clock was set anew."""
-        begin_s = float(executed[0, 0])
-        rested = begin_s - self._end_s >= REST_S or begin_s < self._zero_s
-        if self._run == 0 or rested:
-            self._run += 1
-            self._zero_s = begin_s
-            group = file["runs"].create_group(f"run{self._run}")
-            group.attrs["ambient_K"] = self._about["ambient_K"]
-            group.attrs["bridge_width_m"] = self._about["bridge_width_m"]
-            group.attrs["sample"] = self._about["display"]
-            group.attrs["started_at"], group.attrs["started_unix_s"] = about["lit_at"], about["lit_unix_s"]
-            columns = len(TABLES[PULSES])
+        first_s = float(executed[0, 0])
+        starts_run = first_s - self._end_s >= COLD_AFTER_S or first_s < self._run_start_s
+        if self._run_number == 0 or starts_run:
+            self._run_number += 1
+            self._run_start_s = first_s
+            group = file["runs"].create_group(f"run{self._run_number}")
+            group.attrs["ambient_K"] = self._metadata["ambient_K"]
+            group.attrs["bridge_width_m"] = self._metadata["bridge_width_m"]
+            group.attrs["sample"] = self._metadata["display"]
+            group.attrs["started_at"], group.attrs["started_unix_s"] = metadata["lit_at"], metadata["lit_unix_s"]
+            columns = len(TABLE_COLUMNS[PULSES])
             group.create_dataset(
                 PULSES, shape=(0, columns), maxshape=(None, columns), chunks=(256, columns), dtype="f8"
             )
-        pulses = file[f"runs/run{self._run}/{PULSES}"]
+        pulses = file[f"runs/run{self._run_number}/{PULSES}"]
         pulses.resize(len(pulses) + len(executed), axis=0)
-        pulses[-len(executed) :] = executed - np.array([self._zero_s, 0.0, 0.0, 0.0])
+        pulses[-len(executed) :] = executed - np.array([self._run_start_s, 0.0, 0.0, 0.0])
         self._end_s = float(executed[-1, 0] + executed[-1, 1])
 
-    def _write_plan(self, group: Any, about: dict[str, Any], arrays: Arrays) -> None:
-        for key, value in about.items():
+    def _write_plan(self, group: Any, metadata: dict[str, Any], arrays: Arrays) -> None:
+        for key, value in metadata.items():
             if key in ("summary", "trains"):  # longer than an attribute may be
                 group.create_dataset(key, data=value)
             elif value is not None:
@@ -85,7 +85,7 @@ class SessionFile:
             group.create_dataset(name, data=array, compression="gzip" if array.size > 1000 else None)
 
 
-def take_room(path: Path, size: int) -> None:
+def reserve_disk_space(path: Path, size: int) -> None:
     """Have the disk keep room beyond the file's end, which closing it gives back; OSError where there is none."""
     with path.open("r+b") as file:
         end = file.seek(0, os.SEEK_END)
@@ -96,35 +96,35 @@ def take_room(path: Path, size: int) -> None:
             raise
 
 
-def read_note(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
+def read_entry(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
     """The next note; None at the end, or where it ends in the middle of one."""
-    head = stream.read(LENGTH.size)
-    if len(head) < LENGTH.size:
+    head = stream.read(LENGTH_PREFIX.size)
+    if len(head) < LENGTH_PREFIX.size:
         return None
-    (length,) = LENGTH.unpack(head)
+    (length,) = LENGTH_PREFIX.unpack(head)
     body = stream.read(length)
     if len(body) < length:
         return None
     with np.load(io.BytesIO(body), allow_pickle=False) as arrays:
-        found = {name: arrays[name] for name in arrays.files}
-    about: dict[str, Any] = json.loads(found.pop("about_").tobytes())
-    return about, found
+        entry_arrays = {name: arrays[name] for name in arrays.files}
+    metadata: dict[str, Any] = json.loads(entry_arrays.pop("about_").tobytes())
+    return metadata, entry_arrays
 
 
 def main() -> int:
     """Write notes until there are none."""
     for number in (signal.SIGXFSZ, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends when its pipe does, with what the daemon had to say at the end
-    first = read_note(sys.stdin.buffer)
+    first = read_entry(sys.stdin.buffer)
     if first is None:
         return 0
     try:
-        file = SessionFile(Path(sys.argv[1]), first[0])
-        sys.stdout.buffer.write(WRITTEN)
+        file = SessionRecordingFile(Path(sys.argv[1]), first[0])
+        sys.stdout.buffer.write(ACKNOWLEDGEMENT)
         sys.stdout.buffer.flush()
-        while (note := read_note(sys.stdin.buffer)) is not None:
-            file.add(*note)
-            sys.stdout.buffer.write(WRITTEN)
+        while (note := read_entry(sys.stdin.buffer)) is not None:
+            file.add_plan(*note)
+            sys.stdout.buffer.write(ACKNOWLEDGEMENT)
             sys.stdout.buffer.flush()
     except BrokenPipeError:
         return 0  # whoever fed it is gone: what came is written

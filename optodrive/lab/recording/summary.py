@@ -8,32 +8,32 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 
 
-def summary(measurement: Measurement) -> list[dict[str, Any]]:
+def build_summary(measurement: Measurement) -> list[dict[str, Any]]:
     """Figures of each run, SI units, fit for JSON."""
-    return [_of_run(run) for run in measurement.runs]
+    return [_summarize_run(run) for run in measurement.runs]
 
 
-def _of_run(run: Run) -> dict[str, Any]:
+def _summarize_run(run: Run) -> dict[str, Any]:
     group = run.attributes.get("group")
     return {
         "run": run.name,
         "group": None if group is None else str(group),
         "ambient_K": run.ambient_k,
-        "attributes": {key: _finite(value) for key, value in run.attributes.items()},
+        "attributes": {key: _finite_or_none(value) for key, value in run.attributes.items()},
         "pulses": len(run.pulses),
         "lit": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
-        "energy_J": _finite(_energy_j(run.pulses)),
+        "energy_J": _finite_or_none(_compute_energy_j(run.pulses)),
         "commands": None if run.commands is None else len(run.commands),
-        "signals": {name: _of_signal(signal) for name, signal in run.signals.items()},
+        "signals": {name: _summarize_signal(signal) for name, signal in run.signals.items()},
     }
 
 
-def _energy_j(pulses: FloatArray) -> float:
+def _compute_energy_j(pulses: FloatArray) -> float:
     with np.errstate(over="ignore"):
         return float(np.sum(pulses[:, 1] * pulses[:, 2]))
 
 
-def _of_signal(signal: Signal) -> dict[str, Any]:
+def _summarize_signal(signal: Signal) -> dict[str, Any]:
     measured = signal.value[np.isfinite(signal.value)]
     return {
         "pixel": signal.pixel,
@@ -47,6 +47,6 @@ def _of_signal(signal: Signal) -> dict[str, Any]:
     }
 
 
-def _finite(value: str | float) -> str | float | None:
+def _finite_or_none(value: str | float) -> str | float | None:
     # JSON has no word for NaN and infinity.
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -6,23 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.errors import InputError, nearest
-from optodrive.core.files import written_whole
+from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.files import atomic_write
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import csv_folder, hdf5
 from optodrive.lab.recording.reader import read_with_notes
 from optodrive.lab.recording.storage import (
     COMMANDS,
-    MEMBERS,
     PULSES,
+    RUN_MEMBERS,
     SIGNALS,
-    TABLES,
+    TABLE_COLUMNS,
     check_run_name,
+    convert_errors,
+    format_name,
     is_hdf5,
-    plain,
-    plain_attributes,
-    refusing,
-    shown,
+    normalize_attribute,
+    normalize_attributes,
 )
 
 
@@ -32,15 +32,15 @@ def write_recording(path: Path, measurement: Measurement, instrument_notes: str 
     InputError where it cannot be written, or holds names, attributes or shapes that not both forms can carry.
     """
     path = Path(path)
-    runs = _fit(str(path), measurement)
+    runs = _normalize_runs(str(path), measurement)
     _check_attribute(str(path), "instrument_notes", instrument_notes)
     if is_hdf5(path):
-        hdf5.h5py_module()
-        with written_whole(path) as file, refusing(str(path), "a file that can be written"):
-            hdf5.fill(file, runs, instrument_notes)
+        hdf5.import_h5py()
+        with atomic_write(path) as file, convert_errors(str(path), "a file that can be written"):
+            hdf5.write_file(file, runs, instrument_notes)
     else:
-        with csv_folder.folder_whole(path) as folder, refusing(str(path), "a folder that can be written"):
-            csv_folder.fill(folder, runs, instrument_notes)
+        with csv_folder.atomic_folder(path) as folder, convert_errors(str(path), "a folder that can be written"):
+            csv_folder.write_folder(folder, runs, instrument_notes)
 
 
 def convert_recording(source: Path, target: Path) -> Measurement:
@@ -50,32 +50,34 @@ def convert_recording(source: Path, target: Path) -> Measurement:
     return measurement
 
 
-def _fit(where: str, measurement: Measurement) -> tuple[Run, ...]:
+def _normalize_runs(where: str, measurement: Measurement) -> tuple[Run, ...]:
     """The runs, numbers and text as plain as the forms carry them."""
     names = [run.name for run in measurement.runs]
     if not names or len(set(names)) < len(names):
         raise InputError(f"{where}: /runs", names, "at least one run, and no name twice")
     for name in names:
         check_run_name(f"{where}: /runs", name)
-    return tuple(_fit_run(f"{where}: /runs/{run.name}", run) for run in measurement.runs)
+    return tuple(_normalize_run(f"{where}: /runs/{run.name}", run) for run in measurement.runs)
 
 
-def _fit_run(where: str, run: Run) -> Run:
+def _normalize_run(where: str, run: Run) -> Run:
     for key, value in run.attributes.items():
         _check_attribute(where, key, value)
-    _check_shape(f"{where}/{PULSES}", run.pulses, len(TABLES[PULSES]))
+    _check_shape(f"{where}/{PULSES}", run.pulses, len(TABLE_COLUMNS[PULSES]))
     if run.commands is not None:
-        _check_shape(f"{where}/{COMMANDS}", run.commands, len(TABLES[COMMANDS]))
+        _check_shape(f"{where}/{COMMANDS}", run.commands, len(TABLE_COLUMNS[COMMANDS]))
     for name in run.signals:
         if name not in SIGNALS:
-            raise InputError(f"{where}/{shown(name)}", name, f"a known signal, {nearest(name, list(SIGNALS))}")
+            raise InputError(
+                f"{where}/{format_name(name)}", name, f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
+            )
     # Numbers of numpy print otherwise than Python's own.
-    attributes = plain_attributes(run.attributes)
-    signals = {name: _fit_signal(f"{where}/{name}", signal) for name, signal in run.signals.items()}
+    attributes = normalize_attributes(run.attributes)
+    signals = {name: _normalize_signal(f"{where}/{name}", signal) for name, signal in run.signals.items()}
     return replace(run, ambient_k=float(run.ambient_k), attributes=attributes, signals=signals)
 
 
-def _fit_signal(where: str, signal: Signal) -> Signal:
+def _normalize_signal(where: str, signal: Signal) -> Signal:
     if signal.t_s.ndim != 1 or signal.value.shape != signal.t_s.shape:
         raise InputError(f"{where}/value", signal.value.shape, f"as many values as times, {signal.t_s.shape}")
     return replace(signal, pixel=int(signal.pixel), sigma=None if signal.sigma is None else float(signal.sigma))
@@ -87,8 +89,8 @@ def _check_shape(where: str, table: np.ndarray[Any, Any], columns: int) -> None:
 
 
 def _check_attribute(where: str, key: str, value: object) -> None:
-    if not key or not key.isprintable() or key in MEMBERS or key == "ambient_K":
+    if not key or not key.isprintable() or key in RUN_MEMBERS or key == "ambient_K":
         raise InputError(where, key, "an attribute's name: printable, and not the name of a part of a run")
-    converted = plain(value)
+    converted = normalize_attribute(value)
     if converted is None or (isinstance(value, str) and converted != value):
         raise InputError(f"{where}: {key}", value, "text without NUL, or a number of 64 bits")

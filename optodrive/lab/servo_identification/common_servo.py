@@ -7,7 +7,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
-from optodrive.device.gate_timing import settled_s
+from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import Identified
 
@@ -77,7 +77,7 @@ def _late_enough(
 
 
 def _times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> FloatArray:
-    return np.array([settled_s(servo, step, tolerance) for step, tolerance, _ in moves])
+    return np.array([settling_s(servo, step, tolerance) for step, tolerance, _ in moves])
 
 
 def _later(

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.device.gate_timing import settled_s
+from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.step_response import angles_rad
 from optodrive.lab.servo_identification.step_trace import AXES, Piece, Trace
@@ -75,8 +75,8 @@ class Identified:
 
     def settled_s(self, step_rad: float, tolerance_rad: float) -> tuple[float, float, float]:
         """Settle time, as the gate counts it, and its 95 % interval, s."""
-        times_s = [settled_s(servo, step_rad, tolerance_rad) for servo in self.drawn()]
-        best_s = settled_s(self.servo, step_rad, tolerance_rad)
+        times_s = [settling_s(servo, step_rad, tolerance_rad) for servo in self.drawn()]
+        best_s = settling_s(self.servo, step_rad, tolerance_rad)
         low, high = np.quantile(times_s, [0.5 - SURE / 2, 0.5 + SURE / 2]).tolist()
         return best_s, min(low, best_s), max(high, best_s)
 

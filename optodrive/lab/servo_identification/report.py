@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.device.config import MIRRORS_FORMAT, MIRRORS_VERSION, Config
-from optodrive.device.gate_timing import servo_of, settled_s
+from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.common_servo import Common
 from optodrive.lab.servo_identification.identify import Identified
@@ -77,7 +77,7 @@ def write_mirrors(path: Path, told: dict[str, Any], source: str) -> None:
     text += ["", "[galvo] # what the quicker mirror leaves of the galvo cap", *_pairs(told["galvo"])]
     for name, axis in told["axes"].items():
         text += ["", f"[axes.{name}] # as measured, for people", *_pairs(axis)]
-    with written_whole(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
 
 
@@ -120,7 +120,7 @@ def _sizes_rad(steps_rad: "np.ndarray[Any, np.dtype[np.float64]]") -> list[float
 
 
 def _settle(mirror: Identified, step_rad: float, config: Config) -> dict[str, Any]:
-    stated = servo_of(config.scanner)
+    stated = build_servo(config.scanner)
     row: dict[str, Any] = {"step_rad": step_rad}
     for name, tolerance_rad in (("gate", config.tolerance_rad[mirror.trace.axis]), ("share", SHARE * step_rad)):
         best_s, low_s, high_s = mirror.settled_s(step_rad, tolerance_rad)
@@ -128,7 +128,7 @@ def _settle(mirror: Identified, step_rad: float, config: Config) -> dict[str, An
             "tolerance_rad": tolerance_rad,
             "measured_s": best_s,
             "interval_s": [low_s, high_s],
-            "configured_s": settled_s(stated, step_rad, tolerance_rad),
+            "configured_s": settling_s(stated, step_rad, tolerance_rad),
         }
     return row
 

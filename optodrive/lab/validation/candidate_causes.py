@@ -7,7 +7,7 @@ import numpy as np
 
 
 @dataclass(frozen=True)
-class Cause:
+class CauseHypothesis:
     """One hypothesis.
 
     words: what is wrong; symbol, unit, low, high: the number that is freed, and its plausible range, all alike likely
@@ -17,39 +17,43 @@ class Cause:
     """
 
     key: str
-    words: str
+    description: str
     symbol: str
     unit: str
     low: float
     high: float
     source: str
-    settle: str
-    without: tuple[str, ...] = ()
-    instead: bool = False
+    deciding_measurement: str
+    excludes: tuple[str, ...] = ()
+    replaces_law: bool = False
 
     @property
     def logarithmic(self) -> bool:
         """Whether the number is fitted by its logarithm."""
         return self.low > 0.0
 
-    def value(self, share: float) -> float:
+    def compute_value(self, fraction: float) -> float:
         """The number at a share of its range, 0 to 1."""
         if self.logarithmic:
-            return exp(log(self.low) + share * log(self.high / self.low))
-        return self.low + share * (self.high - self.low)
+            return exp(log(self.low) + fraction * log(self.high / self.low))
+        return self.low + fraction * (self.high - self.low)
 
-    def share(self, value: float) -> float:
+    def compute_fraction(self, value: float) -> float:
         """Where in its range a number is, 0 to 1."""
         if self.logarithmic:
             return float(np.clip(log(max(value, 1e-300) / self.low) / log(self.high / self.low), 0.0, 1.0))
         return float(np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0))
 
 
-GAS, LIFT, PUSH = ("gas_membrane", "gas_share"), ("membrane_plate", "gas_membrane"), ("force_area", "load_cell_gives")
-THERMAL = "the absorber's temperature through a pulse and the cooling after it, at three powers"
+GAS_CAUSES, LIFT_CAUSES, FORCE_CAUSES = (
+    ("gas_membrane", "gas_share"),
+    ("membrane_plate", "gas_membrane"),
+    ("force_area", "load_cell_gives"),
+)
+THERMAL_MEASUREMENT = "the absorber's temperature through a pulse and the cooling after it, at three powers"
 
-CATALOGUE = (
-    Cause(
+CAUSES = (
+    CauseHypothesis(
         "gas_lag",
         "the gas follows the absorber in another time than R_air C_air / 2",
         "tau_g",
@@ -59,7 +63,7 @@ CATALOGUE = (
         "conduction over half the cavity, 1.2 ms, to Text S1's 64 ms and sluggish corners",
         "displacement at 10 kHz through the first 10 ms of a pulse",
     ),
-    Cause(
+    CauseHypothesis(
         "gas_share",
         "the gas settles at another share of the absorber's rise than half",
         "share",
@@ -68,9 +72,9 @@ CATALOGUE = (
         0.5,
         "half at most, conduction both ways",
         "pressure in a closed cavity, beside displacement",
-        GAS,
+        GAS_CAUSES,
     ),
-    Cause(
+    CauseHypothesis(
         "membrane_plate",
         "the constant of the membrane's plate formula is another than 3/1280",
         "kappa_factor",
@@ -79,9 +83,9 @@ CATALOGUE = (
         80.0,
         "3/16 of a clamped plate is 80 times as much; room for the gas takes some of it back",
         "displacement against a known static pressure, to 1 mm",
-        LIFT,
+        LIFT_CAUSES,
     ),
-    Cause(
+    CauseHypothesis(
         "gas_membrane",
         "the membrane stretches and the gas makes room under it: no plate, no constant volume",
         "share",
@@ -90,10 +94,10 @@ CATALOGUE = (
         0.5,
         "half at most, conduction both ways; E, ν, h, r, V are the paper's",
         "displacement against a known static pressure, to 1 mm",
-        (*LIFT, *GAS),
-        instead=True,
+        (*LIFT_CAUSES, *GAS_CAUSES),
+        replaces_law=True,
     ),
-    Cause(
+    CauseHypothesis(
         "force_area",
         "the blocked force was felt on less than the whole aperture",
         "area",
@@ -102,9 +106,9 @@ CATALOGUE = (
         7.07e-6,
         "at most the aperture",
         "blocked force with probes of two areas, and the pressure in the cavity beside it",
-        PUSH,
+        FORCE_CAUSES,
     ),
-    Cause(
+    CauseHypothesis(
         "load_cell_gives",
         "the blocked membrane gave way: the gas made room against the load cell",
         "compliance",
@@ -113,9 +117,9 @@ CATALOGUE = (
         1e-11,
         "volume a pascal: 0.08 µL to several cavities at 8 kPa",
         "blocked force with probes of two areas, and the pressure in the cavity beside it",
-        PUSH,
+        FORCE_CAUSES,
     ),
-    Cause(
+    CauseHypothesis(
         "absorber_resistance",
         "the bridges' resistances are all off by one factor",
         "r_factor",
@@ -123,9 +127,9 @@ CATALOGUE = (
         0.7,
         1.4,
         "R fitted on 30 ms of a rise that takes longer",
-        THERMAL,
+        THERMAL_MEASUREMENT,
     ),
-    Cause(
+    CauseHypothesis(
         "absorber_capacity",
         "the absorbers' heat capacities are all off by one factor",
         "c_factor",
@@ -133,9 +137,9 @@ CATALOGUE = (
         0.7,
         1.4,
         "the gas's share of 10 %, and C scattered by 16 %",
-        THERMAL,
+        THERMAL_MEASUREMENT,
     ),
-    Cause(
+    CauseHypothesis(
         "absorbed_power",
         "the absorbed power is off by one factor",
         "power_factor",
@@ -143,9 +147,9 @@ CATALOGUE = (
         0.8,
         1.2,
         "2.45 W or 2.5, absorption by two routes",
-        THERMAL,
+        THERMAL_MEASUREMENT,
     ),
-    Cause(
+    CauseHypothesis(
         "bridge_conductivity",
         "the bridges conduct worse when hot",
         "exponent",
@@ -153,9 +157,9 @@ CATALOGUE = (
         0.0,
         1.3,
         "k ~ 1/T is 1 (Text S2)",
-        THERMAL,
+        THERMAL_MEASUREMENT,
     ),
-    Cause(
+    CauseHypothesis(
         "radiation",
         "the hot absorber radiates",
         "emitting_area",
@@ -163,9 +167,9 @@ CATALOGUE = (
         0.0,
         2e-5,
         "both faces of absorber and bridges",
-        THERMAL,
+        THERMAL_MEASUREMENT,
     ),
-    Cause(
+    CauseHypothesis(
         "wall_heating",
         "the wall at the bridges' far end warms",
         "resistance",
@@ -175,7 +179,7 @@ CATALOGUE = (
         "a cell of the laminate to its surroundings, 1.2 s with its capacity",
         "displacement through a train of seconds",
     ),
-    Cause(
+    CauseHypothesis(
         "laser_late",
         "the light comes later than the pulse, in every pulse",
         "delay",
@@ -185,7 +189,7 @@ CATALOGUE = (
         "driver and diode, 0.02 to 3 ms, but at 200 Hz there was some; a ramp misses as much energy as a delay",
         "a photodiode beside the sample",
     ),
-    Cause(
+    CauseHypothesis(
         "dead_time",
         "a pixel rate counts a time without light beside each pulse: the mirrors' move and settling",
         "dead_time",
@@ -195,7 +199,7 @@ CATALOGUE = (
         "small steps of cheap mirrors 0.3 ms, long ones some ms; the paper speaks of pulse times alone",
         "pixel rates at two distances between pixels, with the mirrors' positions",
     ),
-    Cause(
+    CauseHypothesis(
         "rate_pixel",
         "the pixel rates are those of a pixel of another bridge width than 0.55 mm",
         "width",
@@ -205,7 +209,7 @@ CATALOGUE = (
         "the widths of Table S3",
         "displacement against pulse width on the pixel of Fig. 3F",
     ),
-    Cause(
+    CauseHypothesis(
         "rate_power",
         "the pixel rates were taken with less than full power",
         "power_factor",
@@ -219,6 +223,6 @@ CATALOGUE = (
 """Every cause that can be named."""
 
 
-def catalogue() -> dict[str, Cause]:
+def index_causes() -> dict[str, CauseHypothesis]:
     """By key."""
-    return {cause.key: cause for cause in CATALOGUE}
+    return {cause.key: cause for cause in CAUSES}

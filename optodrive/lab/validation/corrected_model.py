@@ -9,170 +9,177 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.validation.extended_outcomes import AMBIENT_K
-from optodrive.lab.validation.measured_facts import HEIGHTS_M, Datum
-from optodrive.lab.validation.paper_outcomes import LONG_S
-from optodrive.lab.validation.stimulus_heat import Pulse, Terms, Train, frozen, pulse_rises_k, train_gas_k
-from optodrive.physics.paper_facts import paper_facts
+from optodrive.lab.validation.measured_facts import RATE_HEIGHTS_M, Datum
+from optodrive.lab.validation.paper_outcomes import LONG_PULSE_S
+from optodrive.lab.validation.stimulus_heat import (
+    FrozenTerms,
+    PulseStimulus,
+    TrainStimulus,
+    freeze_terms,
+    pulse_rises_k,
+    train_gas_k,
+)
+from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel
-from optodrive.physics.term import View
+from optodrive.physics.term import StateView
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
 from optodrive.physics.terms.gas_membrane import TERM as MEMBRANE
 
-Numbers = Mapping[str, float]
+CauseValues = Mapping[str, float]
 """Causes at work and the number of each."""
 
-WALL_S = 1.2
+WALL_TAU_S = 1.2
 """Relaxation time of the wall: the estimate of the shipped surroundings."""
-QUICK_S = 2.5e-3
+HALF_PERIOD_S = 2.5e-3
 """Half a period of 200 Hz."""
-SHORTEST_S = 1e-5
-LONGEST_S = 1.0
+MIN_PULSE_S = 1e-5
+MAX_PULSE_S = 1.0
 """Pulses looked for that reach a height."""
-PULSES = {
-    "dT_peak_w020": (0.20e-3, LONG_S),
-    "T_peak_w075": (0.75e-3, LONG_S),
-    "z_peak_w020": (0.20e-3, LONG_S),
-    "z_peak_w075": (0.75e-3, LONG_S),
+PULSE_FACTS = {
+    "dT_peak_w020": (0.20e-3, LONG_PULSE_S),
+    "T_peak_w075": (0.75e-3, LONG_PULSE_S),
+    "z_peak_w020": (0.20e-3, LONG_PULSE_S),
+    "z_peak_w075": (0.75e-3, LONG_PULSE_S),
     "z_tp8_w040": (0.40e-3, 8e-3),
-    "F_peak_w020": (0.20e-3, LONG_S),
-    "F_peak_w055": (0.55e-3, LONG_S),
+    "F_peak_w020": (0.20e-3, LONG_PULSE_S),
+    "F_peak_w055": (0.55e-3, LONG_PULSE_S),
 }
 """Bridge and pulse of the facts that are read from one pulse."""
 
 
-GAS_K = np.linspace(0.0, 1500.0, 6001)
+GAS_GRID_K = np.linspace(0.0, 1500.0, 6001)
 """Rises of the gas between which the membrane's height is interpolated."""
 
 
 @cache
-def _membrane_m() -> FloatArray:
+def _membrane_table_m() -> FloatArray:
     """Height of the stretched membrane at GAS_K; only share × rise matters, so one table serves every share."""
-    values = {"share": GAS_FRACTION, "volume": paper_facts()["V_pixel"].value}
-    return MEMBRANE.displacement_m(values, View({"gas_k": GAS_K}, AMBIENT_K, None), GAS_K)
+    values = {"share": GAS_FRACTION, "volume": load_paper_facts()["V_pixel"].value}
+    return MEMBRANE.displacement_m(values, StateView({"gas_k": GAS_GRID_K}, AMBIENT_K, None), GAS_GRID_K)
 
 
 @dataclass(frozen=True)
-class Extended:
+class CorrectedModel:
     """A parameter set with causes at work."""
 
     base: ParameterSet
-    numbers: Numbers
+    values: CauseValues
 
-    def misses(self, data: Sequence[Datum]) -> FloatArray:
+    def compute_log_errors(self, data: Sequence[Datum]) -> FloatArray:
         """Logarithm of model over measured; of rates, of the height in the time that they leave a pixel."""
-        return np.array([self._miss(datum) for datum in data])
+        return np.array([self._compute_log_error(datum) for datum in data])
 
-    def outcome(self, name: str) -> float:
+    def compute_outcome(self, name: str) -> float:
         """A fact, SI, temperatures as rises; of a height that is out of reach, the rate of the longest pulse."""
-        if name in HEIGHTS_M:
-            return self._rate_per_s(HEIGHTS_M[name])
-        if name in PULSES:
-            return self._pulse(name)
-        return self._train(name)
+        if name in RATE_HEIGHTS_M:
+            return self._rate_per_s(RATE_HEIGHTS_M[name])
+        if name in PULSE_FACTS:
+            return self._compute_pulse_fact(name)
+        return self._compute_train_fact(name)
 
-    def _miss(self, datum: Datum) -> float:
-        if datum.id in HEIGHTS_M:
+    def _compute_log_error(self, datum: Datum) -> float:
+        if datum.id in RATE_HEIGHTS_M:
             height_m = self._rate_height_m(1.0 / datum.value)
-            return log(height_m / HEIGHTS_M[datum.id])
-        return log(self.outcome(datum.id) / datum.value)
+            return log(height_m / RATE_HEIGHTS_M[datum.id])
+        return log(self.compute_outcome(datum.id) / datum.value)
 
-    def _pixel(self, width_m: float, row: bool = True) -> Pixel:
+    def _build_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
         """As the literal set has it, scaled; row: R and C of Table S3, else the smooth law between its rows."""
-        base, numbers = self.base, self.numbers
-        pixel = base.pixel(width_m)
-        if not row:
+        base, values = self.base, self.values
+        pixel = base.build_pixel(width_m)
+        if not from_table:
             pixel = pixel._replace(r_k_per_w=base.R_width_product.value / width_m, c_j_per_k=base.C_mean.value)
         return pixel._replace(
-            r_k_per_w=pixel.r_k_per_w * numbers.get("absorber_resistance", 1.0),
-            c_j_per_k=pixel.c_j_per_k * numbers.get("absorber_capacity", 1.0),
-            epsilon=pixel.epsilon * numbers.get("absorbed_power", 1.0),
-            tau_g_s=numbers.get("gas_lag", pixel.tau_g_s),
+            r_k_per_w=pixel.r_k_per_w * values.get("absorber_resistance", 1.0),
+            c_j_per_k=pixel.c_j_per_k * values.get("absorber_capacity", 1.0),
+            epsilon=pixel.epsilon * values.get("absorbed_power", 1.0),
+            tau_g_s=values.get("gas_lag", pixel.tau_g_s),
         )
 
     @cached_property
-    def _terms(self) -> Terms:
-        numbers = self.numbers
+    def _terms(self) -> FrozenTerms:
+        values = self.values
         out: dict[str, dict[str, float]] = {}
-        if numbers.get("bridge_conductivity", 0.0) > 0.0:
-            out["bridge_conductivity"] = {"exponent": numbers["bridge_conductivity"]}
-        if numbers.get("radiation", 0.0) > 0.0:
-            out["radiation"] = {"emitting_area": numbers["radiation"]}
-        if numbers.get("wall_heating", 0.0) > 0.0:
-            resistance = numbers["wall_heating"]
-            out["wall_heating"] = {"resistance": resistance, "capacity": WALL_S / resistance}
-        return frozen(out)
+        if values.get("bridge_conductivity", 0.0) > 0.0:
+            out["bridge_conductivity"] = {"exponent": values["bridge_conductivity"]}
+        if values.get("radiation", 0.0) > 0.0:
+            out["radiation"] = {"emitting_area": values["radiation"]}
+        if values.get("wall_heating", 0.0) > 0.0:
+            resistance = values["wall_heating"]
+            out["wall_heating"] = {"resistance": resistance, "capacity": WALL_TAU_S / resistance}
+        return freeze_terms(out)
 
-    def _lit_s(self, pulse_s: float) -> float:
+    def _on_time_s(self, pulse_s: float) -> float:
         """How long there is light in a pulse."""
-        return max(pulse_s - self.numbers.get("laser_late", 0.0), SHORTEST_S)
+        return max(pulse_s - self.values.get("laser_late", 0.0), MIN_PULSE_S)
 
     def _train_gas_k(self, pulse_s: float) -> FloatArray:
         """A steady train's, as long lit as dark, over a period."""
-        lit_s = self._lit_s(pulse_s)
-        return train_gas_k(Train(self._pixel(0.55e-3), lit_s, 2.0 * pulse_s - lit_s), self._terms)
+        on_s = self._on_time_s(pulse_s)
+        return train_gas_k(TrainStimulus(self._build_pixel(0.55e-3), on_s, 2.0 * pulse_s - on_s), self._terms)
 
     def _pulse_rises_k(self, pixel: Pixel, pulse_s: float) -> tuple[float, float]:
         """Absorber's and gas's largest."""
-        return pulse_rises_k(Pulse(pixel, self._lit_s(pulse_s)), self._terms)
+        return pulse_rises_k(PulseStimulus(pixel, self._on_time_s(pulse_s)), self._terms)
 
-    def _lifted_m(self, gas_k: FloatArray) -> FloatArray:
+    def _displacement_m(self, gas_k: FloatArray) -> FloatArray:
         """Displacement of a gas that settles at half the absorber's rise."""
-        numbers = self.numbers
-        if "gas_membrane" in numbers:
-            return np.interp(numbers["gas_membrane"] / GAS_FRACTION * gas_k, GAS_K, _membrane_m())
-        kappa = self.base.kappa.value * numbers.get("membrane_plate", 1.0)
-        return kappa * self._share / GAS_FRACTION * gas_k
+        values = self.values
+        if "gas_membrane" in values:
+            return np.interp(values["gas_membrane"] / GAS_FRACTION * gas_k, GAS_GRID_K, _membrane_table_m())
+        kappa = self.base.kappa.value * values.get("membrane_plate", 1.0)
+        return kappa * self._gas_share / GAS_FRACTION * gas_k
 
     @property
-    def _share(self) -> float:
-        return self.numbers.get("gas_share", self.numbers.get("gas_membrane", GAS_FRACTION))
+    def _gas_share(self) -> float:
+        return self.values.get("gas_share", self.values.get("gas_membrane", GAS_FRACTION))
 
-    def _pushed_n(self, gas_k: float) -> float:
+    def _force_n(self, gas_k: float) -> float:
         """Blocked force of a gas that settles at half the absorber's rise."""
-        aperture_m2 = pi * paper_facts()["cavity_r"].value ** 2
-        whole_n: float = self.base.phi.value * self._share / GAS_FRACTION * gas_k
-        if "force_area" in self.numbers:
-            return whole_n * self.numbers["force_area"] / aperture_m2
-        if "load_cell_gives" in self.numbers:
+        aperture_m2 = pi * load_paper_facts()["cavity_r"].value ** 2
+        full_n: float = self.base.phi.value * self._gas_share / GAS_FRACTION * gas_k
+        if "force_area" in self.values:
+            return full_n * self.values["force_area"] / aperture_m2
+        if "load_cell_gives" in self.values:
             # (1 + p)(1 + q p) = 1 + x: p the pressure in atmospheres, x at constant volume, q the room it makes
-            q = self.numbers["load_cell_gives"] * ATMOSPHERE_PA / paper_facts()["V_pixel"].value
-            x = whole_n / (aperture_m2 * ATMOSPHERE_PA)
+            q = self.values["load_cell_gives"] * ATMOSPHERE_PA / load_paper_facts()["V_pixel"].value
+            x = full_n / (aperture_m2 * ATMOSPHERE_PA)
             root = sqrt((1.0 + q) ** 2 + 4.0 * q * x)
             return 2.0 * x / (1.0 + q + root) * aperture_m2 * ATMOSPHERE_PA
-        return whole_n
+        return full_n
 
-    def _pulse(self, name: str) -> float:
-        width_m, pulse_s = PULSES[name]
-        absorber_k, gas_k = self._pulse_rises_k(self._pixel(width_m), pulse_s)
+    def _compute_pulse_fact(self, name: str) -> float:
+        width_m, pulse_s = PULSE_FACTS[name]
+        absorber_k, gas_k = self._pulse_rises_k(self._build_pixel(width_m), pulse_s)
         if name.startswith("F_"):
-            return self._pushed_n(gas_k)
-        return float(self._lifted_m(np.array([gas_k]))[0]) if name.startswith("z_") else absorber_k
+            return self._force_n(gas_k)
+        return float(self._displacement_m(np.array([gas_k]))[0]) if name.startswith("z_") else absorber_k
 
     def _rate_height_m(self, time_s: float) -> float:
         """Height that a pixel reaches in the time that a rate leaves it."""
-        other = "rate_pixel" in self.numbers
-        pixel = self._pixel(self.numbers.get("rate_pixel", 0.55e-3), row=not other)
-        pixel = pixel._replace(epsilon=pixel.epsilon * self.numbers.get("rate_power", 1.0))
-        pulse_s = max(time_s - self.numbers.get("dead_time", 0.0), SHORTEST_S)
-        return float(self._lifted_m(np.array([self._pulse_rises_k(pixel, pulse_s)[1]]))[0])
+        other = "rate_pixel" in self.values
+        pixel = self._build_pixel(self.values.get("rate_pixel", 0.55e-3), from_table=not other)
+        pixel = pixel._replace(epsilon=pixel.epsilon * self.values.get("rate_power", 1.0))
+        pulse_s = max(time_s - self.values.get("dead_time", 0.0), MIN_PULSE_S)
+        return float(self._displacement_m(np.array([self._pulse_rises_k(pixel, pulse_s)[1]]))[0])
 
     def _rate_per_s(self, height_m: float) -> float:
-        low, high = log(SHORTEST_S), log(LONGEST_S)
+        low, high = log(MIN_PULSE_S), log(MAX_PULSE_S)
         while high - low > 1e-4:
             middle = 0.5 * (low + high)
             reached = self._rate_height_m(float(np.exp(middle))) >= height_m
             low, high = (low, middle) if reached else (middle, high)
         return float(np.exp(-high))
 
-    def _train(self, name: str) -> float:
-        pixel = self._pixel(0.55e-3)
+    def _compute_train_fact(self, name: str) -> float:
+        pixel = self._build_pixel(0.55e-3)
         if name == "dpp_200Hz":
-            return float(np.ptp(self._lifted_m(self._train_gas_k(QUICK_S))))
+            return float(np.ptp(self._displacement_m(self._train_gas_k(HALF_PERIOD_S))))
         # Fig. 3D's laws at t_p = t_g = τ, the τ of Table S3 whatever the causes: it is a setting of the drive.
-        tau_s = self.base.pixel(0.55e-3).tau_s
+        tau_s = self.base.build_pixel(0.55e-3).tau_s
         first_k = self._pulse_rises_k(pixel, tau_s)[1]
-        heights_m = self._lifted_m(np.append(self._train_gas_k(tau_s), first_k))
+        heights_m = self._displacement_m(np.append(self._train_gas_k(tau_s), first_k))
         steady_m, first_m = heights_m[:-1], heights_m[-1]
-        told = np.ptp(steady_m) if name == "dpp_law" else 0.5 * (steady_m[1:] + steady_m[:-1]).mean()
-        return float(told / first_m)
+        numerator_m = np.ptp(steady_m) if name == "dpp_law" else 0.5 * (steady_m[1:] + steady_m[:-1]).mean()
+        return float(numerator_m / first_m)

@@ -11,19 +11,19 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.units import ZERO_CELSIUS_K
-from optodrive.lab.validation.paper_outcomes import FULL_W, GAS_J_PER_K, LONG_S
+from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, GAS_J_PER_K, LONG_PULSE_S
 from optodrive.physics.numpy_model import Drive, Model
-from optodrive.physics.paper_facts import AMBIENT_C, paper_facts
+from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
 
 AMBIENT_K = AMBIENT_C + ZERO_CELSIUS_K
 SAMPLE_S = 1e-4
-LADDER_S = np.geomspace(1.5e-3, 80e-3, 48)
+WIDTH_LADDER_S = np.geomspace(1.5e-3, 80e-3, 48)
 """Pulse widths between which the one that reaches a height is looked for."""
-PERIODS = 24
+STEADY_PERIODS = 24
 """Periods after which a train counts as steady."""
 
 
@@ -33,28 +33,28 @@ class _Stimulus:
 
     width_mm: float
     on_s: float
-    power_w: float = FULL_W
+    power_w: float = FULL_POWER_W
     off_s: float = 0.0
-    times: int = 1
+    repeats: int = 1
 
     def power_at_w(self, time_s: float) -> float:
         """Incident power just after a time."""
         period_s = self.on_s + self.off_s
         count = int((time_s + 1e-9) / period_s)
-        return self.power_w if count < self.times and time_s + 1e-9 - count * period_s < self.on_s else 0.0
+        return self.power_w if count < self.repeats and time_s + 1e-9 - count * period_s < self.on_s else 0.0
 
     def pulses(self) -> FloatArray:
         """[n, 4] start_s, width_s, power_w, pixel 0."""
         period_s = self.on_s + self.off_s
-        return np.array([[k * period_s, self.on_s, self.power_w, 0.0] for k in range(self.times)])
+        return np.array([[k * period_s, self.on_s, self.power_w, 0.0] for k in range(self.repeats)])
 
     def edges_s(self) -> list[float]:
         """When the light changes."""
         period_s = self.on_s + self.off_s
-        return [k * period_s + edge_s for k in range(self.times) for edge_s in (0.0, self.on_s)]
+        return [k * period_s + edge_s for k in range(self.repeats) for edge_s in (0.0, self.on_s)]
 
 
-class _Told(NamedTuple):
+class _Responses(NamedTuple):
     """What the columns of a run do: [m, columns]."""
 
     absorber_k: FloatArray
@@ -62,49 +62,57 @@ class _Told(NamedTuple):
     force_n: FloatArray
 
 
-def outcomes(parameters: ParameterSet) -> dict[str, float]:
+def simulate_outcomes(parameters: ParameterSet) -> dict[str, float]:
     """Every outcome of `paper.OUTCOMES`, SI (temperatures in °C as the paper has them), by fact."""
-    return _pulse_outcomes(parameters) | _train_outcomes(parameters) | {"z_repeat_w040": _spread_of_four_m(parameters)}
+    return (
+        _simulate_pulse_outcomes(parameters)
+        | _simulate_train_outcomes(parameters)
+        | {"z_repeat_w040": _simulate_repeatability_m(parameters)}
+    )
 
 
-def _run(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None) -> _Told:
+def _simulate(
+    parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None
+) -> _Responses:
     """By the terms that heights are planned with, where the set names them; else by all of its terms."""
-    pixels = [parameters.pixel(stimulus.width_mm * 1e-3) for stimulus in stimuli]
+    pixels = [parameters.build_pixel(stimulus.width_mm * 1e-3) for stimulus in stimuli]
     if parameters.planner_terms:
-        active = Active.of({key: parameters.term_values(key) for key in parameters.planner_terms})
-        seen = [
-            observe(Scene(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0), pixel, active)
+        active = ActiveTerms.from_values({key: parameters.term_values(key) for key in parameters.planner_terms})
+        responses = [
+            simulate_signals(
+                PixelExperiment(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0), pixel, active
+            )
             for stimulus, pixel in zip(stimuli, pixels, strict=True)
         ]
-        return _Told(*(np.stack(signal, axis=1) for signal in zip(*seen, strict=True)))
+        return _Responses(*(np.stack(signal, axis=1) for signal in zip(*responses, strict=True)))
     columns = (np.array([getattr(pixel, name) for pixel in pixels]) for name in Pixel._fields)
-    model = Model.of(parameters, PixelArray(*columns), AMBIENT_K)
+    model = Model.from_parameters(parameters, PixelArray(*columns), AMBIENT_K)
     edges_s = sorted({round(edge_s, 9) for stimulus in stimuli for edge_s in stimulus.edges_s()})
     drives = [Drive(at_s, np.array([stimulus.power_at_w(at_s) for stimulus in stimuli])) for at_s in edges_s]
-    traced = model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
-    return _Told(traced.rise_k["absorber_k"], traced.displacement_m, traced.force_n)
+    trace = model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
+    return _Responses(trace.rise_k["absorber_k"], trace.displacement_m, trace.force_n)
 
 
-def _pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
+def _simulate_pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
     single = [
-        _Stimulus(0.20, LONG_S),
-        _Stimulus(0.75, LONG_S),
+        _Stimulus(0.20, LONG_PULSE_S),
+        _Stimulus(0.75, LONG_PULSE_S),
         _Stimulus(0.40, 8e-3),
-        _Stimulus(0.55, LONG_S),
-        _Stimulus(0.55, LONG_S, 0.5 * FULL_W),
+        _Stimulus(0.55, LONG_PULSE_S),
+        _Stimulus(0.55, LONG_PULSE_S, 0.5 * FULL_POWER_W),
     ]
-    ladder = [_Stimulus(0.55, width_s) for width_s in LADDER_S]
+    ladder = [_Stimulus(0.55, width_s) for width_s in WIDTH_LADDER_S]
     t_s = np.arange(1.0, 0.1 / SAMPLE_S) * SAMPLE_S
-    traced = _run(parameters, single + ladder, t_s)
+    responses = _simulate(parameters, single + ladder, t_s)
     absorber_k, displacement_m, force_n = (
-        values.max(axis=0) for values in (traced.absorber_k, traced.displacement_m, traced.force_n)
+        values.max(axis=0) for values in (responses.absorber_k, responses.displacement_m, responses.force_n)
     )
     heights_m = displacement_m[len(single) :]
-    absorbed_j = parameters.epsilon.value * FULL_W * LONG_S
+    absorbed_j = parameters.epsilon.value * FULL_POWER_W * LONG_PULSE_S
     work_j = 0.5 * force_n[0] * displacement_m[0]
     # The paper had its gas from the force, by the gas law on the whole aperture: so has the model.
-    gas_k = force_n[0] * AMBIENT_K / (ATMOSPHERE_PA * pi * paper_facts()["cavity_r"].value ** 2)
-    told = {
+    gas_k = force_n[0] * AMBIENT_K / (ATMOSPHERE_PA * pi * load_paper_facts()["cavity_r"].value ** 2)
+    outcomes = {
         "T_peak_w020": AMBIENT_C + absorber_k[0],
         "dT_peak_w020": absorber_k[0],
         "T_peak_w075": AMBIENT_C + absorber_k[1],
@@ -119,25 +127,27 @@ def _pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
         "eta_stroke": work_j / absorbed_j,
         "eta_qt": GAS_J_PER_K * gas_k / absorbed_j,
         "eta_tm": work_j / (GAS_J_PER_K * gas_k),
-        "N_50um": 1.0 / np.interp(50e-6, heights_m, LADDER_S, right=np.inf),
-        "N_400um": 1.0 / np.interp(400e-6, heights_m, LADDER_S, right=np.inf),
+        "N_50um": 1.0 / np.interp(50e-6, heights_m, WIDTH_LADDER_S, right=np.inf),
+        "N_400um": 1.0 / np.interp(400e-6, heights_m, WIDTH_LADDER_S, right=np.inf),
     }
-    return {name: float(value) for name, value in told.items()}
+    return {name: float(value) for name, value in outcomes.items()}
 
 
-def _train_outcomes(parameters: ParameterSet) -> dict[str, float]:
-    tau_s = round(parameters.pixel(0.55e-3).tau_s, 6)
-    quick = _Stimulus(0.55, 2.5e-3, off_s=2.5e-3, times=2 * PERIODS)
-    slow = _Stimulus(0.55, tau_s, off_s=tau_s, times=PERIODS // 2)
-    alone = _Stimulus(0.55, tau_s)
-    ends_s = {stimulus: stimulus.times * (stimulus.on_s + stimulus.off_s) for stimulus in (quick, slow)}
-    last = {stimulus: end_s - np.linspace(1.0, 0.0, 401) * 2 * stimulus.on_s for stimulus, end_s in ends_s.items()}
+def _simulate_train_outcomes(parameters: ParameterSet) -> dict[str, float]:
+    tau_s = round(parameters.build_pixel(0.55e-3).tau_s, 6)
+    quick = _Stimulus(0.55, 2.5e-3, off_s=2.5e-3, repeats=2 * STEADY_PERIODS)
+    slow = _Stimulus(0.55, tau_s, off_s=tau_s, repeats=STEADY_PERIODS // 2)
+    single = _Stimulus(0.55, tau_s)
+    ends_s = {stimulus: stimulus.repeats * (stimulus.on_s + stimulus.off_s) for stimulus in (quick, slow)}
+    final_times_s = {
+        stimulus: end_s - np.linspace(1.0, 0.0, 401) * 2 * stimulus.on_s for stimulus, end_s in ends_s.items()
+    }
     begin_s = np.arange(1.0, 600.0) * SAMPLE_S
-    t_s = np.unique(np.concatenate([begin_s, *last.values()]))
-    heights_m = _run(parameters, [quick, slow, alone], t_s).displacement_m
+    t_s = np.unique(np.concatenate([begin_s, *final_times_s.values()]))
+    heights_m = _simulate(parameters, [quick, slow, single], t_s).displacement_m
 
     def steady_m(column: int, stimulus: _Stimulus) -> FloatArray:
-        return np.asarray(np.interp(last[stimulus], t_s, heights_m[:, column]))
+        return np.asarray(np.interp(final_times_s[stimulus], t_s, heights_m[:, column]))
 
     first_m = float(heights_m[t_s <= begin_s[-1], 2].max())
     ripple_m = steady_m(1, slow)
@@ -148,9 +158,9 @@ def _train_outcomes(parameters: ParameterSet) -> dict[str, float]:
     }
 
 
-def _spread_of_four_m(parameters: ParameterSet) -> float:
+def _simulate_repeatability_m(parameters: ParameterSet) -> float:
     """Peaks of four pulses 5 s apart: what is left by then moves slowly, so a coarse step is enough for its size."""
-    train = _Stimulus(0.40, LONG_S, off_s=4.95, times=4)
-    around_s = [k * 5.0 + LONG_S + np.arange(1, 41) * 2.5e-4 for k in range(4)]
-    heights_m = _run(parameters, [train], np.concatenate(around_s), steps=2).displacement_m
+    train = _Stimulus(0.40, LONG_PULSE_S, off_s=4.95, repeats=4)
+    around_s = [k * 5.0 + LONG_PULSE_S + np.arange(1, 41) * 2.5e-4 for k in range(4)]
+    heights_m = _simulate(parameters, [train], np.concatenate(around_s), steps=2).displacement_m
     return float(np.ptp(heights_m.reshape(4, -1).max(axis=1)))

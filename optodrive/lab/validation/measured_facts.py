@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import sqrt
 
-from optodrive.physics.paper_facts import AMBIENT_C, Fact
+from optodrive.physics.paper_facts import AMBIENT_C, PaperFact
 from optodrive.physics.parameters import ParameterSet
 
-READING = 0.05
+READING_ERROR = 0.05
 """Relative error of a number read from a figure or rounded in the text, where the paper states none."""
 
 GROUPS = {
@@ -19,15 +19,15 @@ GROUPS = {
 }
 """Measured facts by what was measured."""
 
-MEASURED = tuple(name for group in GROUPS.values() for name in group)
+MEASURED_IDS = tuple(name for group in GROUPS.values() for name in group)
 
 LAW_R2 = {"dpp_law": 0.95, "slow_law": 0.81}
 """Two facts are a law at one point: its r² (Fig. 3D) leaves √(1 − r²) of the spread, taken as large as the value."""
 
-HEIGHTS_M = {"N_50um": 50e-6, "N_400um": 400e-6}
+RATE_HEIGHTS_M = {"N_50um": 50e-6, "N_400um": 400e-6}
 """Rates are compared as the height reached in the time that they leave a pixel: near the plateau a rate says little."""
 
-LEFT_OUT = {
+EXCLUDED = {
     "T_peak_w020": "the same reading as dT_peak_w020",
     "z_repeat_w040": "an upper bound, which every model here meets",
     "F_linear_in_P": "a statement; no number was read",
@@ -50,17 +50,17 @@ class Datum:
     id: str
     group: str
     value: float
-    reading: float
+    reading_error: float
     scatter: float
     source: str
 
     @property
     def sigma(self) -> float:
         """Of the logarithm."""
-        return sqrt(self.reading**2 + self.scatter**2)
+        return sqrt(self.reading_error**2 + self.scatter**2)
 
 
-def scatter_of(parameters: ParameterSet) -> float:
+def compute_scatter(parameters: ParameterSet) -> float:
     """Relative scatter from sample to sample, which no model of one pixel can know.
 
     The geometric mean of what Table S3 shows of R w and of C: which of them a fact feels depends on its pulse.
@@ -69,16 +69,16 @@ def scatter_of(parameters: ParameterSet) -> float:
     return sqrt(shares[0] * shares[1])
 
 
-def recording(facts: Mapping[str, Fact], parameters: ParameterSet) -> tuple[Datum, ...]:
+def build_data(facts: Mapping[str, PaperFact], parameters: ParameterSet) -> tuple[Datum, ...]:
     """The measured facts, in the order of GROUPS."""
-    scatter = scatter_of(parameters)
-    return tuple(_datum(facts[name], group, scatter) for group, names in GROUPS.items() for name in names)
+    scatter = compute_scatter(parameters)
+    return tuple(_build_datum(facts[name], group, scatter) for group, names in GROUPS.items() for name in names)
 
 
-def _datum(fact: Fact, group: str, scatter: float) -> Datum:
+def _build_datum(fact: PaperFact, group: str, scatter: float) -> Datum:
     value = fact.value - (AMBIENT_C if fact.unit == "°C" else 0.0)
     if fact.id in LAW_R2:
         return Datum(fact.id, group, value, sqrt(1.0 - LAW_R2[fact.id]), scatter, f"r² = {LAW_R2[fact.id]:g}")
     if fact.uncertainty is not None:
         return Datum(fact.id, group, value, fact.uncertainty / value, scatter, "stated")
-    return Datum(fact.id, group, value, READING, scatter, "assumed")
+    return Datum(fact.id, group, value, READING_ERROR, scatter, "assumed")

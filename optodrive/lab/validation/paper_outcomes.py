@@ -2,22 +2,22 @@
 
 from collections.abc import Callable
 
-from optodrive.lab.validation.stimulus_response import SteadyTrain, pulse_peak_k, steady_train, width_to_reach_s
-from optodrive.physics.paper_facts import AMBIENT_C, paper_facts
+from optodrive.lab.validation.stimulus_response import SteadyTrain, compute_steady_train, pulse_peak_k, width_to_reach_s
+from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import advance, cooling_peak
 
-Model = Callable[[ParameterSet], float]
+OutcomeFunction = Callable[[ParameterSet], float]
 
-FULL_W = paper_facts()["incident_power"].value
-GAS_J_PER_K = paper_facts()["C_gas"].value
-LONG_S = 50e-3
+FULL_POWER_W = load_paper_facts()["incident_power"].value
+GAS_J_PER_K = load_paper_facts()["C_gas"].value
+LONG_PULSE_S = 50e-3
 """The paper's pulse for peak temperatures, displacements and forces."""
 
 FITTED_ON = {"kappa": "z_peak_w020", "tau_g": "dpp_200Hz", "phi": "F_peak_w020"}
 """Parameters of the calibrated set and the one fact each was fitted on; every other outcome is predicted."""
 
-STANDS_ON_FITTED = {"eta_stroke"}
+DERIVED_FROM_FITTED = {"eta_stroke"}
 """Outcomes made of fitted facts alone, hence no test of the set."""
 
 EXTENDED_FITTED_ON = {
@@ -28,33 +28,33 @@ EXTENDED_FITTED_ON = {
 }
 """The extended set's parameters and their facts: the calibrated set's, and the temperature of the same pixel."""
 
-EXTENDED_STANDS_ON_FITTED = {"T_peak_w020", "dT_air_isometric", "dQ_air", "eta_stroke", "eta_qt", "eta_tm"}
+EXTENDED_DERIVED_FROM_FITTED = {"T_peak_w020", "dT_air_isometric", "dQ_air", "eta_stroke", "eta_qt", "eta_tm"}
 """Outcomes that follow from these by arithmetic; the gas is had from the force as the paper had it."""
 
 
-def _rise_k(width_mm: float) -> Model:
-    return lambda s: advance(s.pixel(width_mm * 1e-3), 0.0, 0.0, FULL_W, LONG_S)[0]
+def _rise_k(width_mm: float) -> OutcomeFunction:
+    return lambda s: advance(s.build_pixel(width_mm * 1e-3), 0.0, 0.0, FULL_POWER_W, LONG_PULSE_S)[0]
 
 
-def _temperature_c(width_mm: float) -> Model:
+def _temperature_c(width_mm: float) -> OutcomeFunction:
     rise_k = _rise_k(width_mm)
     return lambda s: AMBIENT_C + rise_k(s)
 
 
-def _gas_k(s: ParameterSet, width_mm: float, power_w: float = FULL_W, pulse_s: float = LONG_S) -> float:
-    return pulse_peak_k(s.pixel(width_mm * 1e-3), power_w, pulse_s)
+def _gas_k(s: ParameterSet, width_mm: float, power_w: float = FULL_POWER_W, pulse_s: float = LONG_PULSE_S) -> float:
+    return pulse_peak_k(s.build_pixel(width_mm * 1e-3), power_w, pulse_s)
 
 
-def _displacement_m(width_mm: float, pulse_s: float = LONG_S) -> Model:
+def _displacement_m(width_mm: float, pulse_s: float = LONG_PULSE_S) -> OutcomeFunction:
     return lambda s: s.kappa.value * _gas_k(s, width_mm, pulse_s=pulse_s)
 
 
-def _force_n(width_mm: float) -> Model:
+def _force_n(width_mm: float) -> OutcomeFunction:
     return lambda s: s.phi.value * _gas_k(s, width_mm)
 
 
 def _absorbed_j(s: ParameterSet) -> float:
-    return s.epsilon.value * FULL_W * LONG_S
+    return s.epsilon.value * FULL_POWER_W * LONG_PULSE_S
 
 
 def _stroke_work_j(s: ParameterSet) -> float:
@@ -65,23 +65,25 @@ def _gas_heat_j(s: ParameterSet) -> float:
     return GAS_J_PER_K * _gas_k(s, 0.20)
 
 
-def _pixels_per_s(height_m: float) -> Model:
-    return lambda s: 1.0 / width_to_reach_s(s.pixel(0.55e-3), FULL_W, height_m)
+def _pixels_per_s(height_m: float) -> OutcomeFunction:
+    return lambda s: 1.0 / width_to_reach_s(s.build_pixel(0.55e-3), FULL_POWER_W, height_m)
 
 
 def _dpp_200hz_m(s: ParameterSet) -> float:
-    train = steady_train(s.pixel(0.55e-3), FULL_W, 2.5e-3, 2.5e-3)
-    return s.kappa.value * (train.largest_k - train.least_k)
+    train = compute_steady_train(s.build_pixel(0.55e-3), FULL_POWER_W, 2.5e-3, 2.5e-3)
+    return s.kappa.value * (train.max_k - train.min_k)
 
 
 def _train_at_tau(s: ParameterSet) -> tuple[SteadyTrain, float]:
-    pixel = s.pixel(0.55e-3)
-    return steady_train(pixel, FULL_W, pixel.tau_s, pixel.tau_s), pulse_peak_k(pixel, FULL_W, pixel.tau_s)
+    pixel = s.build_pixel(0.55e-3)
+    return compute_steady_train(pixel, FULL_POWER_W, pixel.tau_s, pixel.tau_s), pulse_peak_k(
+        pixel, FULL_POWER_W, pixel.tau_s
+    )
 
 
 def _dpp_over_first(s: ParameterSet) -> float:
     train, first_k = _train_at_tau(s)
-    return (train.largest_k - train.least_k) / first_k
+    return (train.max_k - train.min_k) / first_k
 
 
 def _mean_over_first(s: ParameterSet) -> float:
@@ -90,35 +92,35 @@ def _mean_over_first(s: ParameterSet) -> float:
 
 
 def _force_per_power(s: ParameterSet) -> float:
-    return _gas_k(s, 0.55) / (2.0 * _gas_k(s, 0.55, power_w=0.5 * FULL_W))
+    return _gas_k(s, 0.55) / (2.0 * _gas_k(s, 0.55, power_w=0.5 * FULL_POWER_W))
 
 
-def _spread_of_four_m(s: ParameterSet) -> float:
-    pixel = s.pixel(0.40e-3)
+def _repeatability_m(s: ParameterSet) -> float:
+    pixel = s.build_pixel(0.40e-3)
     theta_k = gamma_k = 0.0
     peaks_k = []
     for _ in range(4):
-        theta_k, gamma_k = advance(pixel, theta_k, gamma_k, FULL_W, LONG_S)
+        theta_k, gamma_k = advance(pixel, theta_k, gamma_k, FULL_POWER_W, LONG_PULSE_S)
         peaks_k.append(cooling_peak(pixel, theta_k, gamma_k)[0])
         theta_k, gamma_k = advance(pixel, theta_k, gamma_k, 0.0, 4.95)
     return pixel.kappa_m_per_k * (max(peaks_k) - min(peaks_k))
 
 
-def _least_squares_a(s: ParameterSet) -> float:
+def _r_width_product_k_m_per_w(s: ParameterSet) -> float:
     rows = [(row.R.value, 1.0 / row.width_m) for row in s.bridge]
     return sum(r * inverse for r, inverse in rows) / sum(inverse**2 for _, inverse in rows)
 
 
-def _resistance(width_mm: float) -> Model:
-    return lambda s: s.pixel(width_mm * 1e-3).r_k_per_w
+def _resistance(width_mm: float) -> OutcomeFunction:
+    return lambda s: s.build_pixel(width_mm * 1e-3).r_k_per_w
 
 
-def _capacity(width_mm: float) -> Model:
-    return lambda s: s.pixel(width_mm * 1e-3).c_j_per_k
+def _capacity(width_mm: float) -> OutcomeFunction:
+    return lambda s: s.build_pixel(width_mm * 1e-3).c_j_per_k
 
 
-INPUTS: dict[str, Model] = {
-    "absorbed_power": lambda s: s.epsilon.value * FULL_W,
+INPUTS: dict[str, OutcomeFunction] = {
+    "absorbed_power": lambda s: s.epsilon.value * FULL_POWER_W,
     "epsilon": lambda s: s.epsilon.value,
     "R_w020": _resistance(0.20),
     "R_w025": _resistance(0.25),
@@ -131,19 +133,19 @@ INPUTS: dict[str, Model] = {
     "C_w055": _capacity(0.55),
     "C_w075": _capacity(0.75),
     "C_mean": lambda s: sum(row.C.value for row in s.bridge) / len(s.bridge),
-    "R_of_w": _least_squares_a,
-    "energy_range_high": lambda s: FULL_W * LONG_S,
+    "R_of_w": _r_width_product_k_m_per_w,
+    "energy_range_high": lambda s: FULL_POWER_W * LONG_PULSE_S,
 }
 """Facts that a set takes from the paper, read back from it or followed from it by arithmetic alone."""
 
-OUTCOMES: dict[str, Model] = {
+OUTCOMES: dict[str, OutcomeFunction] = {
     "T_peak_w020": _temperature_c(0.20),
     "dT_peak_w020": _rise_k(0.20),
     "T_peak_w075": _temperature_c(0.75),
     "z_peak_w020": _displacement_m(0.20),
     "z_peak_w075": _displacement_m(0.75),
     "z_tp8_w040": _displacement_m(0.40, 8e-3),
-    "z_repeat_w040": _spread_of_four_m,
+    "z_repeat_w040": _repeatability_m,
     "F_peak_w020": _force_n(0.20),
     "F_peak_w055": _force_n(0.55),
     "F_linear_in_P": _force_per_power,
@@ -160,7 +162,7 @@ OUTCOMES: dict[str, Model] = {
 }
 """Facts that follow from a set: fitted on (FITTED_ON) or predicted."""
 
-SILENT = {
+NOT_MODELLED = {
     "incident_power": "the drive of every other row",
     "acrylic_transmission": "a part of ε: 0.924 × 0.723 = 0.668",
     "pgs_absorption": "a part of ε: 0.924 × 0.723 = 0.668",

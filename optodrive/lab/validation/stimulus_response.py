@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from optodrive.physics.pixel import GAS_FRACTION, Pixel, advance, cooling_peak, gas_peak
 
-LONGEST_PULSE_S = 1.0
+MAX_PULSE_S = 1.0
 """Pulses longer than this are not looked for; every relaxation time here is far shorter."""
 
 
@@ -15,13 +15,13 @@ def pulse_peak_k(pixel: Pixel, power_w: float, width_s: float) -> float:
 
 def width_to_reach_s(pixel: Pixel, power_w: float, height_m: float) -> float:
     """Width, s, of the shortest pulse from rest that reaches a height; infinite for a height out of reach."""
-    goal_k = height_m / pixel.kappa_m_per_k
-    low_s, high_s = 0.0, LONGEST_PULSE_S
-    if pulse_peak_k(pixel, power_w, high_s) < goal_k:
+    target_k = height_m / pixel.kappa_m_per_k
+    low_s, high_s = 0.0, MAX_PULSE_S
+    if pulse_peak_k(pixel, power_w, high_s) < target_k:
         return float("inf")
     for _ in range(60):
         middle_s = 0.5 * (low_s + high_s)
-        if pulse_peak_k(pixel, power_w, middle_s) < goal_k:
+        if pulse_peak_k(pixel, power_w, middle_s) < target_k:
             low_s = middle_s
         else:
             high_s = middle_s
@@ -32,12 +32,12 @@ def width_to_reach_s(pixel: Pixel, power_w: float, height_m: float) -> float:
 class SteadyTrain:
     """Gas rise, K, of a pulse train that has run for ever: least, largest and mean over a period."""
 
-    least_k: float
-    largest_k: float
+    min_k: float
+    max_k: float
     mean_k: float
 
 
-def steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: float) -> SteadyTrain:
+def compute_steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: float) -> SteadyTrain:
     """The steady state of pulses of width_s with gap_s between.
 
     The mean is exact: over a period nothing is stored, so absorber and gas average what the mean power holds them at.
@@ -46,14 +46,14 @@ def steady_train(pixel: Pixel, power_w: float, width_s: float, gap_s: float) -> 
     period_s = width_s + gap_s
     memory_s = pixel.tau_s + pixel.tau_g_s
     for _ in range(1 + int(40.0 * memory_s / period_s)):
-        lit = advance(pixel, theta_k, gamma_k, power_w, width_s)
-        theta_k, gamma_k = advance(pixel, *lit, 0.0, gap_s)
-    largest_k = max(
+        gate_off_state = advance(pixel, theta_k, gamma_k, power_w, width_s)
+        theta_k, gamma_k = advance(pixel, *gate_off_state, 0.0, gap_s)
+    max_k = max(
         gas_peak(pixel, theta_k, gamma_k, power_w, width_s)[0],
-        cooling_peak(pixel, *lit, gap_s)[0],
+        cooling_peak(pixel, *gate_off_state, gap_s)[0],
     )
     # Gas in the dark has no trough but at its ends, which are the pulse's ends too. The equations are linear: the
     # trough is the peak of the same motion upside down.
-    least_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
+    min_k = -gas_peak(pixel, -theta_k, -gamma_k, -power_w, width_s)[0]
     mean_k = GAS_FRACTION * pixel.epsilon * pixel.r_k_per_w * power_w * width_s / period_s
-    return SteadyTrain(least_k, largest_k, mean_k)
+    return SteadyTrain(min_k, max_k, mean_k)

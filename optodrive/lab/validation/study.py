@@ -5,25 +5,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.lab.validation.candidate_causes import catalogue
-from optodrive.lab.validation.cause_search import APART, NAMED, Fit, Search
-from optodrive.lab.validation.contradictions import Contradiction, contradictions
-from optodrive.lab.validation.measured_facts import GROUPS, Datum, recording
-from optodrive.physics.paper_facts import Fact
+from optodrive.lab.validation.candidate_causes import index_causes
+from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST, CauseFit, CauseSearch
+from optodrive.lab.validation.contradictions import Contradiction, find_contradictions
+from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_data
+from optodrive.physics.paper_facts import PaperFact
 from optodrive.physics.parameters import ParameterSet
 
-UNSEEN = 4.0
+CHI2_NOT_OBSERVABLE = 4.0
 """A cause that changes χ² by less, at either end of its range, is one that these facts cannot show: two σ."""
-MOST_OF = 0.8
+EVIDENCE_FRACTION = 0.8
 """A cause rests on the facts that hold so much of what it takes."""
-HALF = 0.5
+RULED_OUT_FRACTION = 0.5
 """A cause that takes so much in a named one's place is told as ruled out, not as idle."""
-MISSED = 2.0
+UNEXPLAINED_SIGMA = 2.0
 """Standard errors from which a fact counts as unexplained."""
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedCause:
     """A cause that is needed: its number and 95 % of it.
 
     taken: by how much χ² grows without it; rests_on: the facts that hold most of that; alike: causes that would do
@@ -34,13 +34,13 @@ class Named:
     value: float
     low: float
     high: float
-    taken: float
-    rests_on: tuple[str, ...]
-    alike: tuple[str, ...]
+    chi2_reduction: float
+    evidence: tuple[str, ...]
+    alternatives: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Candidate:
+class UnchosenCause:
     """A cause that is not in the chosen set.
 
     verdict: "alike" one that is, "as good" beside them in the place of a law, "not shown" by these facts whatever its
@@ -53,14 +53,14 @@ class Candidate:
     key: str
     verdict: str
     value: float | None
-    alone: float
-    beside: float
-    place: str
-    regained: float
+    chi2_reduction_alone: float
+    chi2_reduction_added: float
+    replaces: str
+    replaced_fraction: float
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class LeaveOutPrediction:
     """Facts left out of choice and fit, and predicted.
 
     before, after: ratios model over measured, nominal and extended; lost: named causes that no fact left shows
@@ -69,149 +69,180 @@ class LeftOut:
     label: str
     facts: tuple[str, ...]
     causes: tuple[str, ...]
-    lost: tuple[str, ...]
-    before: tuple[float, ...]
-    after: tuple[float, ...]
+    unobservable: tuple[str, ...]
+    nominal: tuple[float, ...]
+    extended: tuple[float, ...]
 
 
 @dataclass(frozen=True)
-class Answer:
+class StudyResult:
     """All there is to tell; nominal, extended: model over measured, fact by fact; misses: in standard errors."""
 
     base: str
     data: tuple[Datum, ...]
-    nominal: tuple[float, ...]
-    extended: tuple[float, ...]
-    misses: tuple[float, ...]
-    before: Fit
-    chosen: Fit
-    named: tuple[Named, ...]
-    candidates: tuple[Candidate, ...]
-    contradicted: tuple[Contradiction, ...]
-    groups: tuple[LeftOut, ...]
-    singles: tuple[LeftOut, ...]
+    nominal_ratios: tuple[float, ...]
+    extended_ratios: tuple[float, ...]
+    errors_sigma: tuple[float, ...]
+    nominal_fit: CauseFit
+    fit: CauseFit
+    named: tuple[NamedCause, ...]
+    unchosen: tuple[UnchosenCause, ...]
+    contradictions: tuple[Contradiction, ...]
+    group_predictions: tuple[LeaveOutPrediction, ...]
+    fact_predictions: tuple[LeaveOutPrediction, ...]
 
     @property
-    def unpredicted(self) -> tuple[LeftOut, ...]:
+    def unpredictable(self) -> tuple[LeaveOutPrediction, ...]:
         """Groups that alone show one of the named causes."""
-        return tuple(item for item in self.groups if item.lost)
+        return tuple(item for item in self.group_predictions if item.unobservable)
 
     @property
-    def predictions(self) -> tuple[LeftOut, ...]:
+    def predictions(self) -> tuple[LeaveOutPrediction, ...]:
         """Each fact once: with its whole group left out, or by itself where nothing else shows a cause."""
-        lost = {name for group in self.unpredicted for name in group.facts}
-        return tuple(item for item in (*self.groups, *self.singles) if item.label in lost or not item.lost)
+        lost = {name for group in self.unpredictable for name in group.facts}
+        return tuple(
+            item
+            for item in (*self.group_predictions, *self.fact_predictions)
+            if item.label in lost or not item.unobservable
+        )
 
     @property
     def unexplained(self) -> tuple[str, ...]:
         """Facts that the extended model misses."""
-        pairs = zip(self.data, self.misses, strict=True)
-        return tuple(datum.id for datum, miss in pairs if abs(miss) > MISSED)
+        pairs = zip(self.data, self.errors_sigma, strict=True)
+        return tuple(datum.id for datum, miss in pairs if abs(miss) > UNEXPLAINED_SIGMA)
 
 
-def factor(ratios: Sequence[float]) -> float:
+def compute_error_factor(ratios: Sequence[float]) -> float:
     """The factor by which facts are missed, geometric rms: 1 is perfect."""
     return float(np.exp(np.sqrt(np.mean(np.log(np.array(ratios)) ** 2)))) if ratios else float("nan")
 
 
-def study(facts: Mapping[str, Fact], base: ParameterSet, tick: Callable[[str], None] = lambda what: None) -> Answer:
+def run_study(
+    facts: Mapping[str, PaperFact], base: ParameterSet, on_progress: Callable[[str], None] = lambda what: None
+) -> StudyResult:
     """Diagnose a parameter set by the paper's facts."""
-    data = recording(facts, base)
-    tick("choosing causes")
-    search = Search(base, data)
+    data = build_data(facts, base)
+    on_progress("choosing causes")
+    search = CauseSearch(base, data)
     chosen = search.choose()
-    named = _named(search, chosen)
-    groups, singles = [], []
+    named = _build_named_causes(search, chosen)
+    group_predictions, fact_predictions = [], []
     for group, names in GROUPS.items():
-        tick(f"leaving out {group}")
-        whole = left_out(base, data, group, names, named)
-        groups.append(whole)
-        if whole.lost:
-            singles += [left_out(base, data, name, (name,), named) for name in names]
-    return Answer(
+        on_progress(f"leaving out {group}")
+        prediction = predict_left_out(base, data, group, names, named)
+        group_predictions.append(prediction)
+        if prediction.unobservable:
+            fact_predictions += [predict_left_out(base, data, name, (name,), named) for name in names]
+    return StudyResult(
         base=base.name,
         data=data,
-        nominal=_ratios(search, search.nominal, data),
-        extended=_ratios(search, chosen, data),
-        misses=tuple((search.model(chosen).misses(data) / [datum.sigma for datum in data]).tolist()),
-        before=search.nominal,
-        chosen=chosen,
+        nominal_ratios=_compute_ratios(search, search.nominal, data),
+        extended_ratios=_compute_ratios(search, chosen, data),
+        errors_sigma=tuple(
+            (search.build_model(chosen).compute_log_errors(data) / [datum.sigma for datum in data]).tolist()
+        ),
+        nominal_fit=search.nominal,
+        fit=chosen,
         named=named,
-        candidates=_candidates(search, chosen),
-        contradicted=contradictions(facts),
-        groups=tuple(groups),
-        singles=tuple(singles),
+        unchosen=_judge_unchosen(search, chosen),
+        contradictions=find_contradictions(facts),
+        group_predictions=tuple(group_predictions),
+        fact_predictions=tuple(fact_predictions),
     )
 
 
-def left_out(
-    base: ParameterSet, data: Sequence[Datum], label: str, names: Sequence[str], named: Sequence[Named]
-) -> LeftOut:
+def predict_left_out(
+    base: ParameterSet, data: Sequence[Datum], label: str, names: Sequence[str], named: Sequence[NamedCause]
+) -> LeaveOutPrediction:
     """Choice and fit made anew without some facts, then those predicted; named: what all facts together name."""
-    search = Search(base, [datum for datum in data if datum.id not in names])
+    search = CauseSearch(base, [datum for datum in data if datum.id not in names])
     chosen = search.choose()
-    hidden = [datum for datum in data if datum.id in names]
-    lost = [item.key for item in named if not {item.key, *item.alike} & set(chosen.keys)]
-    before, after = _ratios(search, search.nominal, hidden), _ratios(search, chosen, hidden)
-    return LeftOut(label, tuple(names), chosen.keys, tuple(lost), before, after)
+    left_out_data = [datum for datum in data if datum.id in names]
+    unobservable = [item.key for item in named if not {item.key, *item.alternatives} & set(chosen.keys)]
+    nominal, extended = (
+        _compute_ratios(search, search.nominal, left_out_data),
+        _compute_ratios(search, chosen, left_out_data),
+    )
+    return LeaveOutPrediction(label, tuple(names), chosen.keys, tuple(unobservable), nominal, extended)
 
 
-def _ratios(search: Search, fit: Fit, data: Sequence[Datum]) -> tuple[float, ...]:
-    model = search.model(fit)
-    return tuple(model.outcome(datum.id) / datum.value for datum in data)
+def _compute_ratios(search: CauseSearch, fit: CauseFit, data: Sequence[Datum]) -> tuple[float, ...]:
+    model = search.build_model(fit)
+    return tuple(model.compute_outcome(datum.id) / datum.value for datum in data)
 
 
-def _named(search: Search, chosen: Fit) -> tuple[Named, ...]:
-    removed, exchanged = search.removals(chosen), search.exchanges(chosen)
+def _build_named_causes(search: CauseSearch, chosen: CauseFit) -> tuple[NamedCause, ...]:
+    removed, exchanged = search.fit_removals(chosen), search.fit_exchanges(chosen)
     out = []
     for key in chosen.keys:
-        alike = [other for (own, other), fit in exchanged.items() if own == key and fit.aicc - chosen.aicc < APART]
-        low, high = search.interval(chosen, key)
-        taken = removed[key].chi2 - chosen.chi2
-        rests_on = _held_by(search, removed[key], chosen)
-        out.append(Named(key, chosen.numbers[key], low, high, taken, rests_on, tuple(alike)))
-    return tuple(sorted(out, key=lambda item: -item.taken))
+        alternatives = [
+            other
+            for (own, other), fit in exchanged.items()
+            if own == key and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
+        ]
+        low, high = search.compute_interval(chosen, key)
+        chi2_reduction = removed[key].chi2 - chosen.chi2
+        evidence = _find_evidence(search, removed[key], chosen)
+        out.append(NamedCause(key, chosen.values[key], low, high, chi2_reduction, evidence, tuple(alternatives)))
+    return tuple(sorted(out, key=lambda item: -item.chi2_reduction))
 
 
-def _held_by(search: Search, without: Fit, chosen: Fit) -> tuple[str, ...]:
+def _find_evidence(search: CauseSearch, without: CauseFit, chosen: CauseFit) -> tuple[str, ...]:
     """The facts that, the most first, hold MOST_OF of what a cause takes."""
-    taken = search.squares(without) - search.squares(chosen)
+    reductions = search.compute_chi2_terms(without) - search.compute_chi2_terms(chosen)
     out: list[str] = []
-    held = 0.0
-    for place in np.argsort(-taken).tolist():
-        if held >= MOST_OF * taken.clip(0.0).sum():
+    total = 0.0
+    for place in np.argsort(-reductions).tolist():
+        if total >= EVIDENCE_FRACTION * reductions.clip(0.0).sum():
             break
-        held += float(taken[place])
+        total += float(reductions[place])
         out.append(search.data[place].id)
     return tuple(out)
 
 
-def _candidates(search: Search, chosen: Fit) -> tuple[Candidate, ...]:
-    exchanged, removed = search.exchanges(chosen), search.removals(chosen)
-    added = {fit.keys[-1]: fit for fit in search.additions(chosen)}
+def _judge_unchosen(search: CauseSearch, chosen: CauseFit) -> tuple[UnchosenCause, ...]:
+    exchanged, removed = search.fit_exchanges(chosen), search.fit_removals(chosen)
+    added = {fit.keys[-1]: fit for fit in search.fit_additions(chosen)}
     out = []
-    for key, cause in catalogue().items():
+    for key, cause in index_causes().items():
         if key in chosen.keys:
             continue
-        alone = search.nominal.chi2 - search.fit((key,)).chi2
+        chi2_reduction_alone = search.nominal.chi2 - search.fit((key,)).chi2
         swaps = {own: fit for (own, other), fit in exchanged.items() if other == key}
-        regained = {own: _regained(removed[own], fit, chosen) for own, fit in swaps.items()}
-        place = max(regained, key=lambda own: regained[own], default="")
-        beside = chosen.chi2 - added[key].chi2 if key in added else 0.0
-        if any(fit.aicc - chosen.aicc < APART for fit in swaps.values()):
+        replaced_fractions = {own: _compute_replaced_fraction(removed[own], fit, chosen) for own, fit in swaps.items()}
+        replaces = max(replaced_fractions, key=lambda own: replaced_fractions[own], default="")
+        chi2_reduction_added = chosen.chi2 - added[key].chi2 if key in added else 0.0
+        if any(fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE for fit in swaps.values()):
             verdict = "alike"
-        elif key in added and cause.instead and added[key].aicc - chosen.aicc < APART:
+        elif key in added and cause.replaces_law and added[key].aicc - chosen.aicc < AICC_INDISTINGUISHABLE:
             verdict = "as good"
-        elif key in added and not cause.instead and search.most_changed(chosen, key) < UNSEEN:
+        elif (
+            key in added
+            and not cause.replaces_law
+            and search.compute_max_chi2_increase(chosen, key) < CHI2_NOT_OBSERVABLE
+        ):
             verdict = "not shown"
         else:
-            tempting = alone >= NAMED or regained.get(place, 0.0) >= HALF
-            verdict = "ruled out" if tempting else "not needed"
-        value = added[key].numbers[key] if key in added else None
-        out.append(Candidate(key, verdict, value, alone, beside, place, regained.get(place, 0.0)))
-    return tuple(sorted(out, key=lambda item: -item.alone))
+            is_plausible = (
+                chi2_reduction_alone >= CAUSE_COST or replaced_fractions.get(replaces, 0.0) >= RULED_OUT_FRACTION
+            )
+            verdict = "ruled out" if is_plausible else "not needed"
+        value = added[key].values[key] if key in added else None
+        out.append(
+            UnchosenCause(
+                key,
+                verdict,
+                value,
+                chi2_reduction_alone,
+                chi2_reduction_added,
+                replaces,
+                replaced_fractions.get(replaces, 0.0),
+            )
+        )
+    return tuple(sorted(out, key=lambda item: -item.chi2_reduction_alone))
 
 
-def _regained(without: Fit, swapped: Fit, chosen: Fit) -> float:
+def _compute_replaced_fraction(without: CauseFit, swapped: CauseFit, chosen: CauseFit) -> float:
     """Share of what a cause takes that another takes in its place."""
     return (without.chi2 - swapped.chi2) / (without.chi2 - chosen.chi2)

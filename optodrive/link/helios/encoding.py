@@ -12,24 +12,24 @@ import numpy as np
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import LimitedPlan
-from optodrive.device.config import HELIOS_CODES_A_SIDE, Config
+from optodrive.device.config import HELIOS_HALF_RANGE_CODES, Config
 from optodrive.link.helios.frames import (
     CLOCK_HZ,
     FRAME_MAX_S,
     POINT_BYTES,
     POINTS_MAX,
     HeliosFrame,
-    Table,
-    fills_packets,
+    PointTable,
+    is_whole_packets,
+    parse_points,
     point_ticks,
-    points_of,
 )
-from optodrive.link.protocol.dac_codes import Converter
+from optodrive.link.protocol.dac_codes import BipolarDac
 
-DAC = Converter(12)
+DAC = BipolarDac(12)
 LEVEL_MAX = 255
 TICKS_PER_US = CLOCK_HZ // 1_000_000
-TAIL = 2
+TRAILING_POINTS = 2
 """Dark points after a plan: one ends its last frame, the other lets that be a point shorter."""
 
 
@@ -42,9 +42,9 @@ class PointScale:
     points_per_s: int
 
     @classmethod
-    def of(cls, config: Config) -> "PointScale":
+    def from_config(cls, config: Config) -> "PointScale":
         """Codes span the scanner's whole range, level 255 is the laser's full power."""
-        rad_per_code = config.scanner.range_rad / HELIOS_CODES_A_SIDE
+        rad_per_code = config.scanner.range_rad / HELIOS_HALF_RANGE_CODES
         return cls(rad_per_code, config.laser.max_power_w, config.board.points_per_s)
 
     @property
@@ -52,13 +52,13 @@ class PointScale:
         """The time from one point to the next as the board keeps it, s."""
         return point_ticks(self.points_per_s) / CLOCK_HZ
 
-    def codes(self, angle_rad: FloatArray) -> IntArray:
+    def to_codes(self, angle_rad: FloatArray) -> IntArray:
         """Mirror angle to codes; LocalProtocolError beyond the converter's range. Any shape."""
-        return DAC.codes(angle_rad, self.rad_per_code)
+        return DAC.to_codes(angle_rad, self.rad_per_code)
 
-    def angles(self, codes: IntArray) -> FloatArray:
+    def to_angles_rad(self, codes: IntArray) -> FloatArray:
         """Codes to mirror angle, rad. Any shape."""
-        return DAC.angles(codes, self.rad_per_code)
+        return DAC.to_angles_rad(codes, self.rad_per_code)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,11 +83,13 @@ class PointPulses:
 
 def encode(plan: LimitedPlan, scale: PointScale) -> tuple[HeliosFrame, ...]:
     """Frames for a plan; power is rounded down, each frame ends dark, within a pulse if there is no other place."""
-    points = _points(plan, scale)
-    return tuple(HeliosFrame.of(points[first:last], scale.points_per_s) for first, last in _cut(points, scale))
+    points = _encode_points(plan, scale)
+    return tuple(
+        HeliosFrame.from_points(points[first:last], scale.points_per_s) for first, last in _split_frames(points, scale)
+    )
 
 
-def _points(plan: LimitedPlan, scale: PointScale) -> Table:
+def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     """All points of a plan, [n, 7]: the first begins with the plan."""
     ticks = point_ticks(scale.points_per_s)
     start = np.rint(plan.start_s * 1e6).astype(np.int64) * TICKS_PER_US
@@ -99,19 +101,21 @@ def _points(plan: LimitedPlan, scale: PointScale) -> Table:
         raise LocalProtocolError(f"levels {level.min()} to {level.max()} leave the range 0 to {LEVEL_MAX}")
     first, last = -(-start // ticks), end // ticks
     last[:-1] -= last[:-1] == first[1:]  # a dark point between any two, by which they are told apart
-    lit = (level > 0) & (last > first)  # the mirrors do not go where there is no light
-    first, last, level = first[lit], last[lit], level[lit]
-    x, y = scale.codes(plan.x_rad[lit]), scale.codes(plan.y_rad[lit])
+    emitting = (level > 0) & (last > first)  # the mirrors do not go where there is no light
+    first, last, level = first[emitting], last[emitting], level[emitting]
+    x, y = scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting])
     before = np.concatenate([[0], last[:-1]])[: len(last)]
-    pairs = np.column_stack([first - before, last - first]).ravel()
-    tail = [TAIL]
-    levels = np.repeat(np.append(np.column_stack([np.zeros_like(level), level]).ravel(), 0), np.append(pairs, tail))
-    stays = np.append(last - before, tail)
-    x, y = (np.repeat(np.append(codes, codes[-1:] if len(codes) else DAC.centre), stays) for codes in (x, y))
-    return _packed(x, y, levels)
+    run_lengths = np.column_stack([first - before, last - first]).ravel()
+    tail = [TRAILING_POINTS]
+    levels = np.repeat(
+        np.append(np.column_stack([np.zeros_like(level), level]).ravel(), 0), np.append(run_lengths, tail)
+    )
+    dwell_points = np.append(last - before, tail)
+    x, y = (np.repeat(np.append(codes, codes[-1:] if len(codes) else DAC.centre), dwell_points) for codes in (x, y))
+    return _pack_points(x, y, levels)
 
 
-def _packed(x: IntArray, y: IntArray, level: IntArray) -> Table:
+def _pack_points(x: IntArray, y: IntArray, level: IntArray) -> PointTable:
     points = np.empty((len(level), POINT_BYTES), dtype=np.uint8)
     points[:, 0] = x >> 4
     points[:, 1] = (x & 15) << 4 | y >> 8
@@ -120,24 +124,24 @@ def _packed(x: IntArray, y: IntArray, level: IntArray) -> Table:
     return points
 
 
-def _cut(points: Table, scale: PointScale) -> Iterator[tuple[int, int]]:
+def _split_frames(points: PointTable, scale: PointScale) -> Iterator[tuple[int, int]]:
     """Where frames begin and end; a point that ends a frame within a pulse is darkened."""
-    most, first = min(POINTS_MAX, int(FRAME_MAX_S / scale.point_s)), 0
+    points_max, first = min(POINTS_MAX, int(FRAME_MAX_S / scale.point_s)), 0
     while first < len(points):
-        longest = min(first + most, len(points))
-        last = _dark_end(points, first, longest)
+        longest = min(first + points_max, len(points))
+        last = _find_gate_off_end(points, first, longest)
         if last is None:
-            last = longest - 1 if fills_packets(longest - first) else longest
+            last = longest - 1 if is_whole_packets(longest - first) else longest
             points[last - 1, 3:] = 0
         yield first, last
         first = last
 
 
-def _dark_end(points: Table, first: int, longest: int) -> int | None:
+def _find_gate_off_end(points: PointTable, first: int, longest: int) -> int | None:
     """The latest end of a frame after a dark point, in the later half of what it may hold; None without one."""
-    least = first + (longest - first) // 2
-    for last in (least + 1 + np.flatnonzero(points[least:longest, 6] == 0))[::-1].tolist():
-        if not fills_packets(last - first):
+    min_end = first + (longest - first) // 2
+    for last in (min_end + 1 + np.flatnonzero(points[min_end:longest, 6] == 0))[::-1].tolist():
+        if not is_whole_packets(last - first):
             return int(last)
     return None
 
@@ -146,22 +150,22 @@ def decode(frames: Sequence[bytes], scale: PointScale) -> PointPulses:
     """Read pulses back from the bytes of frames in order; the brightest channel counts. LocalProtocolError if bad."""
     tables, ticks = [], []
     for data in frames:
-        table, points_per_s = points_of(data)
+        table, points_per_s = parse_points(data)
         tables.append(table)
         ticks.append(np.full(len(table), point_ticks(points_per_s), dtype=np.int64))
     points = np.concatenate([*tables, np.zeros((1, POINT_BYTES), dtype=np.uint8)]).astype(np.int64)
-    begins = np.concatenate([[0], np.cumsum(np.concatenate([*ticks, np.zeros(1, dtype=np.int64)]))[:-1]])
+    begin_ticks = np.concatenate([[0], np.cumsum(np.concatenate([*ticks, np.zeros(1, dtype=np.int64)]))[:-1]])
     x, y = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2]
     level = points[:, 3:].max(axis=1)
     changes = np.flatnonzero((np.diff(x) != 0) | (np.diff(y) != 0) | (np.diff(level) != 0)) + 1
-    heads = np.concatenate([[0], changes])
-    ends = np.append(changes, len(points) - 1)
-    lit = level[heads] > 0
-    heads, ends = heads[lit], ends[lit]
+    run_starts = np.concatenate([[0], changes])
+    run_ends = np.append(changes, len(points) - 1)
+    emitting = level[run_starts] > 0
+    run_starts, run_ends = run_starts[emitting], run_ends[emitting]
     return PointPulses(
-        start_s=begins[heads] / CLOCK_HZ,
-        width_s=(begins[ends] - begins[heads]) / CLOCK_HZ,
-        x_rad=scale.angles(x[heads]),
-        y_rad=scale.angles(y[heads]),
-        power_w=level[heads] / LEVEL_MAX * scale.full_power_w,
+        start_s=begin_ticks[run_starts] / CLOCK_HZ,
+        width_s=(begin_ticks[run_ends] - begin_ticks[run_starts]) / CLOCK_HZ,
+        x_rad=scale.to_angles_rad(x[run_starts]),
+        y_rad=scale.to_angles_rad(y[run_starts]),
+        power_w=level[run_starts] / LEVEL_MAX * scale.full_power_w,
     )

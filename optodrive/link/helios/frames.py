@@ -17,10 +17,10 @@ POINTS_MAX = 4095
 RATE_MIN, RATE_MAX = 7, 65_535
 PACKET_BYTES = 64
 FRAME_MAX_S = 0.025
-DARK_WITHIN_S = 2 * FRAME_MAX_S
+HOST_LOSS_EMISSION_MAX_S = 2 * FRAME_MAX_S
 """The longest light after the host fell silent: the frame that plays, and the one that waits behind it."""
 
-Table = NDArray[np.uint8]
+PointTable = NDArray[np.uint8]
 
 
 def point_ticks(points_per_s: int) -> int:
@@ -28,7 +28,7 @@ def point_ticks(points_per_s: int) -> int:
     return CLOCK_HZ // points_per_s + 1
 
 
-def fills_packets(points: int) -> bool:
+def is_whole_packets(points: int) -> bool:
     """Whether a frame of so many points is a whole number of packets: the board would wait for more for ever."""
     return (points * POINT_BYTES + TRAILER.size) % PACKET_BYTES == 0
 
@@ -41,14 +41,14 @@ class HeliosFrame:
     duration_s: float
 
     @classmethod
-    def of(cls, points: Table, points_per_s: int) -> "HeliosFrame":
+    def from_points(cls, points: PointTable, points_per_s: int) -> "HeliosFrame":
         """A frame of points [n, 7], played once."""
-        return cls.checked(points.tobytes() + TRAILER.pack(points_per_s, len(points), PLAY_ONCE))
+        return cls.from_bytes(points.tobytes() + TRAILER.pack(points_per_s, len(points), PLAY_ONCE))
 
     @classmethod
-    def checked(cls, data: bytes) -> "HeliosFrame":
+    def from_bytes(cls, data: bytes) -> "HeliosFrame":
         """The frame of these bytes; LocalProtocolError for one that could leave the light on, or stall."""
-        table, points_per_s = points_of(data)
+        table, points_per_s = parse_points(data)
         flags, duration_s = data[-1], len(table) * point_ticks(points_per_s) / CLOCK_HZ
         if flags != PLAY_ONCE:
             raise LocalProtocolError(
@@ -58,12 +58,12 @@ class HeliosFrame:
             raise LocalProtocolError("a frame whose last point is not dark")
         if duration_s > FRAME_MAX_S:
             raise LocalProtocolError(f"a frame of {duration_s:.4f} s, the longest allowed is {FRAME_MAX_S:g} s")
-        if fills_packets(len(table)):
+        if is_whole_packets(len(table)):
             raise LocalProtocolError(f"a frame of {len(table)} points fills whole packets, on which the board stalls")
         return cls(data, duration_s)
 
 
-def points_of(data: bytes) -> tuple[Table, int]:
+def parse_points(data: bytes) -> tuple[PointTable, int]:
     """Points [n, 7] and rate of a frame's bytes, as the board reads them; LocalProtocolError where they do not fit."""
     if len(data) < POINT_BYTES + TRAILER.size:
         raise LocalProtocolError(f"a frame of {len(data)} bytes holds no point")

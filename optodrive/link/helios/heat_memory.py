@@ -10,61 +10,63 @@ from zipfile import BadZipFile
 import numpy as np
 
 from optodrive.core.errors import InputError
-from optodrive.core.files import written_whole
+from optodrive.core.files import atomic_write
 from optodrive.core.types.plans import BudgetState
-from optodrive.planning.limiter.limiter import shifted
+from optodrive.planning.limiter.limiter import shift_state
 
 FORMAT = "optodrive-helios-memory"
 VERSION = 1
-WHEN_COLD = "remove it once the display has cooled"
-AHEAD_S = 1.0
+REMOVE_WHEN_COLD = "remove it once the display has cooled"
+ZERO_OFFSET_S = 1.0
 """Kept before the first light, a plan's zero is put so much later: it counts as warmer, never as colder."""
 
 
-class Memory:
+class HeatMemory:
     """The limiter's budget after the last play on one Helios, by the time of day."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @classmethod
-    def of(cls, name: str) -> Self:
+    def for_device(cls, name: str) -> Self:
         """The memory of the Helios of this name, in the user's folder for what programs keep."""
         folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "optodrive"
         return cls(folder / f"{re.sub('[^0-9A-Za-z]+', '-', name)}.npz")
 
-    def keep(self, budget: BudgetState, zero_s: float) -> None:
+    def save(self, budget: BudgetState, zero_s: float) -> None:
         """Remember a budget whose time line begins at zero_s, the time of day; InputError where that fails."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
             raise InputError(str(self.path), error.strerror, "a file that can be written") from None
         columns = {item.name: getattr(budget, item.name) for item in fields(BudgetState)}
-        with written_whole(self.path) as temporary, temporary.open("wb") as file:
+        with atomic_write(self.path) as temporary, temporary.open("wb") as file:
             np.savez(file, format=FORMAT, version=VERSION, zero_s=zero_s, **columns)
 
-    def recall(self, now_s: float, fresh: BudgetState) -> BudgetState:
+    def load(self, now_s: float, cold: BudgetState) -> BudgetState:
         """The budget on a time line that begins now; `fresh` where nothing was ever played.
 
         at_s above 0: earlier pulses may last so much longer. InputError where the file does not tell what is needed.
         """
         if not self.path.exists():
-            return fresh
+            return cold
         try:
             with self.path.open("rb") as file, np.load(file) as table:
-                found = {key: table[key] for key in table.files}
+                arrays = {key: table[key] for key in table.files}
         except (OSError, ValueError, EOFError, BadZipFile) as error:
-            raise InputError(str(self.path), str(error), f"a file that can be read; {WHEN_COLD}") from None
-        if (str(found.get("format")), int(found.get("version", 0))) != (FORMAT, VERSION):
-            raise InputError(f"{self.path}: version", found.get("version"), f"{FORMAT} {VERSION}; {WHEN_COLD}")
-        kept = {item.name: found[item.name] for item in fields(BudgetState)}
-        columns: dict[str, Any] = {key: float(value) if value.ndim == 0 else value for key, value in kept.items()}
+            raise InputError(str(self.path), str(error), f"a file that can be read; {REMOVE_WHEN_COLD}") from None
+        if (str(arrays.get("format")), int(arrays.get("version", 0))) != (FORMAT, VERSION):
+            raise InputError(f"{self.path}: version", arrays.get("version"), f"{FORMAT} {VERSION}; {REMOVE_WHEN_COLD}")
+        state_arrays = {item.name: arrays[item.name] for item in fields(BudgetState)}
+        columns: dict[str, Any] = {
+            key: float(value) if value.ndim == 0 else value for key, value in state_arrays.items()
+        }
         budget = BudgetState(**columns)
-        if len(budget.rise_k) != len(fresh.rise_k):
-            expected = f"{len(fresh.rise_k)}, the configured display's; {WHEN_COLD}"
+        if len(budget.rise_k) != len(cold.rise_k):
+            expected = f"{len(cold.rise_k)}, the configured display's; {REMOVE_WHEN_COLD}"
             raise InputError(f"{self.path}: pixels", len(budget.rise_k), expected)
-        if now_s < float(found["zero_s"]) - AHEAD_S:
+        if now_s < float(arrays["zero_s"]) - ZERO_OFFSET_S:
             raise InputError(
-                "the time of day", now_s, f"a time after the last play, as {self.path} has it; {WHEN_COLD}"
+                "the time of day", now_s, f"a time after the last play, as {self.path} has it; {REMOVE_WHEN_COLD}"
             )
-        return shifted(budget, float(found["zero_s"]) - now_s)
+        return shift_state(budget, float(arrays["zero_s"]) - now_s)

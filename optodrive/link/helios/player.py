@@ -8,28 +8,30 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import LinkError
 from optodrive.link.helios.dac import Helios
 from optodrive.link.helios.frames import HeliosFrame
-from optodrive.link.helios.verification import ProvenFrames
+from optodrive.link.helios.verification import VerifiedFrames
 
-POLL_S = 0.001
-PATIENCE_S = 0.5
+POLL_INTERVAL_S = 0.001
+READY_TIMEOUT_S = 0.5
 """A board that is not ready for so long, with frames of a twentieth of that, is not well."""
 
-Tick = Callable[[float], None]
+ProgressCallback = Callable[[float], None]
 
 
 @dataclass(frozen=True)
-class Played:
+class PlaybackReport:
     """What was sent. holes: how often the board had nothing to play between two frames; hole_s: for how long at least.
 
     In a hole it is dark, and all that follows comes so much later.
     """
 
     frames: int
-    holes: int
-    hole_s: float
+    underruns: int
+    underrun_s: float
 
 
-def play(helios: Helios, proven: ProvenFrames, clock: Clock, tick: Tick = lambda _share: None) -> Played:
+def play(
+    helios: Helios, verified: VerifiedFrames, clock: Clock, on_progress: ProgressCallback = lambda _share: None
+) -> PlaybackReport:
     """Play frames on a display that is as cool as the plan takes it to be; blocks until the light has ended.
 
     tick: told the share sent, often, also while the board is not ready; what it raises ends the light. Raises
@@ -37,38 +39,40 @@ def play(helios: Helios, proven: ProvenFrames, clock: Clock, tick: Tick = lambda
     """
     helios.require_interlock()
     try:
-        helios.dark()  # and with that its mirrors in the middle, where every plan begins
+        helios.stop()  # and with that its mirrors in the middle, where every plan begins
         helios.open_shutter()
-        played = _stream(helios, proven.frames, clock, tick)
+        report = _send_frames(helios, verified.frames, clock, on_progress)
     except BaseException:
         with suppress(LinkError):  # what went wrong first is told; leaving the board tries once more
-            helios.dark()
+            helios.stop()
         raise
-    helios.dark()
-    return played
+    helios.stop()
+    return report
 
 
-def _stream(helios: Helios, frames: tuple[HeliosFrame, ...], clock: Clock, tick: Tick) -> Played:
-    holes, hole_s, ends_s = 0, 0.0, clock.now_s()
+def _send_frames(
+    helios: Helios, frames: tuple[HeliosFrame, ...], clock: Clock, on_progress: ProgressCallback
+) -> PlaybackReport:
+    underruns, underrun_s, end_s = 0, 0.0, clock.now_s()
     for number, frame in enumerate(frames):
         share = number / len(frames)
-        _wait_until_ready(helios, clock, lambda share=share: tick(share))  # type: ignore[misc]
+        _wait_until_ready(helios, clock, lambda share=share: on_progress(share))  # type: ignore[misc]
         helios.send(frame)
         now_s = clock.now_s()
-        if number and now_s > ends_s:
-            holes, hole_s = holes + 1, hole_s + now_s - ends_s
-        ends_s = max(ends_s, now_s) + frame.duration_s
-    while clock.now_s() < ends_s:
-        tick(1.0)
-        clock.sleep(POLL_S)
-    return Played(len(frames), holes, hole_s)
+        if number and now_s > end_s:
+            underruns, underrun_s = underruns + 1, underrun_s + now_s - end_s
+        end_s = max(end_s, now_s) + frame.duration_s
+    while clock.now_s() < end_s:
+        on_progress(1.0)
+        clock.sleep(POLL_INTERVAL_S)
+    return PlaybackReport(len(frames), underruns, underrun_s)
 
 
-def _wait_until_ready(helios: Helios, clock: Clock, tick: Callable[[], None]) -> None:
-    give_up_s = clock.now_s() + PATIENCE_S
-    tick()
-    while not helios.ready():
-        if clock.now_s() > give_up_s:
-            raise LinkError(f"the Helios was not ready for a frame within {PATIENCE_S:g} s; it was stopped")
-        tick()
-        clock.sleep(POLL_S)
+def _wait_until_ready(helios: Helios, clock: Clock, on_progress: Callable[[], None]) -> None:
+    deadline_s = clock.now_s() + READY_TIMEOUT_S
+    on_progress()
+    while not helios.is_ready():
+        if clock.now_s() > deadline_s:
+            raise LinkError(f"the Helios was not ready for a frame within {READY_TIMEOUT_S:g} s; it was stopped")
+        on_progress()
+        clock.sleep(POLL_INTERVAL_S)

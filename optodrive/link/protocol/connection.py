@@ -44,17 +44,17 @@ class HostConnection:
         self._rto_s = rto_s
         self._decoder = FrameDecoder()
         self._control: list[bytes] = []
-        self._waiting: deque[Message] = deque()
+        self._queued: deque[Message] = deque()
         self._unacked: deque[bytes] = deque()
         self._next_seq = 0
         self._base_seq = 0
-        self._resend = False
-        self._resent = False
-        self._sent_s = 0.0
+        self._retransmit_pending = False
+        self._retransmit_done = False
+        self._timer_start_s = 0.0
         self._nonce: int | None = None
-        self._naks = 0
-        self._retransmitted = 0
-        self._aborted = 0
+        self._nak_count = 0
+        self._retransmit_count = 0
+        self._aborted_session = 0
         self.peer: HelloReply | None = None
 
     @property
@@ -65,71 +65,73 @@ class HostConnection:
     @property
     def outstanding(self) -> int:
         """Sequenced messages not yet acknowledged."""
-        return len(self._unacked) + len(self._waiting)
+        return len(self._unacked) + len(self._queued)
 
     @property
     def counters(self) -> LinkCounters:
         """How the link fared so far."""
-        counted = self._decoder.counters
-        return LinkCounters(counted.crc_errors, counted.format_errors, self._retransmitted, self._naks)
+        frame_counters = self._decoder.counters
+        return LinkCounters(
+            frame_counters.crc_errors, frame_counters.format_errors, self._retransmit_count, self._nak_count
+        )
 
-    def hello(self, nonce: int) -> None:
+    def send_hello(self, nonce: int) -> None:
         """Begin a new session; what was for the one before is forgotten, what was queued since waits for this one."""
         if self.peer is not None:
-            self._forget()
+            self._reset()
         self.peer = None
         self._nonce = nonce
-        self._control.append(encode_frame(Frame(Hello.TYPE, 0, 0, Hello(MAJOR, MINOR, nonce).body())))
+        self._control.append(encode_frame(Frame(Hello.TYPE, 0, 0, Hello(MAJOR, MINOR, nonce).encode_body())))
 
     def abort(self) -> None:
         """Put ABORT ahead of all and forget everything else; only a new hello goes on from here.
 
         Until its answer the board's events of the session before are still given: they say what became of ABORT.
         """
-        self._aborted = self.session or self._aborted
+        self._aborted_session = self.session or self._aborted_session
         self._control = [encode_frame(Frame(Abort.TYPE, 0, self.session, b""))]
         self.peer = self._nonce = None
-        self._forget()
+        self._reset()
 
-    def _forget(self) -> None:
-        self._waiting.clear()
+    def _reset(self) -> None:
+        self._queued.clear()
         self._unacked.clear()
         self._next_seq = self._base_seq = 0
-        self._resend = self._resent = False
+        self._retransmit_pending = self._retransmit_done = False
 
-    def send(self, message: Message, first: bool = False) -> None:
+    def send(self, message: Message, at_front: bool = False) -> None:
         """Queue a message. first: before all sequenced ones that wait."""
-        if message.SEQUENCED and first:
-            self._waiting.appendleft(message)
+        if message.SEQUENCED and at_front:
+            self._queued.appendleft(message)
         elif message.SEQUENCED:
-            self._waiting.append(message)
+            self._queued.append(message)
         else:
-            self._control.append(encode_frame(Frame(message.TYPE, 0, self.session, message.body())))
+            self._control.append(encode_frame(Frame(message.TYPE, 0, self.session, message.encode_body())))
 
-    def bytes_to_send(self, now_s: float, flight_bytes: int) -> bytes:
+    def bytes_to_send(self, now_s: float, max_in_flight_bytes: int) -> bytes:
         """What may leave now, keeping at most flight_bytes of sequenced frames unacknowledged."""
         out, self._control = b"".join(self._control), []
         if self.peer is not None:
-            out += self._sequenced(now_s, flight_bytes)
+            out += self._collect_sequenced(now_s, max_in_flight_bytes)
         # A frame whose end was lost would swallow the next one, an ABORT perhaps: a delimiter first ends it.
         return b"\0" + out if out else b""
 
-    def _sequenced(self, now_s: float, flight_bytes: int) -> bytes:
+    def _collect_sequenced(self, now_s: float, max_in_flight_bytes: int) -> bytes:
         out = b""
-        if self._unacked and (self._resend or now_s - self._sent_s > self._rto_s):
+        if self._unacked and (self._retransmit_pending or now_s - self._timer_start_s > self._rto_s):
             out += b"".join(self._unacked)
-            self._retransmitted += len(self._unacked)
-            self._resend, self._resent = False, True
-            self._sent_s = now_s
+            self._retransmit_count += len(self._unacked)
+            self._retransmit_pending, self._retransmit_done = False, True
+            self._timer_start_s = now_s
         in_flight = sum(len(frame) for frame in self._unacked)
-        while self._waiting and len(self._unacked) < WINDOW:
-            message = self._waiting[0]
-            frame = encode_frame(Frame(message.TYPE, self._next_seq, self.session, message.body()))
-            if self._unacked and in_flight + len(frame) > flight_bytes:
+        while self._queued and len(self._unacked) < WINDOW:
+            message = self._queued[0]
+            frame = encode_frame(Frame(message.TYPE, self._next_seq, self.session, message.encode_body()))
+            if self._unacked and in_flight + len(frame) > max_in_flight_bytes:
                 break
             if not self._unacked:
-                self._sent_s = now_s
-            self._waiting.popleft()
+                self._timer_start_s = now_s
+            self._queued.popleft()
             self._unacked.append(frame)
             self._next_seq = (self._next_seq + 1) % SEQ_MODULUS
             in_flight += len(frame)
@@ -151,23 +153,29 @@ class HostConnection:
             if isinstance(message, HelloReply):
                 if message.host_nonce != self._nonce or self.peer is not None:
                     continue
-                self.peer, self._aborted = message, 0
+                self.peer, self._aborted_session = message, 0
             elif self.peer is None:
-                if not self._aborted or frame.session != self._aborted or not isinstance(message, Event):
+                if (
+                    not self._aborted_session
+                    or frame.session != self._aborted_session
+                    or not isinstance(message, Event)
+                ):
                     continue
             elif frame.session != self.session:
                 continue
             if isinstance(message, Ack):
-                self._acknowledged(message.next_seq, now_s)
+                self._advance_window(message.next_seq, now_s)
             elif isinstance(message, Nak):
-                self._naks += 1
-                self._acknowledged(message.next_seq, now_s)
-                if message.reason == NAK_REASONS.index("SEQUENCE") and not self._resent:
-                    self._resend = True  # once: the other frames behind a gap are refused too, and say no more
+                self._nak_count += 1
+                self._advance_window(message.next_seq, now_s)
+                if message.reason == NAK_REASONS.index("SEQUENCE") and not self._retransmit_done:
+                    self._retransmit_pending = (
+                        True  # once: the other frames behind a gap are refused too, and say no more
+                    )
             messages.append(message)
         return messages
 
-    def _acknowledged(self, next_seq: int, now_s: float) -> None:
+    def _advance_window(self, next_seq: int, now_s: float) -> None:
         count = (next_seq - self._base_seq) % SEQ_MODULUS
         if count > len(self._unacked):
             return  # an old acknowledgement, overtaken
@@ -175,8 +183,8 @@ class HostConnection:
             self._unacked.popleft()
         if count:
             self._base_seq = next_seq
-            self._sent_s = now_s
-            self._resend = self._resent = False
+            self._timer_start_s = now_s
+            self._retransmit_pending = self._retransmit_done = False
 
 
 class BoardLink:
@@ -186,31 +194,31 @@ class BoardLink:
         self.decoder = FrameDecoder()
         self.session = 0
         self.seq_errors = 0
-        self._expected = 0
-        self._last_answer: int | None = None
+        self._expected_seq = 0
+        self._last_refusal: int | None = None
 
     @property
     def expected_seq(self) -> int:
         """The sequence number awaited next."""
-        return self._expected
+        return self._expected_seq
 
-    def begin(self, session: int) -> None:
+    def begin_session(self, session: int) -> None:
         """A new session."""
         self.session = session
-        self._expected = 0
-        self._last_answer = None
+        self._expected_seq = 0
+        self._last_refusal = None
 
     def accept(self, seq: int) -> tuple[bool, int | None]:
         """Whether a sequenced frame is the awaited one; if not, the NAK reason to answer with, None for an ACK."""
-        ahead = (seq - self._expected) % SEQ_MODULUS
+        ahead = (seq - self._expected_seq) % SEQ_MODULUS
         if ahead == 0:
             return True, None
         if ahead >= SEQ_MODULUS // 2:
-            return False, self._last_answer
+            return False, self._last_refusal
         self.seq_errors += 1
         return False, NAK_REASONS.index("SEQUENCE")
 
-    def consumed(self, refusal: int | None) -> None:
+    def mark_consumed(self, refusal: int | None) -> None:
         """The awaited frame was taken; refusal: the NAK reason, None where it was carried out."""
-        self._expected = (self._expected + 1) % SEQ_MODULUS
-        self._last_answer = refusal
+        self._expected_seq = (self._expected_seq + 1) % SEQ_MODULUS
+        self._last_refusal = refusal

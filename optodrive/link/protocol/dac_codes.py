@@ -9,7 +9,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True)
-class Converter:
+class BipolarDac:
     """A digital-to-analogue converter of so many bits; its centre code is angle 0."""
 
     bits: int
@@ -24,13 +24,13 @@ class Converter:
         """The largest code."""
         return (1 << self.bits) - 1
 
-    def codes(self, angle_rad: FloatArray, rad_per_code: float) -> IntArray:
+    def to_codes(self, angle_rad: FloatArray, rad_per_code: float) -> IntArray:
         """Mirror angle to codes; LocalProtocolError beyond the range. Any shape."""
         codes = np.rint(angle_rad / rad_per_code).astype(np.int64) + self.centre
         if codes.size and (codes.min() < 0 or codes.max() > self.code_max):
             raise LocalProtocolError(f"codes {codes.min()} to {codes.max()} leave the DAC's range 0 to {self.code_max}")
         return codes
 
-    def angles(self, codes: IntArray, rad_per_code: float) -> FloatArray:
+    def to_angles_rad(self, codes: IntArray, rad_per_code: float) -> FloatArray:
         """Codes to mirror angle, rad. Any shape."""
         return np.asarray((codes - self.centre) * rad_per_code, dtype=np.float64)

@@ -7,17 +7,17 @@ from optodrive.link.protocol import messages as m
 
 DUTY_MAX = 65535
 RESET_CAUSES = ("power-up", "reset", "brown-out", "watchdog")
-SHARES = ("max_duty", "mean_duty")
-NONCES = ("host_nonce", "board_nonce", "host_t")
+DUTY_FIELDS = ("max_duty", "mean_duty")
+NONCE_FIELDS = ("host_nonce", "board_nonce", "host_t")
 
 
-def name_of(message: m.Message) -> str:
+def message_name(message: m.Message) -> str:
     """The message's name as PROTOCOL.md writes it: HELLO_REPLY."""
     name = type(message).__name__
     return "".join(f"_{letter}" if letter.isupper() and at else letter for at, letter in enumerate(name)).upper()
 
 
-def reset_cause(code: int) -> str:
+def describe_reset_cause(code: int) -> str:
     """Why the board last started, in a word; the number where it has no meaning."""
     return RESET_CAUSES[code] if code < len(RESET_CAUSES) else f"unknown cause {code}"
 
@@ -25,16 +25,16 @@ def reset_cause(code: int) -> str:
 def describe(message: m.Message) -> dict[str, Any]:
     """Field by field: enumerations in words, units in the name, nonces in hex, points and records as columns."""
     if isinstance(message, m.Data):
-        return {"first_index": message.first_index, **_points(message)}
+        return {"first_index": message.first_index, **_describe_points(message)}
     if isinstance(message, m.Executed):
-        return {"first_index": message.first_index, **_records(message)}
-    words: dict[str, Any] = {}
+        return {"first_index": message.first_index, **_describe_records(message)}
+    described: dict[str, Any] = {}
     for item in fields(message):  # type: ignore[arg-type]
-        words.update(_field(message, item.name))
-    return words
+        described.update(_describe_field(message, item.name))
+    return described
 
 
-def _field(message: m.Message, name: str) -> dict[str, Any]:
+def _describe_field(message: m.Message, name: str) -> dict[str, Any]:
     value, names = getattr(message, name), message.ENUMS.get(name)
     if names is not None:
         return {name: names[value] or None}
@@ -42,29 +42,29 @@ def _field(message: m.Message, name: str) -> dict[str, Any]:
         return {name: describe(value)}
     if isinstance(value, bytes):
         return {name: value.hex()}
-    if name in NONCES:
+    if name in NONCE_FIELDS:
         return {name: f"{value:08x}"}
-    if name in SHARES:
+    if name in DUTY_FIELDS:
         return {name.replace("duty", "duty_share"): value / DUTY_MAX}
     if name == "inputs":
-        return {name: [what for bit, what in enumerate(m.INPUTS) if value >> bit & 1]}
+        return {name: [input_name for bit, input_name in enumerate(m.INPUTS) if value >> bit & 1]}
     if name == "temperature_dc":
         return {"temperature_c": value / 10.0}
     if name == "reset_cause":
-        return {name: reset_cause(value)}
+        return {name: describe_reset_cause(value)}
     if name == "firmware":
         return {name: f"{value >> 16}.{value & 0xFFFF}"}
     return {name: value}
 
 
-def _points(message: m.Data) -> dict[str, Any]:
+def _describe_points(message: m.Data) -> dict[str, Any]:
     x, y, dark_us, on_us, duty = zip(*m.POINT.iter_unpack(message.points), strict=True)
-    share = [round(value / DUTY_MAX, 6) for value in duty]
+    duty_share = [round(value / DUTY_MAX, 6) for value in duty]
     columns = {"x_code": x, "y_code": y, "dark_us": dark_us, "on_us": on_us}
-    return {"points": len(x), **{name: list(values) for name, values in columns.items()}, "duty_share": share}
+    return {"points": len(x), **{name: list(values) for name, values in columns.items()}, "duty_share": duty_share}
 
 
-def _records(message: m.Executed) -> dict[str, Any]:
+def _describe_records(message: m.Executed) -> dict[str, Any]:
     on_tick, on_ticks, duty = zip(*message.records, strict=True)
-    share = [round(value / DUTY_MAX, 6) for value in duty]
-    return {"records": len(on_tick), "on_tick": list(on_tick), "on_ticks": list(on_ticks), "duty_share": share}
+    duty_share = [round(value / DUTY_MAX, 6) for value in duty]
+    return {"records": len(on_tick), "on_tick": list(on_tick), "on_ticks": list(on_ticks), "duty_share": duty_share}

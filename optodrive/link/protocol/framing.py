@@ -46,13 +46,13 @@ def cobs_encode(raw: bytes) -> bytes:
 def cobs_decode(encoded: bytes) -> bytes | None:
     """The bytes that were encoded, or None where these are no COBS of at most RAW_MAX bytes."""
     runs = []
-    at = 0
-    while at < len(encoded):
-        code = encoded[at]
-        if code == 0 or code > ENCODED_MAX or at + code > len(encoded):
+    position = 0
+    while position < len(encoded):
+        code = encoded[position]
+        if code == 0 or code > ENCODED_MAX or position + code > len(encoded):
             return None
-        runs.append(encoded[at + 1 : at + code])
-        at += code
+        runs.append(encoded[position + 1 : position + code])
+        position += code
     raw = b"\0".join(runs)
     return raw if runs and len(raw) <= RAW_MAX else None
 
@@ -79,7 +79,7 @@ class FrameDecoder:
             if self._overlong:
                 self._overlong = False
             elif encoded:
-                frame = self._frame(encoded)
+                frame = self._decode_frame(encoded)
                 if frame is not None:
                     yield frame
         if len(self._pending) > ENCODED_MAX:
@@ -88,7 +88,7 @@ class FrameDecoder:
             self._overlong = True
             self._pending = b""
 
-    def _frame(self, encoded: bytes) -> Frame | None:
+    def _decode_frame(self, encoded: bytes) -> Frame | None:
         raw = cobs_decode(encoded)
         if raw is None or len(raw) < HEADER.size + CRC.size:
             self.counters.format_errors += 1

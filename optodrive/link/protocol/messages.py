@@ -31,7 +31,7 @@ FAULTS = (
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """Refusals after which the same frame is sent again; after the others it counts as taken and refused."""
-REASONS = (
+EVENT_REASONS = (
     "",
     "boot",
     "hello",
@@ -71,7 +71,7 @@ class Message:
     SEQUENCED: ClassVar[bool] = False
     ENUMS: ClassVar[dict[str, tuple[str, ...]]] = {}
 
-    def body(self) -> bytes:
+    def encode_body(self) -> bytes:
         """The body's bytes."""
         return self.LAYOUT.pack(*(getattr(self, item.name) for item in fields(self)))  # type: ignore[arg-type]
 
@@ -134,18 +134,18 @@ class HelloReply(Message):
     reset_cause: int
     limits: Limits
 
-    def body(self) -> bytes:
+    def encode_body(self) -> bytes:
         """The body's bytes."""
-        own = [getattr(self, item.name) for item in fields(self)[:-1]]
-        return self.LAYOUT.pack(*own) + self.limits.body()
+        values = [getattr(self, item.name) for item in fields(self)[:-1]]
+        return self.LAYOUT.pack(*values) + self.limits.encode_body()
 
     @classmethod
     def parse(cls, body: bytes) -> Self:
         """A message from its body."""
-        own, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
-        if len(own) != cls.LAYOUT.size:
+        fixed_part, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
+        if len(fixed_part) != cls.LAYOUT.size:
             raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes of body")
-        values: tuple[Any, ...] = (*cls.LAYOUT.unpack(own), Limits.parse(rest))
+        values: tuple[Any, ...] = (*cls.LAYOUT.unpack(fixed_part), Limits.parse(rest))
         return cls(*values)
 
 
@@ -183,7 +183,7 @@ class Data(Message):
     first_index: int
     points: bytes
 
-    def body(self) -> bytes:
+    def encode_body(self) -> bytes:
         """The body's bytes."""
         return self.LAYOUT.pack(self.first_index) + self.points
 
@@ -311,7 +311,7 @@ class Event(Message):
     """The state changed."""
 
     TYPE, LAYOUT = 0x92, struct.Struct("<BBBQ")
-    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS, "reason": REASONS}
+    ENUMS: ClassVar = {"state": STATES, "fault": FAULTS, "reason": EVENT_REASONS}
     state: int
     fault: int
     reason: int
@@ -347,7 +347,7 @@ class Executed(Message):
     first_index: int
     records: tuple[tuple[int, int, int], ...]
 
-    def body(self) -> bytes:
+    def encode_body(self) -> bytes:
         """The body's bytes; offsets count from the first record's tick."""
         base = self.records[0][0]
         packed = (RECORD.pack(on_tick - base, on_ticks, duty) for on_tick, on_ticks, duty in self.records)
@@ -356,10 +356,14 @@ class Executed(Message):
     @classmethod
     def parse(cls, body: bytes) -> Self:
         """A message from its body."""
-        head, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
-        if len(head) != cls.LAYOUT.size or len(rest) % RECORD.size or not 1 <= len(rest) // RECORD.size <= RECORDS_MAX:
+        fixed_part, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
+        if (
+            len(fixed_part) != cls.LAYOUT.size
+            or len(rest) % RECORD.size
+            or not 1 <= len(rest) // RECORD.size <= RECORDS_MAX
+        ):
             raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes are not 1 to {RECORDS_MAX} whole records")
-        first_index, base = cls.LAYOUT.unpack(head)
+        first_index, base = cls.LAYOUT.unpack(fixed_part)
         records = tuple((base + offset, on, duty) for offset, on, duty in RECORD.iter_unpack(rest))
         return cls(first_index, records)
 
@@ -391,16 +395,16 @@ BOARD_MESSAGES: tuple[type[Message], ...] = (
     Status,
     Executed,
 )
-BY_TYPE: dict[int, type[Message]] = {kind.TYPE: kind for kind in HOST_MESSAGES + BOARD_MESSAGES}
+MESSAGES_BY_TYPE: dict[int, type[Message]] = {kind.TYPE: kind for kind in HOST_MESSAGES + BOARD_MESSAGES}
 
 
-def parse_message(kind: int, body: bytes) -> Message:
+def parse_message(type_id: int, body: bytes) -> Message:
     """A message from a frame's type and body; RemoteProtocolError for unknown types, lengths and enumerations."""
-    known = BY_TYPE.get(kind)
-    if known is None:
-        raise RemoteProtocolError(f"unknown message type 0x{kind:02x}")
-    message = known.parse(body)
-    for name, names in known.ENUMS.items():
+    message_class = MESSAGES_BY_TYPE.get(type_id)
+    if message_class is None:
+        raise RemoteProtocolError(f"unknown message type 0x{type_id:02x}")
+    message = message_class.parse(body)
+    for name, names in message_class.ENUMS.items():
         if getattr(message, name) >= len(names):
-            raise RemoteProtocolError(f"{known.__name__}: {name} {getattr(message, name)} has no meaning")
+            raise RemoteProtocolError(f"{message_class.__name__}: {name} {getattr(message, name)} has no meaning")
     return message

@@ -7,26 +7,26 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.device.config import Config
-from optodrive.device.field_loader import field_of, moves_of
-from optodrive.device.pixel_map import aimed_layout
+from optodrive.device.field_loader import build_settling_table, load_scan_field
+from optodrive.device.pixel_map import build_aim_layout
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import RTO_S
 from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
 
 PROTOCOL_MAJOR = 1
 TICK_HZ = 1_000_000
-SLACK = 1.05
+CAP_MARGIN = 1.05
 """The board's caps lie this much above the limiter's: it is the second fence, not the first."""
 FIELD_MARGIN_CODES = 64
 FRAME_BYTES = 254
-FLIGHT_S = 0.01
+MAX_IN_FLIGHT_S = 0.01
 """Bytes on their way to the board never take longer than this, so that an ABORT is soon heard, and a lost frame costs
 few others that must be sent again behind it; the protocol allows twice as much."""
-BITS_A_BYTE = 10
+BITS_PER_BYTE = 10
 
 
 @dataclass(frozen=True)
-class Requirements:
+class BoardRequirements:
     """Derived once from a configuration. margin_codes: so far beyond the outermost pixels the board is let go."""
 
     config: Config
@@ -34,7 +34,7 @@ class Requirements:
     margin_codes: int = FIELD_MARGIN_CODES
 
     @classmethod
-    def of(cls, config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> "Requirements":
+    def from_config(cls, config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> "BoardRequirements":
         """Derive them; codes span the scanner's whole range."""
         scale = WireScale(
             rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
@@ -49,27 +49,27 @@ class Requirements:
         return self.config.board.lease_s
 
     @property
-    def flight_bytes(self) -> int:
+    def max_in_flight_bytes(self) -> int:
         """Most bytes that may be unacknowledged on the link."""
-        return max(2 * FRAME_BYTES, int(self.config.board.baud / BITS_A_BYTE * FLIGHT_S))
+        return max(2 * FRAME_BYTES, int(self.config.board.baud / BITS_PER_BYTE * MAX_IN_FLIGHT_S))
 
     @property
     def rto_s(self) -> float:
         """When a frame without an answer is sent again, s: what is in flight must have had time to pass twice."""
-        return RTO_S + 2 * self.flight_bytes * BITS_A_BYTE / self.config.board.baud
+        return RTO_S + 2 * self.max_in_flight_bytes * BITS_PER_BYTE / self.config.board.baud
 
-    def limits(self) -> m.Limits:
+    def build_limits(self) -> m.Limits:
         """The limits this host asks the board to tighten to."""
-        limits, layout = self.config.limits, aimed_layout(self.config)
-        settle_us, settle_ns_per_code = self._settling()
-        angles_rad = field_of(self.config).angles_rad(layout.x_m, layout.y_m)
-        x_codes, y_codes = (self.scale.codes(angle_rad) for angle_rad in angles_rad)
+        limits, layout = self.config.limits, build_aim_layout(self.config)
+        settle_us, settle_ns_per_code = self._compute_settling()
+        angles_rad = load_scan_field(self.config).angles_rad(layout.x_m, layout.y_m)
+        x_codes, y_codes = (self.scale.to_codes(angle_rad) for angle_rad in angles_rad)
         return m.Limits(
             max_on_us=ceil(limits.pulse_width_max_s * 1e6),
             max_duty=65535,
             mean_duty=65535,
-            spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * SLACK),
-            spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * SLACK),
+            spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * CAP_MARGIN),
+            spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * CAP_MARGIN),
             full_power_uw=round(self.config.laser.max_power_w * 1e6),
             x_min=max(0, int(x_codes.min()) - self.margin_codes),
             x_max=min(CODE_MAX, int(x_codes.max()) + self.margin_codes),
@@ -77,24 +77,24 @@ class Requirements:
             y_max=min(CODE_MAX, int(y_codes.max()) + self.margin_codes),
             settle_us=settle_us,
             settle_ns_per_code=settle_ns_per_code,
-            rest_us=round(limits.pulse_rest_min_s * 1e6),
+            rest_us=round(limits.pulse_gap_min_s * 1e6),
             lease_ms=round(self.lease_s * 1e3),
         )
 
-    def _settling(self) -> tuple[int, int]:
+    def _compute_settling(self) -> tuple[int, int]:
         """settle_us and settle_ns_per_code: the slew, and as much as never comes above the plan's own time of a move.
 
         Times jump where a longer move begins to overshoot; a steeper line would have to lie lower for the short ones.
         """
-        moves = moves_of(self.config)
+        settling_table = build_settling_table(self.config)
         ns_per_code = int(self.scale.rad_per_code / self.config.scanner.slew_rad_per_s * 1e9)
-        pitches = np.arange(1, len(moves.calm[0]))
+        pitches = np.arange(1, len(settling_table.after_long_dwell[0]))
         # A move may come out a code longer than planned.
-        codes = np.floor(pitches * moves.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
-        times_us = np.minimum(*(np.array(table)[pitches] for table in moves.calm))
+        codes = np.floor(pitches * settling_table.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
+        times_us = np.minimum(*(np.array(table)[pitches] for table in settling_table.after_long_dwell))
         return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code
 
-    def check(self, peer: m.HelloReply) -> None:
+    def check_board(self, peer: m.HelloReply) -> None:
         """Refuse a board that cannot do what the configuration plans with; InputError names key and value."""
         config = self.config
         if peer.major != PROTOCOL_MAJOR:
@@ -103,36 +103,36 @@ class Requirements:
             raise InputError("board.uid", peer.uid.hex(), f"{config.board.uid}, the board configured", "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
-        limits, asked = peer.limits, self.limits()
+        limits, requested = peer.limits, self.build_limits()
         slower = "a slower servo: the board itself keeps the gate closed"
-        if limits.settle_us > asked.settle_us:
-            expected = f"{slower} for {limits.settle_us} µs a move, the plan for {asked.settle_us} µs"
+        if limits.settle_us > requested.settle_us:
+            expected = f"{slower} for {limits.settle_us} µs a move, the plan for {requested.settle_us} µs"
             raise InputError("scanner.bandwidth_hz", config.scanner.bandwidth_hz, expected, "board")
-        if limits.settle_ns_per_code > asked.settle_ns_per_code:
-            expected = f"{slower} for {limits.settle_ns_per_code} ns a code, the plan for {asked.settle_ns_per_code} ns"
-            raise InputError("scanner.slew_rad_per_s", config.scanner.slew_rad_per_s, expected, "board")
-        if limits.max_on_us < asked.max_on_us:
-            most_s = limits.max_on_us * 1e-6
-            raise InputError(
-                "limits.pulse_width_max_s", config.limits.pulse_width_max_s, f"at most {most_s:g}", "board"
+        if limits.settle_ns_per_code > requested.settle_ns_per_code:
+            expected = (
+                f"{slower} for {limits.settle_ns_per_code} ns a code, the plan for {requested.settle_ns_per_code} ns"
             )
-        if abs(limits.full_power_uw - asked.full_power_uw) > 0.01 * asked.full_power_uw:
+            raise InputError("scanner.slew_rad_per_s", config.scanner.slew_rad_per_s, expected, "board")
+        if limits.max_on_us < requested.max_on_us:
+            max_s = limits.max_on_us * 1e-6
+            raise InputError("limits.pulse_width_max_s", config.limits.pulse_width_max_s, f"at most {max_s:g}", "board")
+        if abs(limits.full_power_uw - requested.full_power_uw) > 0.01 * requested.full_power_uw:
             board_w = limits.full_power_uw * 1e-6
             raise InputError(
                 "laser.max_power_w", config.laser.max_power_w, f"{board_w:g}, what the board was set to", "board"
             )
         if limits.spot_uj < config.limits.pulse_energy_max_j * 1e6:
-            most_j = limits.spot_uj * 1e-6
+            max_j = limits.spot_uj * 1e-6
             raise InputError(
-                "limits.pulse_energy_max_j", config.limits.pulse_energy_max_j, f"at most {most_j:g}", "board"
+                "limits.pulse_energy_max_j", config.limits.pulse_energy_max_j, f"at most {max_j:g}", "board"
             )
         if limits.spot_leak_uw < config.limits.pixel_mean_power_max_w * 1e6:
-            most_w = limits.spot_leak_uw * 1e-6
+            max_w = limits.spot_leak_uw * 1e-6
             key = "limits.pixel_mean_power_max_w"
-            raise InputError(key, config.limits.pixel_mean_power_max_w, f"at most {most_w:g}", "board")
+            raise InputError(key, config.limits.pixel_mean_power_max_w, f"at most {max_w:g}", "board")
         for axis in ("x", "y"):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
-            if getattr(asked, f"{axis}_min") < low or getattr(asked, f"{axis}_max") > high:
+            if getattr(requested, f"{axis}_min") < low or getattr(requested, f"{axis}_max") > high:
                 raise InputError(
                     f"display {axis}", "the lattice", f"to lie within the board's codes {low} to {high}", "board"
                 )

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from optodrive.link.session.fault_hints import hint
+from optodrive.link.session.fault_hints import get_fault_hint
 
 
 @dataclass
@@ -25,6 +25,6 @@ class BoardView:
     uid: str = ""
     firmware: int = 0
 
-    def figures(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """As REST answers it, with the fault's likely cause in plain words."""
-        return {**asdict(self), "fault": self.fault or None, "hint": hint(self.fault)}
+        return {**asdict(self), "fault": self.fault or None, "hint": get_fault_hint(self.fault)}

@@ -1,6 +1,6 @@
 """Board time on the host's clock: each exchange brackets a tick, the narrowest bracket of the last few counts."""
 
-SAMPLES = 16
+SAMPLES_MAX = 16
 DRIFT_MAX = 2e-4
 """Two crystals disagree by less than this; a bracket widens by it as it ages."""
 
@@ -12,13 +12,13 @@ class ClockSync:
         # Replaced, never changed: another thread may be walking through the samples.
         self._samples: tuple[tuple[float, float, float], ...] = ()
 
-    def add(self, sent_s: float, received_s: float, board_s: float) -> None:
+    def add(self, request_s: float, reply_s: float, board_s: float) -> None:
         """Note an exchange: asked at sent_s, answered at received_s, the board read board_s in between."""
-        sample = (received_s - sent_s, (sent_s + received_s) / 2, board_s)
-        self._samples = (*self._samples[1 - SAMPLES :], sample)
+        sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
+        self._samples = (*self._samples[1 - SAMPLES_MAX :], sample)
 
     @property
-    def known(self) -> bool:
+    def is_synchronised(self) -> bool:
         """Whether there was an exchange yet."""
         return bool(self._samples)
 
@@ -32,5 +32,5 @@ class ClockSync:
         samples = self._samples
         if not samples:
             return 0.0
-        _, middle_s, board_s = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
-        return board_s + (host_s - middle_s)
+        _, midpoint_s, board_s = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
+        return board_s + (host_s - midpoint_s)

@@ -1,6 +1,6 @@
 """What a board's fault means and what to do, in plain words."""
 
-HINTS = {
+FAULT_HINTS = {
     "LINK": "the board heard no lease in time: the host stalled, or bytes were lost on the way",
     "RANGE": "a point lay outside the field: the scanner's range in the configuration does not match the board's",
     "ON_TIME": "a point, or several on one spot, kept the gate on longer than the board allows",
@@ -14,8 +14,8 @@ HINTS = {
 }
 
 
-def hint(fault: str | None) -> str:
+def get_fault_hint(fault: str | None) -> str:
     """A sentence on a fault's likely cause; says so where none is known."""
     if not fault:
         return ""
-    return HINTS.get(fault, "no likely cause is known; look at the board's log")
+    return FAULT_HINTS.get(fault, "no likely cause is known; look at the board's log")

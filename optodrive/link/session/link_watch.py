@@ -4,127 +4,131 @@ from collections import deque
 from typing import NamedTuple
 
 from optodrive.link.session.likely_cause import (
-    Evidence,
-    port_cause,
-    why_deaf,
-    why_lease_lapsed,
-    why_lost,
-    why_restarted,
-    why_there_again,
+    LinkEvidence,
+    describe_receive_errors,
+    describe_replug,
+    describe_restart,
+    diagnose_lease_expiry,
+    diagnose_link_loss,
+    diagnose_port,
 )
-from optodrive.link.transport.port_state import PortState, port_state
+from optodrive.link.transport.port_state import PortState, read_port_state
 
-RECENT_S = 5.0
+EVIDENCE_WINDOW_S = 5.0
 """What happened longer ago explains nothing."""
-MARK_EVERY_S = 0.5
+SAMPLE_INTERVAL_S = 0.5
 
 
-class Counts(NamedTuple):
+class LinkErrorCounts(NamedTuple):
     """Counters of the link since it was opened."""
 
-    bad_here: int = 0
-    bad_at_board: int = 0
-    sent_again: int = 0
+    host_bad_frames: int = 0
+    board_bad_frames: int = 0
+    retransmitted: int = 0
     naks: int = 0
 
 
-class Cause(NamedTuple):
+class LinkCause(NamedTuple):
     """A sentence, and when what it explains was noticed, host time in s."""
 
-    sentence: str
-    at_s: float
+    message: str
+    noticed_s: float
 
 
 class LinkWatch:
     """One link's; the loop that owns the session calls it, any thread may read `cause` and `longest_gap_s`."""
 
     def __init__(self, port: str, lease_s: float) -> None:
-        self.cause: Cause | None = None
-        self.longest_gap_s = 0.0
+        self.cause: LinkCause | None = None
+        self.longest_stall_s = 0.0
         self._port = port
         self._lease_s = lease_s
-        self._turned_s: float | None = None
-        self._withheld_s: float | None = None
-        self._gap_s, self._gap_at_s = 0.0, 0.0
-        self._marks: deque[tuple[float, Counts]] = deque()
-        self._counts = Counts()
+        self._last_loop_s: float | None = None
+        self._lease_withheld_s: float | None = None
+        self._stall_s, self._stall_at_s = 0.0, 0.0
+        self._samples: deque[tuple[float, LinkErrorCounts]] = deque()
+        self._counts = LinkErrorCounts()
         self._fault = ""
-        self._heard_s: float | None = None
-        self._bad_at_board: int | None = None
-        self._gone = False
+        self._last_received_s: float | None = None
+        self._board_bad_frames: int | None = None
+        self._port_missing = False
 
-    def opened(self) -> None:
+    def on_opened(self) -> None:
         """The counters begin anew, and connecting was no turn of the loop."""
-        self._marks.clear()
-        self._counts, self._turned_s, self._fault = Counts(), None, ""
+        self._samples.clear()
+        self._counts, self._last_loop_s, self._fault = LinkErrorCounts(), None, ""
 
-    def turn(self, now_s: float, lease: bool, counts: Counts) -> None:
+    def on_loop(self, now_s: float, may_renew_lease: bool, counts: LinkErrorCounts) -> None:
         """The loop is about to serve the link. lease: whether it may renew the lease."""
-        self._note_gap(now_s)
-        self._turned_s = now_s
-        if not lease:
-            self._withheld_s = now_s
+        self._record_stall(now_s)
+        self._last_loop_s = now_s
+        if not may_renew_lease:
+            self._lease_withheld_s = now_s
         self._counts = counts
-        if not self._marks or now_s - self._marks[-1][0] >= MARK_EVERY_S:
-            self._marks.append((now_s, counts))
-        while now_s - self._marks[0][0] > RECENT_S:
-            self._marks.popleft()
+        if not self._samples or now_s - self._samples[-1][0] >= SAMPLE_INTERVAL_S:
+            self._samples.append((now_s, counts))
+        while now_s - self._samples[0][0] > EVIDENCE_WINDOW_S:
+            self._samples.popleft()
 
-    def _note_gap(self, now_s: float) -> None:
-        if self._turned_s is None:
+    def _record_stall(self, now_s: float) -> None:
+        if self._last_loop_s is None:
             return
-        gap_s = now_s - self._turned_s
-        self.longest_gap_s = max(self.longest_gap_s, gap_s)
-        if gap_s >= self._gap_s or now_s - self._gap_at_s > RECENT_S:
-            self._gap_s, self._gap_at_s = gap_s, now_s
+        stall_s = now_s - self._last_loop_s
+        self.longest_stall_s = max(self.longest_stall_s, stall_s)
+        if stall_s >= self._stall_s or now_s - self._stall_at_s > EVIDENCE_WINDOW_S:
+            self._stall_s, self._stall_at_s = stall_s, now_s
 
-    def heard(self, fault: str, now_s: float, counts: Counts) -> None:
+    def on_status(self, fault: str, now_s: float, counts: LinkErrorCounts) -> None:
         """The board told its fault, '' where it has none."""
         # A board that was found in this fault has it from another time, of which nothing is known here.
-        if fault == "LINK" and self._fault != fault and self._turned_s is not None:
-            self._note_gap(now_s)  # it may have stood still within this very turn, waiting for these bytes
+        if fault == "LINK" and self._fault != fault and self._last_loop_s is not None:
+            self._record_stall(now_s)  # it may have stood still within this very turn, waiting for these bytes
             self._counts = counts
-            self.cause = Cause(why_lease_lapsed(self._evidence(now_s, PortState("there"), silent=False)), now_s)
+            self.cause = LinkCause(
+                diagnose_lease_expiry(self._collect_evidence(now_s, PortState("there"), silent=False)), now_s
+            )
         self._fault = fault
 
-    def lost(self, now_s: float, heard_s: float, silent: bool) -> Cause:
+    def on_lost(self, now_s: float, last_received_s: float, silent: bool) -> LinkCause:
         """The link was given up; why, likely. heard_s: when the board was last heard; silent: that was why."""
-        self._heard_s = heard_s
-        self._bad_at_board = self._counts.bad_at_board if silent else None
-        state = port_state(self._port)
-        self._gone = state.fate == "gone"
-        self.cause = Cause(why_lost(self._evidence(now_s, state, silent)), now_s)
+        self._last_received_s = last_received_s
+        self._board_bad_frames = self._counts.board_bad_frames if silent else None
+        state = read_port_state(self._port)
+        self._port_missing = state.status == "gone"
+        self.cause = LinkCause(diagnose_link_loss(self._collect_evidence(now_s, state, silent)), now_s)
         return self.cause
 
-    def not_back(self, now_s: float) -> None:
+    def on_reconnect_failed(self, now_s: float) -> None:
         """The link could not be opened again: the port may tell why."""
-        state = port_state(self._port)
-        self._gone = self._gone or state.fate == "gone"
-        sentence = port_cause(self._port, state)
-        if sentence is not None and (self.cause is None or self.cause.sentence != sentence):
-            self.cause = Cause(sentence, now_s)
+        state = read_port_state(self._port)
+        self._port_missing = self._port_missing or state.status == "gone"
+        message = diagnose_port(self._port, state)
+        if message is not None and (self.cause is None or self.cause.message != message):
+            self.cause = LinkCause(message, now_s)
 
-    def back(self, now_s: float, reset_code: int, uptime_s: float, counts: Counts) -> None:
+    def on_reconnected(self, now_s: float, reset_code: int, uptime_s: float, counts: LinkErrorCounts) -> None:
         """The link is open again; a board younger than the last word heard of it has restarted."""
-        if self._heard_s is not None and uptime_s < now_s - self._heard_s:
-            self.cause = Cause(why_restarted(reset_code, uptime_s), now_s)
-        elif self._bad_at_board is not None and counts.bad_at_board > self._bad_at_board:
-            self.cause = Cause(why_deaf(counts.bad_at_board - self._bad_at_board), now_s)
-        elif self._gone:
-            self.cause = Cause(why_there_again(self._port), now_s)
-        self._heard_s = self._bad_at_board = None
-        self._gone = False
+        if self._last_received_s is not None and uptime_s < now_s - self._last_received_s:
+            self.cause = LinkCause(describe_restart(reset_code, uptime_s), now_s)
+        elif self._board_bad_frames is not None and counts.board_bad_frames > self._board_bad_frames:
+            self.cause = LinkCause(describe_receive_errors(counts.board_bad_frames - self._board_bad_frames), now_s)
+        elif self._port_missing:
+            self.cause = LinkCause(describe_replug(self._port), now_s)
+        self._last_received_s = self._board_bad_frames = None
+        self._port_missing = False
 
-    def _evidence(self, now_s: float, state: PortState, silent: bool) -> Evidence:
-        before = self._marks[0][1] if self._marks else Counts()
-        recent = Counts(*(now - then for now, then in zip(self._counts, before, strict=True)))
-        stuck = self._withheld_s is not None and now_s - self._withheld_s < self._lease_s + MARK_EVERY_S
-        return Evidence(
+    def _collect_evidence(self, now_s: float, state: PortState, silent: bool) -> LinkEvidence:
+        oldest = self._samples[0][1] if self._samples else LinkErrorCounts()
+        recent = LinkErrorCounts(*(now - then for now, then in zip(self._counts, oldest, strict=True)))
+        planner_stalled = (
+            self._lease_withheld_s is not None and now_s - self._lease_withheld_s < self._lease_s + SAMPLE_INTERVAL_S
+        )
+        return LinkEvidence(
             port=self._port,
             port_state=state,
             silent=silent,
             lease_s=self._lease_s,
-            stall_s=self._gap_s if now_s - self._gap_at_s <= RECENT_S else 0.0,
-            planner_stuck=stuck,
+            stall_s=self._stall_s if now_s - self._stall_at_s <= EVIDENCE_WINDOW_S else 0.0,
+            planner_stalled=planner_stalled,
             **recent._asdict(),
         )

@@ -9,9 +9,9 @@ from math import inf
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session.job import Job
+from optodrive.link.session.job import PlanJob
 
-GAP_AFTER_S = 0.1
+MISSING_REPORT_RETRY_S = 0.1
 WATERMARK_POINTS = 48
 
 
@@ -19,45 +19,52 @@ class PointStream:
     """Jobs in order; the board knows them as one, from START to END. Indices count over the session."""
 
     def __init__(self) -> None:
-        self._jobs: deque[Job] = deque()
+        self._jobs: deque[PlanJob] = deque()
         self._number = 0
         self._next_index = 0
         self._sent_index = 0
         self._started = self._end_sent = False
-        self._gap_asked_s = 0.0
+        self._reports_requested_s = 0.0
 
     def __bool__(self) -> bool:
         return bool(self._jobs)
 
-    def restart(self) -> None:
+    def reset_indices(self) -> None:
         """A new session: the board counts from 0 again."""
         self._next_index = self._sent_index = 0
 
-    def begin(self, points: WirePoints, start_tick: int, ahead_ticks: float = inf) -> Job:
+    def begin(self, points: WirePoints, start_tick: int, send_ahead_ticks: float = inf) -> PlanJob:
         """A job whose zero is at the board's start_tick. ahead_ticks: points leave no longer before they begin."""
         self._number += 1
         self._started = self._end_sent = False
-        return self._append(points, start_tick, ahead_ticks)
+        return self._append(points, start_tick, send_ahead_ticks)
 
-    def follow(self, points: WirePoints, keep: int, ahead_ticks: float, soonest_tick: float) -> Job | None:
+    def splice(
+        self, points: WirePoints, kept_points: int, send_ahead_ticks: float, min_end_tick: float
+    ) -> PlanJob | None:
         """Cut the last job after `keep` points and go on with others at once.
 
         None where more has left already, or `keep` points end before soonest_tick and the board might run dry.
         """
         last = self._jobs[-1] if self._jobs else None
-        if last is None or not self._started or last.end_tick_of(keep) < soonest_tick or not self.end_after(keep):
+        if (
+            last is None
+            or not self._started
+            or last.end_tick_after(kept_points) < min_end_tick
+            or not self.truncate(kept_points)
+        ):
             return None
-        return self._append(points, last.end_tick_of(keep), ahead_ticks)
+        return self._append(points, last.end_tick_after(kept_points), send_ahead_ticks)
 
-    def end_after(self, keep: int) -> bool:
+    def truncate(self, kept_points: int) -> bool:
         """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
-        if not self._jobs or self._end_sent or not self._jobs[-1].cut(keep):
+        if not self._jobs or self._end_sent or not self._jobs[-1].truncate(kept_points):
             return False
         self._next_index = self._jobs[-1].end_index
         return True
 
-    def _append(self, points: WirePoints, start_tick: int, ahead_ticks: float) -> Job:
-        job = Job(self._number, points, self._next_index, start_tick, ahead_ticks)
+    def _append(self, points: WirePoints, start_tick: int, send_ahead_ticks: float) -> PlanJob:
+        job = PlanJob(self._number, points, self._next_index, start_tick, send_ahead_ticks)
         self._next_index = job.end_index
         self._jobs.append(job)
         return job
@@ -67,43 +74,43 @@ class PointStream:
         self._next_index = self._sent_index
         self._jobs.clear()
 
-    def note(self, message: m.Executed) -> None:
+    def record_executed(self, message: m.Executed) -> None:
         """Take over what the board reports."""
         for job in self._jobs:
-            job.note(message)
+            job.record_executed(message)
 
     def send(self, link: HostConnection, done_index: int, queue_points: int, now_tick: float) -> None:
         """Hand the link what may leave now: points as far as the board has room, START, END."""
         for job in self._jobs:
             while link.outstanding < link.window:
-                room = queue_points - (job.next_to_send - max(self._jobs[0].first_index, done_index))
-                count = min(m.POINTS_MAX, room, job.leaving(now_tick))
+                free_points = queue_points - (job.next_to_send - max(self._jobs[0].first_index, done_index))
+                count = min(m.POINTS_MAX, free_points, job.count_sendable(now_tick))
                 if count <= 0:
                     break
                 self._send_points(link, job, count, now_tick)
-            if not job.all_sent:
+            if not job.is_fully_sent:
                 return
         if self._jobs and not self._end_sent and link.outstanding < link.window:
             link.send(m.End(self._number, self._next_index))
             self._end_sent = True
 
-    def _send_points(self, link: HostConnection, job: Job, count: int, now_tick: float) -> None:
-        watermark = min(WATERMARK_POINTS, job.leaving(now_tick))
-        link.send(m.Data(job.next_to_send, job.take(count, now_tick)))
+    def _send_points(self, link: HostConnection, job: PlanJob, count: int, now_tick: float) -> None:
+        watermark = min(WATERMARK_POINTS, job.count_sendable(now_tick))
+        link.send(m.Data(job.next_to_send, job.take_payload(count, now_tick)))
         self._sent_index = job.next_to_send
         if not self._started:
             link.send(m.Start(self._number, job.first_index, job.start_tick, watermark))
             self._started = True
 
-    def fill_gaps(self, link: HostConnection, done_index: int, now_s: float) -> None:
+    def request_missing_reports(self, link: HostConnection, done_index: int, now_s: float) -> None:
         """Ask again for reports that were lost: the board has done more than it was heard to say."""
-        missing = next((job.first_missing for job in self._jobs if job.first_missing is not None), None)
-        if missing is None or missing >= done_index or now_s - self._gap_asked_s < GAP_AFTER_S:
+        missing = next((job.first_unreported for job in self._jobs if job.first_unreported is not None), None)
+        if missing is None or missing >= done_index or now_s - self._reports_requested_s < MISSING_REPORT_RETRY_S:
             return
-        self._gap_asked_s = now_s
+        self._reports_requested_s = now_s
         link.send(m.GetExecuted(first_index=missing))
 
-    def forget_finished(self, armed: bool) -> None:
+    def drop_finished(self, armed: bool) -> None:
         """Drop jobs of which everything is known; the last one only when the board has ended it too."""
-        while self._jobs and self._jobs[0].finished and (len(self._jobs) > 1 or (self._end_sent and armed)):
+        while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_sent and armed)):
             self._jobs.popleft()

@@ -15,17 +15,17 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.transcript import Transcript
 from optodrive.link.transport.base import Transport
-from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO_BOARD, Entry
+from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO_BOARD, CaptureEntry
 
 READ_MAX_S = 0.05
-NAP_S = 0.999_999e-4
+SLEEP_BELOW_S = 0.999_999e-4
 """What is left of a wait below this is slept: reading would take longer."""
-GREETING_S = 1.0
-AFTERWARDS_S = 0.5
+HELLO_TIMEOUT_S = 1.0
+DRAIN_S = 0.5
 
 
 @dataclass
-class Account:
+class BoardTrace:
     """What a board told of itself. states: (state, fault, reason) in order.
 
     executed: (gate on in ticks, gate-on ticks, duty) by (session, counted from 1, and point index)
@@ -37,45 +37,45 @@ class Account:
     session: int = 0
     transcript: Transcript = field(default_factory=Transcript)
 
-    def take(self, entry: Entry) -> None:
+    def feed(self, entry: CaptureEntry) -> None:
         """Take in what passed."""
         if entry.kind in (OPENED, CLOSED):
-            self.transcript.broken_off()
+            self.transcript.reset_link()
             return
-        for line in self.transcript.take(entry.host_s, entry.kind == TO_BOARD, entry.data):
+        for line in self.transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data):
             if isinstance(line.message, m.HelloReply):
                 self.sessions += 1
                 self.session = line.message.session
             elif isinstance(line.message, m.Event):
                 event = line.message
-                names = m.STATES[event.state], m.FAULTS[event.fault], m.REASONS[event.reason]
+                names = m.STATES[event.state], m.FAULTS[event.fault], m.EVENT_REASONS[event.reason]
                 self.states.append(names)
             elif isinstance(line.message, m.Executed):
                 for offset, record in enumerate(line.message.records):
                     self.executed[self.sessions, line.message.first_index + offset] = record
 
 
-def clock_shift_s(entries: Iterable[Entry]) -> float:
+def clock_shift_s(entries: Iterable[CaptureEntry]) -> float:
     """The board's time less the host's when recorded, s, from CLOCK and its replies; 0 where that agrees with them."""
     low_s, high_s = -inf, inf
-    transcript, asked_s = Transcript(), dict[int, float]()
+    transcript, request_s = Transcript(), dict[int, float]()
     for entry in entries:
         if entry.kind in (OPENED, CLOSED):
-            transcript.broken_off()
+            transcript.reset_link()
             continue
-        for line in transcript.take(entry.host_s, entry.kind == TO_BOARD, entry.data):
+        for line in transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data):
             if isinstance(line.message, m.Clock):
-                asked_s[line.message.host_t] = line.host_s
-            elif isinstance(line.message, m.ClockReply) and line.message.host_t in asked_s:
+                request_s[line.message.host_t] = line.host_s
+            elif isinstance(line.message, m.ClockReply) and line.message.host_t in request_s:
                 board_s = line.message.tick * 1e-6
-                sent_s = asked_s.pop(line.message.host_t)
+                sent_s = request_s.pop(line.message.host_t)
                 if board_s - sent_s < low_s or board_s - line.host_s > high_s:
-                    return _middle(low_s, high_s)  # the board started anew: what came before counts
+                    return _choose_shift_s(low_s, high_s)  # the board started anew: what came before counts
                 low_s, high_s = max(low_s, board_s - line.host_s), min(high_s, board_s - sent_s)
-    return _middle(low_s, high_s)
+    return _choose_shift_s(low_s, high_s)
 
 
-def _middle(low_s: float, high_s: float) -> float:
+def _choose_shift_s(low_s: float, high_s: float) -> float:
     return 0.0 if low_s <= 0.0 <= high_s else (low_s + high_s) / 2.0
 
 
@@ -86,27 +86,27 @@ class Replay:
     """
 
     def __init__(self, transport: Transport, clock: Clock, shift_s: float, may_arm: bool) -> None:
-        self.recorded, self.replayed = Account(), Account()
+        self.recorded, self.replayed = BoardTrace(), BoardTrace()
         self._transport = transport
         self._clock = clock
         self._shift_s = shift_s
         self._may_arm = may_arm
         self._open = False
 
-    def run(self, entries: Iterable[Entry]) -> None:
+    def run(self, entries: Iterable[CaptureEntry]) -> None:
         """Do it all, to the end; LinkError where the link fails."""
         try:
             for entry in entries:
-                self.recorded.take(entry)
+                self.recorded.feed(entry)
                 if entry.kind != FROM_BOARD:
                     self._wait_until(entry.host_s + self._shift_s)
-                    self._do(entry)
+                    self._apply(entry)
             if self._open:
-                self._wait_until(self._clock.now_s() + AFTERWARDS_S)
+                self._wait_until(self._clock.now_s() + DRAIN_S)
         finally:
             self._transport.release()
 
-    def _do(self, entry: Entry) -> None:
+    def _apply(self, entry: CaptureEntry) -> None:
         if entry.kind == OPENED:
             self._transport.open()
             self._open = True
@@ -114,47 +114,47 @@ class Replay:
             self._transport.close()
             self._open = False
         elif self._open:
-            data = self._for_this_board(entry.data)
+            data = self._translate_frames(entry.data)
             if data:
-                self.replayed.take(Entry(TO_BOARD, self._clock.now_s(), data))
+                self.replayed.feed(CaptureEntry(TO_BOARD, self._clock.now_s(), data))
                 self._transport.write(data)
         if entry.kind != TO_BOARD:
-            self.replayed.take(entry)
+            self.replayed.feed(entry)
 
-    def _wait_until(self, due_s: float) -> None:
-        while (left_s := due_s - self._clock.now_s()) > 0.0:
-            if self._open and left_s >= NAP_S:
-                self._listen(min(left_s, READ_MAX_S))
+    def _wait_until(self, deadline_s: float) -> None:
+        while (remaining_s := deadline_s - self._clock.now_s()) > 0.0:
+            if self._open and remaining_s >= SLEEP_BELOW_S:
+                self._receive(min(remaining_s, READ_MAX_S))
             else:
-                self._clock.sleep(left_s)
+                self._clock.sleep(remaining_s)
 
-    def _listen(self, wait_s: float) -> None:
+    def _receive(self, wait_s: float) -> None:
         data = self._transport.read(wait_s)
         if data:
-            self.replayed.take(Entry(FROM_BOARD, self._clock.now_s(), data))
+            self.replayed.feed(CaptureEntry(FROM_BOARD, self._clock.now_s(), data))
 
-    def _for_this_board(self, data: bytes) -> bytes:
+    def _translate_frames(self, data: bytes) -> bytes:
         """The host's frames under the session this board gave; what is no frame of a host never leaves."""
         out = []
         for frame in FrameDecoder().feed(data):
-            kind = m.BY_TYPE.get(frame.type)
+            kind = m.MESSAGES_BY_TYPE.get(frame.type)
             if kind not in m.HOST_MESSAGES or (kind is m.ArmConfirm and not self._may_arm):
                 continue
             if frame.session:
-                self._hear_greeting()
+                self._await_hello_reply()
                 frame = frame._replace(session=self.replayed.session)
             out.append(encode_frame(frame))
         return b"\0" + b"".join(out) if out else b""
 
-    def _hear_greeting(self) -> None:
-        give_up_s = self._clock.now_s() + GREETING_S
+    def _await_hello_reply(self) -> None:
+        deadline_s = self._clock.now_s() + HELLO_TIMEOUT_S
         while self.replayed.sessions < self.recorded.sessions:
-            if self._clock.now_s() > give_up_s:
+            if self._clock.now_s() > deadline_s:
                 raise LinkError(f"{self._transport.name}: the board does not answer the recorded HELLO")
-            self._listen(NAP_S)
+            self._receive(SLEEP_BELOW_S)
 
 
-def compare(recorded: Account, replayed: Account) -> dict[str, Any]:
+def compare_traces(recorded: BoardTrace, replayed: BoardTrace) -> dict[str, Any]:
     """Whether a board did what was recorded; what it did beyond the recording's end does not count against it."""
     states = len(recorded.states)
     first = next(
@@ -162,19 +162,19 @@ def compare(recorded: Account, replayed: Account) -> dict[str, Any]:
     )
     if first is None and len(replayed.states) < states:
         first = len(replayed.states)
-    both = [(recorded.executed[key], replayed.executed[key]) for key in recorded.executed if key in replayed.executed]
-    changed = sum(was[1:] != now[1:] for was, now in both)
-    moves = [now[0] - was[0] for was, now in both]
-    missing = len(recorded.executed) - len(both)
+    pairs = [(recorded.executed[key], replayed.executed[key]) for key in recorded.executed if key in replayed.executed]
+    changed = sum(was[1:] != now[1:] for was, now in pairs)
+    shifts = [now[0] - was[0] for was, now in pairs]
+    missing = len(recorded.executed) - len(pairs)
     return {
-        "same": first is None and not missing and not changed and not any(moves),
+        "same": first is None and not missing and not changed and not any(shifts),
         "states": {"recorded": states, "replayed": len(replayed.states), "first_difference": first},
         "executed": {
             "recorded": len(recorded.executed),
             "replayed": len(replayed.executed),
             "missing": missing,
             "changed": changed,
-            "moved": sum(map(bool, moves)),
-            "largest_move_ticks": max(moves, key=abs, default=0),
+            "moved": sum(map(bool, shifts)),
+            "largest_move_ticks": max(shifts, key=abs, default=0),
         },
     }

@@ -17,58 +17,58 @@ from optodrive.core.histogram import Histogram
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
-from optodrive.link.session.job import Job
-from optodrive.link.session.link_watch import Cause, Counts, LinkWatch
+from optodrive.link.session.job import PlanJob
+from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 
-LEASE_SHARE = 0.2
+LEASE_RENEWAL_FRACTION = 0.2
 """The lease is renewed five times in its length."""
 HELLO_RETRY_S = 0.25
 CONNECT_TIMEOUT_S = 6.0
-STATUS_EVERY_S = 0.2
-CLOCK_EVERY_S = 1.0
-CLOCK_FIRST = 8
-SILENCE_S = 2.0
+STATUS_INTERVAL_S = 0.2
+CLOCK_INTERVAL_S = 1.0
+CLOCK_INITIAL_SAMPLES = 8
+SILENCE_TIMEOUT_S = 2.0
 """A board that answers nothing for this long counts as lost."""
-FOLLOW_S = 0.01
+SPLICE_LEAD_S = 0.01
 """Points that follow others must be on their way so long before those end."""
-LEASE_AGES_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
-LEASED = ("ARMING", "ARMED", "RUNNING", "HOLD")
+LEASE_AGE_BUCKETS_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
+LEASED_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
-class Session:
+class BoardSession:
     """A session over a transport, with the requirements of a configuration.
 
     faults: how often the board was seen to go into each; lease_ages: seconds since the last renewal, at each;
     lease_slack_s: the least of the lease that was left then, None before the second renewal
     """
 
-    def __init__(self, transport: Transport, clock: Clock, requirements: Requirements) -> None:
+    def __init__(self, transport: Transport, clock: Clock, requirements: BoardRequirements) -> None:
         self._transport = transport
         self._clock = clock
         self._requirements = requirements
         self._connection = HostConnection()
-        self._sync = ClockSync()
-        self._clock_asked_s: dict[int, float] = {}
+        self._clock_sync = ClockSync()
+        self._clock_requests_s: dict[int, float] = {}
         self._points = PointStream()
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
         self._arm_nonce: int | None = None
-        self._lease_sent_s = self._status_asked_s = self._clock_sent_s = self._heard_s = 0.0
+        self._lease_sent_s = self._status_requested_s = self._clock_sent_s = self._last_received_s = 0.0
         self._queue_points = self._reset_code = 0
-        self._leasing = False
+        self._lease_active = False
         self.faults: Counter[str] = Counter()
-        self.lease_ages = Histogram(LEASE_AGES_S)
+        self.lease_ages = Histogram(LEASE_AGE_BUCKETS_S)
         self.lease_slack_s: float | None = None
         self._watch = LinkWatch(transport.name, requirements.lease_s)
         self.board = BoardView()
         self.connected = False
-        self.last_reason = ""
-        self.aborted = False
+        self.last_event_reason = ""
+        self.abort_confirmed = False
         """Whether the board has said that it took the last ABORT: dark, queue dropped, DISARMED."""
 
     @property
@@ -83,15 +83,15 @@ class Session:
 
     def board_s(self) -> float:
         """The board's time now, s."""
-        return self._sync.board_s(self._clock.now_s())
+        return self._clock_sync.board_s(self._clock.now_s())
 
     @property
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether a job may begin now."""
-        return self.board.state == "ARMED" and not self._points and self.quiet
+        return self.board.state == "ARMED" and not self._points and self.is_acknowledged
 
     @property
-    def quiet(self) -> bool:
+    def is_acknowledged(self) -> bool:
         """Whether the board has greeted and acknowledged everything that was sent."""
         return self._connection.peer is not None and self._connection.outstanding == 0
 
@@ -102,189 +102,199 @@ class Session:
 
         Until it has succeeded the clock known before goes on: heat is kept in its time.
         """
-        known = self._sync
+        previous_sync = self._clock_sync
         try:
             self._transport.open()
-            self._shake_hands()
+            self._handshake()
         except (LinkError, InputError):
-            self._sync = known
+            self._clock_sync = previous_sync
             self._transport.close()
-            self._watch.not_back(self._clock.now_s())
+            self._watch.on_reconnect_failed(self._clock.now_s())
             raise
-        self._watch.back(self._clock.now_s(), self._reset_code, self.board_s(), self._counts())
+        self._watch.on_reconnected(self._clock.now_s(), self._reset_code, self.board_s(), self._count_errors())
         self.connected = True
 
-    def _shake_hands(self) -> None:
-        self._forget()
-        self._greet()
-        give_up_s = self._clock.now_s() + CONNECT_TIMEOUT_S
+    def _handshake(self) -> None:
+        self._reset()
+        self._send_hello()
+        deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
         while self._connection.peer is None:
-            self._greet_again()
+            self._retry_hello()
             self._exchange(0.02)
-            if self._clock.now_s() > give_up_s:
+            if self._clock.now_s() > deadline_s:
                 raise LinkError(
                     f"{self.port} is open, but no board answers: is it powered, the right port, the right baud rate?"
                 )
-        while not (self.quiet and self._sync.known and self.board.state != "UNKNOWN"):
-            self._ask_clock()
-            self._ask_status()
+        while not (self.is_acknowledged and self._clock_sync.is_synchronised and self.board.state != "UNKNOWN"):
+            self._request_clock()
+            self._request_status()
             self._exchange(0.02)
-            if self._clock.now_s() > give_up_s:
-                raise LinkError(f"{self.port}: the board greets, but does not answer further; {self._damage()}")
-        for _ in range(CLOCK_FIRST):
-            self._ask_clock()
+            if self._clock.now_s() > deadline_s:
+                raise LinkError(
+                    f"{self.port}: the board greets, but does not answer further; {self._describe_errors()}"
+                )
+        for _ in range(CLOCK_INITIAL_SAMPLES):
+            self._request_clock()
             self._exchange(0.005)
 
-    def _greet(self) -> None:
+    def _send_hello(self) -> None:
         """Begin a session: whatever the board did, it ends, and leads to DISARMED."""
         self._points.clear()
         self._hello_sent_s = self._clock.now_s()
-        self._connection.hello(secrets.randbits(32))
+        self._connection.send_hello(secrets.randbits(32))
 
-    def _greet_again(self) -> None:
+    def _retry_hello(self) -> None:
         if self._connection.peer is None and self._clock.now_s() - self._hello_sent_s > HELLO_RETRY_S:
-            self._greet()
+            self._send_hello()
 
-    def _take_hello(self, peer: m.HelloReply, now_s: float) -> None:
-        self._requirements.check(peer)
+    def _on_hello_reply(self, peer: m.HelloReply, now_s: float) -> None:
+        self._requirements.check_board(peer)
         self.board.uid, self.board.firmware = peer.uid.hex(), peer.firmware
         self._queue_points, self._reset_code = peer.queue_points, peer.reset_cause
-        self._points.restart()
-        self._connection.send(self._requirements.limits(), first=True)  # an order may wait for this session already
-        self._ask_status()
+        self._points.reset_indices()
+        self._connection.send(
+            self._requirements.build_limits(), at_front=True
+        )  # an order may wait for this session already
+        self._request_status()
 
-    def _forget(self) -> None:
+    def _reset(self) -> None:
         self._connection = HostConnection(self._requirements.rto_s)
-        self._sync = ClockSync()
-        self._clock_asked_s.clear()
+        self._clock_sync = ClockSync()
+        self._clock_requests_s.clear()
         self._arm_nonce = None
         self._refusal = None
         self.board = BoardView()
-        self._heard_s = self._clock.now_s()
-        self._watch.opened()
+        self._last_received_s = self._clock.now_s()
+        self._watch.on_opened()
 
-    def drop(self) -> None:
+    def disconnect(self) -> None:
         """Give the link up."""
         self.connected = False
         self._transport.close()
 
-    def lost(self, error: Exception) -> str:
+    def on_lost(self, error: Exception) -> str:
         """Give the link up after an error; the error, and why it likely came where the link itself failed."""
-        told = str(error)
+        message = str(error)
         if isinstance(error, LinkError):
             now_s = self._clock.now_s()
-            cause = self._watch.lost(now_s, self._heard_s, silent=now_s - self._heard_s > SILENCE_S)
-            told = f"{told}; likely cause: {cause.sentence}"
-        self.drop()
-        return told
+            cause = self._watch.on_lost(
+                now_s, self._last_received_s, silent=now_s - self._last_received_s > SILENCE_TIMEOUT_S
+            )
+            message = f"{message}; likely cause: {cause.message}"
+        self.disconnect()
+        return message
 
     def close(self) -> None:
         """Tell the board to abort, if it can still be told, and close the link for good."""
         if self.connected:
-            self._say_goodbye()
+            self._send_abort()
         self.connected = False
         self._transport.release()
 
-    def _say_goodbye(self) -> None:
+    def _send_abort(self) -> None:
         with suppress(LinkError):  # the board's own lease ends it dark where it cannot be told
             self._connection.abort()
-            self._transport.write(self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes))
+            self._transport.write(
+                self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
+            )
 
     # --- the loop's turn ----------------------------------------------------------------------------------------
 
-    def step(self, wait_s: float, lease: bool) -> None:
+    def step(self, wait_s: float, renew_lease: bool) -> None:
         """Send what is due, wait at most wait_s for bytes, take them in. lease: whether the planner is alive."""
         now_s = self._clock.now_s()
-        self._watch.turn(now_s, lease, self._counts())
-        if self.board.state not in LEASED:
-            self._leasing = False
-        elif lease and now_s - self._lease_sent_s >= LEASE_SHARE * self._requirements.lease_s:
+        self._watch.on_loop(now_s, renew_lease, self._count_errors())
+        if self.board.state not in LEASED_STATES:
+            self._lease_active = False
+        elif renew_lease and now_s - self._lease_sent_s >= LEASE_RENEWAL_FRACTION * self._requirements.lease_s:
             self._renew_lease(now_s)
-        if now_s - self._status_asked_s >= STATUS_EVERY_S:
-            self._ask_status()
-        if now_s - self._clock_sent_s >= CLOCK_EVERY_S:
-            self._ask_clock()
-        self._greet_again()
-        self._stream()
+        if now_s - self._status_requested_s >= STATUS_INTERVAL_S:
+            self._request_status()
+        if now_s - self._clock_sent_s >= CLOCK_INTERVAL_S:
+            self._request_clock()
+        self._retry_hello()
+        self._stream_points()
         self._exchange(wait_s)
-        if now_s - self._heard_s > SILENCE_S:
-            raise LinkError(f"{self.port}: the board fell silent for {SILENCE_S:g} s; {self._damage()}")
+        if now_s - self._last_received_s > SILENCE_TIMEOUT_S:
+            raise LinkError(
+                f"{self.port}: the board fell silent for {SILENCE_TIMEOUT_S:g} s; {self._describe_errors()}"
+            )
 
     def _renew_lease(self, now_s: float) -> None:
         lease_s, age_s = self._requirements.lease_s, now_s - self._lease_sent_s
         self._connection.send(m.Lease(ms=round(lease_s * 1e3)))
         self._lease_sent_s = now_s
-        if self._leasing:
+        if self._lease_active:
             self.lease_ages.add(age_s)
             self.lease_slack_s = min(lease_s if self.lease_slack_s is None else self.lease_slack_s, lease_s - age_s)
-        self._leasing = True
+        self._lease_active = True
 
     def _exchange(self, wait_s: float) -> None:
-        out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.flight_bytes)
+        out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
         if out:
             self._transport.write(out)
         data = self._transport.read(wait_s)
         if data:
             now_s = self._clock.now_s()
             for message in self._connection.receive_bytes(data, now_s):
-                self._heard_s = now_s
-                self._take(message, now_s)
+                self._last_received_s = now_s
+                self._on_message(message, now_s)
 
-    def _ask_status(self) -> None:
-        self._status_asked_s = self._clock.now_s()
+    def _request_status(self) -> None:
+        self._status_requested_s = self._clock.now_s()
         self._connection.send(m.Get())
 
-    def _ask_clock(self) -> None:
+    def _request_clock(self) -> None:
         self._clock_sent_s = self._clock.now_s()
         stamp = secrets.randbits(32)
-        if len(self._clock_asked_s) > 64:
-            self._clock_asked_s.clear()
-        self._clock_asked_s[stamp] = self._clock_sent_s
+        if len(self._clock_requests_s) > 64:
+            self._clock_requests_s.clear()
+        self._clock_requests_s[stamp] = self._clock_sent_s
         self._connection.send(m.Clock(host_t=stamp))
 
-    def _take(self, message: m.Message, now_s: float) -> None:
-        takers: dict[type[m.Message], Callable[[Any, float], None]] = {
-            m.HelloReply: self._take_hello,
-            m.Ack: self._take_ack,
-            m.Nak: self._take_nak,
-            m.Status: self._take_status,
-            m.Event: self._take_event,
-            m.ClockReply: self._take_clock,
-            m.ArmChallenge: self._take_challenge,
-            m.Executed: self._take_executed,
+    def _on_message(self, message: m.Message, now_s: float) -> None:
+        handlers: dict[type[m.Message], Callable[[Any, float], None]] = {
+            m.HelloReply: self._on_hello_reply,
+            m.Ack: self._on_ack,
+            m.Nak: self._on_nak,
+            m.Status: self._on_status,
+            m.Event: self._on_event,
+            m.ClockReply: self._on_clock_reply,
+            m.ArmChallenge: self._on_arm_challenge,
+            m.Executed: self._on_executed,
         }
-        taker = takers.get(type(message))
-        if taker is not None:
-            taker(message, now_s)
+        handler = handlers.get(type(message))
+        if handler is not None:
+            handler(message, now_s)
 
-    def _take_ack(self, message: m.Ack, now_s: float) -> None:
+    def _on_ack(self, message: m.Ack, now_s: float) -> None:
         self.board.free_points, self.board.done_index = message.free_points, message.done_index
         self._set_state(m.STATES[message.state])
 
-    def _take_nak(self, message: m.Nak, now_s: float) -> None:
+    def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
         if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first is the cause, others follow from it
             self._refusal = reason
 
-    def _take_status(self, message: m.Status, now_s: float) -> None:
+    def _on_status(self, message: m.Status, now_s: float) -> None:
         board = self.board
         board.inputs, board.done_index, board.queued = message.inputs, message.done_index, message.queued
         board.underruns, board.crc_errors = message.underruns, message.crc_errors
         board.format_errors, board.seq_errors = message.format_errors, message.seq_errors
         board.laser_on_s = message.laser_on_us * 1e-6
         board.temperature_c = message.temperature_dc / 10.0
-        self._note_fault(m.FAULTS[message.fault])
-        self._watch.heard(board.fault, now_s, self._counts())
+        self._record_fault(m.FAULTS[message.fault])
+        self._watch.on_status(board.fault, now_s, self._count_errors())
         self._set_state(m.STATES[message.state])
 
-    def _take_event(self, message: m.Event, now_s: float) -> None:
-        self.aborted |= self._connection.peer is None and m.REASONS[message.reason] == "abort"
-        self._note_fault(m.FAULTS[message.fault])
-        self._watch.heard(self.board.fault, now_s, self._counts())
-        self.last_reason = m.REASONS[message.reason]
+    def _on_event(self, message: m.Event, now_s: float) -> None:
+        self.abort_confirmed |= self._connection.peer is None and m.EVENT_REASONS[message.reason] == "abort"
+        self._record_fault(m.FAULTS[message.fault])
+        self._watch.on_status(self.board.fault, now_s, self._count_errors())
+        self.last_event_reason = m.EVENT_REASONS[message.reason]
         self._set_state(m.STATES[message.state])
 
-    def _note_fault(self, fault: str) -> None:
+    def _record_fault(self, fault: str) -> None:
         if fault and fault != self.board.fault:
             self.faults[fault] += 1
         self.board.fault = fault
@@ -294,20 +304,20 @@ class Session:
         if state != "FAULT":
             self.board.fault = ""
 
-    def _take_clock(self, message: m.ClockReply, now_s: float) -> None:
-        sent_s = self._clock_asked_s.pop(message.host_t, None)
+    def _on_clock_reply(self, message: m.ClockReply, now_s: float) -> None:
+        sent_s = self._clock_requests_s.pop(message.host_t, None)
         if sent_s is not None:
-            self._sync.add(sent_s, now_s, message.tick * self.scale.tick_s)
+            self._clock_sync.add(sent_s, now_s, message.tick * self.scale.tick_s)
 
-    def _take_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
+    def _on_arm_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
         if message.host_nonce == self._arm_nonce:
             self._arm_nonce = None
             self._connection.send(m.ArmConfirm(board_nonce=message.board_nonce, host_nonce=message.host_nonce))
 
-    def _take_executed(self, message: m.Executed, now_s: float) -> None:
+    def _on_executed(self, message: m.Executed, now_s: float) -> None:
         # What is done makes room: a small queue would run dry before an ACK or a STATUS tells.
         self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
-        self._points.note(message)
+        self._points.record_executed(message)
 
     # --- orders -------------------------------------------------------------------------------------------------
 
@@ -330,71 +340,73 @@ class Session:
     def abort(self) -> None:
         """Gate off now, queue dropped, DISARMED; goes ahead of everything else that waits to be sent."""
         self._refusal = None
-        self.aborted = False
+        self.abort_confirmed = False
         self._connection.abort()
-        self._greet()
+        self._send_hello()
 
     def flush(self) -> None:
         """Drop what is queued; the board stays armed."""
         self._points.clear()
         self._connection.send(m.Flush())
 
-    def take_refusal(self) -> str | None:
+    def pop_refusal(self) -> str | None:
         """Why the board refused the last order, once."""
         refusal, self._refusal = self._refusal, None
         return refusal
 
     # --- streaming ----------------------------------------------------------------------------------------------
 
-    def begin(self, points: WirePoints, start_s: float, ahead_s: float = inf) -> Job:
+    def begin(self, points: WirePoints, start_s: float, send_ahead_s: float = inf) -> PlanJob:
         """Begin to stream a plan whose zero is at the board's time start_s, as Job says."""
-        return self._points.begin(points, max(1, round(start_s / self.scale.tick_s)), ahead_s / self.scale.tick_s)
+        return self._points.begin(points, max(1, round(start_s / self.scale.tick_s)), send_ahead_s / self.scale.tick_s)
 
-    def follow(self, points: WirePoints, keep: int, ahead_s: float) -> Job | None:
+    def splice(self, points: WirePoints, kept_points: int, send_ahead_s: float) -> PlanJob | None:
         """Cut the last job after `keep` points and go on without a pause; None where that is too late."""
         tick_s = self.scale.tick_s
-        return self._points.follow(points, keep, ahead_s / tick_s, (self.board_s() + FOLLOW_S) / tick_s)
+        return self._points.splice(
+            points, kept_points, send_ahead_s / tick_s, (self.board_s() + SPLICE_LEAD_S) / tick_s
+        )
 
-    def end_after(self, keep: int) -> bool:
+    def truncate(self, kept_points: int) -> bool:
         """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
-        return self._points.end_after(keep)
+        return self._points.truncate(kept_points)
 
-    def _stream(self) -> None:
+    def _stream_points(self) -> None:
         if not self._points:
             return
         if self.board.state not in ("DISARMED", "FAULT"):  # else it ended by itself: send no more, but hear the rest
             now_tick = self.board_s() / self.scale.tick_s
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
-        self._points.fill_gaps(self._connection, self.board.done_index, self._clock.now_s())
-        self._points.forget_finished(self.board.state == "ARMED")
+        self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
+        self._points.drop_finished(self.board.state == "ARMED")
 
     # --- figures ------------------------------------------------------------------------------------------------
 
     @property
-    def likely_cause(self) -> Cause | None:
+    def likely_cause(self) -> LinkCause | None:
         """Why the link was lost last, or the lease lapsed, as far as can be told; None before that."""
         return self._watch.cause
 
-    def link_figures(self) -> dict[str, Any]:
+    def collect_link_stats(self) -> dict[str, Any]:
         """Counters of the link, for people who wonder why it is slow or lost; any thread may ask."""
-        counts, round_trip_s, cause = self._counts(), self._sync.round_trip_s, self._watch.cause
+        counts, round_trip_s, cause = self._count_errors(), self._clock_sync.round_trip_s, self._watch.cause
         return {
             "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
-            "received_bad": counts.bad_here,
-            "retransmitted": counts.sent_again,
+            "received_bad": counts.host_bad_frames,
+            "retransmitted": counts.retransmitted,
             "naks": counts.naks,
-            "board_bad": counts.bad_at_board,
+            "board_bad": counts.board_bad_frames,
             "underruns": self.board.underruns,
-            "longest_stall_ms": self._watch.longest_gap_s * 1e3,
-            "likely_cause": None if cause is None else cause.sentence,
-            "likely_cause_ago_s": None if cause is None else self._clock.now_s() - cause.at_s,
+            "longest_stall_ms": self._watch.longest_stall_s * 1e3,
+            "likely_cause": None if cause is None else cause.message,
+            "likely_cause_ago_s": None if cause is None else self._clock.now_s() - cause.noticed_s,
         }
 
-    def _counts(self) -> Counts:
-        here, board = self._connection.counters, self.board
-        bad = here.crc_errors + here.format_errors, board.crc_errors + board.format_errors
-        return Counts(*bad, here.retransmitted, here.naks)
+    def _count_errors(self) -> LinkErrorCounts:
+        host, board = self._connection.counters, self.board
+        bad_frames = host.crc_errors + host.format_errors, board.crc_errors + board.format_errors
+        return LinkErrorCounts(*bad_frames, host.retransmitted, host.naks)
 
-    def _damage(self) -> str:
-        counts = self._counts()
-        return f"{counts.bad_here} bad frames here, {counts.bad_at_board} at the board, {counts.sent_again} sent again"
+    def _describe_errors(self) -> str:
+        counts = self._count_errors()
+        return f"{counts.host_bad_frames} bad frames here, {counts.board_bad_frames} at the board, {counts.retransmitted} sent again"

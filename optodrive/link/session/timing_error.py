@@ -22,19 +22,19 @@ class TimingError:
     drift_ppm: float
 
 
-def timing_error(planned_s: FloatArray, executed_s: FloatArray) -> TimingError | None:
+def compute_timing_error(planned_s: FloatArray, executed_s: FloatArray) -> TimingError | None:
     """From starts of the same pulses, [n] each; None where there is none."""
     if not len(planned_s):
         return None
     error_s = executed_s - planned_s
-    left_s, since_s = error_s - error_s[0], planned_s - planned_s.mean()
-    spread_s2 = float(since_s @ since_s)
+    residual_s, centred_s = error_s - error_s[0], planned_s - planned_s.mean()
+    spread_s2 = float(centred_s @ centred_s)
     return TimingError(
         pulses=len(error_s),
         start_delay_s=float(error_s[0]),
         median_s=float(np.median(error_s)),
         largest_s=float(error_s[np.abs(error_s).argmax()]),
-        drift_ppm=1e6 * float(since_s @ left_s) / spread_s2 if spread_s2 else 0.0,
+        drift_ppm=1e6 * float(centred_s @ residual_s) / spread_s2 if spread_s2 else 0.0,
     )
 
 
@@ -46,17 +46,17 @@ class TimingTotals:
 
     def add(self, error: TimingError) -> None:
         """Take a plan's in."""
-        before = self._worst
-        if before is None:
+        previous = self._worst
+        if previous is None:
             self._worst = error
             return
-        figures = {
-            name: max(value, getattr(before, name), key=abs)
+        worst = {
+            name: max(value, getattr(previous, name), key=abs)
             for name, value in asdict(error).items()
             if name != "pulses"
         }
-        self._worst = TimingError(pulses=before.pulses + error.pulses, **figures)
+        self._worst = TimingError(pulses=previous.pulses + error.pulses, **worst)
 
-    def figures(self) -> dict[str, float] | None:
+    def to_dict(self) -> dict[str, float] | None:
         """As the state answers it; None before any pulse."""
         return None if self._worst is None else asdict(self._worst)

@@ -265,7 +265,9 @@ class BoardCore:
             self._go_dark(reason)
         before, self.state = self.state, state
         self._log("state", state=state, before=before, reason=reason)
-        self._send(m.Event(m.STATES.index(state), m.FAULTS.index(self.fault), m.REASONS.index(reason), self._tick()))
+        self._send(
+            m.Event(m.STATES.index(state), m.FAULTS.index(self.fault), m.EVENT_REASONS.index(reason), self._tick())
+        )
 
     def _go_dark(self, reason: str) -> None:
         """Gate off; what a cut-short pulse really did is recorded."""
@@ -378,7 +380,7 @@ class BoardCore:
                 answer = m.NAK_REASONS.index(refusal)
             else:
                 answer = m.NAK_REASONS.index(refusal) if refusal else None
-                self._link.consumed(answer)
+                self._link.mark_consumed(answer)
         if answer is None:
             self._ack_due = True
         else:
@@ -416,7 +418,7 @@ class BoardCore:
         session = self._random.randrange(1, 1 << 16)
         while session == self._link.session:
             session = self._random.randrange(1, 1 << 16)
-        self._link.begin(session)
+        self._link.begin_session(session)
         self._limits = self._settings.limits
         self._next_index = self._done_index = 0
         self._records.clear()
@@ -590,7 +592,7 @@ class BoardCore:
 
     def _send(self, message: m.Message) -> None:
         if self._link.session:
-            self._out.append(encode_frame(Frame(message.TYPE, 0, self._link.session, message.body())))
+            self._out.append(encode_frame(Frame(message.TYPE, 0, self._link.session, message.encode_body())))
 
     def _log(self, event: str, **more: object) -> None:
         self._sink({"t_us": self._now_us, "event": event, **more})

@@ -4,7 +4,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from re import fullmatch
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
 from optodrive.link.protocol.messages import POINTS_MAX, Limits
 
@@ -55,7 +55,7 @@ def load_settings(path: Path) -> BoardSettings:
     known = [*RANGES, "uid", "key_edge"]
     for name, value in table.items():
         if name not in known:
-            raise InputError(f"{path}", name, f"a known key, {nearest(name, known)}")
+            raise InputError(f"{path}", name, f"a known key, {suggest_nearest(name, known)}")
         _check(f"{path}: {name}", name, value)
     limits = replace(OWN, **{name: value for name, value in table.items() if hasattr(OWN, name)})
     return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(OWN, name)})

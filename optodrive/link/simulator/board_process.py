@@ -18,7 +18,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
-from optodrive.core.clock import claim_processor
+from optodrive.core.clock import request_realtime_scheduling
 from optodrive.core.errors import InputError
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings
@@ -328,7 +328,7 @@ def main(arguments: list[str] | None = None, make_core: MakeCore = BoardCore, ac
         options.pty, log, settings, script, options.baud, options.exit_when_closed, make_core, actions, bench
     )
     if simulated:
-        claim_processor()  # a real board waits for none; before an emulator's, it would starve what it serves
+        request_realtime_scheduling()  # a real board waits for none; before an emulator's, it would starve what it serves
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     board.run()

@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.device.config import CODES_A_SIDE, Config
-from optodrive.device.gate_timing import servo_of
+from optodrive.device.config import HALF_RANGE_CODES, Config
+from optodrive.device.gate_timing import build_servo
 from optodrive.device.servo import Servo
 
-CENTRE_CODE = CODES_A_SIDE + 1
+CENTRE_CODE = HALF_RANGE_CODES + 1
 OUTPUT_NOISE_RAD = 1e-5
 FORGOTTEN_S = 0.5
 """A move so long ago is over."""
@@ -29,8 +29,8 @@ class Mirrors:
     """
 
     def __init__(self, config: Config, seed: int | np.random.SeedSequence) -> None:
-        self._servo = servo_of(config.scanner)
-        self._code_rad = config.scanner.code_rad
+        self._servo = build_servo(config.scanner)
+        self._code_rad = config.scanner.rad_per_code
         self._random = np.random.default_rng(seed)
         self._from_rad = (0.0, 0.0)
         self._asked_rad = (0.0, 0.0)

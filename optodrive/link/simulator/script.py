@@ -20,7 +20,7 @@ from math import inf
 from pathlib import Path
 from typing import Any
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
 from optodrive.link.protocol.messages import INPUTS
 
@@ -61,7 +61,7 @@ def _step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> Step:
     known = INPUTS if kind == "set" else actions
     name = entry.get(kind)
     if not isinstance(name, str) or name not in known:
-        raise InputError(f"{where}: {kind}", name, f"a known one, {nearest(str(name), list(known))}")
+        raise InputError(f"{where}: {kind}", name, f"a known one, {suggest_nearest(str(name), list(known))}")
     at_s = _number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
     rate = _number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
     value = entry.get("value", False)
@@ -73,7 +73,7 @@ def _step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> Step:
     allowed = ["at_s", "from", *(("set", "value") if kind == "set" else ("do", "rate"))]
     for key in entry:
         if key not in allowed:
-            raise InputError(where, key, f"a known key, {nearest(key, allowed)}")
+            raise InputError(where, key, f"a known key, {suggest_nearest(key, allowed)}")
     return Step(at_s, kind, name, value, rate, since == "light")
 
 

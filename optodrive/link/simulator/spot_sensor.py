@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.units import m_to_um
-from optodrive.device.config import Config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.link.simulator.galvos import Mirrors
 from optodrive.link.simulator.true_geometry import Truth
 
@@ -43,7 +43,7 @@ class SpotSensor:
         outputs: bool,
         seed: int | np.random.SeedSequence,
     ) -> None:
-        layout = pixel_layout(config.display)
+        layout = build_pixel_layout(config.display)
         self._half_m = float(np.abs(layout.x_m).max()) + MARGIN_M, float(np.abs(layout.y_m).max()) + MARGIN_M
         self._truth, self._mirrors = truth, mirrors
         self._noise_m, self._false_share, self._outputs = noise_m, false_share, outputs

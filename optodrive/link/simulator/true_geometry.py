@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.config import CODES_A_SIDE, Config, pixel_layout
+from optodrive.device.config import HALF_RANGE_CODES, Config, build_pixel_layout
 
-CENTRE_CODE = CODES_A_SIDE + 1
+CENTRE_CODE = HALF_RANGE_CODES + 1
 LEAST_REACH_M = 0.01
 """Half of the field on which deviations are drawn where a display has hardly any size."""
 WAVES = 3
@@ -55,9 +55,9 @@ class Truth:
     def drawn(cls, seed: int, config: Config) -> Self:
         """A geometry within a workshop's tolerances of what the configuration says; the same for the same seed."""
         random = np.random.default_rng(seed)
-        layout = pixel_layout(config.display)
+        layout = build_pixel_layout(config.display)
         twice_f_m = 2.0 * config.scanner.focal_length_m
-        step_rad = config.scanner.code_rad
+        step_rad = config.scanner.rad_per_code
         codes = CENTRE_CODE + np.array([layout.x_m, layout.y_m]) / (twice_f_m * step_rad)
         for _ in range(1000):
             truth = cls._once(random, config)
@@ -69,7 +69,7 @@ class Truth:
 
     @classmethod
     def _once(cls, random: np.random.Generator, config: Config) -> Self:
-        layout, scanner = pixel_layout(config.display), config.scanner
+        layout, scanner = build_pixel_layout(config.display), config.scanner
         reach_m = max(LEAST_REACH_M, float(np.abs([layout.x_m, layout.y_m]).max()))
         edge_rad = np.hypot(reach_m, reach_m) / scanner.focal_length_m
         focal_m = scanner.focal_length_m * (1.0 + random.uniform(-0.005, 0.005))
@@ -83,7 +83,7 @@ class Truth:
         weights = random.uniform(0.3, 1.0, (2, WAVES))
         peak_m = random.uniform(20e-6, 40e-6, (2, 1))
         return cls(
-            nominal_rad_per_code=scanner.code_rad,
+            nominal_rad_per_code=scanner.rad_per_code,
             range_rad=scanner.range_rad,
             mirrors_apart_m=random.uniform(8e-3, 20e-3),
             gain=1.0 + random.uniform(-0.01, 0.01, 2),

@@ -10,8 +10,8 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 from optodrive.core.types.plans import ExecutedPulses
-from optodrive.device.config import Config, pixel_layout
-from optodrive.device.pixel_map import map_of
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.pixel_map import load_pixel_map
 from optodrive.physics.parameters import PixelArray
 
 GAIN_SPREAD, GAIN_RANGE = 0.15, (0.6, 1.5)
@@ -36,7 +36,7 @@ class PixelTruth:
     @classmethod
     def drawn(cls, seed: int, config: Config) -> Self:
         """Pixels within a workshop's tolerances, one of 25 dead and one at least; the same for the same seed."""
-        random, count = np.random.default_rng([seed, 0x9135]), len(pixel_layout(config.display))
+        random, count = np.random.default_rng([seed, 0x9135]), len(build_pixel_layout(config.display))
         lift = np.clip(np.exp(GAIN_SPREAD * random.standard_normal(count)), *GAIN_RANGE)
         x_m, y_m = np.clip(OFFSET_SPREAD_M * random.standard_normal((2, count)), -OFFSET_MOST_M, OFFSET_MOST_M)
         several = min(count - 1, max(1, round(DEAD_SHARE * count)))
@@ -50,7 +50,7 @@ class PixelTruth:
 
     def hit(self, executed: ExecutedPulses, config: Config) -> ExecutedPulses:
         """What was executed, with the mean power that falls on each pixel's absorber."""
-        display, laser, known = config.display, config.laser, map_of(config)
+        display, laser, known = config.display, config.laser, load_pixel_map(config)
         share = np.ones(len(self.lift))
         for axis, side in (("x", "width"), ("y", "height")):
             middle_m = -getattr(self, f"{axis}_m")

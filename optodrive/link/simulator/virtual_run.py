@@ -6,21 +6,23 @@ from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.planning.pipeline import Display, Prepared
+from optodrive.planning.pipeline import DisplayModel, PlannedSequence
 
 STEP_S = 0.005
 START_LEAD_S = 0.05
 
 
-def execute(display: Display, prepared: Prepared, progress: Callable[[float], None] | None = None) -> ExecutedPulses:
+def execute(
+    display: DisplayModel, prepared: PlannedSequence, progress: Callable[[float], None] | None = None
+) -> ExecutedPulses:
     """Arm a fresh simulated board, stream the plan, give what the board says it did."""
     clock = ManualClock(1.0)
     core = BoardCore(seed=1)
-    session = Session(MemoryLink(core, clock), clock, Requirements.of(display.config))
+    session = BoardSession(MemoryLink(core, clock), clock, BoardRequirements.from_config(display.config))
     session.connect()
     session.arm()
     while session.board.state != "ARMED":
@@ -28,16 +30,16 @@ def execute(display: Display, prepared: Prepared, progress: Callable[[float], No
     scale = session.scale
     points = quantise(prepared.plan, scale)
     job = session.begin(points, session.board_s() + START_LEAD_S)
-    while len(points) and not job.finished:
+    while len(points) and not job.is_finished:
         _step(session)
         if progress is not None:
-            progress(job.executed_rows / len(prepared.plan))
+            progress(job.executed_count / len(prepared.plan))
     session.close()
-    return job.executed(prepared.plan, scale.full_power_w, scale.tick_s)
+    return job.build_executed(prepared.plan, scale.full_power_w, scale.tick_s)
 
 
-def _step(session: Session) -> None:
-    session.step(STEP_S, lease=True)
+def _step(session: BoardSession) -> None:
+    session.step(STEP_S, renew_lease=True)
     board = session.board
-    if board.state in ("FAULT", "DISARMED") and session.last_reason not in ("", "boot", "hello"):
-        raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({session.last_reason})")
+    if board.state in ("FAULT", "DISARMED") and session.last_event_reason not in ("", "boot", "hello"):
+        raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({session.last_event_reason})")

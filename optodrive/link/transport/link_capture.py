@@ -17,17 +17,17 @@ from optodrive.core.errors import InputError
 
 MAGIC = b"ODWIRE\r\n"
 VERSION = 1
-HEAD = struct.Struct("<8sIdd")
+HEADER = struct.Struct("<8sIdd")
 ENTRY = struct.Struct("<BdI")
 CRC = struct.Struct("<I")
 KINDS = ("to board", "from board", "opened", "closed")
 TO_BOARD, FROM_BOARD, OPENED, CLOSED = KINDS
 DATA_MAX = 1 << 20
-WAITING_MAX = 8192
+QUEUE_MAX = 8192
 """Entries that may wait for the disk; bytes move in portions of a few hundred."""
 
 
-class Entry(NamedTuple):
+class CaptureEntry(NamedTuple):
     """What passed. kind: one of KINDS; host_s: monotonic time; data: empty where the link was opened or closed."""
 
     kind: str
@@ -35,18 +35,18 @@ class Entry(NamedTuple):
     data: bytes = b""
 
 
-class TapeWriter:
+class LinkCaptureWriter:
     """Writes entries in a thread of its own, so that a slow disk stops nobody. say: gets the one line when it ends."""
 
-    def __init__(self, path: Path, host_s: float, say: Callable[[str], None]) -> None:
+    def __init__(self, path: Path, host_s: float, warn: Callable[[str], None]) -> None:
         """Begin a new file; InputError where there is one already or it cannot be written."""
         self.path = path
         self.recording = True
-        self._say = say
-        self._waiting: Queue[Entry | None] = Queue(WAITING_MAX)
+        self._warn = warn
+        self._queue: Queue[CaptureEntry | None] = Queue(QUEUE_MAX)
         try:
             self._file: BinaryIO = path.open("xb", buffering=0)
-            self._file.write(HEAD.pack(MAGIC, VERSION, host_s, time.time()))
+            self._file.write(HEADER.pack(MAGIC, VERSION, host_s, time.time()))
         except FileExistsError:
             raise InputError("--record", str(path), "a name that is free: nothing is overwritten") from None
         except OSError as error:
@@ -54,34 +54,34 @@ class TapeWriter:
         self._thread = threading.Thread(target=self._write_all, name="tape", daemon=True)
         self._thread.start()
 
-    def note(self, entry: Entry) -> None:
+    def record(self, entry: CaptureEntry) -> None:
         """Have an entry written; never waits, never raises."""
         if not self.recording:
             return
         try:
-            self._waiting.put_nowait(entry)
+            self._queue.put_nowait(entry)
         except Full:
-            self._stop(f"the disk is too slow, {WAITING_MAX} entries wait")
+            self._stop(f"the disk is too slow, {QUEUE_MAX} entries wait")
 
     def close(self) -> None:
         """Write what waits, and end."""
         try:
-            self._waiting.put(None, timeout=1.0)
+            self._queue.put(None, timeout=1.0)
         except Full:
             return
         self._thread.join(timeout=5.0)
 
-    def _stop(self, why: str) -> None:
+    def _stop(self, reason: str) -> None:
         # The loop's thread and the writer's may both come here: one of them may speak.
         was_recording, self.recording = self.recording, False
         if was_recording:
-            self._say(f"recording to {self.path} stopped: {why}; the session goes on")
+            self._warn(f"recording to {self.path} stopped: {reason}; the session goes on")
 
     def _write_all(self) -> None:
         with self._file:
-            while (entry := self._waiting.get()) is not None:
+            while (entry := self._queue.get()) is not None:
                 try:
-                    self._write(pack(entry))
+                    self._write(pack_entry(entry))
                 except OSError as error:
                     self._stop(error.strerror or str(error))
                     return
@@ -91,13 +91,13 @@ class TapeWriter:
             packed = packed[self._file.write(packed) :]
 
 
-def pack(entry: Entry) -> bytes:
+def pack_entry(entry: CaptureEntry) -> bytes:
     """An entry's bytes in the file."""
     content = ENTRY.pack(KINDS.index(entry.kind), entry.host_s, len(entry.data)) + entry.data
     return content + CRC.pack(crc32(content))
 
 
-class Tape:
+class LinkCapture:
     """A recorded file, read entry by entry. ignored: bytes at its end that are no whole entry, known after `entries`.
 
     host_s, unix_s: when it began, monotonic and since 1970
@@ -106,40 +106,40 @@ class Tape:
     def __init__(self, path: Path) -> None:
         """Look at the head; InputError where it is no recording, or one of another version."""
         self.path = path
-        self.ignored = 0
-        with self._opened() as file:
-            head = file.read(HEAD.size)
-        if len(head) < HEAD.size or not head.startswith(MAGIC):
-            raise InputError(str(path), head[:8], "a recording of a link, as `serve --record` writes it")
-        _, version, self.host_s, self.unix_s = HEAD.unpack(head)
+        self.ignored_bytes = 0
+        with self._open() as file:
+            header = file.read(HEADER.size)
+        if len(header) < HEADER.size or not header.startswith(MAGIC):
+            raise InputError(str(path), header[:8], "a recording of a link, as `serve --record` writes it")
+        _, version, self.host_s, self.unix_s = HEADER.unpack(header)
         if version != VERSION:
             raise InputError(f"{path}: version", version, f"{VERSION}, the one this release reads")
 
-    def _opened(self) -> BinaryIO:
+    def _open(self) -> BinaryIO:
         try:
             return self.path.open("rb")
         except OSError as error:
             raise InputError(str(self.path), error.strerror, "a file that can be read") from None
 
-    def entries(self) -> Iterator[Entry]:
+    def read_entries(self) -> Iterator[CaptureEntry]:
         """Every whole entry in order; what follows the last whole one is ignored and counted."""
-        with self._opened() as file:
-            file.seek(HEAD.size)
-            good = HEAD.size
-            while (entry := _next(file)) is not None:
-                good = file.tell()
+        with self._open() as file:
+            file.seek(HEADER.size)
+            whole_end = HEADER.size
+            while (entry := _read_entry(file)) is not None:
+                whole_end = file.tell()
                 yield entry
-            self.ignored = file.seek(0, 2) - good
+            self.ignored_bytes = file.seek(0, 2) - whole_end
 
 
-def _next(file: BinaryIO) -> Entry | None:
-    head = file.read(ENTRY.size)
-    if len(head) < ENTRY.size:
+def _read_entry(file: BinaryIO) -> CaptureEntry | None:
+    header = file.read(ENTRY.size)
+    if len(header) < ENTRY.size:
         return None
-    kind, host_s, length = ENTRY.unpack(head)
+    kind, host_s, length = ENTRY.unpack(header)
     if kind >= len(KINDS) or length > DATA_MAX:
         return None
-    data, tail = file.read(length), file.read(CRC.size)
-    if len(tail) < CRC.size or CRC.unpack(tail)[0] != crc32(head + data):
+    data, crc_bytes = file.read(length), file.read(CRC.size)
+    if len(crc_bytes) < CRC.size or CRC.unpack(crc_bytes)[0] != crc32(header + data):
         return None
-    return Entry(KINDS[kind], host_s, data)
+    return CaptureEntry(KINDS[kind], host_s, data)

@@ -7,11 +7,11 @@ from typing import Literal
 
 ROOT = Path("/")
 SERIAL_NAMES = ("ttyACM*", "ttyUSB*")
-Fate = Literal["no file", "there", "gone", "denied", "held"]
+PortStatus = Literal["no file", "there", "gone", "denied", "held"]
 
 
 @dataclass(frozen=True)
-class Holder:
+class PortHolder:
     """A process that has the port open."""
 
     pid: int
@@ -25,39 +25,39 @@ class Holder:
 class PortState:
     """fate: "no file" for a transport that is none; holders: other processes; others: serial ports there are."""
 
-    fate: Fate
-    holders: tuple[Holder, ...] = ()
-    others: tuple[str, ...] = ()
+    status: PortStatus
+    holders: tuple[PortHolder, ...] = ()
+    other_ports: tuple[str, ...] = ()
 
 
-def under(root: Path, path: str | Path) -> Path:
+def join_root(root: Path, path: str | Path) -> Path:
     """An absolute path within a folder that stands for /."""
     return root / str(path).lstrip("/")
 
 
-def device_name(port: str, root: Path = ROOT) -> str:
+def resolve_device(port: str, root: Path = ROOT) -> str:
     """The device a port's name leads to, links followed: /dev/ttyACM0."""
-    return "/" + str(under(root, port).resolve().relative_to(root.resolve()))
+    return "/" + str(join_root(root, port).resolve().relative_to(root.resolve()))
 
 
-def serial_ports(root: Path = ROOT) -> tuple[str, ...]:
+def list_serial_ports(root: Path = ROOT) -> tuple[str, ...]:
     """Serial ports of USB devices that are there."""
-    found = [path.name for pattern in SERIAL_NAMES for path in under(root, "/dev").glob(pattern)]
+    found = [path.name for pattern in SERIAL_NAMES for path in join_root(root, "/dev").glob(pattern)]
     return tuple(f"/dev/{name}" for name in sorted(found))
 
 
-def holders(port: str, root: Path = ROOT) -> tuple[Holder, ...]:
+def find_holders(port: str, root: Path = ROOT) -> tuple[PortHolder, ...]:
     """Other processes that have the port open, as far as /proc lets us see."""
-    names = {port, device_name(port, root)}
+    names = {port, resolve_device(port, root)}
     pids = {
         int(process.name)
-        for process in under(root, "/proc").glob("[0-9]*")
-        if int(process.name) != os.getpid() and names & _open_files(process)
+        for process in join_root(root, "/proc").glob("[0-9]*")
+        if int(process.name) != os.getpid() and names & _list_open_files(process)
     }
-    return tuple(Holder(pid, command(pid, root)) for pid in sorted(pids))
+    return tuple(PortHolder(pid, read_command_name(pid, root)) for pid in sorted(pids))
 
 
-def _open_files(process: Path) -> set[str]:
+def _list_open_files(process: Path) -> set[str]:
     found = set()
     try:
         for link in (process / "fd").iterdir():
@@ -67,26 +67,26 @@ def _open_files(process: Path) -> set[str]:
     return found
 
 
-def command(pid: int, root: Path = ROOT) -> str:
+def read_command_name(pid: int, root: Path = ROOT) -> str:
     """A process' name."""
     try:
-        return under(root, f"/proc/{pid}/comm").read_text(errors="replace").strip()
+        return join_root(root, f"/proc/{pid}/comm").read_text(errors="replace").strip()
     except OSError:
         return "a process"
 
 
-def port_state(port: str, root: Path = ROOT) -> PortState:
+def read_port_state(port: str, root: Path = ROOT) -> PortState:
     """How a port stands now; opens nothing."""
     if not port.startswith("/"):
         return PortState("no file")
-    path = under(root, port)
+    path = join_root(root, port)
     try:
-        there = path.exists()
+        exists = path.exists()
     except PermissionError:
         return PortState("denied")
-    if not there:
-        return PortState("gone", others=serial_ports(root))
+    if not exists:
+        return PortState("gone", other_ports=list_serial_ports(root))
     if not os.access(path, os.R_OK | os.W_OK, effective_ids=True):
         return PortState("denied")
-    held_by = holders(port, root)
-    return PortState("held" if held_by else "there", held_by)
+    port_holders = find_holders(port, root)
+    return PortState("held" if port_holders else "there", port_holders)

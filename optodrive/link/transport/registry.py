@@ -13,11 +13,11 @@ from optodrive.link.transport.usb_bulk import UsbBulk
 TRANSPORTS: dict[str, Callable[[BoardSection], Transport]] = {
     "serial": lambda board: SerialPort(board.port, board.baud),
     "simulated": lambda board: SimulatedBoard(board.port, board.baud),
-    "usb": UsbBulk.of,
+    "usb": UsbBulk.from_config,
 }
 
 
-def transport_maker(board: BoardSection) -> Callable[[], Transport]:
+def find_transport_factory(board: BoardSection) -> Callable[[], Transport]:
     """What makes the transport, not yet open; InputError for a Helios, which does not speak the board's protocol."""
     if board.transport not in TRANSPORTS:
         raise InputError(
@@ -28,7 +28,7 @@ def transport_maker(board: BoardSection) -> Callable[[], Transport]:
     return partial(TRANSPORTS[board.transport], board)
 
 
-def make_bench(board: BoardSection, display: str) -> tuple[Transport, str]:
+def build_bench_transport(board: BoardSection, display: str) -> tuple[Transport, str]:
     """A transport, not yet open, and the port of the spot sensor that comes with it; '' where none does.
 
     display: the configuration's file or shipped name.
@@ -36,4 +36,4 @@ def make_bench(board: BoardSection, display: str) -> tuple[Transport, str]:
     if board.transport == "simulated":
         simulated = SimulatedBoard(board.port, board.baud, display)
         return simulated, simulated.sensor_port
-    return transport_maker(board)(), ""
+    return find_transport_factory(board)(), ""

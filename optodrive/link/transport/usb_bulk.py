@@ -8,12 +8,12 @@ import usb.util
 
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import BoardSection
-from optodrive.link.transport.usb_device import find_device, lost, open_error, timeout_ms
+from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 
 WRITE_TIMEOUT_S = 0.5
 READ_BYTES = 4096
 """Asked for at a time: a multiple of every packet size, so that no packet is cut."""
-STALE_READS = 64
+STALE_READS_MAX = 64
 """What may wait from a session before, in reads of READ_BYTES."""
 
 
@@ -22,14 +22,14 @@ class UsbBulk:
 
     def __init__(self, vendor_id: int, product_id: int, serial_number: str = "", backend: Any = None) -> None:
         self.name = f"usb {vendor_id:04x}:{product_id:04x}" + (f" {serial_number}" if serial_number else "")
-        self._which = vendor_id, product_id, serial_number
+        self._ids = vendor_id, product_id, serial_number
         self._backend = backend
         self._device: Any = None
         self._in: Any = None
         self._out: Any = None
 
     @classmethod
-    def of(cls, board: BoardSection) -> Self:
+    def from_config(cls, board: BoardSection) -> Self:
         """The device a configuration names; InputError where it names none."""
         if board.vendor_id is None or board.product_id is None:
             raise InputError("board.vendor_id, board.product_id", None, "both, for transport 'usb'")
@@ -37,25 +37,25 @@ class UsbBulk:
 
     def open(self) -> None:
         """Claim the device; InputError where there is none or it may not be opened, LinkError where it is in use."""
-        self._device = find_device(*self._which, backend=self._backend)
+        self._device = find_device(*self._ids, backend=self._backend)
         try:
             self._claim()
         except usb.core.USBError as error:
             self.close()
-            raise open_error(self.name, error) from None
+            raise build_open_error(self.name, error) from None
         except InputError:
             self.close()
             raise
 
     def _claim(self) -> None:
         for interface in self._device.get_active_configuration():
-            ways = {
+            endpoints = {
                 usb.util.endpoint_direction(endpoint.bEndpointAddress): endpoint
                 for endpoint in interface
                 if usb.util.endpoint_type(endpoint.bmAttributes) == usb.util.ENDPOINT_TYPE_BULK
             }
-            if len(ways) == 2:
-                self._in, self._out = ways[usb.util.ENDPOINT_IN], ways[usb.util.ENDPOINT_OUT]
+            if len(endpoints) == 2:
+                self._in, self._out = endpoints[usb.util.ENDPOINT_IN], endpoints[usb.util.ENDPOINT_OUT]
                 usb.util.claim_interface(self._device, interface.bInterfaceNumber)
                 if interface.bAlternateSetting:  # a device with but one may refuse to be told
                     self._device.set_interface_altsetting(interface.bInterfaceNumber, interface.bAlternateSetting)
@@ -65,7 +65,7 @@ class UsbBulk:
 
     def _drain(self) -> None:
         with suppress(usb.core.USBTimeoutError):
-            for _ in range(STALE_READS):
+            for _ in range(STALE_READS_MAX):
                 self._in.read(READ_BYTES, timeout_ms(0.0))
 
     def read(self, timeout_s: float) -> bytes:
@@ -76,17 +76,17 @@ class UsbBulk:
         except usb.core.USBTimeoutError:
             return b""
         except usb.core.USBError as error:
-            raise lost(self.name, error) from None
+            raise build_lost_error(self.name, error) from None
 
     def write(self, data: bytes) -> None:
         """Write all of data; LinkError where the device does not take it within half a second."""
         self._require_open()
         try:
-            taken = self._out.write(data, timeout_ms(WRITE_TIMEOUT_S)) if data else 0
+            written_bytes = self._out.write(data, timeout_ms(WRITE_TIMEOUT_S)) if data else 0
         except usb.core.USBError as error:
-            raise lost(self.name, error) from None
-        if taken != len(data):
-            raise LinkError(f"link to {self.name} lost: it took {taken} of {len(data)} bytes")
+            raise build_lost_error(self.name, error) from None
+        if written_bytes != len(data):
+            raise LinkError(f"link to {self.name} lost: it took {written_bytes} of {len(data)} bytes")
 
     def _require_open(self) -> None:
         if self._device is None:

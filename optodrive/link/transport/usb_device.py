@@ -7,7 +7,7 @@ import usb.core
 
 from optodrive.core.errors import InputError, LinkError
 
-CANNOT_OPEN = (errno.EACCES, errno.EPERM)
+PERMISSION_ERRNOS = (errno.EACCES, errno.EPERM)
 
 
 def find_device(vendor_id: int, product_id: int, serial_number: str = "", backend: Any = None) -> Any:
@@ -17,19 +17,21 @@ def find_device(vendor_id: int, product_id: int, serial_number: str = "", backen
     """
     ids = f"{vendor_id:04x}:{product_id:04x}"
     try:
-        found = list(usb.core.find(find_all=True, backend=backend, idVendor=vendor_id, idProduct=product_id))
+        devices = list(usb.core.find(find_all=True, backend=backend, idVendor=vendor_id, idProduct=product_id))
         if serial_number:
-            found = [device for device in found if _serial_number(device) == serial_number]
+            devices = [device for device in devices if _serial_number(device) == serial_number]
     except usb.core.NoBackendError:
         raise InputError("board.transport", "usb", "libusb 1.0 on this machine (libusb-1.0-0)", "no_port") from None
     except usb.core.USBError as error:
-        raise open_error(ids, error) from None
-    which = f"{ids} {serial_number}".rstrip()
-    if not found:
-        raise InputError("board", which, "a USB device that is plugged in", "no_port")
-    if len(found) > 1:
-        raise InputError("board", f"{len(found)} times {which}", "one such USB device, or its serial_number", "no_port")
-    return found[0]
+        raise build_open_error(ids, error) from None
+    description = f"{ids} {serial_number}".rstrip()
+    if not devices:
+        raise InputError("board", description, "a USB device that is plugged in", "no_port")
+    if len(devices) > 1:
+        raise InputError(
+            "board", f"{len(devices)} times {description}", "one such USB device, or its serial_number", "no_port"
+        )
+    return devices[0]
 
 
 def _serial_number(device: Any) -> str | None:
@@ -41,17 +43,17 @@ def _serial_number(device: Any) -> str | None:
     return serial_number
 
 
-def open_error(name: str, error: Exception) -> InputError | LinkError:
+def build_open_error(name: str, error: Exception) -> InputError | LinkError:
     """Why a device could not be opened."""
-    if getattr(error, "errno", None) in CANNOT_OPEN:
+    if getattr(error, "errno", None) in PERMISSION_ERRNOS:
         return InputError("board", name, "permission to open it (a udev rule for its ids?)", "no_port")
     return LinkError(f"{name} cannot be opened: {error}; does another program hold it?")
 
 
-def lost(name: str, error: Exception) -> LinkError:
+def build_lost_error(name: str, error: Exception) -> LinkError:
     """A link that failed while in use."""
-    gone = "; it is gone: unplugged, or without power" if getattr(error, "errno", None) == errno.ENODEV else ""
-    return LinkError(f"link to {name} lost: {error}{gone}")
+    detail = "; it is gone: unplugged, or without power" if getattr(error, "errno", None) == errno.ENODEV else ""
+    return LinkError(f"link to {name} lost: {error}{detail}")
 
 
 def timeout_ms(timeout_s: float) -> int:

@@ -2,11 +2,11 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import DOSE, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import DOSE, HeatGainBound, Kernels, OperatingEnvelope, Term, TermParameter, TermValues
 
 
 @kernel
-def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """1 − share × dose, dose as a share of the recording's."""
     return float(x * (1.0 - v[0] * c[DOSE]))
 
@@ -16,13 +16,13 @@ class AbsorberAgeing(Term):
 
     key = "absorber_ageing"
     parameters = (TermParameter("share", "1", 0.05, -0.3, 0.3, "lost over the recording's whole dose, 1 to 20 %"),)
-    kernels = Kernels(light=light)
-    by_run = True
-    suspect = "the same pulse early and late"
+    kernels = Kernels(optical_power=optical_power)
+    varies_between_runs = True
+    signature = "the same pulse early and late"
 
-    def warming(self, values: Values, most: Most) -> Warming | None:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
         """As new at the most; where light is absorbed better and better, nobody knows where that ends."""
-        return Warming() if values["share"] >= 0.0 else None
+        return HeatGainBound() if values["share"] >= 0.0 else None
 
 
 TERM = AbsorberAgeing()

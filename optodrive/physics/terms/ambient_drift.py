@@ -2,13 +2,22 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import SESSION, TIME_S, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import (
+    SESSION_TIME,
+    TIME_S,
+    HeatGainBound,
+    Kernels,
+    OperatingEnvelope,
+    Term,
+    TermParameter,
+    TermValues,
+)
 
 
 @kernel
-def reads(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def sensor_reading(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Ramp and parabola in the session's time, −1 to 1, and a rate in the run's."""
-    u = c[SESSION]
+    u = c[SESSION_TIME]
     return float(x + v[0] + v[1] * u + v[2] * (1.5 * u * u - 0.5) + v[3] * c[TIME_S])
 
 
@@ -22,13 +31,13 @@ class AmbientDrift(Term):
         TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording"),
         TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run"),
     )
-    kernels = Kernels(reads=reads)
-    by_run = True
-    suspect = "baselines before the pulse"
+    kernels = Kernels(sensor_reading=sensor_reading)
+    varies_between_runs = True
+    signature = "baselines before the pulse"
 
-    def warming(self, values: Values, most: Most) -> Warming:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """A room as much warmer than stated as it ever was."""
-        return Warming(everywhere_k=abs(values["offset"]) + abs(values["ramp"]) + abs(values["bend"]))
+        return HeatGainBound(uniform_rise_k=abs(values["offset"]) + abs(values["ramp"]) + abs(values["bend"]))
 
 
 TERM = AmbientDrift()

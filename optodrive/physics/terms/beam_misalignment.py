@@ -2,24 +2,34 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import MINE, PIXEL, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import (
+    ILLUMINATED_PIXEL,
+    IS_TARGET,
+    POWER_W,
+    HeatGainBound,
+    Kernels,
+    OperatingEnvelope,
+    Term,
+    TermParameter,
+    TermValues,
+)
 
 
 @kernel
-def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """1 − share on that pixel."""
-    return float(x * (1.0 - v[0]) if c[PIXEL] == v[1] else x)
+    return float(x * (1.0 - v[0]) if c[ILLUMINATED_PIXEL] == v[1] else x)
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
     """The wall warms towards resistance × what misses, while the light is on this pixel."""
-    missing_w = v[0] * c[POWER_W] if c[PIXEL] == v[1] and c[MINE] > 0.0 else 0.0
+    missing_w = v[0] * c[POWER_W] if c[ILLUMINATED_PIXEL] == v[1] and c[IS_TARGET] > 0.0 else 0.0
     x[s] = (v[2] * missing_w - y[s]) / v[3]
 
 
 @kernel
-def wall(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Rise of the bridge's far end, K."""
     return float(x + y[s])
 
@@ -35,12 +45,12 @@ class BeamMisalignment(Term):
         TermParameter("time", "s", 0.5, 0.02, 20.0, "the wall's, 0.1 to 10 s"),
     )
     followers = ("missed_k",)
-    kernels = Kernels(light=light, rates=rates, wall=wall)
-    suspect = "several pixels beside each other"
+    kernels = Kernels(optical_power=optical_power, rates=rates, wall_rise=wall_rise)
+    signature = "several pixels beside each other"
 
-    def warming(self, values: Values, most: Most) -> Warming:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """The wall under what misses at full power for ever."""
-        return Warming(everywhere_k=values["resistance"] * values["share"] * most.full_w)
+        return HeatGainBound(uniform_rise_k=values["resistance"] * values["share"] * envelope.full_w)
 
 
 TERM = BeamMisalignment()

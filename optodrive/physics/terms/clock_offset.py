@@ -13,8 +13,8 @@ class ClockOffset(Term):
         TermParameter("force", "s", 1e-4, -5e-3, 5e-3, "as above"),
         TermParameter("mirrors", "s", 1e-4, -5e-3, 5e-3, "as above"),
     )
-    never_warmer = True
-    suspect = "every edge, in proportion to the slope"
+    cannot_add_heat = True
+    signature = "every edge, in proportion to the slope"
 
 
 TERM = ClockOffset()

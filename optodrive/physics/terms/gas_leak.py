@@ -12,7 +12,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 @kernel
-def lifts(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def membrane_drive(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """γ − m."""
     return float(x - y[s])
 
@@ -23,9 +23,9 @@ class GasLeak(Term):
     key = "gas_leak"
     parameters = (TermParameter("rate", "1/s", 1.0, 0.02, 20.0, "0.1 to 10 1/s"),)
     followers = ("leaked_k",)
-    kernels = Kernels(rates=rates, lifts=lifts, pushes=lifts)
-    never_warmer = True
-    suspect = "long trains, undershoot on cooling"
+    kernels = Kernels(rates=rates, membrane_drive=membrane_drive, force_drive=membrane_drive)
+    cannot_add_heat = True
+    signature = "long trains, undershoot on cooling"
 
 
 TERM = GasLeak()

@@ -5,12 +5,12 @@ from math import pi
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.paper_facts import paper_facts
+from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.pixel import GAS_FRACTION
-from optodrive.physics.term import Term, TermParameter, Values, View
+from optodrive.physics.term import StateView, Term, TermParameter, TermValues
 
 ATMOSPHERE_PA = 101_325.0
-HALVINGS = 60
+BISECTION_STEPS = 60
 
 
 class GasMembrane(Term):
@@ -22,16 +22,16 @@ class GasMembrane(Term):
     """
 
     key = "gas_membrane"
-    never_warmer = True
+    cannot_add_heat = True
     parameters = (
         TermParameter("share", "1", 0.33, 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
         TermParameter("volume", "m^3", 7.8e-9, 6.0e-9, 9.0e-9, "7.1 to 7.8 uL (Text S3, Display fabrication)"),
     )
 
-    def displacement_m(self, values: Values, view: View, displacement_m: FloatArray) -> FloatArray:
+    def displacement_m(self, values: TermValues, view: StateView, displacement_m: FloatArray) -> FloatArray:
         """[p] m; found by bisection, exact to rounding."""
         warmer = values["share"] / GAS_FRACTION * view.rise_k["gas_k"] / view.ambient_k
-        facts = paper_facts()
+        facts = load_paper_facts()
         e_pa, nu = facts["membrane_E"].value, facts["membrane_nu"].value
         h_m, r_m = facts["membrane_h"].value, facts["cavity_r"].value
         plate = 16 * e_pa * h_m**3 / (3 * (1 - nu**2) * r_m**4)
@@ -39,7 +39,7 @@ class GasMembrane(Term):
         swept_m2 = 0.5 * pi * r_m**2
         # At no pressure the gas has swollen as far as it can: z lies between rest and there.
         low_m, high_m = np.zeros_like(warmer), warmer * values["volume"] / swept_m2
-        for _ in range(HALVINGS):
+        for _ in range(BISECTION_STEPS):
             z_m = 0.5 * (low_m + high_m)
             gas_pa = ATMOSPHERE_PA * ((1 + warmer) / (1 + swept_m2 * z_m / values["volume"]) - 1)
             rises = (gas_pa > plate * z_m + cap * z_m**3) == (warmer > 0)

@@ -2,11 +2,11 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import ABSORBER, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import ABSORBER, HeatGainBound, Kernels, OperatingEnvelope, Term, TermParameter, TermValues
 
 
 @kernel
-def capacity(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def heat_capacity(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """C = C₀ (1 + slope θ), J/K."""
     return float(x * (1.0 + v[0] * y[ABSORBER]))
 
@@ -25,12 +25,12 @@ class HeatCapacity(Term):
             "c_p of graphite, 300 to 450 K: 3.9e-3; less where other matter shares the heat",
         ),
     )
-    kernels = Kernels(capacity=capacity)
-    suspect = "initial slopes at several powers, plateaus unchanged"
+    kernels = Kernels(heat_capacity=heat_capacity)
+    signature = "initial slopes at several powers, plateaus unchanged"
 
-    def warming(self, values: Values, most: Most) -> Warming:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """Never less capacity than C₀; the most at the hottest."""
-        return Warming(capacity=1.0 + values["slope"] * most.absorber_k)
+        return HeatGainBound(capacity_factor=1.0 + values["slope"] * envelope.absorber_k)
 
 
 TERM = HeatCapacity()

@@ -13,7 +13,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 @kernel
-def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """P (1 − share × mean warmth of chip and mount)."""
     return float(x * (1.0 - 0.5 * v[0] * (y[s] + y[s + 1])))
 
@@ -28,9 +28,9 @@ class LaserDroop(Term):
         TermParameter("spread", "1", 1.5, 1.0, 30.0, "the mount's time over the chip's"),
     )
     followers = ("chip_1", "mount_1")
-    kernels = Kernels(rates=rates, light=light)
-    never_warmer = True
-    suspect = "long pulses and trains, nothing in cooling"
+    kernels = Kernels(rates=rates, optical_power=optical_power)
+    cannot_add_heat = True
+    signature = "long pulses and trains, nothing in cooling"
 
 
 TERM = LaserDroop()

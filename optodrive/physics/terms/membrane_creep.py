@@ -4,20 +4,20 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.physics.term import GAS, Kernels, Term, TermParameter
 
-SHORTEST_S = 2.5e-3
+MIN_TIME_S = 2.5e-3
 """Quicker than the gas it is no creep."""
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
     """Follows the gas."""
-    x[s] = (y[GAS] - y[s]) / max(SHORTEST_S, v[1] / v[2])
-    x[s + 1] = (y[GAS] - y[s + 1]) / max(SHORTEST_S, v[1])
-    x[s + 2] = (y[GAS] - y[s + 2]) / max(SHORTEST_S, v[1] * v[2])
+    x[s] = (y[GAS] - y[s]) / max(MIN_TIME_S, v[1] / v[2])
+    x[s + 1] = (y[GAS] - y[s + 1]) / max(MIN_TIME_S, v[1])
+    x[s + 2] = (y[GAS] - y[s + 2]) / max(MIN_TIME_S, v[1] * v[2])
 
 
 @kernel
-def lifts(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def membrane_drive(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """γ + share × mean q."""
     return float(x + v[0] * (y[s] + y[s + 1] + y[s + 2]) / 3.0)
 
@@ -34,9 +34,9 @@ class MembraneCreep(Term):
         ),
     )
     followers = ("crept_soon_k", "crept_k", "crept_late_k")
-    kernels = Kernels(rates=rates, lifts=lifts)
-    never_warmer = True
-    suspect = "displacement lags and tails, temperature clean"
+    kernels = Kernels(rates=rates, membrane_drive=membrane_drive)
+    cannot_add_heat = True
+    signature = "displacement lags and tails, temperature clean"
 
 
 TERM = MembraneCreep()

@@ -6,7 +6,7 @@ from optodrive.physics.term import Kernels, Term, TermParameter
 
 
 @kernel
-def lifts(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def membrane_drive(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """γ / (1 + (curvature γ)ᵒ)^(1/o), o the order: 1 bends early, 3 late."""
     return float(x / (1.0 + (v[0] * max(1e-9, x)) ** v[1]) ** (1.0 / v[1]))
 
@@ -19,9 +19,9 @@ class MembraneStiffening(Term):
         TermParameter("curvature", "1/K", 2e-3, 1e-5, 5e-2, "from a plate to a stretched membrane within the stroke"),
         TermParameter("order", "1", 1.5, 0.7, 4.0, "2 for a cubic balance where it is weak"),
     )
-    kernels = Kernels(lifts=lifts)
-    never_warmer = True
-    suspect = "peaks against power, force stays linear"
+    kernels = Kernels(membrane_drive=membrane_drive)
+    cannot_add_heat = True
+    signature = "peaks against power, force stays linear"
 
 
 TERM = MembraneStiffening()

@@ -13,8 +13,8 @@ class MirrorLag(Term):
         TermParameter("delay", "s", 2e-5, 0.0, 2e-3, "driver and filter"),
         TermParameter("slew", "rad/s", 500.0, 5.0, 5000.0, "full current, small-angle galvos"),
     )
-    never_warmer = True
-    suspect = "mirror positions after steps of three sizes"
+    cannot_add_heat = True
+    signature = "mirror positions after steps of three sizes"
 
 
 TERM = MirrorLag()

@@ -2,7 +2,7 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import NEIGHBOUR, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import NEIGHBOUR, HeatGainBound, Kernels, OperatingEnvelope, Term, TermParameter, TermValues
 
 
 @kernel
@@ -12,7 +12,7 @@ def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) ->
 
 
 @kernel
-def wall(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Rise of the bridge's far end, K."""
     return float(x + y[s])
 
@@ -26,12 +26,12 @@ class NeighbourCrosstalk(Term):
         TermParameter("lag", "s", 0.02, 2.5e-3, 1.0, "conduction through one cell's wall"),
     )
     followers = ("crosstalk_k",)
-    kernels = Kernels(rates=rates, wall=wall)
-    suspect = "runs in which only a neighbour is lit"
+    kernels = Kernels(rates=rates, wall_rise=wall_rise)
+    signature = "runs in which only a neighbour is lit"
 
-    def warming(self, values: Values, most: Most) -> Warming:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """All the heat that one beam leaves on a display, beside this very pixel."""
-        return Warming(everywhere_k=values["share"] * most.together_k)
+        return HeatGainBound(uniform_rise_k=values["share"] * envelope.summed_absorbers_k)
 
 
 TERM = NeighbourCrosstalk()

@@ -2,11 +2,20 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import FULL_W, POWER_W, Kernels, Most, Term, TermParameter, Values, Warming
+from optodrive.physics.term import (
+    FULL_W,
+    POWER_W,
+    HeatGainBound,
+    Kernels,
+    OperatingEnvelope,
+    Term,
+    TermParameter,
+    TermValues,
+)
 
 
 @kernel
-def light(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Full power kept: (p − threshold) / (1 − threshold), then p (1 + curvature (1 − p))."""
     if x <= 0.0:
         return x
@@ -23,12 +32,12 @@ class PowerNonlinearity(Term):
         TermParameter("threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command"),
         TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept"),
     )
-    kernels = Kernels(light=light)
-    suspect = "a ladder of powers, shapes unchanged"
+    kernels = Kernels(optical_power=optical_power)
+    signature = "a ladder of powers, shapes unchanged"
 
-    def warming(self, values: Values, most: Most) -> Warming:
+    def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """A threshold takes away; a curve gives the more, the weaker the light."""
-        return Warming(power=1.0 + max(0.0, values["curvature"]))
+        return HeatGainBound(power_factor=1.0 + max(0.0, values["curvature"]))
 
 
 TERM = PowerNonlinearity()

@@ -9,7 +9,7 @@ STEFAN_BOLTZMANN = 5.670374e-8
 
 
 @kernel
-def leaving(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def heat_loss(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """εA σ (T⁴ − T₀⁴), W, on top of x."""
     warm_k = c[AMBIENT_K] + y[ABSORBER]
     return float(x + v[0] * STEFAN_BOLTZMANN * (warm_k**4 - c[AMBIENT_K] ** 4))
@@ -29,10 +29,10 @@ class Radiation(Term):
             "both faces of a 2 mm x 1.5 mm absorber and its bridges, emissivity 0.5 to 0.9",
         ),
     )
-    kernels = Kernels(leaving=leaving)
-    by_run = True
-    never_warmer = True
-    suspect = "narrow bridges, hot, cooling that slows down"
+    kernels = Kernels(heat_loss=heat_loss)
+    varies_between_runs = True
+    cannot_add_heat = True
+    signature = "narrow bridges, hot, cooling that slows down"
 
 
 TERM = Radiation()

@@ -6,7 +6,7 @@ from optodrive.physics.term import Kernels, Term, TermParameter
 
 
 @kernel
-def lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def sensor_lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """First order, s."""
     return float(x + v[0])
 
@@ -19,10 +19,10 @@ class SensorLag(Term):
         TermParameter("time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector"),
         TermParameter("delay_share", "1", 0.0, 0.0, 1.0, "a delay beside it; 0.73 for an exposure's moving mean"),
     )
-    kernels = Kernels(lag=lag)
-    quick = True
-    never_warmer = True
-    suspect = "edges of temperature against edges of displacement"
+    kernels = Kernels(sensor_lag=sensor_lag)
+    is_fast = True
+    cannot_add_heat = True
+    signature = "edges of temperature against edges of displacement"
 
 
 TERM = SensorLag()

@@ -1,7 +1,7 @@
 """The membrane's outer side, where the finger is: it follows the gas below and the wall around it."""
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import Term, TermParameter, Values, View
+from optodrive.physics.term import StateView, Term, TermParameter, TermValues
 
 
 class TouchSurface(Term):
@@ -15,7 +15,7 @@ class TouchSurface(Term):
     )
     followers = ("touch_k",)
 
-    def rates_k_per_s(self, values: Values, view: View) -> dict[str, FloatArray]:
+    def rates_k_per_s(self, values: TermValues, view: StateView) -> dict[str, FloatArray]:
         """K/s."""
         drive_k = values["gas_share"] * view.rise_k["gas_k"] + values["wall_share"] * view.wall_k()
         return {"touch_k": (drive_k - view.rise_k["touch_k"]) / values["lag"]}

@@ -2,13 +2,13 @@
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import FLOW_W, WALL, Flows, Kernels, Term, TermParameter, Values, View
+from optodrive.physics.term import BRIDGE_FLOW_W, WALL, HeatFlows, Kernels, StateView, Term, TermParameter, TermValues
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
     """C dw/dt = flow − w / R."""
-    x[WALL] = (c[FLOW_W] - y[WALL] / v[0]) / v[1]
+    x[WALL] = (c[BRIDGE_FLOW_W] - y[WALL] / v[0]) / v[1]
 
 
 class WallHeating(Term):
@@ -24,11 +24,11 @@ class WallHeating(Term):
     heat_nodes = {"wall_k": "capacity"}  # noqa: RUF012 - a Mapping, never written to
 
     kernels = Kernels(rates=rates)
-    suspect = "trains of seconds, then the slow tail"
+    signature = "trains of seconds, then the slow tail"
 
-    def flow(self, values: Values, view: View, flows: Flows) -> None:
+    def add_flows(self, values: TermValues, view: StateView, flows: HeatFlows) -> None:
         """Wall to ambient."""
-        flows.move("wall_k", None, view.rise_k["wall_k"] / values["resistance"])
+        flows.add_flow("wall_k", None, view.rise_k["wall_k"] / values["resistance"])
 
 
 TERM = WallHeating()

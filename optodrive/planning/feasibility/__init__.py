@@ -1,7 +1,23 @@
 """Whether a sequence fits on one beam, who breaks it, and the nearest that fits; best effort on request."""
 
-from optodrive.planning.feasibility.check import admit
-from optodrive.planning.feasibility.report import Admission, Fit, LeftOut, Nearest, Thinned
-from optodrive.planning.feasibility.sequence_edits import scaled, stretched, without
+from optodrive.planning.feasibility.check import check_feasibility
+from optodrive.planning.feasibility.report import (
+    FeasibilityReport,
+    FitMode,
+    NearestFeasible,
+    Omission,
+    SequenceReduction,
+)
+from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence, stretch_sequence
 
-__all__ = ["Admission", "Fit", "LeftOut", "Nearest", "Thinned", "admit", "scaled", "stretched", "without"]
+__all__ = [
+    "FeasibilityReport",
+    "FitMode",
+    "Omission",
+    "NearestFeasible",
+    "SequenceReduction",
+    "check_feasibility",
+    "scale_sequence",
+    "stretch_sequence",
+    "omit_pixels",
+]

@@ -8,68 +8,81 @@ from dataclasses import dataclass, replace
 from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.physics.thermal_state import Heat
-from optodrive.planning.feasibility.nearest_feasible import lower, slower
-from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, Trials, orders_count
-from optodrive.planning.feasibility.reduction import thinned
-from optodrive.planning.feasibility.report import Admission, Fit, Nearest, Proof
-from optodrive.planning.feasibility.report_builder import fitting, missing, thinned_set
-from optodrive.planning.feasibility.sequence_edits import scaled, without
-from optodrive.planning.feasibility.violation import Breach, deadlines_s, first_breach
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.feasibility.nearest_feasible import find_height_factor, find_time_factor
+from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
+from optodrive.planning.feasibility.reduction import reduce_sequence
+from optodrive.planning.feasibility.report import FeasibilityReport, FitMode, NearestFeasible, Proof
+from optodrive.planning.feasibility.report_builder import (
+    build_feasible_report,
+    build_infeasible_report,
+    build_reduction,
+)
+from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence
+from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
 from optodrive.planning.limiter.limiter import Policy
-from optodrive.planning.pipeline import Display, Prepared, Progress, beyond_reach, prepare, without_dead
+from optodrive.planning.pipeline import (
+    DisplayModel,
+    PlannedSequence,
+    Progress,
+    first_unreachable,
+    plan_sequence,
+    remove_dead_pixels,
+)
 
 PLANS_MAX = 1_000
 """So many plans at most are tried for each of the nearest sets."""
 PULSES_MAX = 30_000
-PULSES_ASKED_MAX = 200_000
+PULSES_REQUESTED_MAX = 200_000
 """And so many pulses, a second's work; for what was asked for by name some seconds'."""
-WITH_TERMS = 0.05
+TERMS_PLAN_FRACTION = 0.05
 """With terms in the model a pulse takes so much longer to plan; this share of plans then."""
-PLANS_LEAST = 12
+PLANS_MIN = 12
 """So many plans all the same for what was asked for by name, however long it is."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Asked:
+class _FeasibilityQuery:
     """What was asked for, and what it is planned from. told: shows progress."""
 
-    display: Display
+    display: DisplayModel
     sequence: FrameSequence
-    heat: Heat
+    heat: ThermalState
     budget: BudgetState
-    fit: Fit
-    told: Progress
+    fit: FitMode
+    on_progress: Progress
 
-    def trials(self, plans_max: int) -> Trials:
-        return Trials(self.display, self.heat, self.budget, lambda: self.told(1.0), plans_max)
+    def new_search(self, plans_max: int) -> OrderSearch:
+        return OrderSearch(self.display, self.heat, self.budget, lambda: self.on_progress(1.0), plans_max)
 
-    def planned(
-        self, policy: Policy = "trim", orders: Orders | None = None, changed: FrameSequence | None = None
-    ) -> Prepared:
-        sequence = self.sequence if changed is None else changed
-        return prepare(self.display, sequence, self.heat, self.budget, policy, self.told, orders=orders)
+    def plan(
+        self, policy: Policy = "trim", orders: Orders | None = None, replacement: FrameSequence | None = None
+    ) -> PlannedSequence:
+        sequence = self.sequence if replacement is None else replacement
+        return plan_sequence(
+            self.display, sequence, self.heat, self.budget, policy, self.on_progress, visiting_orders=orders
+        )
 
-    def share(self) -> float:
-        return WITH_TERMS if self.display.parameters.planner_terms else 1.0
+    def plan_fraction(self) -> float:
+        return TERMS_PLAN_FRACTION if self.display.parameters.planner_terms else 1.0
 
-    def plans_max(self, by_name: bool) -> int:
+    def compute_plans_max(self, is_requested: bool) -> int:
         """How many plans may be tried for one of the nearest sets, by_name: the one that was asked for."""
-        pulses = PULSES_ASKED_MAX if by_name else PULSES_MAX
+        pulses = PULSES_REQUESTED_MAX if is_requested else PULSES_MAX
         frames = sum(int((frame.target_m > 0).sum()) for frame in self.sequence.frames)
         count = frames + sum(len(train.pulse_starts_s()) for train in self.sequence.trains)
-        return max(min(PLANS_MAX, int(self.share() * pulses / max(1, count))), PLANS_LEAST if by_name else 0)
+        return max(min(PLANS_MAX, int(self.plan_fraction() * pulses / max(1, count))), PLANS_MIN if is_requested else 0)
 
 
-def admit(
-    display: Display,
+def check_feasibility(
+    display: DisplayModel,
     sequence: FrameSequence,
-    heat: Heat,
+    heat: ThermalState,
     budget: BudgetState,
     policy: Policy = "trim",
-    progress: Progress | None = None,
-    fit: Fit = "as_is",
-) -> tuple[Prepared, Admission]:
+    on_progress: Progress | None = None,
+    fit: FitMode = "as_is",
+) -> tuple[PlannedSequence, FeasibilityReport]:
     """Plan a sequence as `prepare` does, or what of it fits, and say whether all of it does.
 
     Where the planner's order does not fit and there are few, all orders are tried, and one that fits is the plan.
@@ -77,79 +90,91 @@ def admit(
     Dead pixels are left out of frames first. Raises as `prepare`; RefusedError, with the admission, under policy
     "refuse", and where nothing fits that is asked.
     """
-    living, dead = without_dead(display, sequence)
-    asked = _Asked(display, living, heat, budget, fit, progress or (lambda _share: None))
-    prepared, admission = _admitted(asked, policy)
-    return replace(prepared, dead=dead), admission
+    living, dead = remove_dead_pixels(display, sequence)
+    query = _FeasibilityQuery(display, living, heat, budget, fit, on_progress or (lambda _share: None))
+    prepared, report = _check_query(query, policy)
+    return replace(prepared, dead_pixels=dead), report
 
 
-def _admitted(asked: _Asked, policy: Policy) -> tuple[Prepared, Admission]:
-    beyond = None if asked.fit == "as_is" else beyond_reach(asked.display, asked.sequence)
-    if beyond is not None:
-        return _instead(asked, None, Breach("reach", beyond[0], beyond[1]), policy)
-    plan = asked.planned()
-    breach = first_breach(plan.plan, deadlines_s(asked.sequence, plan.lead_s))
-    if breach is None:
-        return plan, fitting(plan, "planned", asked.fit)
-    return _instead(asked, plan, breach, policy)
+def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:
+    unreachable = None if query.fit == "as_is" else first_unreachable(query.display, query.sequence)
+    if unreachable is not None:
+        return _plan_alternative(query, None, Violation("reach", unreachable[0], unreachable[1]), policy)
+    plan = query.plan()
+    violation = find_first_violation(plan.plan, deadlines_s(query.sequence, plan.lead_in_s))
+    if violation is None:
+        return plan, build_feasible_report(plan, "planned", query.fit)
+    return _plan_alternative(query, plan, violation, policy)
 
 
-def _instead(asked: _Asked, plan: Prepared | None, breach: Breach, policy: Policy) -> tuple[Prepared, Admission]:
+def _plan_alternative(
+    query: _FeasibilityQuery, plan: PlannedSequence | None, violation: Violation, policy: Policy
+) -> tuple[PlannedSequence, FeasibilityReport]:
     """What is planned of a sequence whose plan breaks; plan: None where a target is out of reach."""
-    search = asked.trials(int(asked.share() * ORDERS_MAX))
-    orders, proof, least_s = _settled(search, asked.sequence, breach)
+    search = query.new_search(int(query.plan_fraction() * ORDERS_MAX))
+    orders, proof, lower_bound_s = _search_other_orders(search, query.sequence, violation)
     if orders is not None:
-        ordered = asked.planned(orders=orders)
-        found = fitting(ordered, proof, asked.fit)
-        return ordered, replace(found, plans=search.plans, plans_max=search.plans_max)
-    each = [asked.trials(asked.plans_max(asked.fit == fit)) for fit in ("priority", "even", None)]
-    thin, low, slow = thinned(each[0], asked.sequence), lower(each[1], asked.sequence), slower(each[2], asked.sequence)
-    nearest = Nearest(
-        pixels=None if thin is None else thinned_set(asked.sequence, thin[0], breach.source),
-        height=None if low is None else low[0],
-        rate=None if slow is None else slow[0],
-        complete=not any(trials.spent for trials in each),
+        ordered = query.plan(orders=orders)
+        report_found = build_feasible_report(ordered, proof, query.fit)
+        return ordered, replace(report_found, plans_tried=search.plans_tried, plans_tried_max=search.plans_max)
+    searches = [query.new_search(query.compute_plans_max(query.fit == fit)) for fit in ("priority", "even", None)]
+    reduced, scaled, stretched = (
+        reduce_sequence(searches[0], query.sequence),
+        find_height_factor(searches[1], query.sequence),
+        find_time_factor(searches[2], query.sequence),
     )
-    admission = replace(
-        missing(asked.sequence, plan, breach, proof, least_s, nearest),
-        plans=sum(trials.plans for trials in (search, *each)),
-        plans_max=sum(trials.plans_max for trials in (search, *each)),
-        fit=asked.fit,
+    nearest = NearestFeasible(
+        pixels=None if reduced is None else build_reduction(query.sequence, reduced[0], violation.source),
+        height_factor=None if scaled is None else scaled[0],
+        time_factor=None if stretched is None else stretched[0],
+        complete=not any(trials.is_exhausted for trials in searches),
     )
-    if asked.fit == "as_is":
-        return _by_policy(asked, plan, admission, policy), admission
-    if asked.fit == "even" and low is not None:
-        return asked.planned("trim", low[1], scaled(asked.sequence, low[0])), replace(admission, height=low[0])
-    if asked.fit == "priority" and thin is not None and nearest.pixels is not None:
-        thinner = asked.planned("trim", thin[1], without(asked.sequence, thin[0]))
-        return thinner, replace(admission, left_out=nearest.pixels.left_out)
-    no = "no height fits" if asked.fit == "even" else "nothing of it fits"
-    raise _with(RefusedError(f"{no}: {admission.sentence}"), admission)
+    report = replace(
+        build_infeasible_report(query.sequence, plan, violation, proof, lower_bound_s, nearest),
+        plans_tried=sum(trials.plans_tried for trials in (search, *searches)),
+        plans_tried_max=sum(trials.plans_max for trials in (search, *searches)),
+        fit=query.fit,
+    )
+    if query.fit == "as_is":
+        return _apply_policy(query, plan, report, policy), report
+    if query.fit == "even" and scaled is not None:
+        return query.plan("trim", scaled[1], scale_sequence(query.sequence, scaled[0])), replace(
+            report, height_factor=scaled[0]
+        )
+    if query.fit == "priority" and reduced is not None and nearest.pixels is not None:
+        reduced_plan = query.plan("trim", reduced[1], omit_pixels(query.sequence, reduced[0]))
+        return reduced_plan, replace(report, omitted=nearest.pixels.omitted)
+    refusal = "no height fits" if query.fit == "even" else "nothing of it fits"
+    raise _attach_report(RefusedError(f"{refusal}: {report.message}"), report)
 
 
-def _settled(search: Trials, sequence: FrameSequence, breach: Breach) -> tuple[Orders | None, Proof, float | None]:
+def _search_other_orders(
+    search: OrderSearch, sequence: FrameSequence, violation: Violation
+) -> tuple[Orders | None, Proof, float | None]:
     """Other orders that fit, or how far it is proven that there are none, and the frame's least beam time, s."""
-    impossible, least_s = search.proven(sequence, breach)
+    impossible, lower_bound_s = search.prove_infeasible(sequence, violation)
     if impossible:
-        return None, "bound", least_s
-    if orders_count(sequence) > ORDERS_MAX:
-        return None, "not found", least_s
-    orders = search.searched(sequence)
-    return orders, "not found" if search.spent else "searched", least_s
+        return None, "bound", lower_bound_s
+    if count_orders(sequence) > ORDERS_MAX:
+        return None, "not found", lower_bound_s
+    orders = search.search_all_orders(sequence)
+    return orders, "not found" if search.is_exhausted else "searched", lower_bound_s
 
 
-def _by_policy(asked: _Asked, plan: Prepared | None, admission: Admission, policy: Policy) -> Prepared:
+def _apply_policy(
+    query: _FeasibilityQuery, plan: PlannedSequence | None, report: FeasibilityReport, policy: Policy
+) -> PlannedSequence:
     """The plan as it is, or with its waits; raises under "refuse", and where waiting does not help."""
     if plan is not None and policy == "trim":
         return plan
     try:
         if policy == "delay" or plan is None or plan.shortfall is not None:
-            return asked.planned(policy)
+            return query.plan(policy)
     except OverBudgetError as error:
-        raise _with(error, admission) from None
-    raise _with(RefusedError(admission.sentence), admission)
+        raise _attach_report(error, report) from None
+    raise _attach_report(RefusedError(report.message), report)
 
 
-def _with(error: RefusedError, admission: Admission) -> RefusedError:
-    error.admission = admission.answer()
+def _attach_report(error: RefusedError, report: FeasibilityReport) -> RefusedError:
+    error.feasibility = report.to_dict()
     return error

@@ -14,10 +14,23 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
-from optodrive.physics.thermal_state import Heat
-from optodrive.planning.feasibility.violation import Breach, deadlines_s, first_breach, least_s, no_order_helps
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.feasibility.violation import (
+    Violation,
+    beam_lower_bound_s,
+    deadlines_s,
+    find_first_violation,
+    is_order_independent,
+)
 from optodrive.planning.limiter.limiter import limit
-from optodrive.planning.pipeline import ROUNDING_S, Display, Prepared, beyond_reach, mirrors_rest, prepare
+from optodrive.planning.pipeline import (
+    TIME_TOLERANCE_S,
+    DisplayModel,
+    PlannedSequence,
+    find_galvo_pause,
+    first_unreachable,
+    plan_sequence,
+)
 from optodrive.planning.scheduler.scheduler import Scheduler
 
 ORDERS_MAX = 14_000
@@ -29,11 +42,11 @@ Orders = Mapping[int, IntArray]
 """By source, the order in which a frame's driven pixels are visited."""
 
 
-class _SpentError(Exception):
+class _PlanLimitError(Exception):
     """So many plans were tried as may be."""
 
 
-class Trials:
+class OrderSearch:
     """Tries plans. plans: how many so far; spent: whether one more was wanted than plans_max; tick: shows progress.
 
     What is found is given as orders by source, with which `prepare` makes the plan that was tried; the planner's own
@@ -41,141 +54,161 @@ class Trials:
     """
 
     def __init__(
-        self, display: Display, heat: Heat, budget: BudgetState, tick: Callable[[], None], plans_max: int
+        self,
+        display: DisplayModel,
+        heat: ThermalState,
+        budget: BudgetState,
+        on_progress: Callable[[], None],
+        plans_max: int,
     ) -> None:
-        self.plans = 0
+        self.plans_tried = 0
         self.plans_max = plans_max
-        self.spent = False
+        self.is_exhausted = False
         self._display = display
         self._heat = heat
         self._budget = budget
-        self.tick = tick
+        self.on_progress = on_progress
 
-    def found(self, sequence: FrameSequence) -> Orders | None:
+    def find_orders(self, sequence: FrameSequence) -> Orders | None:
         """Orders with which the sequence fits, the planner's own or others; None where none were found."""
         try:
-            breach = self._breach(sequence)
-            if breach is None:
+            violation = self._try_orders(sequence)
+            if violation is None:
                 return {}
-            few = orders_count(sequence) <= ORDERS_MAX
-            return self._search(sequence) if few and not self.proven(sequence, breach)[0] else None
-        except _SpentError:
-            self.spent = True
+            is_small = count_orders(sequence) <= ORDERS_MAX
+            return (
+                self._search_depth_first(sequence)
+                if is_small and not self.prove_infeasible(sequence, violation)[0]
+                else None
+            )
+        except _PlanLimitError:
+            self.is_exhausted = True
             return None
 
-    def searched(self, sequence: FrameSequence) -> Orders | None:
+    def search_all_orders(self, sequence: FrameSequence) -> Orders | None:
         """Orders with which a small sequence fits; None where there are none, unless spent."""
         try:
-            return self._search(sequence)
-        except _SpentError:
-            self.spent = True
+            return self._search_depth_first(sequence)
+        except _PlanLimitError:
+            self.is_exhausted = True
             return None
 
-    def broken(self, sequence: FrameSequence) -> Breach | None:
+    def find_violation(self, sequence: FrameSequence) -> Violation | None:
         """What breaks the plan by the planner's order; None where nothing does, or no more plans may be tried."""
         try:
-            return self._breach(sequence)
-        except _SpentError:
-            self.spent = True
+            return self._try_orders(sequence)
+        except _PlanLimitError:
+            self.is_exhausted = True
             return None
 
-    def planned(self, sequence: FrameSequence) -> Prepared | None:
+    def plan(self, sequence: FrameSequence) -> PlannedSequence | None:
         """The plan by the planner's order, late and trimmed as it may be; None out of reach, or when spent."""
-        if beyond_reach(self._display, sequence) is not None:
+        if first_unreachable(self._display, sequence) is not None:
             return None
-        if self.plans >= self.plans_max:
-            self.spent = True
+        if self.plans_tried >= self.plans_max:
+            self.is_exhausted = True
             return None
-        self.plans += 1
+        self.plans_tried += 1
         try:
-            return prepare(self._display, sequence, self._heat, self._budget, "trim", lambda _share: self.tick())
+            return plan_sequence(
+                self._display, sequence, self._heat, self._budget, "trim", lambda _share: self.on_progress()
+            )
         except InputError:  # a train by height has no such cycle
             return None
 
-    def proven(self, sequence: FrameSequence, breach: Breach) -> tuple[bool, float | None]:
+    def prove_infeasible(self, sequence: FrameSequence, violation: Violation) -> tuple[bool, float | None]:
         """Whether no order can mend a breach, and the beam time that its frame takes at the least, s, if known."""
-        if no_order_helps(breach, sequence):
+        if is_order_independent(violation, sequence):
             return True, None
-        if breach.reason != "deadline":
+        if violation.reason != "deadline":
             return False, None
-        frame = sequence.frames[breach.source]
-        lead_s = self._display.machine.moves.lead_us * 1e-6
-        least = least_s(self._display, sequence, self._heat, breach.source, lead_s)
+        frame = sequence.frames[violation.source]
+        lead_s = self._display.scan_head.settling.lead_in_us * 1e-6
+        lower_bound_s = beam_lower_bound_s(self._display, sequence, self._heat, violation.source, lead_s)
         # The beam counts from a whole microsecond, a deadline does not.
-        return least is not None and least > frame.duration_s + MICROSECOND_S + ROUNDING_S, least
+        return (
+            lower_bound_s is not None and lower_bound_s > frame.duration_s + MICROSECOND_S + TIME_TOLERANCE_S,
+            lower_bound_s,
+        )
 
-    def _breach(self, sequence: FrameSequence, orders: Orders | None = None) -> Breach | None:
+    def _try_orders(self, sequence: FrameSequence, orders: Orders | None = None) -> Violation | None:
         """What breaks the plan by these orders first; the planner's own where None."""
-        beyond = beyond_reach(self._display, sequence) if orders is None else None
-        if beyond is not None:
-            return Breach("reach", beyond[0], beyond[1])
-        if self.plans >= self.plans_max:
-            raise _SpentError
-        self.plans += 1
+        unreachable = first_unreachable(self._display, sequence) if orders is None else None
+        if unreachable is not None:
+            return Violation("reach", unreachable[0], unreachable[1])
+        if self.plans_tried >= self.plans_max:
+            raise _PlanLimitError
+        self.plans_tried += 1
         try:
             # Most orders end early for want of time, and the limiter takes four times as long to ask.
-            return self._walked(sequence, orders, limited=False) or self._walked(sequence, orders, limited=True)
+            return self._plan_until_violation(sequence, orders, through_limiter=False) or self._plan_until_violation(
+                sequence, orders, through_limiter=True
+            )
         except InputError:  # as scaled or stretched, a train by height has no such cycle
             source, train = next((k, t) for k, t in enumerate(sequence.trains) if isinstance(t, HeightTrain))
-            return Breach("reach", len(sequence.frames) + source, train.pixel)
+            return Violation("reach", len(sequence.frames) + source, train.pixel)
 
-    def _walked(self, sequence: FrameSequence, orders: Orders | None, limited: bool) -> Breach | None:
+    def _plan_until_violation(
+        self, sequence: FrameSequence, orders: Orders | None, through_limiter: bool
+    ) -> Violation | None:
         """The plan piece by piece up to its first breach, through the limiter or as if there were none."""
-        machine, at_rest = self._display.machine, self._display.heat_at_rest
-        scheduler = Scheduler(machine, sequence, at_rest, tick=self.tick, orders=orders)
-        due_s = deadlines_s(sequence, scheduler.lead_us * 1e-6)
+        machine, cold_heat = self._display.scan_head, self._display.build_cold_heat
+        scheduler = Scheduler(machine, sequence, cold_heat, on_progress=self.on_progress, visiting_orders=orders)
+        deadline_s = deadlines_s(sequence, scheduler.lead_in_us * 1e-6)
         heat, state = self._heat.copy(), self._budget
-        pieces = scheduler.pieces(heat)
-        asked = next(pieces, None)
-        while asked is not None:
-            self.tick()
-            piece: PulsePlan = asked
-            if limited:
-                rest = mirrors_rest(self._display, asked, state, len(sequence.frames))
-                if rest is not None:
-                    asked = pieces.send(rest)
+        batches = scheduler.pieces(heat)
+        requested = next(batches, None)
+        while requested is not None:
+            self.on_progress()
+            batch: PulsePlan = requested
+            if through_limiter:
+                pause = find_galvo_pause(self._display, requested, state, len(sequence.frames))
+                if pause is not None:
+                    requested = batches.send(pause)
                     continue
-                piece, state = limit(asked, state, self._display.budget)
-            breach = first_breach(piece, due_s)
-            if breach is not None:
-                return breach
-            heat.pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self.tick)
-            asked = next(pieces, None)
+                batch, state = limit(requested, state, self._display.budget)
+            violation = find_first_violation(batch, deadline_s)
+            if violation is not None:
+                return violation
+            heat.apply_pulses(batch.pixel, batch.start_s, batch.width_s, batch.power_w, self.on_progress)
+            requested = next(batches, None)
         return None
 
-    def _search(self, sequence: FrameSequence) -> Orders | None:
+    def _search_depth_first(self, sequence: FrameSequence) -> Orders | None:
         """Orders one after the other, depth first: all that begin as one did up to where it broke are passed over."""
         driven = [np.flatnonzero(frame.target_m > 0) for frame in sequence.frames]
         ranks = [list(range(len(pixels))) for pixels in driven]
         while True:
             orders = {source: pixels[ranks[source]] for source, pixels in enumerate(driven)}
-            breach = self._breach(sequence, orders)
-            if breach is None:
+            violation = self._try_orders(sequence, orders)
+            if violation is None:
                 return orders
-            if no_order_helps(breach, sequence) or not _advance(ranks, *_broken_at(breach, orders, ranks)):
+            if is_order_independent(violation, sequence) or not _advance_orders(
+                ranks, *_locate_violation(violation, orders, ranks)
+            ):
                 return None
 
 
-def orders_count(sequence: FrameSequence) -> int:
+def count_orders(sequence: FrameSequence) -> int:
     """In how many orders the pixels of all frames can be visited; beyond counting where pixels come several times."""
-    if any(frame.together for frame in sequence.frames):
+    if any(frame.simultaneous for frame in sequence.frames):
         return ORDERS_MAX + 1
     return prod(factorial(int(np.count_nonzero(frame.target_m > 0))) for frame in sequence.frames)
 
 
-def _broken_at(breach: Breach, orders: Orders, ranks: list[list[int]]) -> tuple[int, int]:
+def _locate_violation(violation: Violation, orders: Orders, ranks: list[list[int]]) -> tuple[int, int]:
     """The frame and the place in its order up to which a breach is decided; for a train's pulse, the very last."""
-    if breach.source < len(ranks):
-        return breach.source, orders[breach.source].tolist().index(breach.pixel)
+    if violation.source < len(ranks):
+        return violation.source, orders[violation.source].tolist().index(violation.pixel)
     return len(ranks) - 1, len(ranks[-1]) - 1 if ranks else 0
 
 
-def _advance(ranks: list[list[int]], source: int, place: int) -> bool:
+def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
     """To the next orders that differ up to this place of this frame, in place; False where there are no more."""
     for later in ranks[source + 1 :]:
         later.sort()
     while source >= 0:
-        if _next(ranks[source], place):
+        if _advance_permutation(ranks[source], place):
             return True
         ranks[source].sort()
         source -= 1
@@ -183,7 +216,7 @@ def _advance(ranks: list[list[int]], source: int, place: int) -> bool:
     return False
 
 
-def _next(rank: list[int], place: int) -> bool:
+def _advance_permutation(rank: list[int], place: int) -> bool:
     """The next permutation that differs up to a place, in place; False where there is none."""
     rank[place + 1 :] = sorted(rank[place + 1 :], reverse=True)
     for k in range(len(rank) - 2, -1, -1):

@@ -4,17 +4,17 @@ from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.planning.feasibility.bulk_reduction import Left, in_rounds, tallest_first
-from optodrive.planning.feasibility.order_search import Orders, Trials
-from optodrive.planning.feasibility.sequence_edits import without
+from optodrive.planning.feasibility.bulk_reduction import OmittedPixels, reduce_in_bulk, sort_pixels_by_height
+from optodrive.planning.feasibility.order_search import Orders, OrderSearch
+from optodrive.planning.feasibility.sequence_edits import omit_pixels
 
-EVERY_SUBSET = 6
+EXHAUSTIVE_PIXELS_MAX = 6
 """In a frame of so many pixels at most every set is tried; of a larger one the tallest go first."""
-PLANS_A_SOURCE = 12
+PLANS_PER_SOURCE = 12
 """Where there may be fewer plans, all frames are thinned at once, in rounds."""
 
 
-def thinned(trials: Trials, sequence: FrameSequence) -> tuple[Left, Orders] | None:
+def reduce_sequence(search: OrderSearch, sequence: FrameSequence) -> tuple[OmittedPixels, Orders] | None:
     """Pixels left out, by source, of a sequence that does not fit; and orders for the rest. None where nothing fits.
 
     Frames and trains are admitted in order of priority, the earlier first among equals; from what does not fit beside
@@ -22,50 +22,52 @@ def thinned(trials: Trials, sequence: FrameSequence) -> tuple[Left, Orders] | No
     """
     sources = len(sequence.frames) + len(sequence.trains)
     priorities = {frame.priority for frame in sequence.frames} | {train.priority for train in sequence.trains}
-    if len(priorities) == 1 and trials.plans_max < PLANS_A_SOURCE * sources:
-        found = in_rounds(trials, sequence)
-        if found is not None:
-            return found
-    return _Thinning(trials, sequence).result()
+    if len(priorities) == 1 and search.plans_max < PLANS_PER_SOURCE * sources:
+        reduced = reduce_in_bulk(search, sequence)
+        if reduced is not None:
+            return reduced
+    return _Reducer(search, sequence).run()
 
 
-class _Thinning:
+class _Reducer:
     """One walk through frames and trains by priority."""
 
-    def __init__(self, trials: Trials, sequence: FrameSequence) -> None:
-        self._trials = trials
+    def __init__(self, search: OrderSearch, sequence: FrameSequence) -> None:
+        self._search = search
         self._sequence = sequence
-        self._pixels = _pixels(sequence)
-        self._left: Left = dict(self._pixels)
-        self._best: Orders | None = None
+        self._source_pixels = _list_source_pixels(sequence)
+        self._omitted: OmittedPixels = dict(self._source_pixels)
+        self._orders: Orders | None = None
 
-    def result(self) -> tuple[Left, Orders] | None:
-        rest, whole_fits = by_priority(self._sequence), False
-        while rest and not self._trials.spent:
-            fitting = self._most(rest, whole_fits)
-            rest = rest[fitting:]
-            if rest:
-                self._fewest(rest[0])
-                rest, whole_fits = rest[1:], True
-        shown = any(set(pixels) - set(self._left.get(source, ())) for source, pixels in self._pixels.items())
-        return (self._left, self._best) if self._best is not None and shown else None
+    def run(self) -> tuple[OmittedPixels, Orders] | None:
+        remaining, whole_may_fit = sort_by_priority(self._sequence), False
+        while remaining and not self._search.is_exhausted:
+            accepted = self._accept_whole_sources(remaining, whole_may_fit)
+            remaining = remaining[accepted:]
+            if remaining:
+                self._accept_reduced_frame(remaining[0])
+                remaining, whole_may_fit = remaining[1:], True
+        shows_anything = any(
+            set(pixels) - set(self._omitted.get(source, ())) for source, pixels in self._source_pixels.items()
+        )
+        return (self._omitted, self._orders) if self._orders is not None and shows_anything else None
 
-    def _fits(self, left: Left) -> bool:
-        orders = self._trials.found(without(self._sequence, left))
+    def _try_omitted(self, omitted: OmittedPixels) -> bool:
+        orders = self._search.find_orders(omit_pixels(self._sequence, omitted))
         if orders is None:
             return False
-        self._left, self._best = left, orders
+        self._omitted, self._orders = omitted, orders
         return True
 
-    def _most(self, rest: Sequence[int], whole_may_fit: bool) -> int:
+    def _accept_whole_sources(self, remaining: Sequence[int], whole_may_fit: bool) -> int:
         """Admit as many of the rest as fit whole, by halving; how many."""
-        before = self._left
+        before = self._omitted
 
         def fits(count: int) -> bool:
-            admitted = set(rest[:count])
-            return self._fits({source: pixels for source, pixels in before.items() if source not in admitted})
+            accepted = set(remaining[:count])
+            return self._try_omitted({source: pixels for source, pixels in before.items() if source not in accepted})
 
-        low, high = 0, len(rest)
+        low, high = 0, len(remaining)
         if whole_may_fit and fits(high):
             return high
         while high - low > 1:
@@ -73,49 +75,53 @@ class _Thinning:
             low, high = (middle, high) if fits(middle) else (low, middle)
         return low
 
-    def _fewest(self, source: int) -> None:
+    def _accept_reduced_frame(self, source: int) -> None:
         """Admit a frame less the fewest pixels; leaves all out where nothing of it fits."""
         if source >= len(self._sequence.frames):
             return
-        pixels = self._pixels[source]
-        if len(pixels) <= EVERY_SUBSET:
-            any(self._fits(self._left | {source: left}) for left in _subsets(pixels))
+        pixels = self._source_pixels[source]
+        if len(pixels) <= EXHAUSTIVE_PIXELS_MAX:
+            any(self._try_omitted(self._omitted | {source: left}) for left in _generate_omissions(pixels))
             return
-        dropped = self._hot(source, pixels)
-        tallest = [pixel for pixel in pixels if pixel not in dropped]
-        before, low, high = self._left, 0, len(tallest)
-        if dropped and self._fits(before | {source: dropped}):
+        infeasible = self._find_infeasible_pixels(source, pixels)
+        tallest = [pixel for pixel in pixels if pixel not in infeasible]
+        before, low, high = self._omitted, 0, len(tallest)
+        if infeasible and self._try_omitted(before | {source: infeasible}):
             return
         while high - low > 1:
             middle = (low + high) // 2
-            fit = self._fits(before | {source: dropped + tuple(tallest[:middle])})
-            low, high = (low, middle) if fit else (middle, high)
+            fits = self._try_omitted(before | {source: infeasible + tuple(tallest[:middle])})
+            low, high = (low, middle) if fits else (middle, high)
 
-    def _hot(self, source: int, pixels: tuple[int, ...]) -> tuple[int, ...]:
+    def _find_infeasible_pixels(self, source: int, pixels: tuple[int, ...]) -> tuple[int, ...]:
         """Those pixels of a frame that a cap or their reach does not allow, one after the other."""
-        dropped: tuple[int, ...] = ()
+        infeasible: tuple[int, ...] = ()
         while True:
-            breach = self._trials.broken(without(self._sequence, self._left | {source: dropped}))
-            if breach is None or breach.reason == "deadline" or breach.pixel not in set(pixels) - set(dropped):
-                return dropped
-            dropped += (breach.pixel,)
+            violation = self._search.find_violation(omit_pixels(self._sequence, self._omitted | {source: infeasible}))
+            if (
+                violation is None
+                or violation.reason == "deadline"
+                or violation.pixel not in set(pixels) - set(infeasible)
+            ):
+                return infeasible
+            infeasible += (violation.pixel,)
 
 
-def by_priority(sequence: FrameSequence) -> list[int]:
+def sort_by_priority(sequence: FrameSequence) -> list[int]:
     """Sources of frames and trains, the most important first, the earlier first among equals."""
     keys = [(-frame.priority, frame.show_at_s) for frame in sequence.frames]
     keys += [(-train.priority, train.start_s) for train in sequence.trains]
     return sorted(range(len(keys)), key=lambda source: keys[source])
 
 
-def _pixels(sequence: FrameSequence) -> Left:
+def _list_source_pixels(sequence: FrameSequence) -> OmittedPixels:
     """What each source drives, the tallest first."""
-    pixels = {source: tallest_first(frame) for source, frame in enumerate(sequence.frames)}
+    pixels = {source: sort_pixels_by_height(frame) for source, frame in enumerate(sequence.frames)}
     first = len(sequence.frames)
     return pixels | {first + k: (train.pixel,) for k, train in enumerate(sequence.trains)}
 
 
-def _subsets(pixels: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+def _generate_omissions(pixels: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
     """All sets to leave out but none and everything: the smaller first, with the taller first."""
     for count in range(1, len(pixels)):
         yield from combinations(pixels, count)

@@ -3,12 +3,12 @@
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-Fit = Literal["as_is", "even", "priority"]
+FitMode = Literal["as_is", "even", "priority"]
 Proof = Literal["planned", "searched", "bound", "not found"]
 
 
 @dataclass(frozen=True)
-class LeftOut:
+class Omission:
     """Pixels of a frame that are not shown, or a train, which is left out whole. source: as in the sequence."""
 
     name: str
@@ -17,30 +17,30 @@ class LeftOut:
 
 
 @dataclass(frozen=True)
-class Thinned:
+class SequenceReduction:
     """A set that fits with pixels left out; kept of asked: pixels of the frame that breaks it (1 for a train)."""
 
     kept: int
-    asked: int
-    left_out: tuple[LeftOut, ...]
+    requested: int
+    omitted: tuple[Omission, ...]
 
 
 @dataclass(frozen=True)
-class Nearest:
+class NearestFeasible:
     """The nearest sets that fit, each planned; None where none was found.
 
     height: largest factor on all targets and powers, in hundredths; rate: least factor on all times, within 1 %
     complete: the bound on work cut none of these short
     """
 
-    pixels: Thinned | None
-    height: float | None
-    rate: float | None
+    pixels: SequenceReduction | None
+    height_factor: float | None
+    time_factor: float | None
     complete: bool
 
 
 @dataclass(frozen=True)
-class Admission:
+class FeasibilityReport:
     """Whether a sequence fits as asked, and what was made of it.
 
     proof: "planned" its plan fits, as the planner orders it; "searched" all orders were tried, or one was found that
@@ -55,20 +55,20 @@ class Admission:
 
     fits: bool
     proof: Proof
-    sentence: str
+    message: str
     reason: str | None = None
     name: str | None = None
     pixel: int | None = None
-    beam_needed_s: float | None = None
-    beam_there_s: float | None = None
-    beam_least_s: float | None = None
-    nearest: Nearest | None = None
-    plans: int = 0
-    plans_max: int = 0
-    fit: Fit = "as_is"
-    height: float = 1.0
-    left_out: tuple[LeftOut, ...] = ()
+    beam_required_s: float | None = None
+    beam_available_s: float | None = None
+    beam_lower_bound_s: float | None = None
+    nearest: NearestFeasible | None = None
+    plans_tried: int = 0
+    plans_tried_max: int = 0
+    fit: FitMode = "as_is"
+    height_factor: float = 1.0
+    omitted: tuple[Omission, ...] = ()
 
-    def answer(self) -> dict[str, Any]:
+    def to_dict(self) -> dict[str, Any]:
         """All of it, JSON-able."""
         return asdict(self)

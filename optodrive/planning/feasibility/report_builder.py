@@ -1,62 +1,73 @@
 """The answer made up of what was found."""
 
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.planning.feasibility.bulk_reduction import Left
-from optodrive.planning.feasibility.messages import sentence, source_name, suggestion
-from optodrive.planning.feasibility.report import Admission, Fit, LeftOut, Nearest, Proof, Thinned
-from optodrive.planning.feasibility.violation import Breach
-from optodrive.planning.pipeline import Prepared
+from optodrive.planning.feasibility.bulk_reduction import OmittedPixels
+from optodrive.planning.feasibility.messages import describe_nearest, describe_violation, name_source
+from optodrive.planning.feasibility.report import (
+    FeasibilityReport,
+    FitMode,
+    NearestFeasible,
+    Omission,
+    Proof,
+    SequenceReduction,
+)
+from optodrive.planning.feasibility.violation import Violation
+from optodrive.planning.pipeline import PlannedSequence
 
 
-def fitting(plan: Prepared, proof: Proof, fit: Fit) -> Admission:
+def build_feasible_report(plan: PlannedSequence, proof: Proof, fit: FitMode) -> FeasibilityReport:
     """The answer for a plan that fits."""
-    there_s = [timing.due_s for timing in plan.frames]
+    end_s = [timing.deadline_s for timing in plan.frames]
     if len(plan.plan):
-        there_s.append(
+        end_s.append(
             float(
-                (plan.plan.nominal_s + plan.plan.width_s)[plan.plan.source >= len(plan.sequence.frames)].max(
+                (plan.plan.requested_start_s + plan.plan.width_s)[plan.plan.source >= len(plan.sequence.frames)].max(
                     initial=0.0
                 )
             )
         )
-    return Admission(
+    return FeasibilityReport(
         fits=True,
         proof=proof,
-        sentence="all of it fits" if proof == "planned" else "all of it fits, in another order than the planner's own",
-        beam_needed_s=float(plan.plan.width_s.sum() + plan.plan.settle_s[1:].sum()),
-        beam_there_s=max(0.0, max(there_s, default=0.0) - plan.lead_s),
+        message="all of it fits" if proof == "planned" else "all of it fits, in another order than the planner's own",
+        beam_required_s=float(plan.plan.width_s.sum() + plan.plan.settling_s[1:].sum()),
+        beam_available_s=max(0.0, max(end_s, default=0.0) - plan.lead_in_s),
         fit=fit,
     )
 
 
-def missing(
+def build_infeasible_report(
     sequence: FrameSequence,
-    plan: Prepared | None,
-    breach: Breach,
+    plan: PlannedSequence | None,
+    violation: Violation,
     proof: Proof,
-    least_s: float | None,
-    nearest: Nearest,
-) -> Admission:
+    lower_bound_s: float | None,
+    nearest: NearestFeasible,
+) -> FeasibilityReport:
     """The answer for a sequence that does not fit; plan: None where a target is out of reach."""
-    needed_s, there_s = (None, None) if plan is None else _beam_s(plan, breach)
-    parts = [sentence(sequence, plan, breach), _PROOFS[proof], suggestion(nearest, sequence, breach.source)]
-    if proof == "bound" and least_s is not None:
-        parts[1] = f"in any order it takes {least_s:.4f} s at the least"
-    return Admission(
+    required_s, available_s = (None, None) if plan is None else _beam_times_s(plan, violation)
+    parts = [
+        describe_violation(sequence, plan, violation),
+        _PROOF_MESSAGES[proof],
+        describe_nearest(nearest, sequence, violation.source),
+    ]
+    if proof == "bound" and lower_bound_s is not None:
+        parts[1] = f"in any order it takes {lower_bound_s:.4f} s at the least"
+    return FeasibilityReport(
         fits=False,
         proof=proof,
-        sentence="; ".join(part for part in parts if part),
-        reason=breach.reason,
-        name=source_name(sequence, breach.source),
-        pixel=breach.pixel,
-        beam_needed_s=needed_s,
-        beam_there_s=there_s,
-        beam_least_s=least_s,
+        message="; ".join(part for part in parts if part),
+        reason=violation.reason,
+        name=name_source(sequence, violation.source),
+        pixel=violation.pixel,
+        beam_required_s=required_s,
+        beam_available_s=available_s,
+        beam_lower_bound_s=lower_bound_s,
         nearest=nearest,
     )
 
 
-_PROOFS: dict[Proof, str] = {
+_PROOF_MESSAGES: dict[Proof, str] = {
     "planned": "",
     "searched": "no other order fits",
     "bound": "no order mends that",
@@ -64,29 +75,31 @@ _PROOFS: dict[Proof, str] = {
 }
 
 
-def _beam_s(plan: Prepared, breach: Breach) -> tuple[float, float]:
+def _beam_times_s(plan: PlannedSequence, violation: Violation) -> tuple[float, float]:
     """Beam time needed and there of the frame that breaks, or of a train's pulse from its nominal time."""
     for timing in plan.frames:
-        if timing.source == breach.source:
-            return timing.finished_s - timing.show_at_s, timing.due_s - timing.show_at_s
+        if timing.source == violation.source:
+            return timing.end_s - timing.show_at_s, timing.deadline_s - timing.show_at_s
     pulses = plan.plan
-    own = pulses.source == breach.source
-    late_s = (pulses.start_s - pulses.nominal_s - pulses.settle_s)[own]
-    row = own.nonzero()[0][int((late_s > 0).argmax())]
+    is_source = pulses.source == violation.source
+    late_s = (pulses.start_s - pulses.requested_start_s - pulses.settling_s)[is_source]
+    row = is_source.nonzero()[0][int((late_s > 0).argmax())]
     width_s = float(pulses.width_s[row])
-    return width_s + float(pulses.start_s[row] - pulses.nominal_s[row]), width_s + float(pulses.settle_s[row])
+    return width_s + float(pulses.start_s[row] - pulses.requested_start_s[row]), width_s + float(pulses.settling_s[row])
 
 
-def thinned_set(sequence: FrameSequence, left: Left, source: int) -> Thinned:
+def build_reduction(sequence: FrameSequence, omitted_pixels: OmittedPixels, source: int) -> SequenceReduction:
     """What is left out of a sequence, and how much is kept of a source."""
 
-    def asked(index: int) -> int:
+    def count_requested(index: int) -> int:
         frames = sequence.frames
         return int((frames[index].target_m > 0).sum()) if index < len(frames) else 1
 
-    left_out = tuple(
-        LeftOut(source_name(sequence, index), index, tuple(sorted(pixels)))
-        for index, pixels in sorted(left.items())
+    omitted = tuple(
+        Omission(name_source(sequence, index), index, tuple(sorted(pixels)))
+        for index, pixels in sorted(omitted_pixels.items())
         if pixels
     )
-    return Thinned(asked(source) - len(left.get(source, ())), asked(source), left_out)
+    return SequenceReduction(
+        count_requested(source) - len(omitted_pixels.get(source, ())), count_requested(source), omitted
+    )

@@ -26,7 +26,7 @@ class Caps(NamedTuple):
     pixel_window_s: float
     display_mean_w: float
     display_window_s: float
-    least_w: float
+    min_power_w: float
 
 
 class HeatBound(NamedTuple):
@@ -53,28 +53,28 @@ class HeatBound(NamedTuple):
     c_high_j_per_k: FloatArray
     knot_k: FloatArray
     loss_k: FloatArray
-    absorber_wall: float
+    absorber_wall_factor: float
     wall_w_per_k: FloatArray
     wall_j_per_k: FloatArray
     wall_k_per_j: FloatArray
-    wall_spread: float
-    beside: IntArray
-    side_w_per_k: float
-    step_s: float
+    wall_specht_ratio: float
+    neighbours: IntArray
+    lateral_w_per_k: float
+    exchange_step_s: float
     touch_lag_s: FloatArray
     touch_k_per_j: FloatArray
     touch_per_wall_k: float
-    touch_spread: float
-    least_k_per_w: FloatArray
-    least_rate_per_s: FloatArray
-    lost_k: float
-    wall_flight: float
-    touch_flight: float
-    touch_lost_k: float
+    touch_specht_ratio: float
+    lower_bound_k_per_w: FloatArray
+    lower_bound_rate_per_s: FloatArray
+    deficit_k: float
+    wall_transit_credit: float
+    touch_transit_credit: float
+    touch_deficit_k: float
     power_max_w: float
 
 
-class Mirrors(NamedTuple):
+class GalvoModel(NamedTuple):
     """Servos of the second order, natural frequency omega_per_s; delay_s after a command their targets run at the slew.
 
     lead_s: from a plan's begin to its first pulse at least; mean_s: time constant of the mean
@@ -82,14 +82,14 @@ class Mirrors(NamedTuple):
     early_s: by how much two times of a plan may come nearer to each other on their way to points
     """
 
-    omega_per_s: float
+    omega_rad_per_s: float
     damping: float
     delay_s: float
     slew_rad_per_s: float
-    lead_s: float
-    mean_s: float
-    code_rad: float
-    early_s: float
+    lead_in_s: float
+    averaging_s: float
+    code_step_rad: float
+    interval_shrink_s: float
 
 
 class Budget(NamedTuple):
@@ -97,4 +97,4 @@ class Budget(NamedTuple):
 
     caps: Caps
     heat: HeatBound
-    mirrors: Mirrors
+    galvo: GalvoModel

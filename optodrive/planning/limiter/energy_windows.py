@@ -10,17 +10,17 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 
 
-class Pulses(NamedTuple):
+class PulseHistory(NamedTuple):
     """Pulses fired lately, then those of the plan in hand, in order of time; fired [1] of them are valid. All [m]."""
 
     start_s: FloatArray
     width_s: FloatArray
     power_w: FloatArray
     pixel: IntArray
-    fired: IntArray
+    n_valid: IntArray
 
 
-class Chains(NamedTuple):
+class WindowChains(NamedTuple):
     """Chains through `Pulses`, one a row of c. first, last: [c] index, −1 where empty; total_j: [c] energy so far.
 
     following: [m] the chain's next pulse, −1 for none; before_j: [m] the chain's energy before a pulse.
@@ -29,43 +29,49 @@ class Chains(NamedTuple):
     first: IntArray
     last: IntArray
     total_j: FloatArray
-    following: IntArray
-    before_j: FloatArray
+    next_row: IntArray
+    energy_before_j: FloatArray
 
 
 @kernel
-def append(chains: Chains, chain: int, pulses: Pulses, row: int) -> None:
+def append(chains: WindowChains, chain: int, history: PulseHistory, row: int) -> None:
     """Count a pulse; it starts no earlier than the chain's last one ended."""
-    chains.following[row] = -1
-    chains.before_j[row] = chains.total_j[chain]
-    chains.total_j[chain] += pulses.width_s[row] * pulses.power_w[row]
+    chains.next_row[row] = -1
+    chains.energy_before_j[row] = chains.total_j[chain]
+    chains.total_j[chain] += history.width_s[row] * history.power_w[row]
     if chains.first[chain] < 0:
         chains.first[chain] = row
     else:
-        chains.following[chains.last[chain]] = row
+        chains.next_row[chains.last[chain]] = row
     chains.last[chain] = row
 
 
 @kernel
-def allowed_w(
-    chains: Chains, chain: int, pulses: Pulses, start_s: float, width_s: float, window_s: float, mean_w: float
+def max_window_power_w(
+    chains: WindowChains,
+    chain: int,
+    history: PulseHistory,
+    start_s: float,
+    width_s: float,
+    window_s: float,
+    mean_w: float,
 ) -> float:
     """Largest power of a next pulse that keeps every window ending within it at or below window × mean."""
     row = chains.first[chain]
-    while row >= 0 and pulses.start_s[row] + pulses.width_s[row] <= start_s - window_s:
-        row = chains.following[row]
+    while row >= 0 and history.start_s[row] + history.width_s[row] <= start_s - window_s:
+        row = chains.next_row[row]
     chains.first[chain] = row
     # The energy in a window that ends during the pulse is piecewise linear in its end: it can peak at the pulse's
     # end, or where the window's far edge meets the start of an earlier pulse.
     cap_j, total_j = window_s * mean_w, chains.total_j[chain]
-    far_s = start_s + width_s - window_s
-    gone_j = total_j if row < 0 else chains.before_j[row]
-    most_w = inf
-    while row >= 0 and pulses.start_s[row] <= far_s:
-        meets_s = pulses.start_s[row] + window_s
-        if meets_s > start_s:
-            most_w = min(most_w, (cap_j - (total_j - chains.before_j[row])) / (meets_s - start_s))
-        inside_s = min(far_s - pulses.start_s[row], pulses.width_s[row])
-        gone_j = chains.before_j[row] + pulses.power_w[row] * inside_s
-        row = chains.following[row]
-    return float(min(most_w, (cap_j - (total_j - gone_j)) / width_s))
+    window_start_s = start_s + width_s - window_s
+    expired_j = total_j if row < 0 else chains.energy_before_j[row]
+    max_w = inf
+    while row >= 0 and history.start_s[row] <= window_start_s:
+        edge_s = history.start_s[row] + window_s
+        if edge_s > start_s:
+            max_w = min(max_w, (cap_j - (total_j - chains.energy_before_j[row])) / (edge_s - start_s))
+        inside_s = min(window_start_s - history.start_s[row], history.width_s[row])
+        expired_j = chains.energy_before_j[row] + history.power_w[row] * inside_s
+        row = chains.next_row[row]
+    return float(min(max_w, (cap_j - (total_j - expired_j)) / width_s))

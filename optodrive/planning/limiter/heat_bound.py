@@ -11,11 +11,11 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.budget import HeatBound
 
-PAUSE_GROWTH = 1.1
+COOLING_STEP_GROWTH = 1.1
 """In the dark each exchange between walls may be so much longer than the one before."""
 
 
-class Nodes(NamedTuple):
+class ThermalNodes(NamedTuple):
     """The bound while a plan is walked through; arrays are written to.
 
     absorber_k: [p] rise over the wall at the end of the pixel's last pulse, dark_since_s [p]
@@ -26,15 +26,15 @@ class Nodes(NamedTuple):
     """
 
     absorber_k: FloatArray
-    least_k: FloatArray
-    dark_since_s: FloatArray
+    lower_bound_k: FloatArray
+    last_pulse_end_s: FloatArray
     wall_k: FloatArray
     touch_k: FloatArray
     nodes_at_s: FloatArray
     inflow_w: FloatArray
     exchanged_at_s: FloatArray
-    crude_k: FloatArray
-    firm_k: FloatArray
+    coarse_k: FloatArray
+    refined_k: FloatArray
 
 
 @kernel
@@ -49,42 +49,42 @@ def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float,
     chord = 0
     while chord < last and heat.knot_k[chord + 1] <= rise_k:
         chord += 1
-    left_s = time_s
+    remaining_s = time_s
     while True:
         low_k, high_k = heat.knot_k[chord], heat.knot_k[chord + 1]
         slope = (heat.loss_k[chord + 1] - heat.loss_k[chord]) / (high_k - low_k) / r_k_per_w
         steady_k = low_k + (drive_w - heat.loss_k[chord] / r_k_per_w) / slope
         warms = steady_k > rise_k
         rate = slope / (heat.c_low_j_per_k[pixel] if warms else heat.c_high_j_per_k[pixel])
-        end_k = steady_k + (rise_k - steady_k) * exp(-rate * left_s)
+        end_k = steady_k + (rise_k - steady_k) * exp(-rate * remaining_s)
         if warms and end_k > high_k and chord < last:
-            left_s -= log((steady_k - rise_k) / (steady_k - high_k)) / rate
+            remaining_s -= log((steady_k - rise_k) / (steady_k - high_k)) / rate
             rise_k, chord = high_k, chord + 1
         elif not warms and end_k < low_k and chord > 0:
-            left_s -= log((rise_k - steady_k) / (low_k - steady_k)) / rate
+            remaining_s -= log((rise_k - steady_k) / (low_k - steady_k)) / rate
             rise_k, chord = low_k, chord - 1
         else:
             return float(end_k)
-        if left_s <= 0.0:
+        if remaining_s <= 0.0:
             return float(rise_k)
 
 
 @kernel
-def least_after_k(heat: HeatBound, pixel: int, least_k: float, power_w: float, time_s: float) -> float:
+def lower_bound_after_k(heat: HeatBound, pixel: int, lower_bound_k: float, power_w: float, time_s: float) -> float:
     """Least rise over the wall after time_s at constant power."""
-    steady_k = heat.least_k_per_w[pixel] * power_w
-    rate = heat.least_rate_per_s[pixel, 0 if steady_k > least_k else 1]
-    return float(steady_k + (least_k - steady_k) * exp(-rate * time_s))
+    steady_k = heat.lower_bound_k_per_w[pixel] * power_w
+    rate = heat.lower_bound_rate_per_s[pixel, 0 if steady_k > lower_bound_k else 1]
+    return float(steady_k + (lower_bound_k - steady_k) * exp(-rate * time_s))
 
 
 @kernel
-def wall_bound_k(heat: HeatBound, nodes: Nodes, pixel: int) -> float:
+def wall_bound_k(heat: HeatBound, nodes: ThermalNodes, pixel: int) -> float:
     """The wall's rise at its own time, whatever its capacity."""
-    return float(heat.wall_spread * max(nodes.wall_k[pixel, 0], nodes.wall_k[pixel, 1]))
+    return float(heat.wall_specht_ratio * max(nodes.wall_k[pixel, 0], nodes.wall_k[pixel, 1]))
 
 
 @kernel
-def wall_after_k(heat: HeatBound, nodes: Nodes, pixel: int, capacity: int, time_s: float) -> float:
+def wall_after_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, capacity: int, time_s: float) -> float:
     """One of a wall's two values time_s after its own time, without light."""
     steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel]
     rate = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[capacity]
@@ -92,13 +92,13 @@ def wall_after_k(heat: HeatBound, nodes: Nodes, pixel: int, capacity: int, time_
 
 
 @kernel
-def touch_after_k(heat: HeatBound, nodes: Nodes, pixel: int, lag: int, drive_k: float, time_s: float) -> float:
+def touch_after_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, lag: int, drive_k: float, time_s: float) -> float:
     """One of a touch surface's two values time_s later, driven towards drive_k."""
     return float(drive_k + (nodes.touch_k[pixel, lag] - drive_k) * exp(-time_s / heat.touch_lag_s[lag]))
 
 
 @kernel
-def settle(heat: HeatBound, nodes: Nodes, pixel: int, to_s: float) -> None:
+def advance_pixel(heat: HeatBound, nodes: ThermalNodes, pixel: int, to_s: float) -> None:
     """Bring a pixel's wall and touch surface to a later time, without light."""
     time_s = to_s - nodes.nodes_at_s[pixel]
     if time_s <= 0.0:
@@ -118,7 +118,7 @@ def settle(heat: HeatBound, nodes: Nodes, pixel: int, to_s: float) -> None:
 
 @kernel
 def _relax(
-    heat: HeatBound, nodes: Nodes, pixel: int, wall_0: float, wall_1: float, touch_0: float, touch_1: float
+    heat: HeatBound, nodes: ThermalNodes, pixel: int, wall_0: float, wall_1: float, touch_0: float, touch_1: float
 ) -> None:
     """Let a pixel keep these shares of its distances from where it is driven to."""
     steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel]
@@ -127,24 +127,24 @@ def _relax(
     walls_k[0] = steady_k + (walls_k[0] - steady_k) * wall_0
     walls_k[1] = steady_k + (walls_k[1] - steady_k) * wall_1
     # A wall moves one way between events: its largest value lies at an end.
-    drive_k = heat.touch_per_wall_k * heat.wall_spread * max(before_k, walls_k[0], walls_k[1])
+    drive_k = heat.touch_per_wall_k * heat.wall_specht_ratio * max(before_k, walls_k[0], walls_k[1])
     touch_k[0] = drive_k + (touch_k[0] - drive_k) * touch_0
     touch_k[1] = drive_k + (touch_k[1] - drive_k) * touch_1
 
 
 @kernel
-def _settle_all(heat: HeatBound, nodes: Nodes, from_s: float, to_s: float) -> None:
+def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: float) -> None:
     """Bring every wall to a later time; those that were not lit since from_s share their factors."""
-    known_w_per_k, wall_0, wall_1 = -1.0, 1.0, 1.0
+    cached_w_per_k, wall_0, wall_1 = -1.0, 1.0, 1.0
     touch_0 = exp(-(to_s - from_s) / heat.touch_lag_s[0])
     touch_1 = exp(-(to_s - from_s) / heat.touch_lag_s[1])
     for pixel in range(len(nodes.nodes_at_s)):
         if nodes.nodes_at_s[pixel] != from_s:
-            settle(heat, nodes, pixel, to_s)
+            advance_pixel(heat, nodes, pixel, to_s)
             continue
         rate_w_per_k = heat.wall_w_per_k[pixel]
-        if known_w_per_k != rate_w_per_k:
-            known_w_per_k = rate_w_per_k
+        if cached_w_per_k != rate_w_per_k:
+            cached_w_per_k = rate_w_per_k
             wall_0 = exp(-rate_w_per_k / heat.wall_j_per_k[0] * (to_s - from_s))
             wall_1 = exp(-rate_w_per_k / heat.wall_j_per_k[1] * (to_s - from_s))
         _relax(heat, nodes, pixel, wall_0, wall_1, touch_0, touch_1)
@@ -152,29 +152,29 @@ def _settle_all(heat: HeatBound, nodes: Nodes, from_s: float, to_s: float) -> No
 
 
 @kernel
-def exchange(heat: HeatBound, nodes: Nodes, to_s: float, pulse_width_s: float) -> None:
+def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_width_s: float) -> None:
     """Let walls exchange heat up to to_s, in steps; afterwards inflow_w holds for one step and a pulse more."""
-    if heat.step_s == inf:  # no walls
+    if heat.exchange_step_s == inf:  # no walls
         return
     if nodes.exchanged_at_s[0] == -inf:
-        nodes.exchanged_at_s[0] = to_s - heat.step_s
-    step_s = heat.step_s
-    while to_s - nodes.exchanged_at_s[0] >= heat.step_s:
+        nodes.exchanged_at_s[0] = to_s - heat.exchange_step_s
+    step_s = heat.exchange_step_s
+    while to_s - nodes.exchanged_at_s[0] >= heat.exchange_step_s:
         now_s = nodes.exchanged_at_s[0] + step_s
-        _settle_all(heat, nodes, nodes.exchanged_at_s[0], now_s)
+        _advance_all(heat, nodes, nodes.exchanged_at_s[0], now_s)
         nodes.exchanged_at_s[0] = now_s
-        dark_s = to_s - now_s
-        if dark_s >= heat.step_s:
-            step_s = min(PAUSE_GROWTH * step_s, dark_s)
-            _inflow(heat, nodes, step_s, 0.0)
+        remaining_s = to_s - now_s
+        if remaining_s >= heat.exchange_step_s:
+            step_s = min(COOLING_STEP_GROWTH * step_s, remaining_s)
+            _update_inflow(heat, nodes, step_s, 0.0)
         else:
-            ahead_s = heat.step_s + pulse_width_s
-            most_k = heat.wall_spread * heat.wall_k_per_j[0] * heat.power_max_w * ahead_s
-            _inflow(heat, nodes, ahead_s, most_k)
+            horizon_s = heat.exchange_step_s + pulse_width_s
+            max_pulse_k = heat.wall_specht_ratio * heat.wall_k_per_j[0] * heat.power_max_w * horizon_s
+            _update_inflow(heat, nodes, horizon_s, max_pulse_k)
 
 
 @kernel
-def _inflow(heat: HeatBound, nodes: Nodes, ahead_s: float, pulses_k: float) -> None:
+def _update_inflow(heat: HeatBound, nodes: ThermalNodes, horizon_s: float, pulses_k: float) -> None:
     """What neighbours send at most during ahead_s, in which all pulses together warm walls by pulses_k.
 
     No wall passes what its neighbours hold it to: first all of them are taken to be as warm as the warmest, then as
@@ -185,31 +185,35 @@ def _inflow(heat: HeatBound, nodes: Nodes, ahead_s: float, pulses_k: float) -> N
     for pixel in range(pixels):
         warmest_k = max(warmest_k, wall_bound_k(heat, nodes, pixel) + pulses_k)
     for pixel in range(pixels):
-        sides = 0
+        neighbour_count = 0
         for side in range(4):
-            if heat.beside[pixel, side] >= 0:
-                sides += 1
-        nodes.crude_k[pixel] = _risen_k(heat, nodes, pixel, heat.side_w_per_k * sides * warmest_k, ahead_s)
+            if heat.neighbours[pixel, side] >= 0:
+                neighbour_count += 1
+        nodes.coarse_k[pixel] = _max_wall_k(
+            heat, nodes, pixel, heat.lateral_w_per_k * neighbour_count * warmest_k, horizon_s
+        )
     for pixel in range(pixels):
-        nodes.firm_k[pixel] = _risen_k(heat, nodes, pixel, _sent_w(heat, nodes.crude_k, pixel, pulses_k), ahead_s)
+        nodes.refined_k[pixel] = _max_wall_k(
+            heat, nodes, pixel, _lateral_inflow_w(heat, nodes.coarse_k, pixel, pulses_k), horizon_s
+        )
     for pixel in range(pixels):
-        nodes.inflow_w[pixel] = _sent_w(heat, nodes.firm_k, pixel, pulses_k)
+        nodes.inflow_w[pixel] = _lateral_inflow_w(heat, nodes.refined_k, pixel, pulses_k)
 
 
 @kernel
-def _sent_w(heat: HeatBound, walls_k: FloatArray, pixel: int, pulses_k: float) -> float:
+def _lateral_inflow_w(heat: HeatBound, walls_k: FloatArray, pixel: int, pulses_k: float) -> float:
     sum_k = pulses_k
     for side in range(4):
-        other = heat.beside[pixel, side]
+        other = heat.neighbours[pixel, side]
         if other >= 0:
             sum_k += walls_k[other]
-    return heat.side_w_per_k * sum_k
+    return heat.lateral_w_per_k * sum_k
 
 
 @kernel
-def _risen_k(heat: HeatBound, nodes: Nodes, pixel: int, inflow_w: float, time_s: float) -> float:
+def _max_wall_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, inflow_w: float, time_s: float) -> float:
     """The most a wall without light of its own reaches within time_s."""
     wall_k = wall_bound_k(heat, nodes, pixel)
     steady_k = inflow_w / heat.wall_w_per_k[pixel]
-    share = min(1.0, heat.wall_w_per_k[pixel] / heat.wall_j_per_k[0] * time_s)
-    return float(wall_k + share * max(0.0, steady_k - wall_k))
+    fraction = min(1.0, heat.wall_w_per_k[pixel] / heat.wall_j_per_k[0] * time_s)
+    return float(wall_k + fraction * max(0.0, steady_k - wall_k))

@@ -5,15 +5,21 @@ from typing import NamedTuple
 
 from optodrive.core.kernels import kernel
 from optodrive.planning.limiter.budget import Budget, HeatBound
-from optodrive.planning.limiter.heat_bound import Nodes, least_after_k, touch_after_k, wall_after_k, wall_bound_k
+from optodrive.planning.limiter.heat_bound import (
+    ThermalNodes,
+    lower_bound_after_k,
+    touch_after_k,
+    wall_after_k,
+    wall_bound_k,
+)
 
-FEWER_HALVINGS = 16
-AHEAD = 2.0
+BISECTIONS = 16
+LOOK_AHEAD_TAUS = 2.0
 """How many of an absorber's own times a wall is looked ahead for its touch surface."""
 WALL_NODE, TOUCH_NODE = range(2)
 
 
-class Ask(NamedTuple):
+class PulseRequest(NamedTuple):
     """One pulse as asked for."""
 
     pixel: int
@@ -27,47 +33,51 @@ class Ask(NamedTuple):
 @kernel
 def _wall_cap_k(budget: Budget) -> float:
     """No wall may be warmer than the touch surface can bear for ever: then no later moment in the dark is too warm."""
-    per_wall = budget.heat.touch_per_wall_k * budget.heat.touch_spread
+    per_wall = budget.heat.touch_per_wall_k * budget.heat.touch_specht_ratio
     return min(budget.caps.wall_k, budget.caps.touch_k / per_wall) if per_wall > 0.0 else budget.caps.wall_k
 
 
 @kernel
-def slow_nodes_allow(budget: Budget, nodes: Nodes, ask: Ask, least_k: float) -> tuple[float, float]:
+def slow_node_limits_w(
+    budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float
+) -> tuple[float, float]:
     """Largest power for wall and touch surface.
 
     First as if all its heat had arrived by the pulse's end; where that is too little, less the heat on its way.
     """
-    heat, pixel, width_s = budget.heat, ask.pixel, ask.width_s
+    heat, pixel, width_s = budget.heat, request.pixel, request.width_s
     wall_w = touch_w = inf
-    cap_k = _wall_cap_k(budget) / heat.wall_spread
+    cap_k = _wall_cap_k(budget) / heat.wall_specht_ratio
     for capacity in range(2):
         if heat.wall_k_per_j[capacity] > 0.0:
-            dark_k = wall_after_k(heat, nodes, pixel, capacity, width_s)
-            wall_w = min(wall_w, (cap_k - dark_k) / (heat.wall_k_per_j[capacity] * width_s))
-    wall_k = wall_over_k(budget, nodes, ask, 0.0)
-    wall_k_per_w = heat.wall_spread * heat.wall_k_per_j[0] * width_s
+            off_k = wall_after_k(heat, nodes, pixel, capacity, width_s)
+            wall_w = min(wall_w, (cap_k - off_k) / (heat.wall_k_per_j[capacity] * width_s))
+    wall_k = wall_peak_k(budget, nodes, request, 0.0)
+    wall_k_per_w = heat.wall_specht_ratio * heat.wall_k_per_j[0] * width_s
     for lag in range(2):
         if heat.touch_k_per_j[lag] > 0.0:
-            caught_up = 1.0 - exp(-width_s / heat.touch_lag_s[lag])
-            dark_k = touch_after_k(heat, nodes, pixel, lag, heat.touch_per_wall_k * wall_k, width_s)
-            k_per_w = heat.touch_k_per_j[lag] * width_s + heat.touch_per_wall_k * wall_k_per_w * caught_up
-            touch_w = min(touch_w, (budget.caps.touch_k / heat.touch_spread - dark_k) / k_per_w)
-    if wall_w < ask.power_w:
-        wall_w = _borne_w(budget, nodes, ask, least_k, WALL_NODE, max(0.0, wall_w))
-    if touch_w < ask.power_w:
-        touch_w = _borne_w(budget, nodes, ask, least_k, TOUCH_NODE, max(0.0, touch_w))
+            response = 1.0 - exp(-width_s / heat.touch_lag_s[lag])
+            off_k = touch_after_k(heat, nodes, pixel, lag, heat.touch_per_wall_k * wall_k, width_s)
+            k_per_w = heat.touch_k_per_j[lag] * width_s + heat.touch_per_wall_k * wall_k_per_w * response
+            touch_w = min(touch_w, (budget.caps.touch_k / heat.touch_specht_ratio - off_k) / k_per_w)
+    if wall_w < request.power_w:
+        wall_w = _max_node_power_w(budget, nodes, request, lower_bound_k, WALL_NODE, max(0.0, wall_w))
+    if touch_w < request.power_w:
+        touch_w = _max_node_power_w(budget, nodes, request, lower_bound_k, TOUCH_NODE, max(0.0, touch_w))
     return wall_w, touch_w
 
 
 @kernel
-def _borne_w(budget: Budget, nodes: Nodes, ask: Ask, least_k: float, node: int, sure_w: float) -> float:
+def _max_node_power_w(
+    budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, node: int, feasible_w: float
+) -> float:
     """The largest power, from sure_w up to what is asked for, that a wall or touch surface bears."""
-    if _bears(budget, nodes, ask, least_k, node, ask.power_w):
-        return ask.power_w
-    low_w, high_w = sure_w, ask.power_w
-    for _ in range(FEWER_HALVINGS):
+    if _is_within_cap(budget, nodes, request, lower_bound_k, node, request.power_w):
+        return request.power_w
+    low_w, high_w = feasible_w, request.power_w
+    for _ in range(BISECTIONS):
         middle_w = 0.5 * (low_w + high_w)
-        if _bears(budget, nodes, ask, least_k, node, middle_w):
+        if _is_within_cap(budget, nodes, request, lower_bound_k, node, middle_w):
             low_w = middle_w
         else:
             high_w = middle_w
@@ -75,121 +85,134 @@ def _borne_w(budget: Budget, nodes: Nodes, ask: Ask, least_k: float, node: int, 
 
 
 @kernel
-def _bears(budget: Budget, nodes: Nodes, ask: Ask, least_k: float, node: int, power_w: float) -> bool:
+def _is_within_cap(
+    budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, node: int, power_w: float
+) -> bool:
     """Whether a wall or touch surface stays within its cap during a pulse, and for ever in the dark after it.
 
     In that dark its bound, y, falls towards what drives it, d, and the heat on its way, h, falls more quickly: y − h
     may rise. Of h only so much counts that it does not: y falls at λ (y − d) at least, h at its rate at most. By the
     time d is passed by a later one, y itself is below the cap.
     """
-    heat, pixel = budget.heat, ask.pixel
-    end_k = least_after_k(heat, pixel, least_k, power_w, ask.width_s)
-    quickest_s = 1.0 / heat.least_rate_per_s[pixel, 1]
+    heat, pixel = budget.heat, request.pixel
+    end_k = lower_bound_after_k(heat, pixel, lower_bound_k, power_w, request.width_s)
+    min_tau_s = 1.0 / heat.lower_bound_rate_per_s[pixel, 1]
     neighbours_w = 0.0
     for side in range(4):
-        if heat.beside[pixel, side] >= 0:
-            neighbours_w += heat.side_w_per_k * _wall_cap_k(budget)
-    wall_k = wall_over_k(budget, nodes, ask, power_w)
+        if heat.neighbours[pixel, side] >= 0:
+            neighbours_w += heat.lateral_w_per_k * _wall_cap_k(budget)
+    wall_k = wall_peak_k(budget, nodes, request, power_w)
     if node == WALL_NODE:
-        cap_k, part, lost_k = _wall_cap_k(budget), heat.wall_flight, heat.wall_flight * heat.lost_k
-        highest_k, after_k = wall_during_k(budget, nodes, ask, least_k, power_w), wall_k
+        cap_k, credit, deficit_k = (
+            _wall_cap_k(budget),
+            heat.wall_transit_credit,
+            heat.wall_transit_credit * heat.deficit_k,
+        )
+        peak_k, after_k = wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w), wall_k
         rate, drive_k = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[1], neighbours_w / heat.wall_w_per_k[pixel]
     else:
-        cap_k, part = budget.caps.touch_k, heat.touch_flight
-        lost_k = part * heat.lost_k + heat.touch_lost_k
-        highest_k, after_k = _touch_during_k(budget, nodes, ask, least_k, power_w)
-        warmer_k = neighbours_w / heat.wall_j_per_k[0] * AHEAD * quickest_s
-        rate, drive_k = 1.0 / heat.touch_lag_s[1], heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + warmer_k)
-    on_its_way_k = min(part * end_k - lost_k, rate * quickest_s * (after_k - drive_k))
-    return bool(max(highest_k, after_k - max(0.0, on_its_way_k)) <= cap_k)
+        cap_k, credit = budget.caps.touch_k, heat.touch_transit_credit
+        deficit_k = credit * heat.deficit_k + heat.touch_deficit_k
+        peak_k, after_k = _touch_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
+        wall_warming_k = neighbours_w / heat.wall_j_per_k[0] * LOOK_AHEAD_TAUS * min_tau_s
+        rate, drive_k = (
+            1.0 / heat.touch_lag_s[1],
+            heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_warming_k),
+        )
+    in_transit_k = min(credit * end_k - deficit_k, rate * min_tau_s * (after_k - drive_k))
+    return bool(max(peak_k, after_k - max(0.0, in_transit_k)) <= cap_k)
 
 
 @kernel
-def wall_during_k(budget: Budget, nodes: Nodes, ask: Ask, least_k: float, power_w: float) -> float:
+def wall_credited_peak_k(
+    budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, power_w: float
+) -> float:
     """The pixel's wall at most during a pulse, less the heat still in the absorber."""
-    heat, pixel = budget.heat, ask.pixel
-    highest_k = 0.0
+    heat, pixel = budget.heat, request.pixel
+    peak_k = 0.0
     for capacity in range(2):
         rate = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[capacity]
         steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel] + heat.wall_k_per_j[capacity] * power_w / rate
-        highest_k = max(
-            highest_k,
-            _less_on_its_way_k(
+        peak_k = max(
+            peak_k,
+            _credited_peak_k(
                 heat,
-                ask,
-                least_k,
+                request,
+                lower_bound_k,
                 power_w,
                 nodes.wall_k[pixel, capacity],
                 steady_k,
                 rate,
-                heat.wall_flight / heat.wall_spread,
+                heat.wall_transit_credit / heat.wall_specht_ratio,
             ),
         )
-    highest_k = heat.wall_spread * highest_k + heat.wall_flight * heat.lost_k
-    return min(highest_k, wall_over_k(budget, nodes, ask, power_w))
+    peak_k = heat.wall_specht_ratio * peak_k + heat.wall_transit_credit * heat.deficit_k
+    return min(peak_k, wall_peak_k(budget, nodes, request, power_w))
 
 
 @kernel
-def _touch_during_k(budget: Budget, nodes: Nodes, ask: Ask, least_k: float, power_w: float) -> tuple[float, float]:
+def _touch_credited_peak_k(
+    budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, power_w: float
+) -> tuple[float, float]:
     """The pixel's touch surface at most during a pulse, less the heat on its way; and its bound at the pulse's end."""
-    heat, pixel = budget.heat, ask.pixel
-    drive_k = heat.touch_per_wall_k * wall_during_k(budget, nodes, ask, least_k, power_w)
-    highest_k = bound_k = after_k = 0.0
+    heat, pixel = budget.heat, request.pixel
+    drive_k = heat.touch_per_wall_k * wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
+    peak_k = bound_k = after_k = 0.0
     for lag in range(2):
-        rate, brings_k = 1.0 / heat.touch_lag_s[lag], heat.touch_k_per_j[lag] * power_w
+        rate, heating_k_per_s = 1.0 / heat.touch_lag_s[lag], heat.touch_k_per_j[lag] * power_w
         before_k = nodes.touch_k[pixel, lag]
-        end_k = touch_after_k(heat, nodes, pixel, lag, drive_k, ask.width_s) + brings_k * ask.width_s
+        end_k = touch_after_k(heat, nodes, pixel, lag, drive_k, request.width_s) + heating_k_per_s * request.width_s
         after_k, bound_k = max(after_k, end_k), max(bound_k, before_k, end_k)
-        highest_k = max(
-            highest_k,
-            _less_on_its_way_k(
+        peak_k = max(
+            peak_k,
+            _credited_peak_k(
                 heat,
-                ask,
-                least_k,
+                request,
+                lower_bound_k,
                 power_w,
                 before_k,
-                drive_k + brings_k / rate,
+                drive_k + heating_k_per_s / rate,
                 rate,
-                heat.touch_flight / heat.touch_spread,
+                heat.touch_transit_credit / heat.touch_specht_ratio,
             ),
         )
-    highest_k = heat.touch_spread * highest_k + heat.touch_flight * heat.lost_k + heat.touch_lost_k
-    return min(highest_k, heat.touch_spread * bound_k), heat.touch_spread * after_k
+    peak_k = heat.touch_specht_ratio * peak_k + heat.touch_transit_credit * heat.deficit_k + heat.touch_deficit_k
+    return min(peak_k, heat.touch_specht_ratio * bound_k), heat.touch_specht_ratio * after_k
 
 
 @kernel
-def _less_on_its_way_k(
+def _credited_peak_k(
     heat: HeatBound,
-    ask: Ask,
-    least_k: float,
+    request: PulseRequest,
+    lower_bound_k: float,
     power_w: float,
     before_k: float,
     steady_k: float,
     rate: float,
-    part: float,
+    credit: float,
 ) -> float:
     """Largest value of y − part × u during a pulse: y goes from before_k to steady_k, u is the absorber at least."""
-    least_steady_k = heat.least_k_per_w[ask.pixel] * power_w
-    least_rate = heat.least_rate_per_s[ask.pixel, 0 if least_steady_k > least_k else 1]
-    highest_k = before_k - part * least_k
-    falls, freed = rate * (before_k - steady_k), part * least_rate * (least_k - least_steady_k)
-    at_s = ask.width_s
+    lower_steady_k = heat.lower_bound_k_per_w[request.pixel] * power_w
+    lower_rate = heat.lower_bound_rate_per_s[request.pixel, 0 if lower_steady_k > lower_bound_k else 1]
+    peak_k = before_k - credit * lower_bound_k
+    node_fall, credit_fall = rate * (before_k - steady_k), credit * lower_rate * (lower_bound_k - lower_steady_k)
+    at_s = request.width_s
     for _ in range(2):
         y_k = steady_k + (before_k - steady_k) * exp(-rate * at_s)
-        u_k = least_steady_k + (least_k - least_steady_k) * exp(-least_rate * at_s)
-        highest_k = max(highest_k, y_k - part * u_k)
+        u_k = lower_steady_k + (lower_bound_k - lower_steady_k) * exp(-lower_rate * at_s)
+        peak_k = max(peak_k, y_k - credit * u_k)
         # Where both fall, the difference may peak in between.
-        if freed > falls > 0.0 and least_rate > rate:
-            at_s = min(at_s, log(freed / falls) / (least_rate - rate))
-    return float(highest_k)
+        if credit_fall > node_fall > 0.0 and lower_rate > rate:
+            at_s = min(at_s, log(credit_fall / node_fall) / (lower_rate - rate))
+    return float(peak_k)
 
 
 @kernel
-def wall_over_k(budget: Budget, nodes: Nodes, ask: Ask, power_w: float) -> float:
+def wall_peak_k(budget: Budget, nodes: ThermalNodes, request: PulseRequest, power_w: float) -> float:
     """Bound on the pixel's wall during a pulse."""
     heat = budget.heat
-    most_k = wall_bound_k(heat, nodes, ask.pixel)
+    max_k = wall_bound_k(heat, nodes, request.pixel)
     for capacity in range(2):
-        dark_k = wall_after_k(heat, nodes, ask.pixel, capacity, ask.width_s)
-        most_k = max(most_k, heat.wall_spread * (dark_k + heat.wall_k_per_j[capacity] * power_w * ask.width_s))
-    return most_k
+        off_k = wall_after_k(heat, nodes, request.pixel, capacity, request.width_s)
+        max_k = max(max_k, heat.wall_specht_ratio * (off_k + heat.wall_k_per_j[capacity] * power_w * request.width_s))
+    return max_k

@@ -9,9 +9,9 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.heat_bound import absorber_after_k, exchange, settle, wall_bound_k
-from optodrive.planning.limiter.pulse_application import Ledger
-from optodrive.planning.limiter.workspace import open_ledger
+from optodrive.planning.limiter.heat_bound import absorber_after_k, advance_pixel, exchange_wall_heat, wall_bound_k
+from optodrive.planning.limiter.pulse_application import LimiterWorkspace
+from optodrive.planning.limiter.workspace import open_workspace
 
 ABSORBER, WALL, TOUCH, SPOT = range(4)
 
@@ -25,28 +25,31 @@ class Usage(NamedTuple):
     pixel: int | None
 
 
-def usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usage, ...]:
+def compute_usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usage, ...]:
     """Every cap that is used little by little, at at_s on the state's time line, dark since the state's own time."""
     caps, pixels = budget.caps, len(state.rise_k)
-    most = np.zeros((4, pixels))
+    peak = np.zeros((4, pixels))
     at_s = max(at_s, state.at_s)
-    _levels(budget, open_ledger(state, 0), at_s, most)
-    where = most.argmax(axis=1)
-    pixel_w = np.bincount(state.recent_pixel, _energy_j(state, at_s, caps.pixel_window_s), pixels) / caps.pixel_window_s
-    display_w = float(_energy_j(state, at_s, caps.display_window_s).sum()) / caps.display_window_s
-    waned = exp(-max(0.0, at_s - state.mirror_at_s) / budget.mirrors.mean_s)
+    _fill_levels(budget, open_workspace(state, 0), at_s, peak)
+    peak_pixel = peak.argmax(axis=1)
+    pixel_w = (
+        np.bincount(state.recent_pixel, _compute_window_energy_j(state, at_s, caps.pixel_window_s), pixels)
+        / caps.pixel_window_s
+    )
+    display_w = float(_compute_window_energy_j(state, at_s, caps.display_window_s).sum()) / caps.display_window_s
+    decay = exp(-max(0.0, at_s - state.mirror_at_s) / budget.galvo.averaging_s)
     return (
-        Usage("absorber_temperature", float(most[ABSORBER].max()), caps.absorber_k, int(where[ABSORBER])),
-        Usage("wall_temperature", float(most[WALL].max()), caps.wall_k, int(where[WALL])),
-        Usage("touch_temperature", float(most[TOUCH].max()), caps.touch_k, int(where[TOUCH])),
-        Usage("spot_energy", float(most[SPOT].max()), caps.pulse_energy_j, int(where[SPOT])),
+        Usage("absorber_temperature", float(peak[ABSORBER].max()), caps.absorber_k, int(peak_pixel[ABSORBER])),
+        Usage("wall_temperature", float(peak[WALL].max()), caps.wall_k, int(peak_pixel[WALL])),
+        Usage("touch_temperature", float(peak[TOUCH].max()), caps.touch_k, int(peak_pixel[TOUCH])),
+        Usage("spot_energy", float(peak[SPOT].max()), caps.pulse_energy_j, int(peak_pixel[SPOT])),
         Usage("pixel_mean_power", float(pixel_w.max()), caps.pixel_mean_w, int(pixel_w.argmax())),
         Usage("display_mean_power", display_w, caps.display_mean_w, None),
-        Usage("galvo_acceleration", float(state.acceleration2.max()) * waned, caps.galvo_rad2_per_s4, None),
+        Usage("galvo_acceleration", float(state.galvo_mean_square.max()) * decay, caps.galvo_rad2_per_s4, None),
     )
 
 
-def _energy_j(state: BudgetState, at_s: float, window_s: float) -> FloatArray:
+def _compute_window_energy_j(state: BudgetState, at_s: float, window_s: float) -> FloatArray:
     """What each recent pulse [r] gave within the window that ends at at_s."""
     begin_s = np.maximum(state.recent_start_s, at_s - window_s)
     end_s = np.minimum(state.recent_start_s + state.recent_width_s, at_s)
@@ -54,16 +57,16 @@ def _energy_j(state: BudgetState, at_s: float, window_s: float) -> FloatArray:
 
 
 @kernel
-def _levels(budget: Budget, ledger: Ledger, at_s: float, most: FloatArray) -> None:
+def _fill_levels(budget: Budget, workspace: LimiterWorkspace, at_s: float, levels: FloatArray) -> None:
     """Fill in bounds [4, p] at at_s, without light until then; the ledger moves there."""
-    heat, nodes = budget.heat, ledger.nodes
-    exchange(heat, nodes, at_s, 0.0)
-    for pixel in range(most.shape[1]):
-        settle(heat, nodes, pixel, at_s)
-        dark_s = max(0.0, at_s - nodes.dark_since_s[pixel])
+    heat, nodes = budget.heat, workspace.nodes
+    exchange_wall_heat(heat, nodes, at_s, 0.0)
+    for pixel in range(levels.shape[1]):
+        advance_pixel(heat, nodes, pixel, at_s)
+        off_s = max(0.0, at_s - nodes.last_pulse_end_s[pixel])
         wall_k = wall_bound_k(heat, nodes, pixel)
-        rise_k = absorber_after_k(heat, pixel, nodes.absorber_k[pixel], 0.0, dark_s)
-        most[ABSORBER, pixel] = rise_k + heat.absorber_wall * wall_k
-        most[WALL, pixel] = wall_k
-        most[TOUCH, pixel] = heat.touch_spread * max(nodes.touch_k[pixel, 0], nodes.touch_k[pixel, 1])
-        most[SPOT, pixel] = max(0.0, ledger.spots.bucket_j[pixel] - dark_s * budget.caps.pixel_mean_w)
+        rise_k = absorber_after_k(heat, pixel, nodes.absorber_k[pixel], 0.0, off_s)
+        levels[ABSORBER, pixel] = rise_k + heat.absorber_wall_factor * wall_k
+        levels[WALL, pixel] = wall_k
+        levels[TOUCH, pixel] = heat.touch_specht_ratio * max(nodes.touch_k[pixel, 0], nodes.touch_k[pixel, 1])
+        levels[SPOT, pixel] = max(0.0, workspace.budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)

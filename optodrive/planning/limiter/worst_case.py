@@ -14,7 +14,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.planning.limiter.budget import Caps, HeatBound
 
 CHORDS = 8
-STEP_SHARE = 0.07
+STEP_FRACTION = 0.07
 """Walls exchange heat at steps of this share of the quickest wall's own time."""
 
 
@@ -35,17 +35,17 @@ class Uncertainty:
 
 
 @dataclass(frozen=True, eq=False)
-class Walls:
+class NominalWalls:
     """A wall node a pixel, K/W and J/K; side, frame: to a neighbour, to the frame, infinite for none."""
 
     r_k_per_w: float
     c_j_per_k: float
-    side_k_per_w: float
+    lateral_k_per_w: float
     frame_k_per_w: float
 
 
 @dataclass(frozen=True)
-class Touch:
+class NominalTouch:
     """The touch surface: share of the gas's and of the wall's rise, and its lag."""
 
     gas_share: float
@@ -54,7 +54,7 @@ class Touch:
 
 
 @dataclass(frozen=True, eq=False)
-class Declared:
+class NominalThermalModel:
     """The model in use. epsilon, r_k_per_w, c_j_per_k: [p]; exponent: of R = R₀ (T / T₀)ⁿ, T the bridge's mean.
 
     beside, frame_edges: [p, 4], [p] the lattice; walls, touch: None where the model has none
@@ -68,15 +68,15 @@ class Declared:
     tau_g_s: float
     ambient_k: float
     exponent: float
-    beside: IntArray
+    neighbours: IntArray
     frame_edges: IntArray
-    walls: Walls | None
-    touch: Touch | None
-    hot_capacity: float = 1.0
-    warmer_k: float = 0.0
+    walls: NominalWalls | None
+    touch: NominalTouch | None
+    hot_capacity_factor: float = 1.0
+    extra_rise_k: float = 0.0
 
 
-def spread(ratio: float) -> float:
+def specht_ratio(ratio: float) -> float:
     """By how much a sum of responses (1/c) e^(−t/rc) may exceed the larger of its values at both ends of c.
 
     ratio: of the ends.
@@ -90,22 +90,24 @@ def spread(ratio: float) -> float:
     return float((ratio - 1) * ratio ** (1 / (ratio - 1)) / (e * log(ratio)))
 
 
-def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: float) -> HeatBound:
+def build_heat_bound(model: NominalThermalModel, uncertainty: Uncertainty, caps: Caps, power_max_w: float) -> HeatBound:
     """The upper corner; raises InputError where a wall or touch surface is too quick beside the absorber."""
-    epsilon = model.epsilon * (1 + unsure.absorbed_power)
-    r_high = model.r_k_per_w * (1 + unsure.bridge_resistance)
-    c_low = model.c_j_per_k * (1 - unsure.absorber_capacity)
-    c_high = model.c_j_per_k * (1 + unsure.absorber_capacity) * model.hot_capacity
-    knot_k, loss_k = _chords(model, unsure, caps)
-    hottest = float(knot_k[-1] / loss_k[-1])
-    tau_max_s = float((r_high * c_high).max()) * hottest
+    epsilon = model.epsilon * (1 + uncertainty.absorbed_power)
+    r_high = model.r_k_per_w * (1 + uncertainty.bridge_resistance)
+    c_low = model.c_j_per_k * (1 - uncertainty.absorber_capacity)
+    c_high = model.c_j_per_k * (1 + uncertainty.absorber_capacity) * model.hot_capacity_factor
+    knot_k, loss_k = _compute_loss_chords(model, uncertainty, caps)
+    resistance_factor = float(knot_k[-1] / loss_k[-1])
+    tau_max_s = float((r_high * c_high).max()) * resistance_factor
     slope_min = float(np.min(np.diff(loss_k) / np.diff(knot_k)))
     lag_max_s = float((r_high * c_high).max()) / slope_min
 
     epsilon_max = float(epsilon.max())
-    wall = _wall_bound(model, unsure, epsilon_max, c_high, hottest, tau_max_s, lag_max_s)
-    touch = _touch_bound(model, unsure, epsilon_max, float(r_high.max()) * hottest, tau_max_s, wall)
-    least = _least(model, unsure, caps, c_low, c_high, wall, touch)
+    wall = _build_wall_bound(model, uncertainty, epsilon_max, c_high, resistance_factor, tau_max_s, lag_max_s)
+    touch = _build_touch_bound(
+        model, uncertainty, epsilon_max, float(r_high.max()) * resistance_factor, tau_max_s, wall
+    )
+    lower = _build_lower_bound(model, uncertainty, caps, c_low, c_high, wall, touch)
     bound = HeatBound(
         epsilon=epsilon,
         r_k_per_w=r_high,
@@ -113,24 +115,24 @@ def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: fl
         c_high_j_per_k=c_high,
         knot_k=knot_k,
         loss_k=loss_k,
-        absorber_wall=wall.absorber_wall,
+        absorber_wall_factor=wall.absorber_wall_factor,
         wall_w_per_k=wall.w_per_k,
         wall_j_per_k=wall.j_per_k,
         wall_k_per_j=wall.k_per_j,
-        wall_spread=wall.spread,
-        beside=np.ascontiguousarray(model.beside),
-        side_w_per_k=wall.side_w_per_k,
-        step_s=wall.step_s,
+        wall_specht_ratio=wall.specht_ratio,
+        neighbours=np.ascontiguousarray(model.neighbours),
+        lateral_w_per_k=wall.lateral_w_per_k,
+        exchange_step_s=wall.exchange_step_s,
         touch_lag_s=touch.lag_s,
         touch_k_per_j=touch.k_per_j,
         touch_per_wall_k=touch.per_wall_k,
-        touch_spread=touch.spread,
-        least_k_per_w=least.k_per_w,
-        least_rate_per_s=least.rate_per_s,
-        lost_k=least.lost_k,
-        wall_flight=float(c_low.min()) / (wall.still_there * float(wall.j_per_k[1])),
-        touch_flight=float(c_low.min()) * float(touch.k_per_j[1]) / epsilon_max,
-        touch_lost_k=least.touch_lost_k,
+        touch_specht_ratio=touch.specht_ratio,
+        lower_bound_k_per_w=lower.k_per_w,
+        lower_bound_rate_per_s=lower.rate_per_s,
+        deficit_k=lower.deficit_k,
+        wall_transit_credit=float(c_low.min()) / (wall.retained_fraction * float(wall.j_per_k[1])),
+        touch_transit_credit=float(c_low.min()) * float(touch.k_per_j[1]) / epsilon_max,
+        touch_deficit_k=lower.touch_deficit_k,
         power_max_w=power_max_w,
     )
     for column in bound:
@@ -139,13 +141,15 @@ def heat_bound(model: Declared, unsure: Uncertainty, caps: Caps, power_max_w: fl
     return bound
 
 
-def _chords(model: Declared, unsure: Uncertainty, caps: Caps) -> tuple[FloatArray, FloatArray]:
+def _compute_loss_chords(
+    model: NominalThermalModel, uncertainty: Uncertainty, caps: Caps
+) -> tuple[FloatArray, FloatArray]:
     """Chords of the loss u / R(u), times R₀, from 0 to the cap. The loss is concave, so they lie below it."""
-    exponent = model.exponent + unsure.exponent if model.exponent > 0 else 0.0
+    exponent = model.exponent + uncertainty.exponent if model.exponent > 0 else 0.0
     knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
     wall_k = caps.wall_k if np.isfinite(caps.wall_k) and model.walls is not None else 0.0
-    warmer = (model.ambient_k + model.warmer_k + wall_k + 0.5 * knot_k) / model.ambient_k
-    return knot_k, knot_k * warmer**-exponent
+    temperature_ratio = (model.ambient_k + model.extra_rise_k + wall_k + 0.5 * knot_k) / model.ambient_k
+    return knot_k, knot_k * temperature_ratio**-exponent
 
 
 @dataclass(frozen=True, eq=False)
@@ -153,20 +157,20 @@ class _WallBound:
     w_per_k: FloatArray
     j_per_k: FloatArray
     k_per_j: FloatArray
-    spread: float
-    side_w_per_k: float
-    step_s: float
+    specht_ratio: float
+    lateral_w_per_k: float
+    exchange_step_s: float
     rate_per_s: float
-    still_there: float
-    absorber_wall: float
+    retained_fraction: float
+    absorber_wall_factor: float
 
 
-def _wall_bound(
-    model: Declared,
-    unsure: Uncertainty,
+def _build_wall_bound(
+    model: NominalThermalModel,
+    uncertainty: Uncertainty,
     epsilon: float,
     c_absorber_j_per_k: FloatArray,
-    hottest: float,
+    resistance_factor: float,
     tau_max_s: float,
     lag_max_s: float,
 ) -> _WallBound:
@@ -174,40 +178,43 @@ def _wall_bound(
     walls = model.walls
     if walls is None:
         return _WallBound(np.ones(pixels), np.ones(2), np.zeros(2), 1.0, 0.0, inf, 0.0, 1.0, 1.0)
-    sides = np.count_nonzero(model.beside >= 0, axis=1)
+    neighbour_count = np.count_nonzero(model.neighbours >= 0, axis=1)
 
-    def leaving(own: float, side: float) -> FloatArray:
-        rim = model.frame_edges / (walls.frame_k_per_w * side)
-        return np.asarray(1 / (walls.r_k_per_w * own) + sides / (walls.side_k_per_w * side) + rim, dtype=np.float64)
+    def compute_conductance(wall_factor: float, lateral_factor: float) -> FloatArray:
+        rim = model.frame_edges / (walls.frame_k_per_w * lateral_factor)
+        return np.asarray(
+            1 / (walls.r_k_per_w * wall_factor) + neighbour_count / (walls.lateral_k_per_w * lateral_factor) + rim,
+            dtype=np.float64,
+        )
 
-    least = leaving(1 + unsure.wall_resistance, 1 + unsure.side_resistance)
-    most = leaving(1 - unsure.wall_resistance, 1 - unsure.side_resistance)
-    c_low = walls.c_j_per_k * (1 - unsure.wall_capacity)
+    min_w_per_k = compute_conductance(1 + uncertainty.wall_resistance, 1 + uncertainty.side_resistance)
+    max_w_per_k = compute_conductance(1 - uncertainty.wall_resistance, 1 - uncertainty.side_resistance)
+    c_low = walls.c_j_per_k * (1 - uncertainty.wall_capacity)
     # All heat of a pulse is put into the wall at once though it comes over the absorber's time: with 1 / (1 − rate ×
     # time) more of it, the bound lies above the wall at every later moment.
-    still_there = 1.0 - float(most.max()) / c_low * tau_max_s
-    behind = 1.0 - float(least.max()) / c_low * lag_max_s
-    if min(still_there, behind) < 0.5:
+    retained_fraction = 1.0 - float(max_w_per_k.max()) / c_low * tau_max_s
+    lag_retained_fraction = 1.0 - float(min_w_per_k.max()) / c_low * lag_max_s
+    if min(retained_fraction, lag_retained_fraction) < 0.5:
         raise InputError(
             "terms.wall_heating",
-            f"a wall that cools in {c_low / float(most.max()):.3g} s",
+            f"a wall that cools in {c_low / float(max_w_per_k.max()):.3g} s",
             f"more than twice the absorber's {max(tau_max_s, lag_max_s):.3g} s",
         )
     # A wall that cools takes its absorber's heat along.
-    carried = float(c_absorber_j_per_k.max()) / still_there
-    capacities = np.array([c_low, walls.c_j_per_k * (1 + unsure.wall_capacity) + carried])
+    carried_j_per_k = float(c_absorber_j_per_k.max()) / retained_fraction
+    capacities = np.array([c_low, walls.c_j_per_k * (1 + uncertainty.wall_capacity) + carried_j_per_k])
     # An absorber colder than its wall, because neighbours warm the wall, lags by more than a hot one does.
-    colder = 1 + carried / (c_low + carried) * (hottest - 1)
+    cold_absorber_factor = 1 + carried_j_per_k / (c_low + carried_j_per_k) * (resistance_factor - 1)
     return _WallBound(
-        w_per_k=least,
+        w_per_k=min_w_per_k,
         j_per_k=capacities,
-        k_per_j=epsilon / capacities / still_there,
-        spread=spread(capacities[1] / capacities[0]),
-        side_w_per_k=colder / (walls.side_k_per_w * (1 - unsure.side_resistance)),
-        step_s=STEP_SHARE * c_low / float(least.max()),
-        rate_per_s=float(most.max()) / c_low,
-        still_there=still_there,
-        absorber_wall=1.0 / behind,
+        k_per_j=epsilon / capacities / retained_fraction,
+        specht_ratio=specht_ratio(capacities[1] / capacities[0]),
+        lateral_w_per_k=cold_absorber_factor / (walls.lateral_k_per_w * (1 - uncertainty.side_resistance)),
+        exchange_step_s=STEP_FRACTION * c_low / float(min_w_per_k.max()),
+        rate_per_s=float(max_w_per_k.max()) / c_low,
+        retained_fraction=retained_fraction,
+        absorber_wall_factor=1.0 / lag_retained_fraction,
     )
 
 
@@ -216,12 +223,17 @@ class _TouchBound:
     lag_s: FloatArray
     k_per_j: FloatArray
     per_wall_k: float
-    spread: float
+    specht_ratio: float
     gas_s: float
 
 
-def _touch_bound(
-    model: Declared, unsure: Uncertainty, epsilon: float, r_k_per_w: float, tau_max_s: float, wall: _WallBound
+def _build_touch_bound(
+    model: NominalThermalModel,
+    uncertainty: Uncertainty,
+    epsilon: float,
+    r_k_per_w: float,
+    tau_max_s: float,
+    wall: _WallBound,
 ) -> _TouchBound:
     """A bound on s + c₁ u + c₂ h: touch surface, absorber over its wall, gas over the wall.
 
@@ -232,50 +244,55 @@ def _touch_bound(
     touch = model.touch
     if touch is None:
         return _TouchBound(np.ones(2), np.zeros(2), 0.0, 1.0, 0.0)
-    lags_s = touch.lag_s * np.array([1 - unsure.touch_lag, 1 + unsure.touch_lag])
-    gas_share, wall_share = touch.gas_share * (1 + unsure.touch_share), touch.wall_share * (1 + unsure.touch_share)
-    tau_g_s = model.tau_g_s * (1 + unsure.gas_lag)
-    still_there = (1.0 - tau_max_s / lags_s[0]) * (1.0 - tau_g_s / lags_s[0])
-    if still_there < 0.5 or lags_s[0] < tau_max_s:
+    lags_s = touch.lag_s * np.array([1 - uncertainty.touch_lag, 1 + uncertainty.touch_lag])
+    gas_share, wall_share = (
+        touch.gas_share * (1 + uncertainty.touch_share),
+        touch.wall_share * (1 + uncertainty.touch_share),
+    )
+    tau_g_s = model.tau_g_s * (1 + uncertainty.gas_lag)
+    retained_fraction = (1.0 - tau_max_s / lags_s[0]) * (1.0 - tau_g_s / lags_s[0])
+    if retained_fraction < 0.5 or lags_s[0] < tau_max_s:
         raise InputError("terms.touch_surface.lag", touch.lag_s, f"well above the absorber's {tau_max_s:.3g} s")
     gas_s = gas_share * tau_g_s / (1.0 - tau_g_s / float(lags_s[0]))
-    absorber_s = 0.5 * gas_share * tau_max_s / still_there
+    absorber_s = 0.5 * gas_share * tau_max_s / retained_fraction
     return _TouchBound(
         lag_s=lags_s,
-        k_per_j=0.5 * gas_share * epsilon * r_k_per_w / lags_s / still_there,
+        k_per_j=0.5 * gas_share * epsilon * r_k_per_w / lags_s / retained_fraction,
         per_wall_k=gas_share + wall_share + (absorber_s + gas_s) * wall.rate_per_s,
-        spread=spread(lags_s[1] / lags_s[0]),
+        specht_ratio=specht_ratio(lags_s[1] / lags_s[0]),
         gas_s=gas_s,
     )
 
 
 @dataclass(frozen=True, eq=False)
-class _Least:
+class _LowerBound:
     k_per_w: FloatArray
     rate_per_s: FloatArray
-    lost_k: float
-    touch_lost_k: float
+    deficit_k: float
+    touch_deficit_k: float
 
 
-def _least(
-    model: Declared,
-    unsure: Uncertainty,
+def _build_lower_bound(
+    model: NominalThermalModel,
+    uncertainty: Uncertainty,
     caps: Caps,
     c_low: FloatArray,
     c_high: FloatArray,
     wall: _WallBound,
     touch: _TouchBound,
-) -> _Least:
+) -> _LowerBound:
     """The lower corner of an absorber over its wall: a wall that nothing warms but the absorber's own heat."""
-    r_low = model.r_k_per_w * (1 - unsure.bridge_resistance)
-    both = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
-    rate_per_s = np.stack([both / (r_low * c_high), both / (r_low * c_low)], axis=1)
-    k_per_w = model.epsilon * (1 - unsure.absorbed_power) * r_low / both
-    if wall.side_w_per_k == 0.0:
-        return _Least(k_per_w, rate_per_s, 0.0, 0.0)
-    warmest_k = min(caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.spread) if touch.per_wall_k > 0.0 else inf)
-    inflow_k_per_s = 4 * wall.side_w_per_k * warmest_k / float(wall.j_per_k[0])
-    lost_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + unsure.gas_lag)
-    gas_lost_k = gas_lag_s * inflow_k_per_s + 0.5 * lost_k
-    touch_lost_k = touch.gas_s / float(touch.lag_s[0]) * gas_lost_k if touch.gas_s > 0.0 else 0.0
-    return _Least(k_per_w, rate_per_s, lost_k, touch_lost_k)
+    r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance)
+    coupling_factor = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
+    rate_per_s = np.stack([coupling_factor / (r_low * c_high), coupling_factor / (r_low * c_low)], axis=1)
+    k_per_w = model.epsilon * (1 - uncertainty.absorbed_power) * r_low / coupling_factor
+    if wall.lateral_w_per_k == 0.0:
+        return _LowerBound(k_per_w, rate_per_s, 0.0, 0.0)
+    max_wall_k = min(
+        caps.wall_k, caps.touch_k / (touch.per_wall_k * touch.specht_ratio) if touch.per_wall_k > 0.0 else inf
+    )
+    inflow_k_per_s = 4 * wall.lateral_w_per_k * max_wall_k / float(wall.j_per_k[0])
+    deficit_k, gas_lag_s = inflow_k_per_s / float(rate_per_s.min()), model.tau_g_s * (1 + uncertainty.gas_lag)
+    gas_deficit_k = gas_lag_s * inflow_k_per_s + 0.5 * deficit_k
+    touch_deficit_k = touch.gas_s / float(touch.lag_s[0]) * gas_deficit_k if touch.gas_s > 0.0 else 0.0
+    return _LowerBound(k_per_w, rate_per_s, deficit_k, touch_deficit_k)

@@ -19,40 +19,40 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import HeightTrain
 from optodrive.core.units import m_to_um
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.thermal_state import Heat
+from optodrive.physics.thermal_state import ThermalState
 
-SETTLED = 10.0
+SETTLING_TAUS = 10.0
 """Cycles repeat after so many relaxation times of the pixel."""
 SAMPLES = 400
 """Of the steady cycle."""
-EARLY = 0.8
+EARLY_PEAK_FRACTION = 0.8
 """A pulse from rest whose peak comes before this share of the period can be planned for its peak."""
-ROUNDS, CLOSE = 6, 1e-4
+MAX_POWER_CORRECTIONS, PEAK_TOLERANCE = 6, 1e-4
 """The power of steady pulses is corrected at most so often, until the peak is this close, relative."""
-SWING_CLOSE = 0.01
+PEAK_TO_PEAK_TOLERANCE = 0.01
 """A whole number of PWM periods will do where it brings the swing this close, relative."""
-NEARLY = 0.99
+WIDENING_THRESHOLD = 0.99
 """A pulse that comes so near to its height is not made wider for it."""
-HALVINGS = 8
+BISECTIONS = 8
 """Of the head's share, from none to all."""
-SOON_S = 1e-9
+MIN_REFERENCE_S = 1e-9
 
 
 @dataclass(frozen=True)
-class Cycle:
+class PulseRecipe:
     """How each pulse of a train is planned: pulse_for_peak(…, goal_m, …, least_periods, from_s), after its head.
 
     head_w: power of a PWM period before that pulse, 0 for none
     """
 
-    goal_m: float
-    least_periods: int = 1
+    target_m: float
+    min_periods: int = 1
     from_s: float = 0.0
-    head_w: float = 0.0
+    lead_period_w: float = 0.0
 
 
 @dataclass(frozen=True)
-class Steady:
+class PeriodicSteadyState:
     """A cycle that repeats: PWM periods and duty of its pulse and of a period before it; peak and least height, m.
 
     after_m: height so long after the pulse's start, after_s, that it tells this pulse's energy from the last one's
@@ -60,160 +60,168 @@ class Steady:
 
     periods: int
     duty: float
-    head: float
+    lead_duty: float
     peak_m: float
-    least_m: float
-    after_m: float
-    after_s: float
+    trough_m: float
+    reference_m: float
+    reference_s: float
 
     @property
     def peak_to_peak_m(self) -> float:
         """Fall of the membrane between two peaks, m."""
-        return self.peak_m - self.least_m
+        return self.peak_m - self.trough_m
 
 
-def cycle_of(train: HeightTrain, at_rest: Heat, drive: DriveRange, where: str) -> Cycle:
+def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> PulseRecipe:
     """How the train's pulses are planned; drive.max_periods: the longest pulse its cycle has room for.
 
     Raises InputError (target_out_of_reach, bad_train) where no steady cycle has the train's height or swing.
     """
-    periods, head = _fewest(train, at_rest, drive, where), 0.0
-    least_periods = 1
+    periods, lead_ratio = _find_min_periods(train, cold_heat, drive, where), 0.0
+    min_periods = 1
     if train.peak_to_peak_m is not None:
-        periods, head = _shape_for_swing(train, at_rest, drive, periods, where)
-        least_periods = periods
-    first = at_rest.pulse_for_peak(train.pixel, 0.0, train.target_m, drive, least_periods)
-    found = at_target(train, at_rest, drive, periods, head)
-    head_w = found.head * drive.max_power_w
-    if first is None or _peak_after_s(train, at_rest, drive, *first) <= EARLY * train.period_s:
-        return Cycle(train.target_m, least_periods, head_w=head_w)
-    return Cycle(found.after_m, least_periods, found.after_s, head_w)
+        periods, lead_ratio = _find_peak_to_peak_shape(train, cold_heat, drive, periods, where)
+        min_periods = periods
+    first = cold_heat.solve_pulse(train.pixel, 0.0, train.target_m, drive, min_periods)
+    steady_state = solve_steady_state(train, cold_heat, drive, periods, lead_ratio)
+    lead_period_w = steady_state.lead_duty * drive.max_power_w
+    if first is None or _find_first_peak_s(train, cold_heat, drive, *first) <= EARLY_PEAK_FRACTION * train.period_s:
+        return PulseRecipe(train.target_m, min_periods, lead_period_w=lead_period_w)
+    return PulseRecipe(steady_state.reference_m, min_periods, steady_state.reference_s, lead_period_w)
 
 
-def next_pulse(
-    train: HeightTrain, cycle: Cycle, heat: Heat, at_s: float, drive: DriveRange
+def compute_next_pulse(
+    train: HeightTrain, recipe: PulseRecipe, heat: ThermalState, start_s: float, drive: DriveRange
 ) -> tuple[int, float] | None:
     """PWM periods and duty of the train's pulse at at_s, after its head, from the heat there; None: none is needed.
 
     A swing has its width: were a pulse wider for want of little, the next would be narrower, and so they would go on.
     """
-    shape = (drive, cycle.least_periods, cycle.from_s)
-    pulse = heat.pulse_for_peak(train.pixel, at_s, cycle.goal_m, *shape)
-    if train.peak_to_peak_m is None or pulse is None or pulse[0] <= cycle.least_periods:
+    shape = (drive, recipe.min_periods, recipe.from_s)
+    pulse = heat.solve_pulse(train.pixel, start_s, recipe.target_m, *shape)
+    if train.peak_to_peak_m is None or pulse is None or pulse[0] <= recipe.min_periods:
         return pulse
-    nearly = heat.pulse_for_peak(train.pixel, at_s, NEARLY * cycle.goal_m, *shape)
-    return pulse if nearly is not None and nearly[0] > cycle.least_periods else (cycle.least_periods, 1.0)
+    lower_pulse = heat.solve_pulse(train.pixel, start_s, WIDENING_THRESHOLD * recipe.target_m, *shape)
+    return pulse if lower_pulse is not None and lower_pulse[0] > recipe.min_periods else (recipe.min_periods, 1.0)
 
 
-def steady(
-    train: HeightTrain, at_rest: Heat, drive: DriveRange, periods: int, duty: float, head: float = 0.0
-) -> Steady:
+def compute_steady_state(
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float, lead_duty: float = 0.0
+) -> PeriodicSteadyState:
     """What the same pulse in every cycle comes to, after a period of duty `head` where there is one."""
-    own = at_rest.pixels.each[train.pixel]
-    count = 2 + ceil(SETTLED * (own.tau_s + own.tau_g_s) / train.period_s)
-    head_s = drive.period_s if head else 0.0
-    shapes = [(head_s, periods * drive.period_s, duty)] + ([(0.0, head_s, head)] if head else [])
+    pixel = cold_heat.pixels.elements[train.pixel]
+    count = 2 + ceil(SETTLING_TAUS * (pixel.tau_s + pixel.tau_g_s) / train.period_s)
+    lead_s = drive.period_s if lead_duty else 0.0
+    shapes = [(lead_s, periods * drive.period_s, duty)] + ([(0.0, lead_s, lead_duty)] if lead_duty else [])
     pulses = np.zeros((count, len(shapes), 4))
-    for k, (after_s, width_s, share) in enumerate(reversed(shapes)):
-        pulses[:, k, 0] = train.period_s * np.arange(count) + after_s
-        pulses[:, k, 1], pulses[:, k, 2] = width_s, share * drive.max_power_w
+    for k, (reference_s, width_s, pulse_duty) in enumerate(reversed(shapes)):
+        pulses[:, k, 0] = train.period_s * np.arange(count) + reference_s
+        pulses[:, k, 1], pulses[:, k, 2] = width_s, pulse_duty * drive.max_power_w
     pulses[:, :, 3] = train.pixel
-    before, last = pulses[:-1].reshape(-1, 4), pulses[-1]
-    warm = at_rest.copy()
-    warm.pulses(np.full(len(before), train.pixel), before[:, 0], before[:, 1], before[:, 2])
+    earlier, last = pulses[:-1].reshape(-1, 4), pulses[-1]
+    heat = cold_heat.copy()
+    heat.apply_pulses(np.full(len(earlier), train.pixel), earlier[:, 0], earlier[:, 1], earlier[:, 2])
     t_s = last[0, 0] + train.period_s * np.linspace(0.0, 1.0, SAMPLES + 1)
-    height_m = warm.heights_m(last, train.pixel, t_s)
+    height_m = heat.simulate_displacement_m(last, train.pixel, t_s)
     peak = int(height_m.argmax())
-    after = peak if train.peak_to_peak_m is not None else (peak + SAMPLES) // 2
-    after_s = max(SOON_S, float(t_s[after] - t_s[0]) - head_s)
-    return Steady(periods, duty, head, float(height_m.max()), float(height_m.min()), float(height_m[after]), after_s)
+    reference = peak if train.peak_to_peak_m is not None else (peak + SAMPLES) // 2
+    reference_s = max(MIN_REFERENCE_S, float(t_s[reference] - t_s[0]) - lead_s)
+    return PeriodicSteadyState(
+        periods, duty, lead_duty, float(height_m.max()), float(height_m.min()), float(height_m[reference]), reference_s
+    )
 
 
-def at_target(train: HeightTrain, at_rest: Heat, drive: DriveRange, periods: int, share: float = 0.0) -> Steady:
+def solve_steady_state(
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, lead_ratio: float = 0.0
+) -> PeriodicSteadyState:
     """The steady cycle of pulses so wide whose peak is the target, or that of full power where none is.
 
     share: duty of the period before the pulse, over the pulse's own
     """
-    found = steady(train, at_rest, drive, periods, 1.0, share)
-    for _ in range(ROUNDS):
-        if abs(found.peak_m / train.target_m - 1.0) < CLOSE:
+    steady_state = compute_steady_state(train, cold_heat, drive, periods, 1.0, lead_ratio)
+    for _ in range(MAX_POWER_CORRECTIONS):
+        if abs(steady_state.peak_m / train.target_m - 1.0) < PEAK_TOLERANCE:
             break
         # Heights are all but proportional to power.
-        duty = min(1.0, found.duty * train.target_m / found.peak_m)
-        if duty == found.duty:
+        duty = min(1.0, steady_state.duty * train.target_m / steady_state.peak_m)
+        if duty == steady_state.duty:
             break
-        found = steady(train, at_rest, drive, periods, duty, share * duty)
-    return found
+        steady_state = compute_steady_state(train, cold_heat, drive, periods, duty, lead_ratio * duty)
+    return steady_state
 
 
-def _fewest(train: HeightTrain, at_rest: Heat, drive: DriveRange, where: str) -> int:
+def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> int:
     """PWM periods of the shortest pulse whose steady cycle at full power reaches the target."""
     low, high = 0, drive.max_periods
-    most_m = steady(train, at_rest, drive, high, 1.0).peak_m
-    if most_m < train.target_m:
+    max_m = compute_steady_state(train, cold_heat, drive, high, 1.0).peak_m
+    if max_m < train.target_m:
         raise InputError(
             f"{where}.target_um",
             round(m_to_um(train.target_m), 3),
-            f"at most {m_to_um(most_m):.0f} µm, what pulses of {high * drive.period_s * 1e3:.4g} ms at "
+            f"at most {m_to_um(max_m):.0f} µm, what pulses of {high * drive.period_s * 1e3:.4g} ms at "
             f"{drive.max_power_w:g} W every {train.period_s * 1e3:.4g} ms come to",
             code="target_out_of_reach",
         )
     while high - low > 1:
         middle = (low + high) // 2
-        if steady(train, at_rest, drive, middle, 1.0).peak_m >= train.target_m:
+        if compute_steady_state(train, cold_heat, drive, middle, 1.0).peak_m >= train.target_m:
             high = middle
         else:
             low = middle
     return high
 
 
-def _shape_for_swing(
-    train: HeightTrain, at_rest: Heat, drive: DriveRange, fewest: int, where: str
+def _find_peak_to_peak_shape(
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, min_periods: int, where: str
 ) -> tuple[int, float]:
     """PWM periods of the pulse whose steady cycle swings by what is asked, and its head's share: wider swings less."""
-    asked_m = train.peak_to_peak_m or 0.0
-    swing_m = {n: at_target(train, at_rest, drive, n).peak_to_peak_m for n in (fewest, drive.max_periods)}
-    low, high = fewest, drive.max_periods
-    for bound_m, beyond, word, kind in (
-        (swing_m[low], asked_m > swing_m[low] * (1.0 + CLOSE), "at most", "shortest"),
-        (swing_m[high], asked_m < swing_m[high] * (1.0 - CLOSE), "at least", "longest"),
+    target_m = train.peak_to_peak_m or 0.0
+    peak_to_peak_m = {
+        n: solve_steady_state(train, cold_heat, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
+    }
+    low, high = min_periods, drive.max_periods
+    for bound_m, is_out_of_range, word, kind in (
+        (peak_to_peak_m[low], target_m > peak_to_peak_m[low] * (1.0 + PEAK_TOLERANCE), "at most", "shortest"),
+        (peak_to_peak_m[high], target_m < peak_to_peak_m[high] * (1.0 - PEAK_TOLERANCE), "at least", "longest"),
     ):
-        if beyond:
+        if is_out_of_range:
             raise InputError(
                 f"{where}.peak_to_peak_um",
-                round(m_to_um(asked_m), 3),
+                round(m_to_um(target_m), 3),
                 f"{word} {m_to_um(bound_m):.4g} µm, what the {kind} pulses to {m_to_um(train.target_m):.4g} µm "
                 f"every {train.period_s * 1e3:.4g} ms come to",
                 code="bad_train",
             )
     while high - low > 1:
         middle = (low + high) // 2
-        swing_m[middle] = at_target(train, at_rest, drive, middle).peak_to_peak_m
-        if swing_m[middle] >= asked_m:
+        peak_to_peak_m[middle] = solve_steady_state(train, cold_heat, drive, middle).peak_to_peak_m
+        if peak_to_peak_m[middle] >= target_m:
             low = middle
         else:
             high = middle
-    nearest = min((low, high), key=lambda n: abs(swing_m[n] - asked_m))
-    if abs(swing_m[nearest] - asked_m) <= SWING_CLOSE * asked_m:
+    nearest = min((low, high), key=lambda n: abs(peak_to_peak_m[n] - target_m))
+    if abs(peak_to_peak_m[nearest] - target_m) <= PEAK_TO_PEAK_TOLERANCE * target_m:
         return nearest, 0.0
-    none, whole = 0.0, 1.0
-    for _ in range(HALVINGS):
-        share = 0.5 * (none + whole)
-        if at_target(train, at_rest, drive, low, share).peak_to_peak_m >= asked_m:
-            none = share
+    low_ratio, high_ratio = 0.0, 1.0
+    for _ in range(BISECTIONS):
+        ratio = 0.5 * (low_ratio + high_ratio)
+        if solve_steady_state(train, cold_heat, drive, low, ratio).peak_to_peak_m >= target_m:
+            low_ratio = ratio
         else:
-            whole = share
-    return low, 0.5 * (none + whole)
+            high_ratio = ratio
+    return low, 0.5 * (low_ratio + high_ratio)
 
 
-def _peak_after_s(train: HeightTrain, at_rest: Heat, drive: DriveRange, periods: int, duty: float) -> float:
+def _find_first_peak_s(
+    train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float
+) -> float:
     """When the first pulse's peak comes after its start, s."""
     width_s = periods * drive.period_s
     t_s: FloatArray = np.linspace(0.0, 2.0 * train.period_s + width_s, 2 * SAMPLES + 1)
     pulse = np.array([[0.0, width_s, duty * drive.max_power_w, train.pixel]])
-    return float(t_s[np.argmax(at_rest.heights_m(pulse, train.pixel, t_s))])
+    return float(t_s[np.argmax(cold_heat.simulate_displacement_m(pulse, train.pixel, t_s))])
 
 
-def with_room(drive: DriveRange, room_us: int) -> DriveRange:
+def limit_pulse_width(drive: DriveRange, max_width_us: int) -> DriveRange:
     """The drive with pulses no longer than room_us, and one PWM period at least."""
-    return replace(drive, max_periods=max(1, min(drive.max_periods, int(room_us * 1e-6 / drive.period_s + 1e-9))))
+    return replace(drive, max_periods=max(1, min(drive.max_periods, int(max_width_us * 1e-6 / drive.period_s + 1e-9))))

@@ -14,59 +14,59 @@ from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import PixelLayout
-from optodrive.device.scan_field import AimedField
-from optodrive.device.settling import MoveModel
-from optodrive.physics.nominal_display import nothing
+from optodrive.device.scan_field import ScanField
+from optodrive.device.settling import SettlingTable
+from optodrive.physics.nominal_display import ignore_progress
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.thermal_state import Heat
+from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.scheduler.interleaving import (
-    ROUNDS,
-    Periods,
-    Rehearsal,
-    Together,
-    best,
-    joined,
-    rested,
-    simultaneity,
-    slices,
+    ROUND_COUNTS,
+    CandidateSchedule,
+    PeriodsByPixel,
+    SimultaneousFrame,
+    compute_simultaneity,
+    concatenate_batches,
+    has_min_rest,
+    select_schedule,
+    split_pulses,
 )
 from optodrive.planning.scheduler.train_pulses import TrainPulses
-from optodrive.planning.scheduler.visiting_path import visiting_order
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 
-TRAIN_PIECE = 1000
+TRAIN_BATCH = 1000
 """Pulses of trains planned in one piece, unless told otherwise."""
 
-TICK = 16
+PROGRESS_INTERVAL = 16
 """Pulses of a frame between two ticks."""
 
 ALL = 2**60
 
 
-class Rest(NamedTuple):
+class GalvoPause(NamedTuple):
     """Of a piece only the first rows may stay as they are; then the mirrors rest for so long, µs."""
 
     rows: int
-    us: int
+    pause_us: int
 
 
-Answer = int | Rest | None
+Answer = int | GalvoPause | None
 Pieces = Generator[PulsePlan, Answer, None]
 """Yields pieces of a plan; takes how much later, µs, the last one must come, a rest, or None where it may stay."""
 
 
 @dataclass(frozen=True)
-class Machine:
+class ScanHead:
     """What the scheduler knows of optics and laser. rest_s: dark time after which a pixel's next pulse counts anew."""
 
     layout: PixelLayout
-    field: AimedField
-    moves: MoveModel
+    field: ScanField
+    settling: SettlingTable
     drive: DriveRange
-    rest_s: float
+    pulse_rest_s: float
 
 
 @dataclass(frozen=True)
-class Skipped:
+class SkippedPulse:
     """A pixel that got no pulse from a frame or in a train's cycle: the heat left reaches its target by itself."""
 
     source: int
@@ -74,14 +74,14 @@ class Skipped:
     target_m: float
 
 
-class _Row(NamedTuple):
+class _PlannedPulse(NamedTuple):
     start_us: int
     width_us: int
     power_w: float
     pixel: int
-    settle_us: int
+    settling_us: int
     target_m: float
-    nominal_us: int
+    requested_start_us: int
     source: int
 
 
@@ -93,13 +93,13 @@ class _Cursor:
     """
 
     free_us: int = 0
-    lit: int | None = None
-    since_us: int = 0
-    stay_us: int = 0
+    pixel: int | None = None
+    arrival_us: int = 0
+    dwell_us: int = 0
     next_train: int = 0
-    place: int = 0
-    waited_us: int = 0
-    skipped: int = 0
+    position: int = 0
+    delay_us: int = 0
+    skipped_count: int = 0
 
 
 class Scheduler:
@@ -117,38 +117,38 @@ class Scheduler:
 
     def __init__(
         self,
-        machine: Machine,
+        scan_head: ScanHead,
         sequence: FrameSequence,
-        at_rest: Callable[[], Heat],
-        train_piece: int = TRAIN_PIECE,
-        tick: Callable[[], None] = nothing,
-        standing_on: int | None = None,
-        orders: Mapping[int, IntArray] | None = None,
+        build_cold_heat: Callable[[], ThermalState],
+        train_batch: int = TRAIN_BATCH,
+        on_progress: Callable[[], None] = ignore_progress,
+        initial_pixel: int | None = None,
+        visiting_orders: Mapping[int, IntArray] | None = None,
     ) -> None:
-        self._machine = machine
+        self._scan_head = scan_head
         self._sequence = sequence
-        self._train_piece = train_piece
-        self._tick = tick
-        self._orders = orders or {}
-        x_rad, y_rad = machine.field.angles_rad(machine.layout.x_m, machine.layout.y_m)
+        self._train_batch = train_batch
+        self._on_progress = on_progress
+        self._visiting_orders = visiting_orders or {}
+        x_rad, y_rad = scan_head.field.angles_rad(scan_head.layout.x_m, scan_head.layout.y_m)
         self._x_rad: list[float] = x_rad.tolist()
         self._y_rad: list[float] = y_rad.tolist()
-        self._now = _Cursor(lit=standing_on)
-        self._most = ALL
-        self.lead_us = machine.moves.lead_us if standing_on is None else 0
-        self.skipped: list[Skipped] = []
-        self.together: list[Together] = []
+        self._cursor = _Cursor(pixel=initial_pixel)
+        self._max_rows = ALL
+        self.lead_in_us = scan_head.settling.lead_in_us if initial_pixel is None else 0
+        self.skipped: list[SkippedPulse] = []
+        self.simultaneous: list[SimultaneousFrame] = []
         self._trains = TrainPulses(
             sequence.trains,
             len(sequence.frames),
-            machine.drive,
-            round(machine.rest_s * 1e6),
-            self._move_us,
-            at_rest,
-            tick,
+            scan_head.drive,
+            round(scan_head.pulse_rest_s * 1e6),
+            self._compute_settling_us,
+            build_cold_heat,
+            on_progress,
         )
 
-    def pieces(self, heat: Heat) -> Pieces:
+    def pieces(self, heat: ThermalState) -> Pieces:
         """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
 
         What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came. A
@@ -159,148 +159,173 @@ class Scheduler:
             yield from self._frame(source, frame, heat)
         yield from self._trains_before(float("inf"), heat)
 
-    def _offer(self, build: Callable[[], list[_Row]]) -> Generator[PulsePlan, Answer, bool]:
+    def _offer(self, build: Callable[[], list[_PlannedPulse]]) -> Generator[PulsePlan, Answer, bool]:
         """Yield what build makes, later or less of it as the answers ask; False where it makes nothing."""
         rest_us = 0
         while True:
-            before = replace(self._now)
+            before = replace(self._cursor)
             rows = build()
             if not rows:
                 return False
-            answer = yield self._plan(rows)
+            answer = yield self._build_plan(rows)
             if not answer:
-                self._now.free_us += rest_us
-                self._most = ALL
+                self._cursor.free_us += rest_us
+                self._max_rows = ALL
                 return True
-            self._now = before
-            del self.skipped[before.skipped :]
+            self._cursor = before
+            del self.skipped[before.skipped_count :]
             if isinstance(answer, int):
-                self._now.free_us += answer
-                self._now.waited_us += answer
+                self._cursor.free_us += answer
+                self._cursor.delay_us += answer
             elif answer.rows:
-                self._most, rest_us = answer.rows, answer.us
+                self._max_rows, rest_us = answer.rows, answer.pause_us
             else:
-                self._now.free_us += answer.us
+                self._cursor.free_us += answer.pause_us
 
-    def _wanted_us(self, time_s: float) -> int:
-        return self.lead_us + round(time_s * 1e6)
+    def _compute_requested_us(self, time_s: float) -> int:
+        return self.lead_in_us + round(time_s * 1e6)
 
-    def _move_us(self, origin: int | None, pixel: int, lit_us: int = 0) -> int:
+    def _compute_settling_us(self, origin: int | None, pixel: int, dwell_us: int = 0) -> int:
         if origin is None:
-            return self.lead_us
-        return self._machine.moves.time_us(
-            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin], lit_us
+            return self.lead_in_us
+        return self._scan_head.settling.settling_us(
+            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin], dwell_us
         )
 
-    def _order(self, frame: TactileFrame) -> list[int]:
-        layout, driven = self._machine.layout, np.flatnonzero(frame.target_m > 0)
+    def _compute_order(self, frame: TactileFrame) -> list[int]:
+        layout, active = self._scan_head.layout, np.flatnonzero(frame.target_m > 0)
         mirrors = np.array(self._x_rad), np.array(self._y_rad)
-        order: list[int] = visiting_order(driven, layout.row, layout.column, *mirrors, self._now.lit).tolist()
+        order: list[int] = compute_visiting_order(
+            active, layout.row, layout.column, *mirrors, self._cursor.pixel
+        ).tolist()
         return order
 
-    def _place(self, pixel: int, width_us: int, power_w: float, wanted_us: int, target_m: float, source: int) -> _Row:
-        now = self._now
-        settle_us = self._move_us(now.lit, pixel, now.stay_us)
-        start_us = max(wanted_us + now.waited_us, now.free_us + settle_us)
-        if pixel != now.lit:
-            now.since_us = start_us
-        now.free_us, now.lit = start_us + width_us, pixel
-        now.stay_us = now.free_us - now.since_us
-        return _Row(start_us, width_us, power_w, pixel, settle_us, target_m, wanted_us, source)
+    def _place_pulse(
+        self, pixel: int, width_us: int, power_w: float, requested_us: int, target_m: float, source: int
+    ) -> _PlannedPulse:
+        cursor = self._cursor
+        settling_us = self._compute_settling_us(cursor.pixel, pixel, cursor.dwell_us)
+        start_us = max(requested_us + cursor.delay_us, cursor.free_us + settling_us)
+        if pixel != cursor.pixel:
+            cursor.arrival_us = start_us
+        cursor.free_us, cursor.pixel = start_us + width_us, pixel
+        cursor.dwell_us = cursor.free_us - cursor.arrival_us
+        return _PlannedPulse(start_us, width_us, power_w, pixel, settling_us, target_m, requested_us, source)
 
-    def _train_rows(self, heat: Heat) -> list[_Row]:
+    def _build_train_rows(self, heat: ThermalState) -> list[_PlannedPulse]:
         """The next train pulse as a row, or none where it asks for a height that the heat there reaches by itself."""
-        now, index = self._now, self._now.next_train
+        cursor, index = self._cursor, self._cursor.next_train
         pulse = self._trains[index]
-        wanted_us = self.lead_us + pulse.nominal_us
-        now.next_train += 1
-        if not pulse.by_height:
-            return [self._place(pulse.pixel, pulse.width_us, pulse.power_w, wanted_us, float("nan"), pulse.source)]
-        start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pulse.pixel, now.stay_us))
-        planned = self._trains.planned(index, heat, start_us, start_us - wanted_us - now.waited_us)
-        target_m = self._trains.target_m(pulse.source)
+        requested_us = self.lead_in_us + pulse.requested_start_us
+        cursor.next_train += 1
+        if not pulse.is_by_height:
+            return [
+                self._place_pulse(pulse.pixel, pulse.width_us, pulse.power_w, requested_us, float("nan"), pulse.source)
+            ]
+        start_us = max(
+            requested_us + cursor.delay_us,
+            cursor.free_us + self._compute_settling_us(cursor.pixel, pulse.pixel, cursor.dwell_us),
+        )
+        planned = self._trains.plan_pulse(index, heat, start_us, start_us - requested_us - cursor.delay_us)
+        target_m = self._trains.get_target_m(pulse.source)
         if planned is None:
-            self.skipped.append(Skipped(pulse.source, pulse.pixel, target_m))
-            now.skipped += 1
+            self.skipped.append(SkippedPulse(pulse.source, pulse.pixel, target_m))
+            cursor.skipped_count += 1
             return []
-        return [self._place(pulse.pixel, *planned, wanted_us, target_m, pulse.source)]
+        return [self._place_pulse(pulse.pixel, *planned, requested_us, target_m, pulse.source)]
 
-    def _heat_is_known(self, rows: list[_Row]) -> bool:
+    def _is_heat_known(self, rows: list[_PlannedPulse]) -> bool:
         """Whether the next train pulse can be planned after rows that the limiter has not seen."""
-        pulse = self._trains[self._now.next_train]
-        return not pulse.by_height or all(row.pixel != pulse.pixel for row in rows)
+        pulse = self._trains[self._cursor.next_train]
+        return not pulse.is_by_height or all(row.pixel != pulse.pixel for row in rows)
 
-    def _trains_before(self, until_s: float, heat: Heat) -> Pieces:
-        def build() -> list[_Row]:
-            rows: list[_Row] = []
-            while self._now.next_train < len(self._trains) and len(rows) < self._train_piece:
-                if self._trains[self._now.next_train].nominal_us >= until_s * 1e6:
+    def _trains_before(self, until_s: float, heat: ThermalState) -> Pieces:
+        def build() -> list[_PlannedPulse]:
+            rows: list[_PlannedPulse] = []
+            while self._cursor.next_train < len(self._trains) and len(rows) < self._train_batch:
+                if self._trains[self._cursor.next_train].requested_start_us >= until_s * 1e6:
                     break
-                if not self._heat_is_known(rows):
+                if not self._is_heat_known(rows):
                     break
-                rows += self._train_rows(heat)
+                rows += self._build_train_rows(heat)
             return rows
 
         while (yield from self._offer(build)):
             pass
 
-    def _train_is_due(self, end_us: int, pixel: int, lit_us: int) -> bool:
+    def _is_train_due(self, end_us: int, pixel: int, dwell_us: int) -> bool:
         """Whether the next train pulse would come late if the beam lit `pixel` for lit_us until end_us."""
-        now = self._now
-        if now.next_train >= len(self._trains):
+        cursor = self._cursor
+        if cursor.next_train >= len(self._trains):
             return False
-        pulse = self._trains[now.next_train]
-        due_us = self.lead_us + pulse.nominal_us + now.waited_us
-        return due_us < end_us + self._move_us(pixel, pulse.pixel, lit_us)
+        pulse = self._trains[cursor.next_train]
+        deadline_us = self.lead_in_us + pulse.requested_start_us + cursor.delay_us
+        return deadline_us < end_us + self._compute_settling_us(pixel, pulse.pixel, dwell_us)
 
-    def _frame(self, source: int, frame: TactileFrame, heat: Heat) -> Pieces:
+    def _frame(self, source: int, frame: TactileFrame, heat: ThermalState) -> Pieces:
         """A frame's pulses, one a pixel, or several where its pixels shall stand up together."""
-        order = self._orders[source].tolist() if source in self._orders else self._order(frame)
-        if frame.together and len(order) > 1:
+        order = (
+            self._visiting_orders[source].tolist() if source in self._visiting_orders else self._compute_order(frame)
+        )
+        if frame.simultaneous and len(order) > 1:
             yield from self._together(source, frame, order, heat)
         else:
             yield from self._round(source, frame, order, heat)
 
-    def _together(self, source: int, frame: TactileFrame, order: list[int], heat: Heat) -> Pieces:
+    def _together(self, source: int, frame: TactileFrame, order: list[int], heat: ThermalState) -> Pieces:
         """A frame in as many rounds as bring its pixels up together best, in the time it has."""
-        drive, waited_us = self._machine.drive, self._now.waited_us
-        begin_us = max(self._wanted_us(frame.show_at_s) + waited_us, self._now.free_us)
+        drive, waited_us = self._scan_head.drive, self._cursor.delay_us
+        begin_us = max(self._compute_requested_us(frame.show_at_s) + waited_us, self._cursor.free_us)
         single = {}
         for pixel in order:
-            pulse = heat.pulse_for_peak(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
+            pulse = heat.solve_pulse(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
             if pulse is not None:
                 single[pixel] = pulse
         if not single:
             yield from self._round(source, frame, order, heat)
             return
-        split = {rounds: shares for rounds in ROUNDS if (shares := slices(single, rounds)) is not None}
+        split = {rounds: shares for rounds in ROUND_COUNTS if (shares := split_pulses(single, rounds)) is not None}
         rehearsals = [self._rehearsal(source, frame, order, heat, *item) for item in split.items()]
-        due_us = self._wanted_us(frame.show_at_s + frame.duration_s) + waited_us
-        chosen, unsplit = best(rehearsals, due_us * 1e-6), rehearsals[0]
+        due_us = self._compute_requested_us(frame.show_at_s + frame.duration_s) + waited_us
+        chosen, unsplit = select_schedule(rehearsals, due_us * 1e-6), rehearsals[0]
         extra_s = chosen.end_s - unsplit.end_s
-        self.together.append(Together(source, chosen.rounds, chosen.simultaneity, unsplit.simultaneity, extra_s))
+        self.simultaneous.append(
+            SimultaneousFrame(source, chosen.rounds, chosen.simultaneity, unsplit.simultaneity, extra_s)
+        )
         yield from self._rounds(source, frame, order, heat, chosen.rounds, split[chosen.rounds])
 
     def _rehearsal(
-        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
-    ) -> Rehearsal:
+        self,
+        source: int,
+        frame: TactileFrame,
+        order: list[int],
+        heat: ThermalState,
+        rounds: int,
+        shares: PeriodsByPixel,
+    ) -> CandidateSchedule:
         """What a number of rounds would come to, on a copy of the heat; the plan stays where it is."""
-        before, trial, pieces, last_round_s = replace(self._now), heat.copy(), [], 0.0
+        before, trial, pieces, last_round_s = replace(self._cursor), heat.copy(), [], 0.0
         for piece in self._rounds(source, frame, order, trial, rounds, shares):
-            trial.pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self._tick)
+            trial.apply_pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self._on_progress)
             pieces.append(piece)
             if np.isfinite(piece.target_m[piece.source == source]).any() and last_round_s == 0.0:
                 last_round_s = float(piece.start_s[0])
-        self._now = before
-        del self.skipped[before.skipped :]
-        plan = joined(pieces)
+        self._cursor = before
+        del self.skipped[before.skipped_count :]
+        plan = concatenate_batches(pieces)
         target_m = {pixel: float(frame.target_m[pixel]) for pixel in order}
-        share = simultaneity(heat, plan, target_m, last_round_s, self._tick)
+        share = compute_simultaneity(heat, plan, target_m, last_round_s, self._on_progress)
         end_s = float(plan.start_s[-1] + plan.width_s[-1])
-        return Rehearsal(rounds, share, end_s, rounds == 1 or rested(plan, self._machine.rest_s))
+        return CandidateSchedule(rounds, share, end_s, rounds == 1 or has_min_rest(plan, self._scan_head.pulse_rest_s))
 
     def _rounds(
-        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, rounds: int, shares: Periods
+        self,
+        source: int,
+        frame: TactileFrame,
+        order: list[int],
+        heat: ThermalState,
+        rounds: int,
+        shares: PeriodsByPixel,
     ) -> Pieces:
         """Slices of so many PWM periods in every round but the last, in which each pixel gets what it still needs."""
         for _ in range(rounds - 1):
@@ -308,48 +333,58 @@ class Scheduler:
         yield from self._round(source, frame, order, heat)
 
     def _round(
-        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None = None
+        self,
+        source: int,
+        frame: TactileFrame,
+        order: list[int],
+        heat: ThermalState,
+        shares: PeriodsByPixel | None = None,
     ) -> Pieces:
         """One pulse a pixel, cut where a train's pulse comes between; to its height, or as wide as its share."""
-        self._now.place = 0
+        self._cursor.position = 0
         while (yield from self._offer(lambda: self._round_rows(source, frame, order, heat, shares))):
             pass
 
     def _round_rows(
-        self, source: int, frame: TactileFrame, order: list[int], heat: Heat, shares: Periods | None
-    ) -> list[_Row]:
+        self, source: int, frame: TactileFrame, order: list[int], heat: ThermalState, shares: PeriodsByPixel | None
+    ) -> list[_PlannedPulse]:
         """The round's rows from where it stands, up to the next train pulse or its own end."""
-        now, drive, wanted_us = self._now, self._machine.drive, self._wanted_us(frame.show_at_s)
-        rows: list[_Row] = []
-        while now.place < len(order) and len(rows) < self._most:
-            pixel = order[now.place]
+        cursor, drive, requested_us = self._cursor, self._scan_head.drive, self._compute_requested_us(frame.show_at_s)
+        rows: list[_PlannedPulse] = []
+        while cursor.position < len(order) and len(rows) < self._max_rows:
+            pixel = order[cursor.position]
             target_m = float(frame.target_m[pixel])
-            start_us = max(wanted_us + now.waited_us, now.free_us + self._move_us(now.lit, pixel, now.stay_us))
-            if now.place % TICK == 0:
-                self._tick()
+            start_us = max(
+                requested_us + cursor.delay_us,
+                cursor.free_us + self._compute_settling_us(cursor.pixel, pixel, cursor.dwell_us),
+            )
+            if cursor.position % PROGRESS_INTERVAL == 0:
+                self._on_progress()
             if shares is None:
-                pulse = heat.pulse_for_peak(pixel, start_us * 1e-6, target_m, drive)
+                pulse = heat.solve_pulse(pixel, start_us * 1e-6, target_m, drive)
             else:
                 pulse, target_m = (shares[pixel], 1.0), float("nan")
             if pulse is None:
-                self.skipped.append(Skipped(source, pixel, target_m))
-                now.skipped += 1
-                now.place += 1
+                self.skipped.append(SkippedPulse(source, pixel, target_m))
+                cursor.skipped_count += 1
+                cursor.position += 1
                 continue
             width_us = round(pulse[0] * drive.period_s * 1e6)
-            if self._train_is_due(start_us + width_us, pixel, width_us):
-                if not self._heat_is_known(rows):
+            if self._is_train_due(start_us + width_us, pixel, width_us):
+                if not self._is_heat_known(rows):
                     return rows
-                rows += self._train_rows(heat)
+                rows += self._build_train_rows(heat)
                 if rows:
                     return rows
                 continue
-            rows.append(self._place(pixel, width_us, pulse[1] * drive.max_power_w, wanted_us, target_m, source))
-            now.place += 1
+            rows.append(
+                self._place_pulse(pixel, width_us, pulse[1] * drive.max_power_w, requested_us, target_m, source)
+            )
+            cursor.position += 1
         return rows
 
-    def _plan(self, rows: list[_Row]) -> PulsePlan:
-        start_us, width_us, power_w, pixel, settle_us, target_m, nominal_us, source = zip(*rows, strict=True)
+    def _build_plan(self, rows: list[_PlannedPulse]) -> PulsePlan:
+        start_us, width_us, power_w, pixel, settling_us, target_m, requested_start_us, source = zip(*rows, strict=True)
         index = np.array(pixel, dtype=np.int64)
         return PulsePlan(
             start_s=np.array(start_us) * 1e-6,
@@ -358,8 +393,8 @@ class Scheduler:
             y_rad=np.array(self._y_rad)[index],
             power_w=np.array(power_w),
             pixel=index,
-            settle_s=np.array(settle_us) * 1e-6,
+            settling_s=np.array(settling_us) * 1e-6,
             target_m=np.array(target_m),
-            nominal_s=np.array(nominal_us) * 1e-6,
+            requested_start_s=np.array(requested_start_us) * 1e-6,
             source=np.array(source, dtype=np.int64),
         )

@@ -10,15 +10,15 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 
-NEAR = 10
+NEIGHBOUR_COUNT = 10
 """So many nearest pixels are tried as a pixel's next."""
-CLOSE = 1.02
+GOOD_ENOUGH_RATIO = 1.02
 """A path this near to one of its own shortest steps alone is left as it is."""
-SEGMENT = 3
+MAX_SEGMENT = 3
 """Pieces of so many pixels at most are shifted."""
 
 
-def serpentine(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
+def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
     """Pixels row by row, every other row backwards, so that most moves are one pitch. active: [k]; row, column: [p]."""
     rows, columns = row[active], column[active]
     rank = np.unique(rows, return_inverse=True)[1]
@@ -26,7 +26,7 @@ def serpentine(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
     return active[np.lexsort((direction, rows))]
 
 
-def visiting_order(
+def compute_visiting_order(
     active: IntArray, row: IntArray, column: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int | None = None
 ) -> IntArray:
     """A short path over pixels `active` [k], from the pixel `origin` if the mirrors stand on one.
@@ -36,25 +36,25 @@ def visiting_order(
     if len(active) < 3:
         return active
     begin = -1 if origin is None else origin
-    tours = [serpentine(active, row, column), serpentine(active, column, row)]
+    tours = [compute_serpentine_order(active, row, column), compute_serpentine_order(active, column, row)]
     tours += [tour[::-1] for tour in tours]
     lengths_rad = [path_rad(tour, x_rad, y_rad, begin) for tour in tours]
     best = int(np.argmin(lengths_rad))
     tour = np.ascontiguousarray(tours[best], dtype=np.int64)
     steps_rad = np.maximum(np.abs(np.diff(x_rad[tour])), np.abs(np.diff(y_rad[tour])))
-    if lengths_rad[best] > CLOSE * len(steps_rad) * steps_rad.min():
-        _improve(tour, _near(tour, x_rad, y_rad, min(NEAR, len(steps_rad))), x_rad, y_rad, begin)
+    if lengths_rad[best] > GOOD_ENOUGH_RATIO * len(steps_rad) * steps_rad.min():
+        _improve(tour, _find_neighbours(tour, x_rad, y_rad, min(NEIGHBOUR_COUNT, len(steps_rad))), x_rad, y_rad, begin)
     return tour
 
 
-def warm() -> None:
+def compile_kernels() -> None:
     """Order pixels for nobody, so that every kernel is compiled and loaded."""
     place = np.array([0, 9, 1, 7, 2, 8])
-    visiting_order(np.arange(6), place, place[::-1].copy(), 0.01 * place, 0.01 * place[::-1])
+    compute_visiting_order(np.arange(6), place, place[::-1].copy(), 0.01 * place, 0.01 * place[::-1])
 
 
 @kernel
-def _apart(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
+def _move_rad(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
     """Length of a move; none where a path begins or ends, which is where −1 stands."""
     if a < 0 or b < 0:
         return 0.0
@@ -64,57 +64,57 @@ def _apart(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
 @kernel
 def path_rad(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> float:
     """Sum of all moves along a path, from the pixel `origin` or, for −1, from its own first."""
-    total = _apart(x_rad, y_rad, origin, tour[0])
+    total = _move_rad(x_rad, y_rad, origin, tour[0])
     for place in range(1, len(tour)):
-        total += _apart(x_rad, y_rad, tour[place - 1], tour[place])
+        total += _move_rad(x_rad, y_rad, tour[place - 1], tour[place])
     return total
 
 
 @kernel
-def _near(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count: int) -> IntArray:
+def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count: int) -> IntArray:
     """[p, count] the nearest pixels of each pixel of a tour, nearest first; −1 for others."""
-    near = np.full((len(x_rad), count), -1)
-    away = np.full(count, np.inf)
+    neighbours = np.full((len(x_rad), count), -1)
+    distance_rad = np.full(count, np.inf)
     for a in tour:
-        away[:] = np.inf
+        distance_rad[:] = np.inf
         for b in tour:
             if a == b:
                 continue
-            move_rad = _apart(x_rad, y_rad, a, b)
-            if move_rad >= away[count - 1]:
+            move_rad = _move_rad(x_rad, y_rad, a, b)
+            if move_rad >= distance_rad[count - 1]:
                 continue
-            place = count - 1
-            while place > 0 and away[place - 1] > move_rad:
-                away[place], near[a, place] = away[place - 1], near[a, place - 1]
-                place -= 1
-            away[place], near[a, place] = move_rad, b
-    return near
+            rank = count - 1
+            while rank > 0 and distance_rad[rank - 1] > move_rad:
+                distance_rad[rank], neighbours[a, rank] = distance_rad[rank - 1], neighbours[a, rank - 1]
+                rank -= 1
+            distance_rad[rank], neighbours[a, rank] = move_rad, b
+    return neighbours
 
 
 @kernel
-def _improve(tour: IntArray, near: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> None:
+def _improve(tour: IntArray, neighbours: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> None:
     """Shorten a path in place until neither a reversal nor a shift between near pixels does."""
     place = np.full(len(x_rad), -1)
     for k in range(len(tour)):
         place[tour[k]] = k
-    enough = 1e-9 * (1.0 + path_rad(tour, x_rad, y_rad, origin))
-    waiting = np.ones(len(x_rad), dtype=np.int64)
-    moved = True
-    while moved:
-        moved = False
+    min_gain_rad = 1e-9 * (1.0 + path_rad(tour, x_rad, y_rad, origin))
+    pending = np.ones(len(x_rad), dtype=np.int64)
+    improved = True
+    while improved:
+        improved = False
         for k in range(len(tour)):
             pixel = tour[k]
-            if waiting[pixel] == 0:
+            if pending[pixel] == 0:
                 continue
-            waiting[pixel] = 0
-            while _reverse(tour, place, near, x_rad, y_rad, origin, pixel, enough, waiting) or _shift(
-                tour, place, near, x_rad, y_rad, origin, pixel, enough, waiting
-            ):
-                moved = True
+            pending[pixel] = 0
+            while _try_reversal(
+                tour, place, neighbours, x_rad, y_rad, origin, pixel, min_gain_rad, pending
+            ) or _try_shift(tour, place, neighbours, x_rad, y_rad, origin, pixel, min_gain_rad, pending):
+                improved = True
 
 
 @kernel
-def _at(tour: IntArray, k: int, origin: int) -> int:
+def _pixel_at(tour: IntArray, k: int, origin: int) -> int:
     """The pixel at a place of the path; the origin before it, nothing after it."""
     if k < 0:
         return origin
@@ -122,7 +122,7 @@ def _at(tour: IntArray, k: int, origin: int) -> int:
 
 
 @kernel
-def _turn(tour: IntArray, place: IntArray, first: int, last: int) -> None:
+def _reverse_segment(tour: IntArray, place: IntArray, first: int, last: int) -> None:
     while first < last:
         tour[first], tour[last] = tour[last], tour[first]
         place[tour[first]], place[tour[last]] = first, last
@@ -130,107 +130,109 @@ def _turn(tour: IntArray, place: IntArray, first: int, last: int) -> None:
 
 
 @kernel
-def _reverse(
+def _try_reversal(
     tour: IntArray,
     place: IntArray,
-    near: IntArray,
+    neighbours: IntArray,
     x_rad: FloatArray,
     y_rad: FloatArray,
     origin: int,
     pixel: int,
-    enough: float,
-    waiting: IntArray,
+    min_gain_rad: float,
+    pending: IntArray,
 ) -> bool:
     """Reverse the piece that brings a near pixel beside this one, where that shortens the path."""
     for after in (True, False):
         k = place[pixel]
-        ahead = _at(tour, k + 1, origin) if after else _at(tour, k - 1, origin)
-        own_rad = _apart(x_rad, y_rad, pixel, ahead)
-        for other in near[pixel]:
+        ahead = _pixel_at(tour, k + 1, origin) if after else _pixel_at(tour, k - 1, origin)
+        edge_rad = _move_rad(x_rad, y_rad, pixel, ahead)
+        for other in neighbours[pixel]:
             if other < 0:
                 break
-            gained_rad = own_rad - _apart(x_rad, y_rad, pixel, other)
+            gained_rad = edge_rad - _move_rad(x_rad, y_rad, pixel, other)
             if ahead >= 0 and gained_rad <= 0.0:
                 break
             m = place[other]
-            beyond = _at(tour, m + 1, origin) if after else _at(tour, m - 1, origin)
-            gained_rad += _apart(x_rad, y_rad, other, beyond) - _apart(x_rad, y_rad, ahead, beyond)
-            if gained_rad <= enough:
+            beyond = _pixel_at(tour, m + 1, origin) if after else _pixel_at(tour, m - 1, origin)
+            gained_rad += _move_rad(x_rad, y_rad, other, beyond) - _move_rad(x_rad, y_rad, ahead, beyond)
+            if gained_rad <= min_gain_rad:
                 continue
             first, last = (min(k, m) + 1, max(k, m)) if after else (min(k, m), max(k, m) - 1)
-            _turn(tour, place, first, last)
-            for touched in (pixel, other, ahead, beyond):
-                if touched >= 0:
-                    waiting[touched] = 1
+            _reverse_segment(tour, place, first, last)
+            for changed in (pixel, other, ahead, beyond):
+                if changed >= 0:
+                    pending[changed] = 1
             return True
     return False
 
 
 @kernel
-def _shift(
+def _try_shift(
     tour: IntArray,
     place: IntArray,
-    near: IntArray,
+    neighbours: IntArray,
     x_rad: FloatArray,
     y_rad: FloatArray,
     origin: int,
     pixel: int,
-    enough: float,
-    waiting: IntArray,
+    min_gain_rad: float,
+    pending: IntArray,
 ) -> bool:
     """Shift the piece that begins at a pixel beside a near one, either way round, where that shortens the path."""
-    for length in range(1, SEGMENT + 1):
+    for length in range(1, MAX_SEGMENT + 1):
         first = place[pixel]
         last = first + length - 1
         if last >= len(tour):
             break
         head, tail = tour[first], tour[last]
-        before, after = _at(tour, first - 1, origin), _at(tour, last + 1, origin)
-        freed_rad = (
-            _apart(x_rad, y_rad, before, head) + _apart(x_rad, y_rad, tail, after) - _apart(x_rad, y_rad, before, after)
+        before, after = _pixel_at(tour, first - 1, origin), _pixel_at(tour, last + 1, origin)
+        removed_rad = (
+            _move_rad(x_rad, y_rad, before, head)
+            + _move_rad(x_rad, y_rad, tail, after)
+            - _move_rad(x_rad, y_rad, before, after)
         )
-        if freed_rad <= enough:
+        if removed_rad <= min_gain_rad:
             continue
-        for other in near[pixel]:
-            if other < 0 or _apart(x_rad, y_rad, pixel, other) >= freed_rad:
+        for other in neighbours[pixel]:
+            if other < 0 or _move_rad(x_rad, y_rad, pixel, other) >= removed_rad:
                 break
             m = place[other]
             if first <= m <= last:
                 continue
             for ahead in (True, False):
-                beyond = _at(tour, m + 1, origin) if ahead else _at(tour, m - 1, origin)
+                beyond = _pixel_at(tour, m + 1, origin) if ahead else _pixel_at(tour, m - 1, origin)
                 left, right = (other, beyond) if ahead else (beyond, other)
                 if (ahead and m + 1 == first) or (not ahead and m - 1 == last):
                     continue
-                joint_rad = _apart(x_rad, y_rad, left, right)
-                straight_rad = _apart(x_rad, y_rad, left, head) + _apart(x_rad, y_rad, tail, right)
-                turned_rad = _apart(x_rad, y_rad, left, tail) + _apart(x_rad, y_rad, head, right)
-                if freed_rad + joint_rad - min(straight_rad, turned_rad) <= enough:
+                joint_rad = _move_rad(x_rad, y_rad, left, right)
+                straight_rad = _move_rad(x_rad, y_rad, left, head) + _move_rad(x_rad, y_rad, tail, right)
+                reversed_rad = _move_rad(x_rad, y_rad, left, tail) + _move_rad(x_rad, y_rad, head, right)
+                if removed_rad + joint_rad - min(straight_rad, reversed_rad) <= min_gain_rad:
                     continue
-                _put(tour, place, first, last, m if ahead else m - 1, turned_rad < straight_rad)
-                for touched in (head, tail, before, after, left, right):
-                    if touched >= 0:
-                        waiting[touched] = 1
+                _move_segment(tour, place, first, last, m if ahead else m - 1, reversed_rad < straight_rad)
+                for changed in (head, tail, before, after, left, right):
+                    if changed >= 0:
+                        pending[changed] = 1
                 return True
     return False
 
 
 @kernel
-def _put(tour: IntArray, place: IntArray, first: int, last: int, behind: int, turned: bool) -> None:
+def _move_segment(tour: IntArray, place: IntArray, first: int, last: int, after: int, is_reversed: bool) -> None:
     """Move the piece first to last to stand behind the place `behind`, which is outside it."""
-    piece = tour[first : last + 1].copy()
-    if turned:
-        piece = piece[::-1].copy()
-    count = len(piece)
-    if behind < first:
-        for k in range(first - 1, behind, -1):
+    segment = tour[first : last + 1].copy()
+    if is_reversed:
+        segment = segment[::-1].copy()
+    count = len(segment)
+    if after < first:
+        for k in range(first - 1, after, -1):
             tour[k + count] = tour[k]
-        begin = behind + 1
+        begin = after + 1
     else:
-        for k in range(last + 1, behind + 1):
+        for k in range(last + 1, after + 1):
             tour[k - count] = tour[k]
-        begin = behind - count + 1
+        begin = after - count + 1
     for k in range(count):
-        tour[begin + k] = piece[k]
-    for k in range(min(first, begin), max(last, behind) + 1):
+        tour[begin + k] = segment[k]
+    for k in range(min(first, begin), max(last, after) + 1):
         place[tour[k]] = k

@@ -11,98 +11,98 @@ from optodrive.core.errors import InputError
 Cell = frozenset[int]
 
 
-def _cells(dots: str) -> tuple[Cell, ...]:
+def _parse_cells(dots: str) -> tuple[Cell, ...]:
     return tuple(frozenset(int(dot) for dot in cell) for cell in dots.split())
 
 
 SPACE: Cell = frozenset()
-CAPITAL = _cells("6")
-CAPITAL_WORD = _cells("6 6")
-NUMBER = _cells("3456")
-LETTER = _cells("56")
+CAPITAL_LETTER_INDICATOR = _parse_cells("6")
+CAPITAL_WORD_INDICATOR = _parse_cells("6 6")
+NUMERIC_INDICATOR = _parse_cells("3456")
+GRADE_1_INDICATOR = _parse_cells("56")
 """Grade 1 indicator: before a small a…j that follows a number and would be read as a digit."""
 
-_ALPHABET = _cells(
+_ALPHABET = _parse_cells(
     "1 12 14 145 15 124 1245 125 24 245 13 123 134 1345 135 1234 12345 1235 234 2345 136 1236 2456 1346 13456 1356"
 )
 LETTERS = dict(zip(ascii_lowercase, _ALPHABET, strict=True))
 DIGITS = {digit: LETTERS[letter] for digit, letter in zip("1234567890", "abcdefghij", strict=True)}
-OPENING_QUOTE, CLOSING_QUOTE = _cells("236"), _cells("356")
+OPENING_QUOTE, CLOSING_QUOTE = _parse_cells("236"), _parse_cells("356")
 PUNCTUATION = {
-    ",": _cells("2"),
-    ";": _cells("23"),
-    ":": _cells("25"),
-    ".": _cells("256"),
-    "!": _cells("235"),
-    "?": _cells("236"),
-    "'": _cells("3"),
-    "’": _cells("3"),
-    "-": _cells("36"),
-    "–": _cells("6 36"),
-    "—": _cells("6 36"),
-    "/": _cells("456 34"),
-    "(": _cells("5 126"),
-    ")": _cells("5 345"),
+    ",": _parse_cells("2"),
+    ";": _parse_cells("23"),
+    ":": _parse_cells("25"),
+    ".": _parse_cells("256"),
+    "!": _parse_cells("235"),
+    "?": _parse_cells("236"),
+    "'": _parse_cells("3"),
+    "’": _parse_cells("3"),
+    "-": _parse_cells("36"),
+    "–": _parse_cells("6 36"),
+    "—": _parse_cells("6 36"),
+    "/": _parse_cells("456 34"),
+    "(": _parse_cells("5 126"),
+    ")": _parse_cells("5 345"),
     "“": OPENING_QUOTE,
     "”": CLOSING_QUOTE,
-    "+": _cells("5 235"),
-    "=": _cells("5 2356"),
-    "%": _cells("46 356"),
-    "&": _cells("4 12346"),
+    "+": _parse_cells("5 235"),
+    "=": _parse_cells("5 2356"),
+    "%": _parse_cells("46 356"),
+    "&": _parse_cells("4 12346"),
 }
 """An upright double quote, known too, opens at the start of a word and closes elsewhere."""
 
-_KNOWN = frozenset(ascii_letters) | DIGITS.keys() | PUNCTUATION.keys() | frozenset('" \t\r\n')
+_SUPPORTED_CHARACTERS = frozenset(ascii_letters) | DIGITS.keys() | PUNCTUATION.keys() | frozenset('" \t\r\n')
 
 
-def braille_lines(text: str, where: str) -> list[list[list[Cell]]]:
+def encode_lines(text: str, where: str) -> list[list[list[Cell]]]:
     """Lines of words of cells; lines end at line breaks only. Raises InputError for a character without a cell."""
     for position, character in enumerate(text, start=1):
-        if character not in _KNOWN:
+        if character not in _SUPPORTED_CHARACTERS:
             name = unicodedata.name(character, f"U+{ord(character):04X}")
             expected = f"a–z, digits and common punctuation; character {position} is {name}"
             raise InputError(where, character, expected, code="bad_text")
-    return [[word_cells(word) for word in line.split()] for line in text.split("\n")]
+    return [[encode_word(word) for word in line.split()] for line in text.split("\n")]
 
 
-def word_cells(word: str) -> list[Cell]:
+def encode_word(word: str) -> list[Cell]:
     """Cells of one word of known characters, with its number, capital and letter signs."""
     cells: list[Cell] = []
     in_number = False
     for position, character in enumerate(word):
         if character in DIGITS:
-            cells += () if in_number else NUMBER
+            cells += () if in_number else NUMERIC_INDICATOR
             cells.append(DIGITS[character])
             in_number = True
         elif character in ".," and (in_number or (word[:position] == "" and word[1:2].isdigit())):
-            cells += () if in_number else NUMBER
+            cells += () if in_number else NUMERIC_INDICATOR
             cells += PUNCTUATION[character]
             in_number = True
         elif character in ascii_letters:
-            cells += _letter_signs(word, position, in_number)
+            cells += _select_letter_indicators(word, position, in_number)
             cells.append(LETTERS[character.lower()])
             in_number = False
         else:
-            cells += _mark(word, position)
+            cells += _encode_punctuation(word, position)
             in_number = False
     return cells
 
 
-def _letter_signs(word: str, position: int, in_number: bool) -> tuple[Cell, ...]:
+def _select_letter_indicators(word: str, position: int, in_number: bool) -> tuple[Cell, ...]:
     """The signs before a letter; one double sign stands for a whole run of capitals."""
     if word[position].islower():
-        return LETTER if in_number and word[position] in "abcdefghij" else ()
+        return GRADE_1_INDICATOR if in_number and word[position] in "abcdefghij" else ()
     start, end = position, position
     while start > 0 and word[start - 1] in ascii_letters:
         start -= 1
     while end < len(word) and word[end] in ascii_letters:
         end += 1
     if end - start >= 2 and word[start:end].isupper():
-        return CAPITAL_WORD if position == start else ()
-    return CAPITAL
+        return CAPITAL_WORD_INDICATOR if position == start else ()
+    return CAPITAL_LETTER_INDICATOR
 
 
-def _mark(word: str, position: int) -> tuple[Cell, ...]:
+def _encode_punctuation(word: str, position: int) -> tuple[Cell, ...]:
     character = word[position]
     if character == '"':
         return OPENING_QUOTE if position == 0 else CLOSING_QUOTE

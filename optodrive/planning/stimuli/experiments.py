@@ -17,7 +17,7 @@ CLOCKWISE = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0
 SPEEDS_S = {"16": 0.200, "32": 0.100, "64": 0.050}
 """Speed in mm/s to the time of one pixel, s."""
 
-PATTERNS_S = {"slow": 0.035, "fast": 0.010}
+PULSE_AND_GAP_S = {"slow": 0.035, "fast": 0.010}
 """Experiment 5: pulse width, and gap, s."""
 
 FINGERS_UP_M = {2: 0.0, 3: 7.2e-3, 4: 3.6e-3, 5: -10.8e-3}
@@ -26,70 +26,78 @@ FINGERS_UP_M = {2: 0.0, 3: 7.2e-3, 4: 3.6e-3, 5: -10.8e-3}
 FINGER_SPACING_M = 18e-3
 
 
-def slot_train(pixel: int, start_s: float, slot_s: float, width_s: float, gap_s: float, power_w: float) -> PulseTrain:
+def build_slot_train(
+    pixel: int, start_s: float, slot_s: float, width_s: float, gap_s: float, power_w: float
+) -> PulseTrain:
     """Cyclic stimulation of a pixel for a slot of time; a pulse that would not end within the slot is left out."""
     period_s = width_s + gap_s
     whole = max(1, int((slot_s + gap_s) / period_s + 1e-9))
     return PulseTrain(pixel, start_s, min(slot_s, whole * period_s), width_s, gap_s, power_w)
 
 
-def linear_motion(config: Config, where: str, direction: str, centre: int | None) -> FrameSequence:
+def build_linear_motion(config: Config, where: str, direction: str, centre: int | None) -> FrameSequence:
     """Experiment 1: three pixels in a row, 300 ms each at 20/60 ms; after a pause of 500 ms once more."""
     up, right = DIRECTIONS[direction]
-    row = Lattice.of(config).around(
+    row = Lattice.from_config(config).pixels_around(
         centre, [(k * up, k * right) for k in (-1, 0, 1)], where, "a neighbour on either side"
     )
     starts_s = [cycle_s + 0.3 * k for cycle_s in (0.0, 1.4) for k in range(3)]
     power_w = config.laser.max_power_w
-    return _trains(slot_train(p, at_s, 0.3, 0.020, 0.060, power_w) for p, at_s in zip(row * 2, starts_s, strict=True))
+    return _build_sequence(
+        build_slot_train(p, at_s, 0.3, 0.020, 0.060, power_w) for p, at_s in zip(row * 2, starts_s, strict=True)
+    )
 
 
-def rotation(config: Config, where: str, direction: str, speed: str, centre: int | None) -> FrameSequence:
+def build_rotation(config: Config, where: str, direction: str, speed: str, centre: int | None) -> FrameSequence:
     """Experiment 2: eight pixels around a centre from the bottom left, once round, at 25/71 ms."""
     places = CLOCKWISE if direction == "cw" else (CLOCKWISE[0], *reversed(CLOCKWISE[1:]))
-    ring = Lattice.of(config).around(centre, places, where, "the eight pixels around it")
+    ring = Lattice.from_config(config).pixels_around(centre, places, where, "the eight pixels around it")
     slot_s, power_w = SPEEDS_S[speed], config.laser.max_power_w
-    return _trains(slot_train(pixel, k * slot_s, slot_s, 0.025, 0.071, power_w) for k, pixel in enumerate(ring))
+    return _build_sequence(
+        build_slot_train(pixel, k * slot_s, slot_s, 0.025, 0.071, power_w) for k, pixel in enumerate(ring)
+    )
 
 
-def localisation(config: Config, where: str, target: int, centre: int | None) -> FrameSequence:
+def build_localisation(config: Config, where: str, target: int, centre: int | None) -> FrameSequence:
     """Experiment 3: the centre for 500 ms at 25/25 ms, a pause of 750 ms, then one of 3 × 3, 1 at the top left."""
     places = [(1 - k // 3, k % 3 - 1) for k in range(9)]
-    grid = Lattice.of(config).around(centre, places, where, "the eight pixels around it")
+    grid = Lattice.from_config(config).pixels_around(centre, places, where, "the eight pixels around it")
     power_w = config.laser.max_power_w
-    return _trains(
-        slot_train(pixel, at_s, 0.5, 0.025, 0.025, power_w)
+    return _build_sequence(
+        build_slot_train(pixel, at_s, 0.5, 0.025, 0.025, power_w)
         for pixel, at_s in ((grid[4], 0.0), (grid[target - 1], 1.25))
     )
 
 
-def intensity(config: Config, where: str, level: int, centre: int | None) -> FrameSequence:
+def build_intensity(config: Config, where: str, level: int, centre: int | None) -> FrameSequence:
     """Experiment 4: one pixel for 1 s at 25/25 ms, level 1…9 from 0.5 to 2.5 W, no more than the laser has."""
-    (pixel,) = Lattice.of(config).around(centre, [(0, 0)], where, "room for itself")
+    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
     power_w = min(0.5 + 0.25 * (level - 1), config.laser.max_power_w)
-    return _trains([slot_train(pixel, 0.0, 1.0, 0.025, 0.025, power_w)])
+    return _build_sequence([build_slot_train(pixel, 0.0, 1.0, 0.025, 0.025, power_w)])
 
 
-def temporal(config: Config, where: str, oddball: int, kind: str, pause_s: float, centre: int | None) -> FrameSequence:
+def build_temporal_pattern(
+    config: Config, where: str, oddball: int, kind: str, pause_s: float, centre: int | None
+) -> FrameSequence:
     """Experiment 5: three stimuli of 400 ms on one pixel, one of them (oddball, 1…3) of `kind`, slow or fast."""
-    (pixel,) = Lattice.of(config).around(centre, [(0, 0)], where, "room for itself")
+    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
     other = "fast" if kind == "slow" else "slow"
-    widths_s = [PATTERNS_S[kind if k == oddball else other] for k in (1, 2, 3)]
-    return _trains(
-        slot_train(pixel, k * (0.4 + pause_s), 0.4, width_s, width_s, config.laser.max_power_w)
+    widths_s = [PULSE_AND_GAP_S[kind if k == oddball else other] for k in (1, 2, 3)]
+    return _build_sequence(
+        build_slot_train(pixel, k * (0.4 + pause_s), 0.4, width_s, width_s, config.laser.max_power_w)
         for k, width_s in enumerate(widths_s)
     )
 
 
-def fingers(config: Config, where: str, digits: str, centre: int | None) -> FrameSequence:
+def build_two_fingers(config: Config, where: str, digits: str, centre: int | None) -> FrameSequence:
     """Experiment 6: squares of four pixels under two fingers, 40 pulses of 15 ms, the fingers in turn, five rounds."""
     pitch_m = config.display.pitch_m
-    pair = [finger_square(int(digit), pitch_m) for digit in digits.split("-")]
+    pair = [compute_finger_places(int(digit), pitch_m) for digit in digits.split("-")]
     turns = [place for both in zip(*pair, strict=True) for place in both]
     needs = "room for fingertips that spread over 58 × 22 mm around it"
-    pixels = Lattice.of(config).around(centre, turns, where, needs)
+    pixels = Lattice.from_config(config).pixels_around(centre, turns, where, needs)
     width_s, period_s, rounds = 0.015, 0.015 * len(pixels), 5
-    return _trains(
+    return _build_sequence(
         PulseTrain(
             pixel=pixel,
             start_s=k * width_s,
@@ -102,12 +110,12 @@ def fingers(config: Config, where: str, digits: str, centre: int | None) -> Fram
     )
 
 
-def finger_square(digit: int, pitch_m: float) -> list[tuple[int, int]]:
+def compute_finger_places(digit: int, pitch_m: float) -> list[tuple[int, int]]:
     """Four places under a finger, clockwise from the top left, as (rows up, columns right) from the hand's centre."""
     right = round(FINGER_SPACING_M / pitch_m * (digit - 3.5) - 0.5)
     up = round(FINGERS_UP_M[digit] / pitch_m)
     return [(up + 1, right), (up + 1, right + 1), (up, right + 1), (up, right)]
 
 
-def _trains(trains: Iterable[PulseTrain]) -> FrameSequence:
+def _build_sequence(trains: Iterable[PulseTrain]) -> FrameSequence:
     return FrameSequence(trains=tuple(trains))

@@ -8,80 +8,80 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import TactileFrame
 from optodrive.core.units import um_to_m
-from optodrive.planning.stimuli.json_values import number_at, priority_at, table_at, time_at
+from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
 ID_MAX = 100
-OVERLAP_S = 1e-9
+OVERLAP_TOLERANCE_S = 1e-9
 """Frames may share this much, the rounding of their times."""
 
 
 def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[TactileFrame, ...]:
     """The entries of `frames`; raises InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
-    names = {str(pixel): pixel for pixel in range(pixel_count)}
+    pixel_by_name = {str(pixel): pixel for pixel in range(pixel_count)}
     frames: list[TactileFrame] = []
     for k, entry in enumerate(entries):
-        frame = _frame(entry, f"{where}[{k}]", k, names)
+        frame = _parse_frame(entry, f"{where}[{k}]", k, pixel_by_name)
         if frames:
-            _check_follows(frames[-1], frame, f"{where}[{k}]", f"frames[{k - 1}]")
+            _check_order(frames[-1], frame, f"{where}[{k}]", f"frames[{k - 1}]")
         frames.append(frame)
     return tuple(frames)
 
 
-def _frame(entry: object, where: str, position: int, names: dict[str, int]) -> TactileFrame:
+def _parse_frame(entry: object, where: str, position: int, pixel_by_name: dict[str, int]) -> TactileFrame:
     required = ("show_at_s", "duration_s", "target_um")
-    table = table_at(entry, where, ("id", *required, "together", "priority"), required)
+    table = require_object(entry, where, ("id", *required, "together", "priority"), required)
     expected = "a time ≥ 0 in s (a frame in the past cannot be shown)"
-    show_at_s = time_at(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
-    duration_s = time_at(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
-    frame_id = _frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
-    target_m = targets_m(table["target_um"], f"{where}.target_um", names)
-    together = _together(table, f"{where}.together")
-    priority = priority_at(table.get("priority", 0), f"{where}.priority")
-    return TactileFrame(frame_id, show_at_s, duration_s, target_m, together, priority)
+    show_at_s = require_time(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
+    duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
+    frame_id = _parse_frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
+    target_m = parse_targets_m(table["target_um"], f"{where}.target_um", pixel_by_name)
+    simultaneous = _parse_simultaneous(table, f"{where}.together")
+    priority = require_priority(table.get("priority", 0), f"{where}.priority")
+    return TactileFrame(frame_id, show_at_s, duration_s, target_m, simultaneous, priority)
 
 
-def _together(table: Mapping[str, object], where: str) -> bool:
+def _parse_simultaneous(table: Mapping[str, object], where: str) -> bool:
     value = table.get("together", False)
     if not isinstance(value, bool):
         raise InputError(where, value, "true or false", code="bad_json")
     return value
 
 
-def _frame_id(value: object, where: str) -> str:
+def _parse_frame_id(value: object, where: str) -> str:
     if not isinstance(value, str) or not 0 < len(value) <= ID_MAX or not value.isprintable():
         raise InputError(where, value, f"1 to {ID_MAX} printable characters", code="bad_json")
     return value
 
 
-def _check_follows(before: TactileFrame, frame: TactileFrame, where: str, before_name: str) -> None:
-    if frame.show_at_s < before.show_at_s:
-        expected = f"frames in order of time, and {before_name} is shown at {before.show_at_s:g} s"
+def _check_order(previous: TactileFrame, frame: TactileFrame, where: str, previous_name: str) -> None:
+    if frame.show_at_s < previous.show_at_s:
+        expected = f"frames in order of time, and {previous_name} is shown at {previous.show_at_s:g} s"
         raise InputError(f"{where}.show_at_s", frame.show_at_s, expected, code="bad_time")
-    end_s = before.show_at_s + before.duration_s
-    if frame.show_at_s < end_s - OVERLAP_S:
-        expected = f"a time ≥ {end_s:.9g} s, when {before_name} ends"
+    end_s = previous.show_at_s + previous.duration_s
+    if frame.show_at_s < end_s - OVERLAP_TOLERANCE_S:
+        expected = f"a time ≥ {end_s:.9g} s, when {previous_name} ends"
         raise InputError(f"{where}.show_at_s", frame.show_at_s, expected, code="bad_time")
 
 
-def targets_m(value: object, where: str, names: dict[str, int]) -> FloatArray:
+def parse_targets_m(value: object, where: str, pixel_by_name: dict[str, int]) -> FloatArray:
     """Heights in µm, by pixel or a list of all, as metres [p]."""
     if isinstance(value, dict):
         for key in value:
-            if key not in names:
-                raise InputError(where, key, f"a pixel, 0…{len(names) - 1}", code="unknown_pixel")
-        pixels = [names[key] for key in value]
-        target_m = np.zeros(len(names))
-        target_m[pixels] = _heights_m(list(value.values()), pixels, where)
+            if key not in pixel_by_name:
+                raise InputError(where, key, f"a pixel, 0…{len(pixel_by_name) - 1}", code="unknown_pixel")
+        pixels = [pixel_by_name[key] for key in value]
+        target_m = np.zeros(len(pixel_by_name))
+        target_m[pixels] = _parse_heights_m(list(value.values()), pixels, where)
         return target_m
     if not isinstance(value, list):
         raise InputError(where, value, 'heights by pixel, {"17": 50}, or a list of all', code="bad_target")
-    if len(value) != len(names):
-        expected = f"{len(names)} heights, one a pixel"
+    if len(value) != len(pixel_by_name):
+        expected = f"{len(pixel_by_name)} heights, one a pixel"
         raise InputError(where, f"a list of {len(value)}", expected, code="bad_target")
-    return _heights_m(value, range(len(names)), where)
+    return _parse_heights_m(value, range(len(pixel_by_name)), where)
 
 
-def _heights_m(values: list[object], pixels: list[int] | range, where: str) -> FloatArray:
+def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str) -> FloatArray:
     if set(map(type, values)) <= {int, float}:
         try:
             heights_um = np.array(values, dtype=np.float64)
@@ -91,6 +91,6 @@ def _heights_m(values: list[object], pixels: list[int] | range, where: str) -> F
             pass
     for pixel, value in zip(pixels, values, strict=True):
         place, expected = f"{where}.{pixel}", "a height ≥ 0 in µm"
-        if number_at(value, place, expected, "bad_target") < 0:
+        if require_number(value, place, expected, "bad_target") < 0:
             raise InputError(place, value, expected, code="bad_target")
     raise AssertionError("a wrong height was seen and not found")

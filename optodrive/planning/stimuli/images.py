@@ -16,7 +16,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import Beam, hold
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -27,64 +27,64 @@ ANIMATION_PIXELS_MAX = 200_000_000
 """Pixels of a picture, and of all pictures of an animation, before they are fitted."""
 
 ANIMATION_FRAMES_MAX = 2_000
-FRAME_MIN_S, FRAME_MAX_S = 0.02, 60.0
-FRAME_DEFAULT_S = 0.1
+FRAME_DURATION_MIN_S, FRAME_DURATION_MAX_S = 0.02, 60.0
+FRAME_DURATION_DEFAULT_S = 0.1
 """Shown this long when the file says nothing."""
 
-DARK_BELOW = 0.04
+BRIGHTNESS_MIN = 0.04
 """Darker than this is not driven: it could not be felt, and each pulse costs beam time."""
 
 
-def image_frames(
+def build_image(
     config: Config, where: str, file: bytes, height_m: float, seconds: float, invert: bool
 ) -> FrameSequence:
     """A picture (the first of several), white at height_m, kept up for `seconds`; raises InputError for no picture."""
-    lattice = Lattice.of(config)
-    with _opened(file, f"{where}: file") as image:
-        target_m = height_m * lattice_brightness(image, lattice, invert)
-    return FrameSequence(frames=tuple(hold(Beam(config), target_m, seconds, "image")))
+    lattice = Lattice.from_config(config)
+    with _open_image(file, f"{where}: file") as image:
+        target_m = height_m * compute_lattice_brightness(image, lattice, invert)
+    return FrameSequence(frames=tuple(hold_picture(BeamTimeEstimator(config), target_m, seconds, "image")))
 
 
-def animation_frames(
+def build_animation(
     config: Config, where: str, file: bytes, height_m: float, rate_hz: float | None, invert: bool
 ) -> FrameSequence:
     """The pictures of an animated GIF or PNG in turn, each shown once; raises InputError for no picture.
 
     Each lasts 1 / rate_hz; with None as long as the file says, at least 20 ms and the beam time that it needs.
     """
-    beam, start_s = Beam(config), 0.0
+    beam, start_s = BeamTimeEstimator(config), 0.0
     frames: list[TactileFrame] = []
-    with _opened(file, f"{where}: file") as image:
-        for position in _positions(image, f"{where}: file"):
+    with _open_image(file, f"{where}: file") as image:
+        for position in _select_positions(image, f"{where}: file"):
             image.seek(position)
-            target_m = height_m * lattice_brightness(image, beam.lattice, invert)
-            duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.picture_s(target_m))
+            target_m = height_m * compute_lattice_brightness(image, beam.lattice, invert)
+            duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.beam_time_s(target_m))
             frames.append(TactileFrame(f"animation-{len(frames)}", start_s, duration_s, target_m))
             start_s += duration_s
     return FrameSequence(frames=tuple(frames))
 
 
-def lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:
+def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:
     """Brightness 0…1 of each pixel [p]: the picture fitted whole into the lattice, centred, nothing around it."""
-    brightness = _brightness(image, invert)
+    brightness = _compute_brightness(image, invert)
     rows, columns = lattice.index.shape
     height, width = brightness.shape
     scale = max(height / rows, width / columns)
-    down, across = _overlap(rows, height, scale), _overlap(columns, width, scale)
+    down, across = _compute_overlap(rows, height, scale), _compute_overlap(columns, width, scale)
     fitted = (down @ brightness @ across.T)[::-1]
     values = np.asarray(fitted[lattice.layout.row, lattice.layout.column], dtype=np.float64)
-    return np.where(values < DARK_BELOW, 0.0, np.minimum(values, 1.0))
+    return np.where(values < BRIGHTNESS_MIN, 0.0, np.minimum(values, 1.0))
 
 
-def _overlap(places: int, source: int, scale: float) -> NDArray[np.float32]:
+def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArray[np.float32]:
     """Share of each lattice place that each source pixel covers, [places, source]; scale: source pixels a place."""
-    low = source / 2 + (np.arange(places)[:, None] - places / 2) * scale
-    pixel = np.arange(source)[None, :]
+    low = pixel_count / 2 + (np.arange(place_count)[:, None] - place_count / 2) * scale
+    pixel = np.arange(pixel_count)[None, :]
     covered = np.clip(np.minimum(low + scale, pixel + 1) - np.maximum(low, pixel), 0.0, None)
     return np.asarray(covered / scale, dtype=np.float32)
 
 
-def _brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
+def _compute_brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
     """Brightness 0…1, [rows from the top, columns]; what is transparent is dark, inverted or not."""
     from PIL import ImageOps
 
@@ -102,11 +102,11 @@ def _duration_s(image: "Image") -> float:
     """How long the file wants this picture shown, s; a PNG can carry text under the same name, which is not it."""
     duration_ms = image.info.get("duration")
     if not isinstance(duration_ms, int | float) or not 0 < duration_ms < float("inf"):
-        return FRAME_DEFAULT_S
-    return min(max(duration_ms / 1e3, FRAME_MIN_S), FRAME_MAX_S)
+        return FRAME_DURATION_DEFAULT_S
+    return min(max(duration_ms / 1e3, FRAME_DURATION_MIN_S), FRAME_DURATION_MAX_S)
 
 
-def _positions(image: "Image", where: str) -> range:
+def _select_positions(image: "Image", where: str) -> range:
     """Which pictures of the file belong to the animation; raises InputError for too many."""
     count = int(getattr(image, "n_frames", 1))
     if count > ANIMATION_FRAMES_MAX:
@@ -119,7 +119,7 @@ def _positions(image: "Image", where: str) -> range:
 
 
 @contextmanager
-def _opened(file: bytes, where: str) -> Iterator["Image"]:
+def _open_image(file: bytes, where: str) -> Iterator["Image"]:
     """A picture of a known format and a sane size; whatever fails while it is read becomes an InputError."""
     from PIL import Image, UnidentifiedImageError
 
@@ -129,15 +129,15 @@ def _opened(file: bytes, where: str) -> Iterator["Image"]:
         try:
             with Image.open(BytesIO(file), formats=FORMATS) as image:
                 if image.width * image.height > SOURCE_PIXELS_MAX:
-                    raise _too_large(where, f"{image.width} × {image.height}")
+                    raise _too_large_error(where, f"{image.width} × {image.height}")
                 yield image
         except (Image.DecompressionBombError, Image.DecompressionBombWarning):
-            raise _too_large(where, "a far larger picture") from None
+            raise _too_large_error(where, "a far larger picture") from None
         except UnidentifiedImageError:
             raise InputError(where, file[:16], "a picture: " + ", ".join(FORMATS), code="bad_picture") from None
         except (OSError, SyntaxError, ValueError, EOFError, IndexError, KeyError, struct.error, zlib.error) as error:
             raise InputError(where, str(error), "a picture without damage", code="bad_picture") from None
 
 
-def _too_large(where: str, size: str) -> InputError:
+def _too_large_error(where: str, size: str) -> InputError:
     return InputError(where, size, f"a picture of at most {SOURCE_PIXELS_MAX} pixels", code="too_many")

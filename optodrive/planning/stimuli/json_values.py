@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from math import isfinite
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 
 PRIORITY_MAX = 1_000_000
 
@@ -15,17 +15,17 @@ TIME_MAX_S = 86_400.0
 def decode_json(body: bytes | str, where: str) -> object:
     """JSON text (UTF-8) as Python values; raises InputError (bad_json) for anything else and for repeated keys."""
 
-    def unique(pairs: list[tuple[str, object]]) -> dict[str, object]:
+    def require_unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
         table = dict(pairs)
         if len(table) < len(pairs):
             keys = [key for key, _ in pairs]
-            twice = next(key for position, key in enumerate(keys) if key in keys[:position])
-            raise InputError(where, twice, "each key of an object once", code="bad_json")
+            repeated = next(key for position, key in enumerate(keys) if key in keys[:position])
+            raise InputError(where, repeated, "each key of an object once", code="bad_json")
         return table
 
     try:
         text = body.decode("utf-8-sig") if isinstance(body, bytes) else body
-        return json.loads(text, object_pairs_hook=unique)
+        return json.loads(text, object_pairs_hook=require_unique_keys)
     except UnicodeDecodeError as error:
         raise InputError(where, body[error.start : error.start + 4], "JSON in UTF-8", code="bad_json") from None
     except json.JSONDecodeError as error:
@@ -38,13 +38,13 @@ def decode_json(body: bytes | str, where: str) -> object:
         ) from None
 
 
-def table_at(value: object, where: str, known: Sequence[str], required: Sequence[str]) -> Mapping[str, object]:
+def require_object(value: object, where: str, known: Sequence[str], required: Sequence[str]) -> Mapping[str, object]:
     """A JSON object with known keys only and all required ones; raises InputError (bad_json, unknown_key)."""
     if not isinstance(value, dict):
         raise InputError(where, value, "an object with " + ", ".join(known), code="bad_json")
     for key in value:
         if key not in known:
-            expected = f"a known key, {nearest(str(key)[:60], list(known))}"
+            expected = f"a known key, {suggest_nearest(str(key)[:60], list(known))}"
             raise InputError(where, key, expected, code="unknown_key")
     for key in required:
         if key not in value:
@@ -52,16 +52,16 @@ def table_at(value: object, where: str, known: Sequence[str], required: Sequence
     return value
 
 
-def list_at(value: object, where: str, at_most: int) -> list[object]:
+def require_list(value: object, where: str, length_max: int) -> list[object]:
     """A JSON list of bounded length; raises InputError (bad_json, too_many)."""
     if not isinstance(value, list):
         raise InputError(where, value, "a list", code="bad_json")
-    if len(value) > at_most:
-        raise InputError(where, len(value), f"at most {at_most} entries", code="too_many")
+    if len(value) > length_max:
+        raise InputError(where, len(value), f"at most {length_max} entries", code="too_many")
     return value
 
 
-def number_at(value: object, where: str, expected: str, code: str) -> float:
+def require_number(value: object, where: str, expected: str, code: str) -> float:
     """A finite JSON number; true and "1" are none. Raises InputError."""
     if type(value) is float and isfinite(value):
         return value
@@ -70,16 +70,16 @@ def number_at(value: object, where: str, expected: str, code: str) -> float:
     raise InputError(where, value, expected, code=code)
 
 
-def priority_at(value: object, where: str) -> int:
+def require_priority(value: object, where: str) -> int:
     """How important a frame or train is, a whole number; raises InputError (bad_priority)."""
     if type(value) is int and abs(value) <= PRIORITY_MAX:
         return value
     raise InputError(where, value, f"a whole number, -{PRIORITY_MAX}…{PRIORITY_MAX}", code="bad_priority")
 
 
-def time_at(value: object, where: str, expected: str, code: str, *, positive: bool) -> float:
+def require_time(value: object, where: str, expected: str, code: str, *, positive: bool) -> float:
     """A time or duration, s, from 0 (or above it, if positive) to a day; raises InputError."""
-    time_s = number_at(value, where, expected, code)
+    time_s = require_number(value, where, expected, code)
     if time_s < 0 or (positive and time_s == 0) or time_s > TIME_MAX_S:
         bound = f" (at most {TIME_MAX_S:.0f} s)" if time_s > TIME_MAX_S else ""
         raise InputError(where, value, expected + bound, code=code)

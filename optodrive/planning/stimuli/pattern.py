@@ -6,14 +6,14 @@ from dataclasses import dataclass
 from math import isfinite
 from typing import Literal
 
-from optodrive.core.errors import InputError, nearest
+from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.device.config import Config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 
-Kind = Literal["number", "integer", "choice", "pixel", "flag", "text", "file"]
-Value = str | int | float | bytes | bool | None
+ParameterKind = Literal["number", "integer", "choice", "pixel", "flag", "text", "file"]
+ParameterValue = str | int | float | bytes | bool | None
 
-SI_NAMES = {"_um": ("_m", 1e-6), "_mm": ("_m", 1e-3)}
+SI_SUFFIXES = {"_um": ("_m", 1e-6), "_mm": ("_m", 1e-3)}
 """Ending of a parameter's name to the ending and factor under which its builder takes it."""
 
 TEXT_MAX = 2_000
@@ -24,13 +24,13 @@ class PatternParameter:
     """One parameter; least and most bound a number, required ones have no default."""
 
     name: str
-    kind: Kind
-    default: Value
-    meaning: str
+    kind: ParameterKind
+    default: ParameterValue
+    description: str
     unit: str = ""
     choices: tuple[str, ...] = ()
-    least: float | None = None
-    most: float | None = None
+    min: float | None = None
+    max: float | None = None
     required: bool = False
 
 
@@ -44,7 +44,7 @@ class Pattern:
     build: Callable[..., FrameSequence]
     notes: str = ""
 
-    def arguments(self, given: object, config: Config) -> dict[str, Value]:
+    def resolve_arguments(self, given: object, config: Config) -> dict[str, ParameterValue]:
         """What the builder takes, from what the caller gave and the defaults; raises InputError."""
         where = f"pattern {self.name}"
         if not isinstance(given, Mapping):
@@ -52,66 +52,68 @@ class Pattern:
         known = {parameter.name: parameter for parameter in self.parameters}
         for key in given:
             if key not in known:
-                expected = f"a known parameter, {nearest(str(key)[:60], list(known))}" if known else "no parameter"
+                expected = (
+                    f"a known parameter, {suggest_nearest(str(key)[:60], list(known))}" if known else "no parameter"
+                )
                 raise InputError(where, key, expected, code="unknown_parameter")
-        values: dict[str, Value] = {}
+        values: dict[str, ParameterValue] = {}
         for name, parameter in known.items():
             place = f"{where}: {name}"
             if name not in given and parameter.required:
-                raise InputError(place, None, f"this parameter ({parameter.meaning})", code="missing_parameter")
-            value = converted(given[name], parameter, place, config) if name in given else parameter.default
-            argument, factor = _si_name(name)
+                raise InputError(place, None, f"this parameter ({parameter.description})", code="missing_parameter")
+            value = convert_value(given[name], parameter, place, config) if name in given else parameter.default
+            argument, factor = _convert_name(name)
             values[argument] = value * factor if factor != 1.0 and isinstance(value, int | float) else value
         return values
 
 
-def converted(value: object, parameter: PatternParameter, where: str, config: Config) -> Value:
+def convert_value(value: object, parameter: PatternParameter, where: str, config: Config) -> ParameterValue:
     """A given value, or the text of one, as the parameter's kind; raises InputError (bad_parameter, unknown_pixel)."""
     match parameter.kind:
         case "number":
-            return _number(value, parameter, where)
+            return _convert_number(value, parameter, where)
         case "integer":
-            return _whole(value, where, int(parameter.least or 0), int(parameter.most or 0), "bad_parameter")
+            return _convert_integer(value, where, int(parameter.min or 0), int(parameter.max or 0), "bad_parameter")
         case "pixel":
-            return _whole(value, where, 0, len(pixel_layout(config.display)) - 1, "unknown_pixel")
+            return _convert_integer(value, where, 0, len(build_pixel_layout(config.display)) - 1, "unknown_pixel")
         case "choice":
-            return _choice(value, parameter, where)
+            return _convert_choice(value, parameter, where)
         case "flag":
-            return _flag(value, where)
+            return _convert_flag(value, where)
         case "text":
-            return _text(value, where)
+            return _convert_text(value, where)
         case "file":
-            return _file(value, where)
+            return _convert_file(value, where)
 
 
-def _number(value: object, parameter: PatternParameter, where: str) -> float:
+def _convert_number(value: object, parameter: PatternParameter, where: str) -> float:
     unit = f" {parameter.unit}" if parameter.unit else ""
-    expected = f"a number from {parameter.least:g} to {parameter.most:g}{unit}"
+    expected = f"a number from {parameter.min:g} to {parameter.max:g}{unit}"
     try:
         number = float(value) if isinstance(value, str | int | float) and not isinstance(value, bool) else float("nan")
     except (ValueError, OverflowError):
         number = float("nan")
-    inside = isfinite(number) and (parameter.least or 0.0) <= number <= (parameter.most or 0.0)
+    inside = isfinite(number) and (parameter.min or 0.0) <= number <= (parameter.max or 0.0)
     if not inside:
         raise InputError(where, value, expected, code="bad_parameter")
     return number
 
 
-def _whole(value: object, where: str, least: int, most: int, code: str) -> int:
+def _convert_integer(value: object, where: str, minimum: int, maximum: int, code: str) -> int:
     text = str(value) if type(value) is int or isinstance(value, str) else ""
     digits = text.removeprefix("-")
-    if digits.isascii() and digits.isdigit() and len(digits) < 10 and least <= int(text) <= most:
+    if digits.isascii() and digits.isdigit() and len(digits) < 10 and minimum <= int(text) <= maximum:
         return int(text)
-    raise InputError(where, value, f"a whole number, {least}…{most}", code=code)
+    raise InputError(where, value, f"a whole number, {minimum}…{maximum}", code=code)
 
 
-def _choice(value: object, parameter: PatternParameter, where: str) -> str:
+def _convert_choice(value: object, parameter: PatternParameter, where: str) -> str:
     if str(value) not in parameter.choices:
         raise InputError(where, value, "one of " + ", ".join(parameter.choices), code="bad_parameter")
     return str(value)
 
 
-def _flag(value: object, where: str) -> bool:
+def _convert_flag(value: object, where: str) -> bool:
     if isinstance(value, bool):
         return value
     if value not in ("true", "false"):
@@ -119,14 +121,14 @@ def _flag(value: object, where: str) -> bool:
     return value == "true"
 
 
-def _text(value: object, where: str) -> str:
+def _convert_text(value: object, where: str) -> str:
     text = str(value) if isinstance(value, str | int | float) else ""
     if not 0 < len(text) <= TEXT_MAX:
         raise InputError(where, value, f"1 to {TEXT_MAX} characters", code="bad_parameter")
     return text
 
 
-def _file(value: object, where: str) -> bytes:
+def _convert_file(value: object, where: str) -> bytes:
     try:
         content = b64decode(value, validate=True) if isinstance(value, str) else value
     except ValueError:
@@ -136,8 +138,8 @@ def _file(value: object, where: str) -> bytes:
     return content
 
 
-def _si_name(name: str) -> tuple[str, float]:
-    for ending, (si_ending, factor) in SI_NAMES.items():
+def _convert_name(name: str) -> tuple[str, float]:
+    for ending, (si_ending, factor) in SI_SUFFIXES.items():
         if name.endswith(ending):
             return name.removesuffix(ending) + si_ending, factor
     return name, 1.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import IntArray, freeze_arrays
-from optodrive.device.config import Config, PixelLayout, pixel_layout
+from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,14 +22,14 @@ class Lattice:
         freeze_arrays(self)
 
     @classmethod
-    def of(cls, config: Config) -> "Lattice":
+    def from_config(cls, config: Config) -> "Lattice":
         """The lattice of a configured display."""
-        layout = pixel_layout(config.display)
+        layout = build_pixel_layout(config.display)
         index = np.full((config.display.rows, config.display.columns), -1, dtype=np.int64)
         index[layout.row, layout.column] = np.arange(len(layout))
         return cls(config.name, index, layout)
 
-    def at(self, row: int, column: int) -> int | None:
+    def pixel_at(self, row: int, column: int) -> int | None:
         """The pixel of a place; None where there is none."""
         rows, columns = self.index.shape
         if not (0 <= row < rows and 0 <= column < columns):
@@ -37,27 +37,29 @@ class Lattice:
         pixel = int(self.index[row, column])
         return pixel if pixel >= 0 else None
 
-    def middle(self) -> int:
+    def middle_pixel(self) -> int:
         """The pixel nearest to the display's middle; the lowest index among equals."""
         distance_m = np.round(np.hypot(self.layout.x_m, self.layout.y_m), 9)
         return int(np.argmin(distance_m))
 
-    def around(self, centre: int | None, steps: Iterable[tuple[int, int]], where: str, needs: str) -> list[int]:
+    def pixels_around(
+        self, centre: int | None, offsets: Iterable[tuple[int, int]], where: str, requirement: str
+    ) -> list[int]:
         """Pixels at (rows up, columns right) from a centre, None for the middle; raises InputError (does_not_fit).
 
         needs: what must lie around the centre, for the message.
         """
-        centre = self.middle() if centre is None else centre
+        centre = self.middle_pixel() if centre is None else centre
         row, column = int(self.layout.row[centre]), int(self.layout.column[centre])
         pixels = []
-        for up, right in steps:
-            pixel = self.at(row + up, column + right)
+        for up, right in offsets:
+            pixel = self.pixel_at(row + up, column + right)
             if pixel is None:
                 rows, columns = self.index.shape
                 raise InputError(
                     f"{where}: centre",
                     centre,
-                    f"a pixel with {needs} ({self.name} is {rows} × {columns})",
+                    f"a pixel with {requirement} ({self.name} is {rows} × {columns})",
                     code="does_not_fit",
                 )
             pixels.append(pixel)

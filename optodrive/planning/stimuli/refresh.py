@@ -7,94 +7,100 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, TactileFrame
 from optodrive.device.config import Config
-from optodrive.device.gate_timing import servo_of, settled_s
-from optodrive.device.pixel_map import map_of, without_map
+from optodrive.device.gate_timing import build_servo, settling_s
+from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
-from optodrive.physics.thermal_state import heat_at_rest
+from optodrive.physics.thermal_state import build_cold_state
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 REFRESH_HZ = 10.0
 """A picture that stays is drawn again at most this often."""
 
-STEP = 0.01
+HEIGHT_STEP_RELATIVE = 0.01
 """Where each pixel is asked for a height of its own, heights are told apart by so much, relative."""
 
-RESERVE = 1.05
+BEAM_TIME_MARGIN = 1.05
 """Beam time asked for over the estimate."""
 
 
-class Beam:
+class BeamTimeEstimator:
     """Estimates how long one beam needs to draw a picture from rest: pulses in whole PWM periods, and moves by rows."""
 
     def __init__(self, config: Config) -> None:
-        self.lattice = Lattice.of(config)
-        self._scanner, self._servo = config.scanner, servo_of(config.scanner)
+        self.lattice = Lattice.from_config(config)
+        self._scanner, self._servo = config.scanner, build_servo(config.scanner)
         self._tolerance_rad, self._pitch_m = min(config.tolerance_rad), config.display.pitch_m
         self._period_s = 1.0 / config.laser.pwm_hz
         laser = config.laser
-        self._drive = DriveRange.of(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
-        known = map_of(config)
-        self._lift = None if known is None else known.lift
-        self._at_rest = heat_at_rest(without_map(config), load_parameters(config.pixel_model.parameters))
+        self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
+        known = load_pixel_map(config)
+        self._lift = None if known is None else known.displacement_factor
+        self._cold_heat = build_cold_state(remove_pixel_map(config), load_parameters(config.pixel_model.parameters))
 
-    def pulse_s(self, target_m: float) -> float:
+    def min_pulse_s(self, target_m: float) -> float:
         """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
-        pulse = self._at_rest.pulse_for_peak(0, 0.0, target_m, self._drive)
+        pulse = self._cold_heat.solve_pulse(0, 0.0, target_m, self._drive)
         return self._drive.period_s * (1 if pulse is None else pulse[0])
 
-    def _move_s(self, step_m: float) -> float:
+    def _settling_s(self, distance_m: float) -> float:
         """From a move's command until the focus lies on the next absorber, s."""
-        return settled_s(self._servo, step_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
+        return settling_s(self._servo, distance_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
 
-    def picture_s(self, target_m: FloatArray) -> float:
+    def beam_time_s(self, target_m: FloatArray) -> float:
         """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
         driven = np.flatnonzero((target_m > 0) if self._lift is None else (target_m > 0) & (self._lift > 0))
         if not len(driven):
             return 0.0
-        heights_m, counts = np.unique(self._nominal_m(target_m, driven), return_counts=True)
-        pulses_s = sum(self.pulse_s(float(h)) * int(n) for h, n in zip(heights_m, counts, strict=True))
+        heights_m, counts = np.unique(self._nominal_targets_m(target_m, driven), return_counts=True)
+        pulses_s = sum(self.min_pulse_s(float(h)) * int(n) for h, n in zip(heights_m, counts, strict=True))
         layout = self.lattice.layout
-        backwards = layout.row[driven] % 2 == 1
-        order = driven[np.lexsort((np.where(backwards, -1, 1) * layout.column[driven], layout.row[driven]))]
-        steps_m = np.maximum(
+        is_reversed = layout.row[driven] % 2 == 1
+        order = driven[np.lexsort((np.where(is_reversed, -1, 1) * layout.column[driven], layout.row[driven]))]
+        distances_m = np.maximum(
             *(np.abs(np.diff(at_m[order], append=at_m[order[0]])) for at_m in (layout.x_m, layout.y_m))
         )
         # A single pixel is still come to from somewhere: a pitch at least.
-        lengths_m, counts = np.unique(np.maximum(steps_m, self._pitch_m).round(9), return_counts=True)
-        moves_s = sum(self._move_s(float(step_m)) * int(n) for step_m, n in zip(lengths_m, counts, strict=True))
-        return ceil(RESERVE * (pulses_s + moves_s) * 1e3) / 1e3
+        distances_unique_m, counts = np.unique(np.maximum(distances_m, self._pitch_m).round(9), return_counts=True)
+        settling_s = sum(
+            self._settling_s(float(step_m)) * int(n) for step_m, n in zip(distances_unique_m, counts, strict=True)
+        )
+        return ceil(BEAM_TIME_MARGIN * (pulses_s + settling_s) * 1e3) / 1e3
 
-    def _nominal_m(self, target_m: FloatArray, driven: IntArray) -> FloatArray:
+    def _nominal_targets_m(self, target_m: FloatArray, driven: IntArray) -> FloatArray:
         """What a nominal pixel would be asked for, so that one of the map stands as high, [driven]; in few steps."""
         if self._lift is None:
             return target_m[driven]
-        asked = np.log(target_m[driven] / self._lift[driven])
-        return np.asarray(np.exp(np.ceil(asked / STEP) * STEP), dtype=np.float64)
+        log_targets = np.log(target_m[driven] / self._lift[driven])
+        return np.asarray(np.exp(np.ceil(log_targets / HEIGHT_STEP_RELATIVE) * HEIGHT_STEP_RELATIVE), dtype=np.float64)
 
 
-def hold(beam: Beam, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0) -> list[TactileFrame]:
+def hold_picture(
+    estimator: BeamTimeEstimator, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0
+) -> list[TactileFrame]:
     """A picture kept up for at least `seconds`: drawn again and again, each time as long as the beam needs.
 
     target_m: [p]. The frames abut; the first starts at start_s.
     """
-    each_s = max(beam.picture_s(target_m), 1.0 / REFRESH_HZ)
-    count = max(1, ceil(seconds / each_s - 1e-9))
-    return [TactileFrame(f"{name}-{k}", start_s + k * each_s, each_s, target_m) for k in range(count)]
+    frame_s = max(estimator.beam_time_s(target_m), 1.0 / REFRESH_HZ)
+    count = max(1, ceil(seconds / frame_s - 1e-9))
+    return [TactileFrame(f"{name}-{k}", start_s + k * frame_s, frame_s, target_m) for k in range(count)]
 
 
-def steps(beam: Beam, pictures: list[FloatArray], step_s: float, name: str) -> list[TactileFrame]:
+def build_steps(
+    estimator: BeamTimeEstimator, pictures: list[FloatArray], step_s: float, name: str
+) -> list[TactileFrame]:
     """Pictures one after the other, each shown once, for step_s or as long as the beam needs. pictures: of [p]."""
     frames: list[TactileFrame] = []
     start_s = 0.0
     for k, target_m in enumerate(pictures):
-        each_s = max(beam.picture_s(target_m), step_s)
-        frames.append(TactileFrame(f"{name}-{k}", start_s, each_s, target_m))
-        start_s += each_s
+        frame_s = max(estimator.beam_time_s(target_m), step_s)
+        frames.append(TactileFrame(f"{name}-{k}", start_s, frame_s, target_m))
+        start_s += frame_s
     return frames
 
 
-def end_s(sequence: FrameSequence) -> float:
+def sequence_end_s(sequence: FrameSequence) -> float:
     """When the last frame, pulse, or cycle of a train by height ends, s; 0 for an empty sequence."""
     frame_ends = [frame.show_at_s + frame.duration_s for frame in sequence.frames]
     train_ends = [

@@ -7,10 +7,10 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame, Train
 from optodrive.core.units import m_to_um
-from optodrive.device.config import Config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.planning.stimuli.frame_json import parse_frames
-from optodrive.planning.stimuli.json_values import decode_json, list_at, table_at
-from optodrive.planning.stimuli.train_json import check_trains, checked_train, parse_train, train_to_json
+from optodrive.planning.stimuli.json_values import decode_json, require_list, require_object
+from optodrive.planning.stimuli.train_json import check_trains, parse_train, train_to_json, validate_train
 
 FRAMES_MAX = 10_000
 TRAINS_MAX = 10_000
@@ -47,22 +47,22 @@ def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
     bad_time, bad_train, bad_priority, overlapping_trains, too_many.
     """
     try:
-        return _sequence(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
+        return _parse_decoded(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
     except RecursionError:  # from showing a value that nests deeper than Python's stack
         raise InputError(where, "deeper nesting", "objects and lists at most 4 deep", code="bad_json") from None
 
 
-def checked_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
+def validate_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
     """A sequence made by a pattern, held to the same bounds as a file; raises InputError (too_many, bad_train, …)."""
-    most = _frames_max(len(pixel_layout(config.display)))
-    if len(sequence.frames) > most:
-        raise InputError(f"{where}: frames", len(sequence.frames), f"at most {most}", code="too_many")
-    trains = [checked_train(train, f"{where}: trains[{k}]", config) for k, train in enumerate(sequence.trains)]
+    frames_max = _compute_frames_max(len(build_pixel_layout(config.display)))
+    if len(sequence.frames) > frames_max:
+        raise InputError(f"{where}: frames", len(sequence.frames), f"at most {frames_max}", code="too_many")
+    trains = [validate_train(train, f"{where}: trains[{k}]", config) for k, train in enumerate(sequence.trains)]
     check_trains(trains, f"{where}: trains", config)
     return FrameSequence(sequence.frames, tuple(trains))
 
 
-def _frames_max(pixel_count: int) -> int:
+def _compute_frames_max(pixel_count: int) -> int:
     return min(FRAMES_MAX, TARGETS_MAX // pixel_count)
 
 
@@ -70,43 +70,43 @@ def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
     """A sequence as FRAMES.json has it; heights to 1e-9 µm, so that parsing gives the same numbers back."""
     return {
         "frames": [_frame_to_json(frame) for frame in sequence.frames],
-        "trains": [train_to_json(train) | _priority(train) for train in sequence.trains],
+        "trains": [train_to_json(train) | _priority_to_json(train) for train in sequence.trains],
     }
 
 
 def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
     driven = np.flatnonzero(frame.target_m)
-    together = {"together": True} if frame.together else {}
+    simultaneous = {"together": True} if frame.simultaneous else {}
     return (
-        together
+        simultaneous
         | {
             "id": frame.frame_id,
             "show_at_s": frame.show_at_s,
             "duration_s": frame.duration_s,
             "target_um": {str(pixel): round(m_to_um(float(frame.target_m[pixel])), 9) for pixel in driven},
         }
-        | _priority(frame)
+        | _priority_to_json(frame)
     )
 
 
-def _priority(item: TactileFrame | Train) -> dict[str, object]:
+def _priority_to_json(item: TactileFrame | Train) -> dict[str, object]:
     return {"priority": item.priority} if item.priority else {}
 
 
-def _sequence(decoded: object, config: Config, where: str) -> FrameSequence:
-    table = table_at(decoded, where, ("frames", "trains"), ())
-    pixel_count = len(pixel_layout(config.display))
-    frame_list = list_at(table.get("frames", []), f"{where}: frames", _frames_max(pixel_count))
-    train_list = list_at(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
+def _parse_decoded(decoded: object, config: Config, where: str) -> FrameSequence:
+    table = require_object(decoded, where, ("frames", "trains"), ())
+    pixel_count = len(build_pixel_layout(config.display))
+    frame_list = require_list(table.get("frames", []), f"{where}: frames", _compute_frames_max(pixel_count))
+    train_list = require_list(table.get("trains", []), f"{where}: trains", TRAINS_MAX)
     if not frame_list and not train_list:
         raise InputError(where, "neither frames nor trains", "at least one of them", code="bad_json")
     return FrameSequence(
         frames=parse_frames(frame_list, f"{where}: frames", pixel_count),
-        trains=_trains(train_list, f"{where}: trains", config, pixel_count),
+        trains=_parse_trains(train_list, f"{where}: trains", config, pixel_count),
     )
 
 
-def _trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:
+def _parse_trains(entries: list[object], where: str, config: Config, pixel_count: int) -> tuple[Train, ...]:
     trains = tuple(parse_train(entry, f"{where}[{k}]", config, pixel_count) for k, entry in enumerate(entries))
     check_trains(trains, where, config)
     return trains

@@ -8,20 +8,22 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import Config
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import Beam, hold, steps
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator, build_steps, hold_picture
 
-RING_SHARE = 0.6
+RING_RADIUS_FRACTION = 0.6
 """Rings and squares reach this far from the middle, as a share of the way to the border, if not told."""
 
 
-def single(config: Config, where: str, pixel: int | None, height_m: float, seconds: float) -> FrameSequence:
+def build_single_pixel(config: Config, where: str, pixel: int | None, height_m: float, seconds: float) -> FrameSequence:
     """One pixel (None: the middle), drawn again and again."""
-    lattice = Lattice.of(config)
-    chosen = lattice.middle() if pixel is None else pixel
-    return _held(config, np.arange(len(lattice.layout)) == chosen, height_m, seconds, f"pixel-{chosen}")
+    lattice = Lattice.from_config(config)
+    chosen_pixel = lattice.middle_pixel() if pixel is None else pixel
+    return _hold_mask(
+        config, np.arange(len(lattice.layout)) == chosen_pixel, height_m, seconds, f"pixel-{chosen_pixel}"
+    )
 
 
-def vibration(
+def build_vibration(
     config: Config,
     where: str,
     pixel: int | None,
@@ -31,83 +33,89 @@ def vibration(
     seconds: float,
 ) -> FrameSequence:
     """One pixel (None: the middle) that swings below a height; peak_to_peak_m None: with as little energy as may be."""
-    chosen = Lattice.of(config).middle() if pixel is None else pixel
-    return FrameSequence(trains=(HeightTrain(chosen, 0.0, seconds, 1.0 / rate_hz, height_m, peak_to_peak_m),))
+    chosen_pixel = Lattice.from_config(config).middle_pixel() if pixel is None else pixel
+    return FrameSequence(trains=(HeightTrain(chosen_pixel, 0.0, seconds, 1.0 / rate_hz, height_m, peak_to_peak_m),))
 
 
-def everything(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
+def build_all_pixels(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
     """Every pixel at one height."""
-    return _held(config, np.ones(len(Lattice.of(config).layout), dtype=np.bool_), height_m, seconds, "all")
+    return _hold_mask(
+        config, np.ones(len(Lattice.from_config(config).layout), dtype=np.bool_), height_m, seconds, "all"
+    )
 
 
-def checker(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
+def build_checkerboard(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
     """Every other pixel, as on a chessboard."""
-    layout = Lattice.of(config).layout
-    return _held(config, (layout.row + layout.column) % 2 == 0, height_m, seconds, "checker")
+    layout = Lattice.from_config(config).layout
+    return _hold_mask(config, (layout.row + layout.column) % 2 == 0, height_m, seconds, "checker")
 
 
-def circle(config: Config, where: str, radius_m: float | None, height_m: float, seconds: float) -> FrameSequence:
+def build_ring(config: Config, where: str, radius_m: float | None, height_m: float, seconds: float) -> FrameSequence:
     """A ring about the display's middle, one pixel wide."""
-    ring = np.isin(np.arange(len(Lattice.of(config).layout)), ring_pixels(config, where, radius_m))
-    return _held(config, ring, height_m, seconds, "circle")
+    ring = np.isin(np.arange(len(Lattice.from_config(config).layout)), find_ring_pixels(config, where, radius_m))
+    return _hold_mask(config, ring, height_m, seconds, "circle")
 
 
-def square(config: Config, where: str, side_m: float | None, height_m: float, seconds: float) -> FrameSequence:
+def build_square_outline(
+    config: Config, where: str, side_m: float | None, height_m: float, seconds: float
+) -> FrameSequence:
     """The outline of a square about the display's middle, one pixel wide."""
-    layout = Lattice.of(config).layout
+    layout = Lattice.from_config(config).layout
     half_m = _default_radius_m(config) if side_m is None else side_m / 2
     farthest_m = np.maximum(np.abs(layout.x_m), np.abs(layout.y_m))
-    outline = _within_one_pixel(farthest_m, half_m, config.display.pitch_m)
+    outline = _is_within_half_pitch(farthest_m, half_m, config.display.pitch_m)
     if not outline.any():
-        raise _too_large(config, f"{where}: side_mm", 2e3 * half_m)
-    return _held(config, outline, height_m, seconds, "square")
+        raise _too_large_error(config, f"{where}: side_mm", 2e3 * half_m)
+    return _hold_mask(config, outline, height_m, seconds, "square")
 
 
-def edge(config: Config, where: str, direction: str, height_m: float, step_s: float) -> FrameSequence:
+def build_moving_edge(config: Config, where: str, direction: str, height_m: float, step_s: float) -> FrameSequence:
     """A line of pixels across the display that moves to its other side, one pitch a step."""
-    layout = Lattice.of(config).layout
+    layout = Lattice.from_config(config).layout
     line = layout.column if direction in ("left", "right") else layout.row
     places = np.arange(line.max() + 1)[:: -1 if direction in ("left", "down") else 1]
     pictures = [np.where(line == place, height_m, 0.0) for place in places]
-    return FrameSequence(frames=tuple(steps(Beam(config), pictures, step_s, "edge")))
+    return FrameSequence(frames=tuple(build_steps(BeamTimeEstimator(config), pictures, step_s, "edge")))
 
 
-def dot(
+def build_moving_dot(
     config: Config, where: str, radius_m: float | None, height_m: float, step_s: float, turns: int
 ) -> FrameSequence:
     """One pixel at a time round a ring, clockwise from the left."""
-    layout = Lattice.of(config).layout
-    ring = ring_pixels(config, where, radius_m)
+    layout = Lattice.from_config(config).layout
+    ring = find_ring_pixels(config, where, radius_m)
     ring = ring[np.argsort(-np.arctan2(layout.y_m[ring], layout.x_m[ring]), kind="stable")]
     pictures = [np.where(np.arange(len(layout)) == pixel, height_m, 0.0) for pixel in ring] * turns
-    return FrameSequence(frames=tuple(steps(Beam(config), pictures, step_s, "dot")))
+    return FrameSequence(frames=tuple(build_steps(BeamTimeEstimator(config), pictures, step_s, "dot")))
 
 
-def ring_pixels(config: Config, where: str, radius_m: float | None) -> NDArray[np.int64]:
+def find_ring_pixels(config: Config, where: str, radius_m: float | None) -> NDArray[np.int64]:
     """Pixels of a ring about the middle (None: of the usual size), by index; raises InputError when it holds none."""
-    layout = Lattice.of(config).layout
+    layout = Lattice.from_config(config).layout
     radius_m = _default_radius_m(config) if radius_m is None else radius_m
-    ring = np.flatnonzero(_within_one_pixel(np.hypot(layout.x_m, layout.y_m), radius_m, config.display.pitch_m))
+    ring = np.flatnonzero(_is_within_half_pitch(np.hypot(layout.x_m, layout.y_m), radius_m, config.display.pitch_m))
     if not len(ring):
-        raise _too_large(config, f"{where}: radius_mm", 1e3 * radius_m)
+        raise _too_large_error(config, f"{where}: radius_mm", 1e3 * radius_m)
     return ring
 
 
-def _held(config: Config, mask: NDArray[np.bool_], height_m: float, seconds: float, name: str) -> FrameSequence:
-    return FrameSequence(frames=tuple(hold(Beam(config), np.where(mask, height_m, 0.0), seconds, name)))
+def _hold_mask(config: Config, mask: NDArray[np.bool_], height_m: float, seconds: float, name: str) -> FrameSequence:
+    return FrameSequence(
+        frames=tuple(hold_picture(BeamTimeEstimator(config), np.where(mask, height_m, 0.0), seconds, name))
+    )
 
 
 def _default_radius_m(config: Config) -> float:
     places = min(config.display.rows, config.display.columns)
-    return RING_SHARE * config.display.pitch_m * (places - 1) / 2
+    return RING_RADIUS_FRACTION * config.display.pitch_m * (places - 1) / 2
 
 
-def _within_one_pixel(distance_m: FloatArray, wanted_m: float, pitch_m: float) -> NDArray[np.bool_]:
-    offset = np.round((distance_m - wanted_m) / pitch_m, 6)
+def _is_within_half_pitch(distance_m: FloatArray, target_distance_m: float, pitch_m: float) -> NDArray[np.bool_]:
+    offset = np.round((distance_m - target_distance_m) / pitch_m, 6)
     return np.asarray((offset > -0.5) & (offset <= 0.5))
 
 
-def _too_large(config: Config, where: str, value_mm: float) -> InputError:
+def _too_large_error(config: Config, where: str, value_mm: float) -> InputError:
     display = config.display
     width_mm, height_mm = (1e3 * display.pitch_m * (places - 1) for places in (display.columns, display.rows))
     expected = f"a size that meets pixels of {config.name}, {width_mm:g} × {height_mm:g} mm from centre to centre"

@@ -7,15 +7,15 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.planning.stimuli.frame_json import targets_m
-from optodrive.planning.stimuli.json_values import decode_json, table_at
+from optodrive.planning.stimuli.frame_json import parse_targets_m
+from optodrive.planning.stimuli.json_values import decode_json, require_object
 
 MAGIC = b"ODF1"
 HEADER = struct.Struct("<4sI")
-UNIT_M = 1e-7
+HEIGHT_UNIT_M = 1e-7
 """Binary heights are whole tenths of a micrometre."""
-NUMBER_MAX = 0xFFFF_FFFF
-SHOWN_S = 3600.0
+FRAME_NUMBER_MAX = 0xFFFF_FFFF
+FRAME_DURATION_S = 3600.0
 """A frame of a stream has no end of its own: it stays until the next, or until it has been drawn once."""
 
 
@@ -26,13 +26,13 @@ def parse_live_frame(message: str | bytes, expected_number: int, pixel_count: in
     then a u16 for each pixel, in 0.1 µm. Raises InputError (bad_json, bad_frame, bad_target, unknown_pixel, …).
     """
     if isinstance(message, bytes):
-        number, target_m = _from_bytes(message, pixel_count)
+        number, target_m = _parse_binary(message, pixel_count)
     else:
-        number, target_m = _from_text(message, expected_number, pixel_count)
-    return number, FrameSequence((TactileFrame(str(number), 0.0, SHOWN_S, target_m),))
+        number, target_m = _parse_text(message, expected_number, pixel_count)
+    return number, FrameSequence((TactileFrame(str(number), 0.0, FRAME_DURATION_S, target_m),))
 
 
-def _from_bytes(message: bytes, pixel_count: int) -> tuple[int, FloatArray]:
+def _parse_binary(message: bytes, pixel_count: int) -> tuple[int, FloatArray]:
     size = HEADER.size + 2 * pixel_count
     if message[:4] != MAGIC:
         raise InputError("frame", message[:4], f"bytes that begin with {MAGIC.decode()}", code="bad_frame")
@@ -40,33 +40,33 @@ def _from_bytes(message: bytes, pixel_count: int) -> tuple[int, FloatArray]:
         expected = f"{size} bytes: {HEADER.size}, and 2 for each of {pixel_count} pixels"
         raise InputError("frame", f"{len(message)} bytes", expected, code="bad_frame")
     number: int = HEADER.unpack_from(message)[1]
-    return number, np.frombuffer(message, dtype="<u2", offset=HEADER.size) * UNIT_M
+    return number, np.frombuffer(message, dtype="<u2", offset=HEADER.size) * HEIGHT_UNIT_M
 
 
-def _from_text(message: str, expected_number: int, pixel_count: int) -> tuple[int, FloatArray]:
+def _parse_text(message: str, expected_number: int, pixel_count: int) -> tuple[int, FloatArray]:
     try:
-        table = table_at(decode_json(message, "frame"), "frame", ("frame", "target_um"), ("target_um",))
+        table = require_object(decode_json(message, "frame"), "frame", ("frame", "target_um"), ("target_um",))
     except RecursionError:
         raise InputError("frame", message[:20], "JSON that nests less deep", code="bad_json") from None
     number = table.get("frame", expected_number)
-    if type(number) is not int or not 0 <= number <= NUMBER_MAX:
-        raise InputError("frame.frame", number, f"a whole number, 0…{NUMBER_MAX}", code="bad_frame")
+    if type(number) is not int or not 0 <= number <= FRAME_NUMBER_MAX:
+        raise InputError("frame.frame", number, f"a whole number, 0…{FRAME_NUMBER_MAX}", code="bad_frame")
     names = {str(pixel): pixel for pixel in range(pixel_count)}
-    return number, targets_m(table["target_um"], "frame.target_um", names)
+    return number, parse_targets_m(table["target_um"], "frame.target_um", names)
 
 
-def may_be_split(sequence: FrameSequence) -> bool:
+def can_split(sequence: FrameSequence) -> bool:
     """Whether a sequence is one frame whose pixels may stand up one after the other."""
-    return len(sequence.frames) == 1 and not sequence.trains and not sequence.frames[0].together
+    return len(sequence.frames) == 1 and not sequence.trains and not sequence.frames[0].simultaneous
 
 
-def unseen_first(sequence: FrameSequence, seen: BoolArray) -> FrameSequence:
+def stale_pixels_first(sequence: FrameSequence, refreshed: BoolArray) -> FrameSequence:
     """A stream's frame in two: first the pixels that this sweep over the display has not lit yet.
 
     So every pixel has its turn however fast frames come. seen: [p], lit in this sweep.
     """
     (frame,) = sequence.frames
-    parts = [np.where(part, frame.target_m, 0.0) for part in (~seen, seen)]
+    parts = [np.where(part, frame.target_m, 0.0) for part in (~refreshed, refreshed)]
     return FrameSequence(
         tuple(TactileFrame(frame.frame_id, 0.0, frame.duration_s, part) for part in parts if part.any()) or (frame,)
     )

@@ -9,11 +9,11 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import Config
-from optodrive.planning.stimuli.braille import SPACE, Cell, braille_lines
+from optodrive.planning.stimuli.braille import SPACE, Cell, encode_lines
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import Beam, end_s, hold
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
 
-DOT_PLACES = {1: (0, 0), 2: (1, 0), 3: (2, 0), 4: (0, 1), 5: (1, 1), 6: (2, 1)}
+DOT_OFFSETS = {1: (0, 0), 2: (1, 0), 3: (2, 0), 4: (0, 1), 5: (1, 1), 6: (2, 1)}
 """Dot to (rows down, columns right) from the cell's top left, in dot steps."""
 
 
@@ -26,16 +26,16 @@ class Spacing:
     line_gap: int
 
     @property
-    def cell(self) -> tuple[int, int]:
+    def cell_size(self) -> tuple[int, int]:
         """Rows and columns that a cell covers."""
         return 2 * self.dot_step + 1, self.dot_step + 1
 
 
-Slot = dict[int, int]
+CellSlot = dict[int, int]
 """Where a cell can be shown: dot to pixel."""
 
 
-def text_frames(
+def build_text(
     config: Config,
     where: str,
     text: str,
@@ -46,51 +46,58 @@ def text_frames(
     line_gap: int = 1,
 ) -> FrameSequence:
     """Text in braille from the top left, `seconds` a page (or as long as the beam needs); raises InputError."""
-    lines = braille_lines(text, f"{where}: text")
+    lines = encode_lines(text, f"{where}: text")
     if not any(lines):
         raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
-    beam, spacing = Beam(config), Spacing(dot_step, cell_gap, line_gap)
-    slots = line_slots(beam.lattice, spacing)
+    estimator, spacing = BeamTimeEstimator(config), Spacing(dot_step, cell_gap, line_gap)
+    slots = find_line_slots(estimator.lattice, spacing)
     if not slots:
-        raise _too_small(config, where, spacing)
-    rows = wrapped(lines, [len(line) for line in slots])
+        raise _too_small_error(config, where, spacing)
+    rows = wrap_words(lines, [len(line) for line in slots])
     frames: list[TactileFrame] = []
     for first in range(0, len(rows), len(slots)):
-        target_m = _picture(rows[first : first + len(slots)], slots, height_m, len(beam.lattice.layout))
-        frames += hold(
-            beam, target_m, seconds, f"page-{first // len(slots) + 1}", end_s(FrameSequence(tuple(frames[-1:])))
+        target_m = _draw_page(rows[first : first + len(slots)], slots, height_m, len(estimator.lattice.layout))
+        frames += hold_picture(
+            estimator,
+            target_m,
+            seconds,
+            f"page-{first // len(slots) + 1}",
+            sequence_end_s(FrameSequence(tuple(frames[-1:]))),
         )
     return FrameSequence(frames=tuple(frames))
 
 
-def line_slots(lattice: Lattice, spacing: Spacing) -> list[list[Slot]]:
+def find_line_slots(lattice: Lattice, spacing: Spacing) -> list[list[CellSlot]]:
     """Lines of cells that fit, top first: of each line the longest run of cells with all six pixels present."""
     rows, columns = lattice.index.shape
-    cell_rows, cell_columns = spacing.cell
-    down, across = cell_rows + spacing.line_gap, cell_columns + spacing.cell_gap
-    line_count, cell_count = (rows + spacing.line_gap) // down, (columns + spacing.cell_gap) // across
-    top = (rows - (line_count * down - spacing.line_gap)) // 2
-    left = (columns - (cell_count * across - spacing.cell_gap)) // 2
+    cell_rows, cell_columns = spacing.cell_size
+    step_rows, step_columns = cell_rows + spacing.line_gap, cell_columns + spacing.cell_gap
+    line_count, cell_count = (rows + spacing.line_gap) // step_rows, (columns + spacing.cell_gap) // step_columns
+    top = (rows - (line_count * step_rows - spacing.line_gap)) // 2
+    left = (columns - (cell_count * step_columns - spacing.cell_gap)) // 2
     lines = []
     for line in range(line_count):
-        cells = [_slot(lattice, top + line * down, left + k * across, spacing.dot_step) for k in range(cell_count)]
+        cells = [
+            _find_cell_slot(lattice, top + line * step_rows, left + k * step_columns, spacing.dot_step)
+            for k in range(cell_count)
+        ]
         runs = [list(run) for whole, run in groupby(cells, key=lambda slot: slot is not None) if whole]
         if runs:
             lines.append([slot for slot in max(runs, key=len) if slot is not None])
     return lines
 
 
-def _slot(lattice: Lattice, from_top: int, from_left: int, dot_step: int) -> Slot | None:
+def _find_cell_slot(lattice: Lattice, from_top: int, from_left: int, dot_step: int) -> CellSlot | None:
     slot = {}
-    for dot, (down, right) in DOT_PLACES.items():
-        pixel = lattice.at(lattice.index.shape[0] - 1 - from_top - down * dot_step, from_left + right * dot_step)
+    for dot, (down, right) in DOT_OFFSETS.items():
+        pixel = lattice.pixel_at(lattice.index.shape[0] - 1 - from_top - down * dot_step, from_left + right * dot_step)
         if pixel is None:
             return None
         slot[dot] = pixel
     return slot
 
 
-def wrapped(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]]:
+def wrap_words(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]]:
     """Words into rows of cells, row k at most widths[k mod n] long; a word longer than its row is cut."""
     rows: list[list[Cell]] = []
     for words in lines:
@@ -111,7 +118,7 @@ def wrapped(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]
     return rows
 
 
-def _picture(rows: list[list[Cell]], slots: list[list[Slot]], height_m: float, pixel_count: int) -> FloatArray:
+def _draw_page(rows: list[list[Cell]], slots: list[list[CellSlot]], height_m: float, pixel_count: int) -> FloatArray:
     target_m = np.zeros(pixel_count)
     for row, line in zip(rows, slots, strict=False):
         for cell, slot in zip(row, line, strict=False):
@@ -119,8 +126,8 @@ def _picture(rows: list[list[Cell]], slots: list[list[Slot]], height_m: float, p
     return target_m
 
 
-def _too_small(config: Config, where: str, spacing: Spacing) -> InputError:
-    rows, columns = spacing.cell
+def _too_small_error(config: Config, where: str, spacing: Spacing) -> InputError:
+    rows, columns = spacing.cell_size
     expected = f"a display with {rows} × {columns} pixels for a cell"
     found = f"{config.display.rows} × {config.display.columns}"
     return InputError(f"{where}: {config.name}", found, expected, code="does_not_fit")

@@ -10,19 +10,19 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain, Train
 from optodrive.core.units import m_to_um, um_to_m
 from optodrive.device.config import Config
-from optodrive.planning.stimuli.json_values import number_at, priority_at, table_at, time_at
+from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
-TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
-HEIGHT_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
-OWN_HEIGHT_KEYS = frozenset(HEIGHT_KEYS) - frozenset(TRAIN_KEYS)
+PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
+HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
+HEIGHT_ONLY_KEYS = frozenset(HEIGHT_TRAIN_KEYS) - frozenset(PULSE_TRAIN_KEYS)
 """One of these makes an entry a train by height."""
 PULSES_MAX = 2_000_000
 HEIGHT_PULSES_MAX = 100_000
 """Pulses of trains by height are planned one by one, each with the heat that the limiter left."""
-OVERLAP_S = 1e-9
+OVERLAP_TOLERANCE_S = 1e-9
 """Pulses may share this much, the rounding of their times."""
 
-PWM_TOLERANCE = 0.01
+PWM_TOLERANCE_PERIODS = 0.01
 """How far from a whole number of PWM periods a width may be written, in periods; it is played as the whole number."""
 
 
@@ -31,76 +31,78 @@ def parse_train(value: object, where: str, config: Config, pixel_count: int) -> 
 
     Raises InputError (bad_train, bad_time, bad_priority, unknown_pixel, unknown_key, missing_key).
     """
-    if isinstance(value, dict) and not OWN_HEIGHT_KEYS.isdisjoint(value):
-        return _height_train(value, where, config, pixel_count)
-    table = table_at(value, where, (*TRAIN_KEYS, "priority"), TRAIN_KEYS)
-    pixel, start_s, duration_s = _place_and_time(table, where, pixel_count)
-    gap_s = time_at(table["gap_s"], f"{where}.gap_s", "a gap ≥ 0 in s", "bad_train", positive=False)
-    width_s = number_at(table["pulse_width_s"], f"{where}.pulse_width_s", "a width > 0 in s", "bad_train")
-    power_w = number_at(table["power_w"], f"{where}.power_w", "a power > 0 in W", "bad_train")
-    priority = priority_at(table.get("priority", 0), f"{where}.priority")
-    return checked_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w, priority), where, config)
+    if isinstance(value, dict) and not HEIGHT_ONLY_KEYS.isdisjoint(value):
+        return _parse_height_train(value, where, config, pixel_count)
+    table = require_object(value, where, (*PULSE_TRAIN_KEYS, "priority"), PULSE_TRAIN_KEYS)
+    pixel, start_s, duration_s = _parse_pixel_and_time(table, where, pixel_count)
+    gap_s = require_time(table["gap_s"], f"{where}.gap_s", "a gap ≥ 0 in s", "bad_train", positive=False)
+    width_s = require_number(table["pulse_width_s"], f"{where}.pulse_width_s", "a width > 0 in s", "bad_train")
+    power_w = require_number(table["power_w"], f"{where}.power_w", "a power > 0 in W", "bad_train")
+    priority = require_priority(table.get("priority", 0), f"{where}.priority")
+    return validate_train(PulseTrain(pixel, start_s, duration_s, width_s, gap_s, power_w, priority), where, config)
 
 
-def _place_and_time(table: Mapping[str, object], where: str, pixel_count: int) -> tuple[int, float, float]:
+def _parse_pixel_and_time(table: Mapping[str, object], where: str, pixel_count: int) -> tuple[int, float, float]:
     pixel = table["pixel"]
     if type(pixel) is not int or not 0 <= pixel < pixel_count:
         raise InputError(f"{where}.pixel", pixel, f"a pixel, 0…{pixel_count - 1}", code="unknown_pixel")
-    start_s = time_at(table["start_s"], f"{where}.start_s", "a time ≥ 0 in s", "bad_time", positive=False)
-    duration_s = time_at(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
+    start_s = require_time(table["start_s"], f"{where}.start_s", "a time ≥ 0 in s", "bad_time", positive=False)
+    duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     return pixel, start_s, duration_s
 
 
-def _height_train(value: object, where: str, config: Config, pixel_count: int) -> HeightTrain:
-    table = table_at(value, where, (*HEIGHT_KEYS, "priority"), HEIGHT_KEYS[:-1])
-    pixel, start_s, duration_s = _place_and_time(table, where, pixel_count)
-    period_s = time_at(table["period_s"], f"{where}.period_s", "a period > 0 in s", "bad_train", positive=True)
-    target_um = number_at(table["target_um"], f"{where}.target_um", "a height > 0 in µm", "bad_target")
-    swing_um = table.get("peak_to_peak_um")
-    swing_m = None
-    if swing_um is not None:
-        swing_m = um_to_m(number_at(swing_um, f"{where}.peak_to_peak_um", "a height > 0 in µm", "bad_train"))
-    priority = priority_at(table.get("priority", 0), f"{where}.priority")
-    train = HeightTrain(pixel, start_s, duration_s, period_s, um_to_m(target_um), swing_m, priority)
-    return _checked_height_train(train, where, config)
+def _parse_height_train(value: object, where: str, config: Config, pixel_count: int) -> HeightTrain:
+    table = require_object(value, where, (*HEIGHT_TRAIN_KEYS, "priority"), HEIGHT_TRAIN_KEYS[:-1])
+    pixel, start_s, duration_s = _parse_pixel_and_time(table, where, pixel_count)
+    period_s = require_time(table["period_s"], f"{where}.period_s", "a period > 0 in s", "bad_train", positive=True)
+    target_um = require_number(table["target_um"], f"{where}.target_um", "a height > 0 in µm", "bad_target")
+    peak_to_peak_um = table.get("peak_to_peak_um")
+    peak_to_peak_m = None
+    if peak_to_peak_um is not None:
+        peak_to_peak_m = um_to_m(
+            require_number(peak_to_peak_um, f"{where}.peak_to_peak_um", "a height > 0 in µm", "bad_train")
+        )
+    priority = require_priority(table.get("priority", 0), f"{where}.priority")
+    train = HeightTrain(pixel, start_s, duration_s, period_s, um_to_m(target_um), peak_to_peak_m, priority)
+    return _validate_height_train(train, where, config)
 
 
-def _checked_height_train(train: HeightTrain, where: str, config: Config) -> HeightTrain:
+def _validate_height_train(train: HeightTrain, where: str, config: Config) -> HeightTrain:
     if train.target_m <= 0.0:
         raise InputError(f"{where}.target_um", m_to_um(train.target_m), "a height > 0 in µm", code="bad_target")
     if train.peak_to_peak_m is not None and not 0.0 < train.peak_to_peak_m <= train.target_m:
-        swing_um = round(m_to_um(train.peak_to_peak_m), 9)
+        peak_to_peak_um = round(m_to_um(train.peak_to_peak_m), 9)
         expected = f"a height above 0, at most target_um = {m_to_um(train.target_m):g} µm"
-        raise InputError(f"{where}.peak_to_peak_um", swing_um, expected, code="bad_train")
-    least_s = 1.0 / config.laser.pwm_hz + config.limits.pulse_rest_min_s
-    if train.period_s < least_s * (1 - 1e-9):
-        expected = f"at least {least_s:g} s, a PWM period and limits.pulse_rest_min_s"
+        raise InputError(f"{where}.peak_to_peak_um", peak_to_peak_um, expected, code="bad_train")
+    period_min_s = 1.0 / config.laser.pwm_hz + config.limits.pulse_gap_min_s
+    if train.period_s < period_min_s * (1 - 1e-9):
+        expected = f"at least {period_min_s:g} s, a PWM period and limits.pulse_gap_min_s"
         raise InputError(f"{where}.period_s", train.period_s, expected, code="bad_train")
     return train
 
 
-def checked_train(train: Train, where: str, config: Config) -> Train:
+def validate_train(train: Train, where: str, config: Config) -> Train:
     """The train as it is played, a width at the whole number of PWM periods; raises InputError (bad_train, …)."""
     if isinstance(train, HeightTrain):
-        return _checked_height_train(train, where, config)
-    return _checked_pulse_train(train, where, config)
+        return _validate_height_train(train, where, config)
+    return _validate_pulse_train(train, where, config)
 
 
-def _checked_pulse_train(train: PulseTrain, where: str, config: Config) -> PulseTrain:
+def _validate_pulse_train(train: PulseTrain, where: str, config: Config) -> PulseTrain:
     if not 0 < train.power_w <= config.laser.max_power_w:
         expected = f"a power above 0, at most laser.max_power_w = {config.laser.max_power_w:g} W"
         raise InputError(f"{where}.power_w", train.power_w, expected, code="bad_train")
-    place, longest_s = f"{where}.pulse_width_s", config.limits.pulse_width_max_s
-    if not 0 < train.pulse_width_s <= longest_s * (1 + 1e-9):
-        expected = f"a width above 0, at most limits.pulse_width_max_s = {longest_s:g} s"
+    place, width_max_s = f"{where}.pulse_width_s", config.limits.pulse_width_max_s
+    if not 0 < train.pulse_width_s <= width_max_s * (1 + 1e-9):
+        expected = f"a width above 0, at most limits.pulse_width_max_s = {width_max_s:g} s"
         raise InputError(place, train.pulse_width_s, expected, code="bad_train")
     periods = train.pulse_width_s * config.laser.pwm_hz
-    whole = max(1, round(periods))
-    if abs(periods - whole) > PWM_TOLERANCE:
-        nearest_s = float(f"{whole / config.laser.pwm_hz:.9g}")
+    period_count = max(1, round(periods))
+    if abs(periods - period_count) > PWM_TOLERANCE_PERIODS:
+        nearest_s = float(f"{period_count / config.laser.pwm_hz:.9g}")
         expected = f"whole PWM periods of {1 / config.laser.pwm_hz:g} s, nearest is {nearest_s!r}"
         raise InputError(place, train.pulse_width_s, expected, code="bad_train")
-    return replace(train, pulse_width_s=whole / config.laser.pwm_hz)
+    return replace(train, pulse_width_s=period_count / config.laser.pwm_hz)
 
 
 def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
@@ -109,7 +111,7 @@ def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
     Raises InputError (too_many, overlapping_trains); pulses that abut are fine. A pulse by height, whose width is not
     known yet, counts as one PWM period; the scheduler sees to the mirrors' moves.
     """
-    counts = [pulse_count(train) for train in trains]
+    counts = [count_pulses(train) for train in trains]
     by_height = sum(n for train, n in zip(trains, counts, strict=True) if isinstance(train, HeightTrain))
     if by_height > HEIGHT_PULSES_MAX:
         expected = f"at most {HEIGHT_PULSES_MAX} pulses in all trains by height"
@@ -124,7 +126,7 @@ def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
     end_s = start_s + np.array(width_s)[owner]
     order = np.argsort(start_s, kind="stable")
     # Sorted by start, two pulses overlap somewhere only if two neighbours do.
-    clash = np.flatnonzero(start_s[order][1:] < end_s[order][:-1] - OVERLAP_S)
+    clash = np.flatnonzero(start_s[order][1:] < end_s[order][:-1] - OVERLAP_TOLERANCE_S)
     if len(clash):
         first, second = (int(pulse) for pulse in order[clash[0] : clash[0] + 2])
         raise InputError(
@@ -136,7 +138,7 @@ def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
         )
 
 
-def pulse_count(train: Train) -> int:
+def count_pulses(train: Train) -> int:
     """Pulses of a train, without making them: those that start before its end."""
     period_s = train.period_s if isinstance(train, HeightTrain) else train.pulse_width_s + train.gap_s
     return max(1, ceil(train.duration_s / period_s - 1e-9))
@@ -145,8 +147,8 @@ def pulse_count(train: Train) -> int:
 def train_to_json(train: Train) -> dict[str, object]:
     """A train as FRAMES.json has it; heights to 1e-9 µm."""
     if isinstance(train, PulseTrain):
-        return {key: getattr(train, key) for key in TRAIN_KEYS}
-    entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_KEYS[:4]}
+        return {key: getattr(train, key) for key in PULSE_TRAIN_KEYS}
+    entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_TRAIN_KEYS[:4]}
     entry["target_um"] = round(m_to_um(train.target_m), 9)
     if train.peak_to_peak_m is not None:
         entry["peak_to_peak_um"] = round(m_to_um(train.peak_to_peak_m), 9)

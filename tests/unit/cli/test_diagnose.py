@@ -8,7 +8,7 @@ import pytest
 from labs import lab
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run
-from optodrive.device.config import shipped_path
+from optodrive.device.config import locate_shipped
 from optodrive.lab.recording import write_recording
 
 DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}
@@ -82,7 +82,7 @@ def test_samples_all_at_edges_leave_nothing_to_compare(tmp_path, capsys):
 def test_the_model_file_is_a_parameter_set_for_a_configuration(recording, tmp_path, capsys):
     out = tmp_path / "answer"
     assert run(["diagnose", str(recording), "--out", str(out)]) == 0
-    text = shipped_path("display-16.toml").read_text()
+    text = locate_shipped("display-16.toml").read_text()
     config = tmp_path / "mine.toml"
     config.write_text(text.replace('parameters = "surroundings"', f'parameters = "{out / "model.toml"}"'))
     assert str(out) in config.read_text()

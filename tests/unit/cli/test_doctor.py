@@ -12,11 +12,11 @@ import pytest
 
 from optodrive.cli import doctor_host as host
 from optodrive.cli.doctor_board import check_board
-from optodrive.cli.doctor_finding import ok
+from optodrive.cli.doctor_finding import report_ok
 from optodrive.cli.doctor_port import check_port
 from optodrive.cli.main import run
 from optodrive.core.clock import ManualClock, MonotonicClock
-from optodrive.device.config import BoardSection, load_config, shipped_path
+from optodrive.device.config import BoardSection, load_config, locate_shipped
 
 
 @pytest.fixture
@@ -42,7 +42,7 @@ def tree(tmp_path):
     return tmp_path
 
 
-def of(findings, check):
+def find_finding(findings, check):
     (finding,) = [finding for finding in findings if finding.check == check]
     return finding
 
@@ -54,48 +54,48 @@ def port_findings(tree, board=SERIAL):
 def test_a_port_in_order_may_be_asked_and_is_better_named_by_id(tree):
     findings, free = port_findings(tree)
     assert free
-    assert of(findings, "name").grade == "warning"
-    assert 'board.port = "/dev/serial/by-id/usb-board"' in of(findings, "name").remedy
-    assert {finding.grade for finding in findings if finding.check != "name"} == {"ok"}
+    assert find_finding(findings, "name").status == "warning"
+    assert 'board.port = "/dev/serial/by-id/usb-board"' in find_finding(findings, "name").remedy
+    assert {finding.status for finding in findings if finding.check != "name"} == {"ok"}
     by_id = BoardSection(transport="serial", port="/dev/serial/by-id/usb-board")
     findings, free = port_findings(tree, by_id)
     assert free
-    assert {finding.grade for finding in findings} == {"ok"}
+    assert {finding.status for finding in findings} == {"ok"}
     shutil.rmtree(tree / "dev/serial")
-    assert "no by-id link" in of(port_findings(tree)[0], "name").remedy
+    assert "no by-id link" in find_finding(port_findings(tree)[0], "name").remedy
 
 
 def test_a_port_that_is_not_there_names_those_that_are(tree):
     (tree / "dev/ttyACM0").rename(tree / "dev/ttyACM1")
     (finding,), free = port_findings(tree)
     assert not free
-    assert finding.grade == "problem"
-    assert "/dev/ttyACM1" in finding.seen
+    assert finding.status == "problem"
+    assert "/dev/ttyACM1" in finding.observation
 
 
 def test_a_held_port_is_left_alone_and_its_holder_named(tree):
     (tree / "proc/77/fd/5").symlink_to("/dev/ttyACM0")
     findings, free = port_findings(tree)
     assert not free
-    assert of(findings, "holder").grade == "warning"
-    assert "bash, process 77" in of(findings, "holder").seen
+    assert find_finding(findings, "holder").status == "warning"
+    assert "bash, process 77" in find_finding(findings, "holder").observation
     (tree / "proc/77/comm").write_text("ModemManager\n")
-    assert of(port_findings(tree)[0], "holder").grade == "problem"
+    assert find_finding(port_findings(tree)[0], "holder").status == "problem"
 
 
 def test_modem_manager_is_a_warning_unless_told_to_ignore_the_port(tree):
     (tree / "proc/77/comm").write_text("ModemManager\n")
-    finding = of(port_findings(tree)[0], "modem manager")
-    assert finding.grade == "warning"
+    finding = find_finding(port_findings(tree)[0], "modem manager")
+    assert finding.status == "warning"
     assert "ID_MM_DEVICE_IGNORE" in finding.remedy
     (tree / "run/udev/data/c166:0").write_text("S:serial/by-id/usb-board\nE:ID_MM_DEVICE_IGNORE=1\n")
-    assert of(port_findings(tree)[0], "modem manager").grade == "ok"
+    assert find_finding(port_findings(tree)[0], "modem manager").status == "ok"
 
 
 @pytest.mark.parametrize(("text", "grade"), [("16\n", "warning"), ("1\n", "ok"), ("?", "ok")])
 def test_the_latency_timer_of_an_ftdi_converter(tree, text, grade):
     (tree / "sys/class/tty/ttyACM0/device/latency_timer").write_text(text)
-    assert of(port_findings(tree)[0], "latency").grade == grade
+    assert find_finding(port_findings(tree)[0], "latency").status == grade
 
 
 def test_missing_permission_for_real(tree):
@@ -109,8 +109,8 @@ def test_missing_permission_for_real(tree):
     finally:
         os.seteuid(was)
     assert not free
-    assert of(findings, "permission").grade == "problem"
-    assert f"usermod -aG {path.group()}" in of(findings, "permission").remedy
+    assert find_finding(findings, "permission").status == "problem"
+    assert f"usermod -aG {path.group()}" in find_finding(findings, "permission").remedy
 
 
 def test_a_pty_held_by_another_process_for_real(tmp_path):
@@ -126,26 +126,26 @@ def test_a_pty_held_by_another_process_for_real(tmp_path):
         findings, free = check_port(board)
         process.stdin.close()
     assert not free
-    assert f"process {process.pid}" in of(findings, "holder").seen
+    assert f"process {process.pid}" in find_finding(findings, "holder").observation
     os.close(master)
 
 
-class Sluggish(ManualClock):
+class SlowClock(ManualClock):
     """A clock whose naps take longer by so much."""
 
-    def __init__(self, late_s):
+    def __init__(self, delay_s):
         super().__init__()
-        self.late_s = late_s
+        self.delay_s = delay_s
 
     def sleep(self, duration_s):
-        super().sleep(duration_s + self.late_s)
+        super().sleep(duration_s + self.delay_s)
 
 
 @pytest.mark.parametrize(("late_s", "grade"), [(0.0, "ok"), (0.009, "ok"), (0.011, "warning"), (0.06, "problem")])
 def test_a_computer_that_wakes_late(late_s, grade):
-    finding = host.check_clock(Sluggish(late_s), lease_s=0.1)
-    assert finding.grade == grade
-    assert f"{late_s * 1e3:.2f} ms" in finding.seen
+    finding = host.check_clock(SlowClock(late_s), lease_s=0.1)
+    assert finding.status == grade
+    assert f"{late_s * 1e3:.2f} ms" in finding.observation
 
 
 @pytest.mark.parametrize(
@@ -157,21 +157,21 @@ def test_the_processor_s_governor(tmp_path, governors, grade):
         folder = tmp_path / f"sys/devices/system/cpu/cpu{k}/cpufreq"
         folder.mkdir(parents=True)
         (folder / "scaling_governor").write_text(governor + "\n")
-    assert host.check_governor(tmp_path).grade == grade
+    assert host.check_governor(tmp_path).status == grade
 
 
 @pytest.mark.parametrize(("free_bytes", "grade"), [(5e9, "ok"), (5e8, "warning"), (1e7, "problem")])
 def test_the_disk_s_room(free_bytes, grade):
-    assert host.check_room(Path("/var"), int(free_bytes)).grade == grade
+    assert host.check_free_space(Path("/var"), int(free_bytes)).status == grade
 
 
 def test_packages_missing_or_too_old_are_named():
-    assert [finding.grade for finding in host.check_packages()] == ["ok"]
-    assert "not installed" in host.check_packages("no-such-package")[0].seen
-    assert host._complaint("no-such-package>=1") == "no-such-package is missing"
-    assert "older than 999" in host._complaint("numpy>=999")
-    assert host._complaint("numpy[dev] >=1.2") is None
-    assert host.check_python().grade == "ok"
+    assert [finding.status for finding in host.check_packages()] == ["ok"]
+    assert "not installed" in host.check_packages("no-such-package")[0].observation
+    assert host._check_requirement("no-such-package>=1") == "no-such-package is missing"
+    assert "older than 999" in host._check_requirement("numpy>=999")
+    assert host._check_requirement("numpy[dev] >=1.2") is None
+    assert host.check_python().status == "ok"
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ def test_packages_missing_or_too_old_are_named():
 def test_the_compiled_kernels(monkeypatch, cached, cold, grade):
     monkeypatch.setattr("optodrive.core.kernels.CACHED", cached)
     monkeypatch.setattr("optodrive.core.kernels.is_cold", lambda: cold)
-    assert host.check_kernels().grade == grade
+    assert host.check_kernels().status == grade
 
 
 # --- the board, and all of it ---------------------------------------------------------------------------------------
@@ -193,29 +193,29 @@ def simulated(**changes):
 
 def test_the_simulated_board_is_greeted_and_not_armed():
     findings = check_board(simulated(), MonotonicClock())
-    assert of(findings, "board").grade == "warning", "no uid is configured"
-    uid = of(findings, "board").remedy.split('"')[1]
-    assert "DISARMED" in of(findings, "board").seen
-    assert {of(findings, check).grade for check in ("limits", "inputs")} == {"ok"}
+    assert find_finding(findings, "board").status == "warning", "no uid is configured"
+    uid = find_finding(findings, "board").remedy.split('"')[1]
+    assert "DISARMED" in find_finding(findings, "board").observation
+    assert {find_finding(findings, check).status for check in ("limits", "inputs")} == {"ok"}
     findings = check_board(simulated(uid=uid), MonotonicClock())
-    assert of(findings, "board").grade == "ok"
+    assert find_finding(findings, "board").status == "ok"
 
 
 def test_another_board_than_the_configured_one_is_a_problem():
     (finding,) = check_board(simulated(uid="ff" * 12), MonotonicClock())
-    assert finding.grade == "problem"
-    assert "board.uid" in finding.seen
+    assert finding.status == "problem"
+    assert "board.uid" in finding.observation
 
 
 def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, monkeypatch):
     # Whether this computer wakes in time is not what is tested here.
-    monkeypatch.setattr(host, "check_clock", lambda clock, lease_s: ok("clock", "left out"))
+    monkeypatch.setattr(host, "check_clock", lambda clock, lease_s: report_ok("clock", "left out"))
     assert run(["doctor", "--config", "display-16", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["ok"]
     assert document["problems"] == 0
     assert {finding["grade"] for finding in document["findings"]} <= {"ok", "warning"}
-    text = shipped_path("display-16.toml").read_text()
+    text = locate_shipped("display-16.toml").read_text()
     path = tmp_path / "config.toml"
     path.write_text(text.replace('transport = "simulated"', f'transport = "serial"\nport = "{tmp_path}/tty"'))
     assert run(["doctor", "--config", str(path)]) == 1

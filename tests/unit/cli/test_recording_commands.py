@@ -72,7 +72,7 @@ def test_the_picture_shows_pulses_curves_and_what_is_missing(path, tmp_path):
     assert run(["recording", "show", str(path), "--out", str(out)]) == 0
     with Image.open(out) as image:
         colours = {colour for _, colour in image.convert("RGB").getcolors(100_000)}
-    for expected in (plot.LIGHT, plot.CURVE, plot.MISSING):
+    for expected in (plot.PULSE_COLOUR, plot.CURVE_COLOUR, plot.MISSING_COLOUR):
         assert tuple(bytes.fromhex(expected[1:])) in colours
 
 

@@ -3,11 +3,11 @@ import json
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.cli.service_files import CONFIG, INSTALLED, RULES, UNIT, USERS
-from optodrive.device.config import load_config, shipped_path
+from optodrive.cli.service_files import CONFIG_PATH, MANIFEST_PATH, RULES_PATH, UNIT_PATH, USERS_PATH
+from optodrive.device.config import load_config, locate_shipped
 
 PROGRAM = "/opt/optodrive/bin/optodrive"
-USB = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'
+USB_BOARD = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'
 
 
 @pytest.fixture
@@ -26,7 +26,7 @@ def at(tmp_path):
 
 
 def board_config(folder, board):
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     path = folder / "mine.toml"
     path.write_text(text.replace('transport = "simulated"', board))
     return path
@@ -34,10 +34,10 @@ def board_config(folder, board):
 
 def test_what_is_written_is_in_order(install, at):
     said = install().out
-    assert all(at(path).is_file() for path in (UNIT, USERS, CONFIG, INSTALLED))
-    assert f"ExecStart={PROGRAM} serve --config {CONFIG}\n" in at(UNIT).read_text()
-    assert "@" not in at(UNIT).read_text().replace("~@", "").replace("=@", "").replace(" @", "")
-    daemon = load_config(at(CONFIG)).daemon
+    assert all(at(path).is_file() for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH, MANIFEST_PATH))
+    assert f"ExecStart={PROGRAM} serve --config {CONFIG_PATH}\n" in at(UNIT_PATH).read_text()
+    assert "@" not in at(UNIT_PATH).read_text().replace("~@", "").replace("=@", "").replace(" @", "")
+    daemon = load_config(at(CONFIG_PATH)).daemon
     assert (daemon.socket, daemon.tokens, daemon.audit) == (
         "/run/optodrive/optodrive.sock",
         "/var/lib/optodrive/tokens.toml",
@@ -50,70 +50,74 @@ def test_what_is_written_is_in_order(install, at):
 
 def test_once_more_changes_nothing(install, at):
     install()
-    before = {path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT, USERS, CONFIG)}
+    before = {
+        path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH)
+    }
     assert install().out.count("there already") == 3
-    assert before == {path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT, USERS, CONFIG)}
+    assert before == {
+        path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH)
+    }
 
 
 def test_an_edited_unit_is_not_overwritten_and_nothing_else_is(install, at):
     install()
-    at(UNIT).write_text("[Service]\nNice=0\n")
-    at(USERS).unlink()
+    at(UNIT_PATH).write_text("[Service]\nNice=0\n")
+    at(USERS_PATH).unlink()
     said = install("--program", "/opt/other/optodrive", status=1).err
     assert said.count("\n") == 1
-    assert str(at(UNIT)) in said
-    assert at(UNIT).read_text() == "[Service]\nNice=0\n"
-    assert not at(USERS).exists()
+    assert str(at(UNIT_PATH)) in said
+    assert at(UNIT_PATH).read_text() == "[Service]\nNice=0\n"
+    assert not at(USERS_PATH).exists()
 
 
 def test_a_file_that_somebody_else_put_there_is_not_overwritten(install, at):
-    at(USERS).parent.mkdir(parents=True)
-    at(USERS).write_text("u other\n")
+    at(USERS_PATH).parent.mkdir(parents=True)
+    at(USERS_PATH).write_text("u other\n")
     install(status=1)
-    assert at(USERS).read_text() == "u other\n"
-    assert not at(UNIT).exists()
+    assert at(USERS_PATH).read_text() == "u other\n"
+    assert not at(UNIT_PATH).exists()
 
 
 def test_an_upgrade_replaces_what_was_not_edited_and_keeps_the_configuration(install, at, tmp_path):
     install("--config", "display-16")
     assert install("--program", "/opt/new/optodrive").out.count("replaced") == 1
-    assert "/opt/new/optodrive" in at(UNIT).read_text()
-    assert load_config(at(CONFIG)).name == "display-16"
-    at(CONFIG).write_text(at(CONFIG).read_text().replace("ambient_c = 20.0", "ambient_c = 25.0"))
+    assert "/opt/new/optodrive" in at(UNIT_PATH).read_text()
+    assert load_config(at(CONFIG_PATH)).name == "display-16"
+    at(CONFIG_PATH).write_text(at(CONFIG_PATH).read_text().replace("ambient_c = 20.0", "ambient_c = 25.0"))
     said = install("--program", "/opt/newer/optodrive").out
-    assert f"{CONFIG}: edited, left as it is" in said
-    assert load_config(at(CONFIG)).ambient_c == 25.0
+    assert f"{CONFIG_PATH}: edited, left as it is" in said
+    assert load_config(at(CONFIG_PATH)).ambient_c == 25.0
 
 
 def test_remove_leaves_what_was_edited(install, at):
     install()
-    at(CONFIG).write_text(at(CONFIG).read_text() + "# mine\n")
+    at(CONFIG_PATH).write_text(at(CONFIG_PATH).read_text() + "# mine\n")
     said = install(command="remove").out
-    assert f"{CONFIG}: edited, left as it is" in said
-    assert not at(UNIT).exists()
-    assert at(CONFIG).exists()
-    at(CONFIG).unlink()
+    assert f"{CONFIG_PATH}: edited, left as it is" in said
+    assert not at(UNIT_PATH).exists()
+    assert at(CONFIG_PATH).exists()
+    at(CONFIG_PATH).unlink()
     install(command="remove")
-    assert not at(INSTALLED).exists()
+    assert not at(MANIFEST_PATH).exists()
     assert install(command="remove").out == "nothing is installed\n"
 
 
 def test_show(install, at):
     assert install(command="show").out == "nothing is installed\n"
     install()
-    at(UNIT).write_text("")
-    at(USERS).unlink()
+    at(UNIT_PATH).write_text("")
+    at(USERS_PATH).unlink()
     shown = json.loads(install("--json", command="show").out)["files"]
     assert {item["path"]: item["standing"] for item in shown} == {
-        str(UNIT): "edited",
-        str(USERS): "missing",
-        str(CONFIG): "as installed",
+        str(UNIT_PATH): "edited",
+        str(USERS_PATH): "missing",
+        str(CONFIG_PATH): "as installed",
     }
 
 
 def test_rules_name_the_board(install, at, tmp_path):
-    install("--config", board_config(tmp_path, USB + 'serial_number = "E6-1"\n'))
-    lines = [line for line in at(RULES).read_text().splitlines() if "idVendor" in line]
+    install("--config", board_config(tmp_path, USB_BOARD + 'serial_number = "E6-1"\n'))
+    lines = [line for line in at(RULES_PATH).read_text().splitlines() if "idVendor" in line]
     assert len(lines) == 2
     for line in lines:
         for part in (
@@ -131,9 +135,9 @@ def test_rules_name_the_board(install, at, tmp_path):
 @pytest.mark.parametrize("serial", ['x", RUN+="/bin/sh', "a b", "ü", "a$b"])
 def test_a_serial_number_that_is_more_than_one_is_refused(install, at, tmp_path, serial):
     quoted = json.dumps(serial, ensure_ascii=False)
-    said = install("--config", board_config(tmp_path, f"{USB}serial_number = {quoted}\n"), status=2).err
+    said = install("--config", board_config(tmp_path, f"{USB_BOARD}serial_number = {quoted}\n"), status=2).err
     assert "board.serial_number" in said
-    assert not at(UNIT).exists()
+    assert not at(UNIT_PATH).exists()
 
 
 @pytest.mark.parametrize("program", ["/home/anna/.venv/bin/optodrive", "/root/x/optodrive", "/tmp/optodrive"])
@@ -148,9 +152,9 @@ def test_a_program_that_is_more_than_a_path_is_refused(install, program):
 
 def test_only_a_board_on_usb_gets_usb_devices(install, at, tmp_path):
     install()
-    assert "usb_device" not in at(UNIT).read_text()
-    install("--config", board_config(tmp_path, USB.replace('"serial"', '"usb"')))
-    assert "DeviceAllow=char-usb_device rw\n" in at(UNIT).read_text()
+    assert "usb_device" not in at(UNIT_PATH).read_text()
+    install("--config", board_config(tmp_path, USB_BOARD.replace('"serial"', '"usb"')))
+    assert "DeviceAllow=char-usb_device rw\n" in at(UNIT_PATH).read_text()
 
 
 def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):

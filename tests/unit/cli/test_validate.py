@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from optodrive.cli.validation_table import cells, validate_table
-from optodrive.lab.validation.paper_outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, OUTCOMES, SILENT
+from optodrive.cli.validation_table import build_validation_rows, format_cells
+from optodrive.lab.validation.paper_outcomes import EXTENDED_FITTED_ON, FITTED_ON, INPUTS, NOT_MODELLED, OUTCOMES
 
-ROWS = {row.fact.id: row for row in validate_table()}
+ROWS = {row.fact.id: row for row in build_validation_rows()}
 
 
 def run(*options):
@@ -24,17 +24,28 @@ def test_rows_are_all_that_can_be_said():
 
 
 def test_cells_are_in_readable_units():
-    assert cells(ROWS["z_tp8_w040"])[:2] == ["z_tp8_w040", "155.2 ± 2.3 µm"]
-    assert cells(ROWS["z_repeat_w040"])[1] == "< 0.5 µm"
-    assert cells(ROWS["z_repeat_w040"])[3] == ""
-    assert cells(ROWS["R_w020"]) == ["R_w020", "382 K/W", "382", "1.00", "382", "1.00", "input", "382", "1.00", "input"]
+    assert format_cells(ROWS["z_tp8_w040"])[:2] == ["z_tp8_w040", "155.2 ± 2.3 µm"]
+    assert format_cells(ROWS["z_repeat_w040"])[1] == "< 0.5 µm"
+    assert format_cells(ROWS["z_repeat_w040"])[3] == ""
+    assert format_cells(ROWS["R_w020"]) == [
+        "R_w020",
+        "382 K/W",
+        "382",
+        "1.00",
+        "382",
+        "1.00",
+        "input",
+        "382",
+        "1.00",
+        "input",
+    ]
 
 
 def test_the_table_shows_every_fact_whole_also_without_a_terminal():
     text = run()
     for row in ROWS.values():
         line = next(line for line in text.splitlines() if f" {row.fact.id} " in line)
-        assert all(cell in line for cell in cells(row))
+        assert all(cell in line for cell in format_cells(row))
         if row.remark:
             assert f"  {row.fact.id}: {row.remark}" in text
     assert "…" not in text
@@ -48,7 +59,7 @@ def test_json_is_one_object_in_si_units():
     assert facts["z_tp8_w040"]["uncertainty"] == pytest.approx(2.3e-6)
     assert facts["N_50um"]["calibrated_ratio"] == pytest.approx(ROWS["N_50um"].calibrated_ratio)
     assert facts["z_repeat_w040"]["calibrated_ratio"] is None
-    assert document["silent"] == SILENT
+    assert document["silent"] == NOT_MODELLED
     assert document["fitted_on"] == FITTED_ON
     assert document["extended_fitted_on"] == EXTENDED_FITTED_ON
     for name in EXTENDED_FITTED_ON.values():
@@ -71,11 +82,11 @@ def test_a_model_of_ones_own_stands_beside_the_others(tmp_path):
         'planner_terms = ["laser_turn_on"]\n'
         '[terms.laser_turn_on.time]\nvalue = 2e-3\nunit = "s"\nsource = "here"\n'
     )
-    rows = {row.fact.id: row for row in validate_table(path)}
+    rows = {row.fact.id: row for row in build_validation_rows(path)}
     assert rows["R_w020"].model == rows["R_w020"].calibrated
     # The light comes 2 ms late: a 50 ms pulse hardly knows; one that lifts 50 µm takes 2 ms longer.
     assert rows["z_peak_w020"].model == pytest.approx(rows["z_peak_w020"].calibrated, rel=0.03)
     width_s = 1.0 / rows["N_50um"].model - 1.0 / rows["N_50um"].calibrated
     assert width_s == pytest.approx(1.6e-3, abs=0.4e-3)
-    assert cells(rows["R_w020"])[-2:] == ["382", "1.00"]
+    assert format_cells(rows["R_w020"])[-2:] == ["382", "1.00"]
     assert rows["z_repeat_w040"].model_ratio is None

@@ -5,30 +5,30 @@ import pytest
 from optodrive.cli.main import run
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
-from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO_BOARD, Entry, TapeWriter
+from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO_BOARD, CaptureEntry, LinkCaptureWriter
 
 
-def wire(message, seq=0):
+def encode_message(message, seq=0):
     return encode_frame(Frame(message.TYPE, seq, 5, message.body()))
 
 
 DATA = m.Data(0, m.POINT.pack(1, 2, 3, 4, 32768) * 20)
 ENTRIES = [
-    Entry(OPENED, 10.0),
-    Entry(TO_BOARD, 10.1, b"\0" + wire(m.Clock(9)) + wire(DATA)),
-    Entry(FROM_BOARD, 10.15, wire(m.ClockReply(9, 77))[:4]),
-    Entry(FROM_BOARD, 10.2, wire(m.ClockReply(9, 77))[4:] + b"\x05no frame\0"),
-    Entry(TO_BOARD, 10.3, wire(DATA)),
-    Entry(FROM_BOARD, 12.3, wire(m.Nak(1, 0))),
-    Entry(CLOSED, 12.5),
+    CaptureEntry(OPENED, 10.0),
+    CaptureEntry(TO_BOARD, 10.1, b"\0" + encode_message(m.Clock(9)) + encode_message(DATA)),
+    CaptureEntry(FROM_BOARD, 10.15, encode_message(m.ClockReply(9, 77))[:4]),
+    CaptureEntry(FROM_BOARD, 10.2, encode_message(m.ClockReply(9, 77))[4:] + b"\x05no frame\0"),
+    CaptureEntry(TO_BOARD, 10.3, encode_message(DATA)),
+    CaptureEntry(FROM_BOARD, 12.3, encode_message(m.Nak(1, 0))),
+    CaptureEntry(CLOSED, 12.5),
 ]
 
 
 @pytest.fixture
 def tape(tmp_path):
-    writer = TapeWriter(tmp_path / "tape", 10.0, pytest.fail)
+    writer = LinkCaptureWriter(tmp_path / "tape", 10.0, pytest.fail)
     for entry in ENTRIES:
-        writer.note(entry)
+        writer.record(entry)
     writer.close()
     with writer.path.open("ab") as file:
         file.write(b"torn")

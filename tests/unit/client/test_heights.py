@@ -6,17 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.client.heights import by_pixel, layout_of, to_bytes, to_json
-from optodrive.client.picture import colour, png
+from optodrive.client.heights import build_layout, convert_to_pixels, encode_frame, encode_json
+from optodrive.client.picture import interpolate_colour, render_png
 from optodrive.core.errors import InputError
-from optodrive.planning.effective_config import resolved_config
+from optodrive.planning.effective_config import build_effective_config
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 LAYOUT = DISPLAYS["display-437"].layout
 
 
 def test_the_layout_comes_out_of_the_daemons_configuration(any_display):
-    layout = layout_of(resolved_config(any_display))
+    layout = build_layout(build_effective_config(any_display))
     for name in ("x_m", "y_m", "row", "column"):
         np.testing.assert_array_equal(getattr(layout, name), getattr(any_display.layout, name))
 
@@ -27,8 +27,8 @@ def test_a_pixel_an_array_and_a_picture_ask_for_the_same():
     by_index = np.zeros(437)
     by_index[17] = 120.0
     for given_um in ({17: 120.0}, by_index, by_index.tolist(), by_place):
-        np.testing.assert_array_equal(by_pixel(given_um, LAYOUT), by_index)
-    assert to_json(by_index) == {"17": 120.0}
+        np.testing.assert_array_equal(convert_to_pixels(given_um, LAYOUT), by_index)
+    assert encode_json(by_index) == {"17": 120.0}
 
 
 @pytest.mark.parametrize(
@@ -47,28 +47,28 @@ def test_a_pixel_an_array_and_a_picture_ask_for_the_same():
 )
 def test_what_cannot_be_is_refused_in_one_line(heights_um, where):
     with pytest.raises(InputError, match=where) as refused:
-        by_pixel(heights_um, LAYOUT)
+        convert_to_pixels(heights_um, LAYOUT)
     assert "\n" not in str(refused.value)
 
 
 @given(st.integers(0, 2**33), st.lists(st.floats(0, 6553.5), min_size=437, max_size=437))
 def test_the_daemon_reads_a_streams_bytes_back(number, heights_um):
-    read, sequence = parse_live_frame(to_bytes(number, np.array(heights_um)), 0, 437)
+    read, sequence = parse_live_frame(encode_frame(number, np.array(heights_um)), 0, 437)
     assert read == number % 2**32
     np.testing.assert_allclose(1e6 * sequence.frames[0].target_m, heights_um, atol=0.0501)
 
 
 def test_a_height_beyond_a_streams_bits_is_refused():
     with pytest.raises(InputError, match=r"6553\.5"):
-        to_bytes(0, by_pixel({3: 6553.6}, LAYOUT))
+        encode_frame(0, convert_to_pixels({3: 6553.6}, LAYOUT))
 
 
 def test_the_picture_has_its_size_and_its_colours_only_grow_lighter(any_display):
     layout = any_display.layout
-    written = png(layout, np.linspace(0.0, 50.0, len(layout)))
+    written = render_png(layout, np.linspace(0.0, 50.0, len(layout)))
     width, height = struct.unpack(">II", written[16:24])
     assert 200 < width <= 700
     assert 40 < height <= 720
-    lightness = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in (colour(k / 50) for k in range(51))]
+    lightness = [0.2126 * r + 0.7152 * g + 0.0722 * b for r, g, b in (interpolate_colour(k / 50) for k in range(51))]
     assert lightness == sorted(lightness)
-    assert png(layout, np.zeros(len(layout)))[:4] == b"\x89PNG"
+    assert render_png(layout, np.zeros(len(layout)))[:4] == b"\x89PNG"

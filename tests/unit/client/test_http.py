@@ -3,7 +3,7 @@ from math import inf
 import httpx
 import pytest
 
-from optodrive.client.http import Access, problem_error, taken
+from optodrive.client.http import Endpoint, build_error, parse_response
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
@@ -13,7 +13,7 @@ from optodrive.core.errors import (
     OverBudgetError,
     RefusedError,
 )
-from optodrive.daemon.web.api import problem_of
+from optodrive.daemon.web.api import build_error_problem
 
 
 @pytest.mark.parametrize(
@@ -29,8 +29,8 @@ from optodrive.daemon.web.api import problem_of
     ],
 )
 def test_what_the_daemon_raises_comes_out_the_same_at_the_caller(error):
-    document = problem_of(error)
-    found = problem_error(document["status"], document)
+    document = build_error_problem(error)
+    found = build_error(document["status"], document)
     assert type(found) is type(error)
     assert str(found) == str(error)
     assert found.code == error.code
@@ -42,17 +42,17 @@ def test_what_the_daemon_raises_comes_out_the_same_at_the_caller(error):
 def test_an_answer_that_is_no_problem_document_is_said_to_be_none():
     for body in (b"<html>", b"[1]", b'{"error": 1}'):
         with pytest.raises(LinkError, match="502 without a problem document"):
-            taken(httpx.Response(502, content=body))
+            parse_response(httpx.Response(502, content=body))
 
 
 def test_codes_that_are_not_known_here_are_refusals_with_their_code():
-    error = problem_error(429, {"detail": "too often", "code": "too_many_requests"})
+    error = build_error(429, {"detail": "too often", "code": "too_many_requests"})
     assert type(error) is RefusedError
     assert error.code == "too_many_requests"
-    assert isinstance(problem_error(500, {"detail": "?"}), OptodriveError)
+    assert isinstance(build_error(500, {"detail": "?"}), OptodriveError)
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8450", "ftp://127.0.0.1", "http://", "unix:", "unix://host/path", "unix:/"])
 def test_an_address_that_is_none_is_refused(url):
     with pytest.raises(InputError, match="--url"):
-        Access(url, "token")
+        Endpoint(url, "token")

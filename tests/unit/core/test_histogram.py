@@ -12,5 +12,5 @@ def test_it_counts_values_at_most_each_bound(values):
     for value in values:
         histogram.add(value)
     counts = [sum(value <= bound for value in values) for bound in BOUNDS]
-    assert histogram.cumulative() == [*counts, len(values)]
+    assert histogram.cumulative_counts() == [*counts, len(values)]
     assert histogram.sum == sum(values)

@@ -6,7 +6,7 @@ from contextlib import closing
 import pytest
 
 from optodrive.daemon import log as log_module
-from optodrive.daemon.log import Log, daemon_log, entry
+from optodrive.daemon.log import DaemonLog, format_entry, open_daemon_log
 
 
 def fields(data):
@@ -33,18 +33,18 @@ def journal(tmp_path):
 
 
 def test_an_entry_has_its_fields():
-    made = fields(entry("dark", "err", {"EVENT": "fault"}))
+    made = fields(format_entry("dark", "err", {"EVENT": "fault"}))
     assert made == {"MESSAGE": "dark", "PRIORITY": "3", "SYSLOG_IDENTIFIER": "optodrive", "OPTODRIVE_EVENT": "fault"}
 
 
 def test_a_value_cannot_forge_another_field():
-    made = fields(entry("a\nPRIORITY=0\nMESSAGE=b", "info", {}))
+    made = fields(format_entry("a\nPRIORITY=0\nMESSAGE=b", "info", {}))
     assert made["MESSAGE"] == "a\nPRIORITY=0\nMESSAGE=b"
     assert made["PRIORITY"] == "6"
 
 
 def test_lines_go_to_the_journal(journal, tmp_path, capsys):
-    with closing(Log(tmp_path / "journal")) as log:
+    with closing(DaemonLog(tmp_path / "journal")) as log:
         log.warn("the link went")
     assert fields(journal.recv(9000))["MESSAGE"] == "the link went"
     assert capsys.readouterr().err == ""
@@ -52,7 +52,7 @@ def test_lines_go_to_the_journal(journal, tmp_path, capsys):
 
 def test_a_journal_that_is_gone_or_stands_still_holds_nothing_up(journal, tmp_path):
     for path in (tmp_path / "journal", tmp_path / "nowhere"):
-        with closing(Log(path)) as log:
+        with closing(DaemonLog(path)) as log:
             for _ in range(5000):
                 log.warn("x" * 1000)
 
@@ -67,15 +67,15 @@ def test_the_journal_is_used_only_where_stderr_is_its_own(monkeypatch, tmp_path)
         (f"{there.st_dev}:{there.st_ino}", str(tmp_path)),
     ):
         monkeypatch.setenv("JOURNAL_STREAM", stream)
-        with closing(daemon_log()) as log:
+        with closing(open_daemon_log()) as log:
             assert log._journal == expected
 
 
 def test_what_libraries_log_is_said(capsys):
     root = logging.getLogger()
     before = list(root.handlers)
-    log = Log()
-    log.take_logging()
+    log = DaemonLog()
+    log.attach_to_root_logger()
     try:
         logging.getLogger("uvicorn.error").error("no good")
         logging.getLogger("uvicorn.error").info("nothing")

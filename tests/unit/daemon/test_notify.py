@@ -39,15 +39,15 @@ def heard(manager):
 
 def test_nobody_listens(make_notifier):
     notifier = make_notifier(ManualClock(), {})
-    notifier.tell("READY=1")
-    notifier.alive()
-    assert not notifier.listened_to
+    notifier.send("READY=1")
+    notifier.feed_watchdog()
+    assert not notifier.is_enabled
 
 
 def test_what_is_told(manager, make_notifier):
     notifier = make_notifier(ManualClock(2.5), {"NOTIFY_SOCKET": manager.getsockname()})
-    notifier.tell("READY=1", "STATUS=well")
-    notifier.reloading()
+    notifier.send("READY=1", "STATUS=well")
+    notifier.notify_reloading()
     assert heard(manager) == ["READY=1\nSTATUS=well", "RELOADING=1\nMONOTONIC_USEC=2500000"]
 
 
@@ -56,7 +56,7 @@ def test_an_abstract_address(manager, make_notifier):
         name = f"optodrive-test-{os.getpid()}"
         abstract.bind("\0" + name)
         abstract.setblocking(False)
-        make_notifier(ManualClock(), {"NOTIFY_SOCKET": "@" + name}).tell("READY=1")
+        make_notifier(ManualClock(), {"NOTIFY_SOCKET": "@" + name}).send("READY=1")
         assert heard(abstract) == ["READY=1"]
 
 
@@ -64,7 +64,7 @@ def test_the_watchdog_is_fed_often_enough_and_only_by_turns(manager, make_notifi
     clock = ManualClock()
     notifier = make_notifier(clock, {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "20000000"})
     for _ in range(2000):
-        notifier.alive()
+        notifier.feed_watchdog()
         clock.sleep(0.01)
     assert heard(manager) == ["WATCHDOG=1"] * 5
     clock.sleep(100.0)
@@ -73,11 +73,11 @@ def test_the_watchdog_is_fed_often_enough_and_only_by_turns(manager, make_notifi
 
 def test_another_process_watchdog_is_not_fed(manager, make_notifier):
     environment = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
-    make_notifier(ManualClock(), environment).alive()
+    make_notifier(ManualClock(), environment).feed_watchdog()
     assert heard(manager) == []
 
 
 def test_a_manager_that_does_not_read_holds_nothing_up(manager, make_notifier):
     notifier = make_notifier(ManualClock(), {"NOTIFY_SOCKET": manager.getsockname()})
     for _ in range(5000):
-        notifier.tell("WATCHDOG=1")
+        notifier.send("WATCHDOG=1")

@@ -1,7 +1,13 @@
 import pytest
 
 from optodrive.core.errors import NotReadyError
-from optodrive.daemon.reload import NOT_WHILE, changed, require_dark, sentence, taken
+from optodrive.daemon.reload import (
+    NON_RELOADABLE_STATES,
+    describe_reload,
+    merge_reloadable,
+    require_disarmed,
+    split_changed_keys,
+)
 from optodrive.device.config import load_config
 
 
@@ -16,31 +22,31 @@ def with_(config, section, **changes):
 
 
 def test_nothing_changed(config):
-    assert changed(config, load_config()) == ([], [])
+    assert split_changed_keys(config, load_config()) == ([], [])
 
 
 def test_hosts_and_bounds_are_taken_the_rest_waits(config):
     new = with_(config, "daemon", hosts=("lab",), port=9000, body_max_bytes=2048)
     new = with_(new, "limits", absorber_max_c=300.0)
-    at_once, waiting = changed(config, new)
+    at_once, waiting = split_changed_keys(config, new)
     assert at_once == ["daemon.body_max_bytes", "daemon.hosts"]
     assert waiting == ["daemon.port", "limits.absorber_max_c"]
-    running = taken(config, new)
+    running = merge_reloadable(config, new)
     assert running.daemon.hosts == ("lab",)
     assert running.daemon.port == config.daemon.port
     assert running.limits == config.limits
     # What waits is said again at the next reload.
-    assert changed(running, new) == ([], waiting)
-    assert "RESTART: daemon.port, limits.absorber_max_c" in sentence(at_once, waiting, None)
+    assert split_changed_keys(running, new) == ([], waiting)
+    assert "RESTART: daemon.port, limits.absorber_max_c" in describe_reload(at_once, waiting, None)
 
 
 @pytest.mark.parametrize("state", ["ARMING", "ARMED", "RUNNING", "HOLD"])
 def test_nothing_is_reloaded_while_armed(state):
-    assert state in NOT_WHILE
+    assert state in NON_RELOADABLE_STATES
     with pytest.raises(NotReadyError, match="disarm it first"):
-        require_dark(state)
+        require_disarmed(state)
 
 
 @pytest.mark.parametrize("state", ["DISARMED", "FAULT", "BOOT", "no link"])
 def test_while_dark_it_may_be(state):
-    require_dark(state)
+    require_disarmed(state)

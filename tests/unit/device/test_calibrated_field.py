@@ -3,14 +3,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hidden_field import CODE_M, CONFIG, PRIOR, grid_codes, seen
+from hidden_field import CODE_M, CONFIG, PRIOR, grid_codes, measure_spots
 from optodrive.core.errors import InputError
-from optodrive.device.field_file import read_field
+from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_writer import write_field
 from optodrive.link.simulator.true_geometry import Truth
 
-FIT = fit_field(seen(Truth.drawn(0, CONFIG), grid_codes(9), np.random.default_rng(0))[0], PRIOR)
+FIT = fit_field(measure_spots(Truth.drawn(0, CONFIG), grid_codes(9), np.random.default_rng(0))[0], PRIOR)
 FIELD = FIT.field
 CODE = st.floats(0.0, 65535.0)
 
@@ -43,10 +43,10 @@ def test_far_places_are_never_taken_for_others():
     """Polynomials fold over: what comes back without being lost leads where it should."""
     far_m = np.random.default_rng(3).uniform(-1.0, 1.0, (2, 4000))
     for seed in range(6):
-        spots, _ = seen(Truth.drawn(seed, CONFIG), grid_codes(5), np.random.default_rng(0))
+        spots, _ = measure_spots(Truth.drawn(seed, CONFIG), grid_codes(5), np.random.default_rng(0))
         field = fit_field(spots, PRIOR).field
         for beyond, most_codes in ((False, 0.1), (True, 10.0)):
-            codes = np.array(field.codes(*far_m, beyond=beyond))
+            codes = np.array(field.codes(*far_m, extrapolate=beyond))
             kept = np.isfinite(codes[0])
             assert kept.any()
             again = np.array(field.position_m(*codes[:, kept]))
@@ -55,12 +55,12 @@ def test_far_places_are_never_taken_for_others():
 
 def test_angles_are_codes_in_the_converter_s_scale():
     x_code, _ = FIELD.codes(0.01, 0.02)
-    assert FIELD.angles_rad(0.01, 0.02)[0] == pytest.approx((x_code - 32768) * CONFIG.scanner.code_rad)
+    assert FIELD.angles_rad(0.01, 0.02)[0] == pytest.approx((x_code - 32768) * CONFIG.scanner.rad_per_code)
 
 
 def test_there_and_back_through_a_file(tmp_path):
     write_field(tmp_path / "field.toml", FIT, 'spots "of" today')
-    again = read_field(tmp_path / "field.toml")
+    again = load_field(tmp_path / "field.toml")
     codes = grid_codes(7).T
     assert np.array_equal(again.position_m(*codes), FIELD.position_m(*codes))
     assert again.sigma_m(*codes) == pytest.approx(FIELD.sigma_m(*codes), rel=1e-3)
@@ -83,4 +83,4 @@ def test_another_file_is_refused_by_name(tmp_path, old, new, named):
     write_field(path, FIT)
     path.write_text(path.read_text().replace(old, new, 1))
     with pytest.raises(InputError, match=named):
-        read_field(path)
+        load_field(path)

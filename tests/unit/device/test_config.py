@@ -2,15 +2,15 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config, pixel_layout, shipped_configs, shipped_path
+from optodrive.device.config import build_pixel_layout, list_shipped_configs, load_config, locate_shipped
 from optodrive.physics.parameters import load_parameters
-from optodrive.planning.effective_config import resolved_config
-from optodrive.planning.pipeline import Display
+from optodrive.planning.effective_config import build_effective_config
+from optodrive.planning.pipeline import DisplayModel
 
 
-@pytest.mark.parametrize("name", shipped_configs())
+@pytest.mark.parametrize("name", list_shipped_configs())
 def test_shipped_configurations_have_the_pixels_they_are_named_after(name):
-    layout = pixel_layout(load_config(name).display)
+    layout = build_pixel_layout(load_config(name).display)
     assert len(layout) == int(name.removeprefix("display-"))
     places = np.column_stack([layout.x_m, layout.y_m])
     assert len(np.unique(places.round(9), axis=0)) == len(layout)
@@ -18,13 +18,13 @@ def test_shipped_configurations_have_the_pixels_they_are_named_after(name):
 
 
 def test_pixels_count_by_rows_from_the_lower_left():
-    layout = pixel_layout(load_config("display-16").display)
+    layout = build_pixel_layout(load_config("display-16").display)
     assert layout.x_m[:4] == pytest.approx([-6e-3, -2e-3, 2e-3, 6e-3])
     assert layout.y_m[::4] == pytest.approx([-6e-3, -2e-3, 2e-3, 6e-3])
 
 
 def test_the_resolved_configuration_carries_what_others_rely_on():
-    resolved = resolved_config(Display.of(load_config()))
+    resolved = build_effective_config(DisplayModel.from_config(load_config()))
     assert resolved["name"] == "display-437"
     assert len(resolved["display"]["pixels"]) == 437
     assert set(resolved["display"]["pixels"][0]) == {"index", "x_m", "y_m", "bridge_width_m"}
@@ -52,8 +52,8 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
         ('transport = "simulated"', 'transport = "serial"', "board", "needs port"),
         ('transport = "simulated"', 'transport = "usb"', "board", "needs vendor_id and product_id"),
         ('transport = "simulated"', 'transport = "usb"\nvendor_id = 0x12345', "board.vendor_id", "65535"),
-        ('transport = "simulated"', 'transport = "helios"', "contradict", "codes_a_side 32767 must be 2047"),
-        ("damping = 0.7", "damping = 0.7\ncodes_a_side = 2047", "contradict", "codes_a_side 2047 must be 32767"),
+        ('transport = "simulated"', 'transport = "helios"', "contradict", "half_range_codes 32767 must be 2047"),
+        ("damping = 0.7", "damping = 0.7\nhalf_range_codes = 2047", "contradict", "codes_a_side 2047 must be 32767"),
         ("baud = 1_000_000", "points_per_s = 60_000", "board.points_per_s", "50000"),
         ("absorber_max_c = 400.0", "absorber_max_c = nan", "absorber_max_c", "finite"),
         ("pulse_width_max_s = 0.050", "pulse_width_max_s = 0.070", "pulse_width_max_s", "0.065535"),
@@ -70,7 +70,7 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
     ],
 )
 def test_wrong_values_are_named_with_place_and_expectation(tmp_path, old, new, where, expected):
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     assert old in text
     path = tmp_path / "c.toml"
     path.write_text(text.replace(old, new, 1))
@@ -92,8 +92,8 @@ def test_parameter_sets_carry_unit_and_source_for_every_value():
 
 def test_a_bridge_width_between_the_rows_of_table_s3_takes_the_fitted_law():
     parameters = load_parameters("calibrated")
-    assert parameters.pixel(0.40e-3).r_k_per_w == 184.0
-    assert parameters.pixel(0.30e-3).r_k_per_w == pytest.approx(73.3 / 0.30)
+    assert parameters.build_pixel(0.40e-3).r_k_per_w == 184.0
+    assert parameters.build_pixel(0.30e-3).r_k_per_w == pytest.approx(73.3 / 0.30)
 
 
 def test_an_unknown_parameter_set_is_refused(tmp_path):

@@ -3,32 +3,32 @@
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, LAYOUT, aimed_by, field_file
+from hidden_field import CONFIG, LAYOUT, calibrate_hidden_field, config_with_field
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import load_config, shipped_path
-from optodrive.device.field_loader import field_of, moves_of
+from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.scan_field import IdealField
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.planning.budget_setup import mirrors_of
-from optodrive.planning.pipeline import Display, prepare
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.budget_setup import build_galvo_model
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """Seed to truth and configuration."""
     folder = tmp_path_factory.mktemp("fields")
-    return {seed: field_file(folder / f"field-{seed}.toml", seed) for seed in (0, 1, 2)}
+    return {seed: calibrate_hidden_field(folder / f"field-{seed}.toml", seed) for seed in (0, 1, 2)}
 
 
 def landed_m(truth, config):
     """Where the light of a full frame really falls, by the very bytes; and the pixel of each pulse."""
-    display, scale = Display.of(config), Requirements.of(config).scale
+    display, scale = DisplayModel.from_config(config), BoardRequirements.from_config(config).scale
     full = FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(len(LAYOUT), 10e-6)),))
-    plan = prepare(display, full, *display.at_rest()).plan
+    plan = plan_sequence(display, full, *display.build_cold_state()).plan
     points = quantise(plan, scale)
-    pulses = decode(points.payload(), scale)
+    pulses = decode(points.encode_payload(), scale)
     codes = (np.rint(angle_rad / scale.rad_per_code) + 32768 for angle_rad in (pulses.x_rad, pulses.y_rad))
     return np.array(truth.position_m(*codes)), plan.pixel[points.row[pulses.index]]
 
@@ -45,56 +45,58 @@ def test_every_planned_pulse_lands_within_30_um_of_its_pixel_and_uncorrected_one
 
 def test_planner_limiter_and_board_see_the_same(made):
     _, config = made[0]
-    display, requirements = Display.of(config), Requirements.of(config)
-    assert mirrors_of(config).lead_s == display.machine.moves.lead_us * 1e-6
-    x_code, y_code = (requirements.scale.codes(a) for a in display.machine.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m))
-    limits = requirements.limits()
+    display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
+    assert build_galvo_model(config).lead_in_s == display.scan_head.settling.lead_in_us * 1e-6
+    x_code, y_code = (
+        requirements.scale.to_codes(a) for a in display.scan_head.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
+    )
+    limits = requirements.build_limits()
     assert limits.x_min <= x_code.min() <= limits.x_min + 65
     assert limits.y_max - 65 <= y_code.max() <= limits.y_max
 
 
 def test_the_board_s_own_time_of_a_move_never_passes_the_plan_s(made):
     for _, config in made.values():
-        display, requirements = Display.of(config), Requirements.of(config)
-        moves, limits = display.machine.moves, requirements.limits()
-        angles_rad = display.machine.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
-        codes = [requirements.scale.codes(angle_rad) for angle_rad in angles_rad]
+        display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
+        moves, limits = display.scan_head.settling, requirements.build_limits()
+        angles_rad = display.scan_head.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
+        codes = [requirements.scale.to_codes(angle_rad) for angle_rad in angles_rad]
         for one, other in np.random.default_rng(0).integers(len(LAYOUT), size=(500, 2)).tolist():
             far = max(abs(int(axis[one] - axis[other])) for axis in codes)
             own_us = limits.settle_us - (-far * limits.settle_ns_per_code // 1000) if far else 0
             dx_rad, dy_rad = (axis[one] - axis[other] for axis in angles_rad)
-            assert own_us <= moves.time_us(dx_rad, dy_rad, moves.calm_us)
+            assert own_us <= moves.settling_us(dx_rad, dy_rad, moves.long_dwell_us)
 
 
 def test_without_a_field_the_lens_is_ideal():
-    assert field_of(CONFIG) == IdealField(CONFIG.scanner.focal_length_m)
+    assert load_scan_field(CONFIG) == IdealField(CONFIG.scanner.focal_length_m)
 
 
 def test_a_field_is_looked_for_beside_the_configuration(tmp_path):
-    field_file(tmp_path / "field.toml", side=5)
-    text = shipped_path("display-437.toml").read_text()
+    calibrate_hidden_field(tmp_path / "field.toml", side=5)
+    text = locate_shipped("display-437.toml").read_text()
     own = tmp_path / "own.toml"
     own.write_text(text.replace("[scanner]\n", '[scanner]\nfield = "field.toml"\n'))
     assert load_config(own).scanner.field == str(tmp_path / "field.toml")
-    moves_of(load_config(own))
+    build_settling_table(load_config(own))
 
 
 def test_a_field_of_another_scanner_is_refused(tmp_path):
-    field_file(tmp_path / "field.toml", side=5)
+    calibrate_hidden_field(tmp_path / "field.toml", side=5)
     with pytest.raises(InputError, match=r"scanner\.range_rad: got 0\.2, expected 0\.1745, what .*field\.toml"):
-        field_of(aimed_by(tmp_path / "field.toml", range_rad=0.2))
+        load_scan_field(config_with_field(tmp_path / "field.toml", range_rad=0.2))
     with pytest.raises(InputError, match=r"scanner\.focal_length_m: got 0\.25, expected 0\.22"):
-        field_of(aimed_by(tmp_path / "field.toml", focal_length_m=0.25))
+        load_scan_field(config_with_field(tmp_path / "field.toml", focal_length_m=0.25))
 
 
 def test_pixels_beyond_the_field_or_the_converter_are_refused_by_name(tmp_path):
-    field_file(tmp_path / "field.toml", side=5)
+    calibrate_hidden_field(tmp_path / "field.toml", side=5)
     large = load_config("display-1511")
     with pytest.raises(InputError, match=r"pixel 0 at -.* mm: got .*codes|reaches"):
-        field_of(aimed_by(tmp_path / "field.toml", large))
+        load_scan_field(config_with_field(tmp_path / "field.toml", large))
 
 
 def test_a_field_less_sure_than_the_aim_error_is_refused(tmp_path):
-    field_file(tmp_path / "field.toml", side=3)
+    calibrate_hidden_field(tmp_path / "field.toml", side=3)
     with pytest.raises(InputError, match=r"scanner\.aim_error_m: got 1e-05, expected at least"):
-        field_of(aimed_by(tmp_path / "field.toml", aim_error_m=1e-5))
+        load_scan_field(config_with_field(tmp_path / "field.toml", aim_error_m=1e-5))

@@ -3,8 +3,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from optodrive.device.gate_timing import outlasting, pole_per_s, settled_s
-from optodrive.device.servo import Servo, follow
+from optodrive.device.gate_timing import envelope_factor, pole_per_s, settling_s
+from optodrive.device.servo import Servo, simulate_servo
 
 SERVO = Servo(frequency=1700.0, damping=0.7, delay=3e-5, slew=100.0)
 servos = st.builds(
@@ -21,9 +21,9 @@ servos = st.builds(
 def test_settled_is_when_the_stepped_servo_last_comes_inside(servo, move_rad, share):
     """The servo as the diagnosis steps it, which is good to some 2e-4 of a step."""
     tolerance_rad = share * min(move_rad, 0.02)
-    done_s = settled_s(servo, move_rad, tolerance_rad)
+    done_s = settling_s(servo, move_rad, tolerance_rad)
     t_s = np.linspace(0.0, done_s + 8 / (servo.damping * 2 * np.pi * servo.frequency), 20_001)
-    angle = follow(np.array([-1.0, 0.0]), np.array([0.0, move_rad]), t_s, servo)
+    angle = simulate_servo(np.array([-1.0, 0.0]), np.array([0.0, move_rad]), t_s, servo)
     error_rad = np.abs(angle - move_rad)
     rough_rad = 2e-3 * min(move_rad, servo.slew / servo.frequency)
     assert error_rad[t_s >= done_s].max() <= tolerance_rad + rough_rad
@@ -32,14 +32,14 @@ def test_settled_is_when_the_stepped_servo_last_comes_inside(servo, move_rad, sh
 
 
 def test_never_before_the_ramp_is_over():
-    assert settled_s(SERVO, 1e-4, 1e-3) == pytest.approx(3e-5 + 1e-6)
-    assert settled_s(SERVO, 0.1, 0.09) >= 3e-5 + 1e-3
+    assert settling_s(SERVO, 1e-4, 1e-3) == pytest.approx(3e-5 + 1e-6)
+    assert settling_s(SERVO, 0.1, 0.09) >= 3e-5 + 1e-3
 
 
 def test_the_servo_of_the_shipped_scanners_settles_as_its_class():
     step_rad = 1e-6  # so small that the slew limit takes no time
-    assert settled_s(SERVO, step_rad, 0.05 * step_rad) - 3e-5 == pytest.approx(0.28e-3, abs=1e-5)
-    assert settled_s(SERVO, step_rad, 0.02 * step_rad) - 3e-5 == pytest.approx(0.55e-3, abs=2e-5)
+    assert settling_s(SERVO, step_rad, 0.05 * step_rad) - 3e-5 == pytest.approx(0.28e-3, abs=1e-5)
+    assert settling_s(SERVO, step_rad, 0.02 * step_rad) - 3e-5 == pytest.approx(0.55e-3, abs=2e-5)
 
 
 def still_to_come(pole, phases):
@@ -58,5 +58,5 @@ def test_what_outlasts_a_tolerance_is_bounded_over_all_phases_and_tightly(dampin
     for later_s in np.linspace(0.0, np.pi / pole.imag, 91):
         later = still_to_come(pole, phases + pole.imag * later_s)  # the decay itself is left out
         most = max(most, (later / now).max())
-    assert most <= outlasting(servo) * (1 + 1e-6)
-    assert most >= 0.99 * outlasting(servo)
+    assert most <= envelope_factor(servo) * (1 + 1e-6)
+    assert most >= 0.99 * envelope_factor(servo)

@@ -11,20 +11,20 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 from optodrive.device.pixel_map import (
     DEAD,
     MEASURED,
-    NUMBERS,
+    NUMERIC_FIELDS,
     PixelMap,
-    aimed_layout,
-    map_of,
-    offset_most_m,
-    with_map,
-    write_map,
+    build_aim_layout,
+    load_pixel_map,
+    max_aim_offset_m,
+    replace_pixel_map,
+    write_pixel_map,
 )
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.planning.feasibility import admit
-from optodrive.planning.pipeline import Display, prepare, warm_up
-from optodrive.planning.plan_summary import summary
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.feasibility import check_feasibility
+from optodrive.planning.pipeline import DisplayModel, plan_sequence, warm_up
+from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import Beam
+from optodrive.planning.stimuli.refresh import BeamTimeEstimator
 
 PLAIN = DISPLAYS["display-16"]
 CONFIG, COUNT = PLAIN.config, len(PLAIN.layout)
@@ -39,14 +39,14 @@ def some_map(offset_m=1e-4):
     return PixelMap(gain, np.full(COUNT, 0.01), x_m, y_m, unknown, np.full(COUNT, 1e-6), state, "surroundings")
 
 
-def mapped(path, known=None, config=CONFIG):
-    write_map(path, some_map() if known is None else known, config, {"source": "a test"})
-    return with_map(CONFIG, path)
+def write_and_use_map(path, known=None, config=CONFIG):
+    write_pixel_map(path, some_map() if known is None else known, config, {"source": "a test"})
+    return replace_pixel_map(CONFIG, path)
 
 
 @pytest.fixture(scope="module")
 def display(tmp_path_factory):
-    return Display.of(mapped(tmp_path_factory.mktemp("map") / "pixels.toml"))
+    return DisplayModel.from_config(write_and_use_map(tmp_path_factory.mktemp("map") / "pixels.toml"))
 
 
 def everywhere(target_m, count=COUNT):
@@ -54,18 +54,18 @@ def everywhere(target_m, count=COUNT):
 
 
 def test_there_and_back(tmp_path):
-    known, again = some_map(), map_of(mapped(tmp_path / "pixels.toml"))
-    for name in NUMBERS:
+    known, again = some_map(), load_pixel_map(write_and_use_map(tmp_path / "pixels.toml"))
+    for name in NUMERIC_FIELDS:
         assert getattr(again, name) == pytest.approx(getattr(known, name), rel=1e-5, nan_ok=True)
     assert again.state.tolist() == known.state.tolist()
-    assert again.lift[DEAD_PIXEL] == 0.0
+    assert again.displacement_factor[DEAD_PIXEL] == 0.0
 
 
 def test_a_changed_file_is_read_again(tmp_path):
-    config = mapped(tmp_path / "pixels.toml")
-    before = map_of(config)
-    mapped(tmp_path / "pixels.toml", PixelMap.uniform(COUNT))
-    assert map_of(config).gain.tolist() != before.gain.tolist()
+    config = write_and_use_map(tmp_path / "pixels.toml")
+    before = load_pixel_map(config)
+    write_and_use_map(tmp_path / "pixels.toml", PixelMap.uniform(COUNT))
+    assert load_pixel_map(config).gain.tolist() != before.gain.tolist()
 
 
 @pytest.mark.parametrize(
@@ -87,35 +87,35 @@ def test_a_changed_file_is_read_again(tmp_path):
 )
 def test_a_map_that_is_not_of_this_display_is_refused(tmp_path, change, says):
     path = tmp_path / "pixels.toml"
-    config = mapped(path)
+    config = write_and_use_map(path)
     assert change[0] in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(*change))
     with pytest.raises(InputError) as caught:
-        Display.of(config)
+        DisplayModel.from_config(config)
     assert says in str(caught.value)
     assert str(path) in str(caught.value)
 
 
 def test_a_map_of_another_display_by_name(tmp_path):
     other = DISPLAYS["display-437"]
-    config = mapped(tmp_path / "p.toml", PixelMap.uniform(len(other.layout)), other.config)
+    config = write_and_use_map(tmp_path / "p.toml", PixelMap.uniform(len(other.layout)), other.config)
     with pytest.raises(InputError, match="this is a map of display-437"):
-        Display.of(config)
+        DisplayModel.from_config(config)
 
 
 def test_nothing_alive_out_of_its_cell_and_no_file(tmp_path):
     path = tmp_path / "pixels.toml"
     with pytest.raises(InputError, match="a pixel that lives"):
-        map_of(mapped(path, replace(some_map(), state=np.full(COUNT, DEAD))))
+        load_pixel_map(write_and_use_map(path, replace(some_map(), state=np.full(COUNT, DEAD))))
     with pytest.raises(InputError, match=r"pixel 0: offset_y_m: got .* the pixel's own cell"):
-        map_of(mapped(path, PixelMap.uniform(COUNT, 0.0, 1.1 * offset_most_m(CONFIG)[1])))
+        load_pixel_map(write_and_use_map(path, PixelMap.uniform(COUNT, 0.0, 1.1 * max_aim_offset_m(CONFIG)[1])))
     with pytest.raises(InputError, match="a readable file"):
-        map_of(with_map(CONFIG, tmp_path / "none.toml"))
+        load_pixel_map(replace_pixel_map(CONFIG, tmp_path / "none.toml"))
 
 
 def test_heights_are_kept_and_heat_is_never_scaled(display):
-    plan = prepare(display, everywhere(60e-6), *display.at_rest())
-    nominal = prepare(PLAIN, everywhere(60e-6), *PLAIN.at_rest())
+    plan = plan_sequence(display, everywhere(60e-6), *display.build_cold_state())
+    nominal = plan_sequence(PLAIN, everywhere(60e-6), *PLAIN.build_cold_state())
     assert plan.predicted_m == pytest.approx(np.full(COUNT - 1, 60e-6), rel=1e-3)
     energy_j, nominal_j = (
         dict(zip(each.plan.pixel.tolist(), each.plan.energy_j, strict=True)) for each in (plan, nominal)
@@ -124,30 +124,32 @@ def test_heights_are_kept_and_heat_is_never_scaled(display):
     assert energy_j[LOW] > 1.3 * nominal_j[LOW]
     assert energy_j[HIGH] < 0.8 * nominal_j[HIGH]
     lit = (plan.plan.pixel, plan.plan.start_s, plan.plan.width_s, plan.plan.power_w)
-    assert np.array_equal(display.heat_at_rest().pulses(*lit).absorber_k, PLAIN.heat_at_rest().pulses(*lit).absorber_k)
+    assert np.array_equal(
+        display.build_cold_heat().apply_pulses(*lit).absorber_k, PLAIN.build_cold_heat().apply_pulses(*lit).absorber_k
+    )
     for name in ("r_k_per_w", "c_j_per_k", "epsilon", "tau_g_s"):
         assert np.array_equal(getattr(display.pixels, name), getattr(PLAIN.pixels, name))
 
 
 def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
-    plan = prepare(display, everywhere(60e-6), *display.at_rest()).plan
+    plan = plan_sequence(display, everywhere(60e-6), *display.build_cold_state()).plan
     known, focal_m = some_map(), CONFIG.scanner.focal_length_m
     aimed_m = PLAIN.layout.x_m + known.offset_x_m, PLAIN.layout.y_m + known.offset_y_m
     assert plan.x_rad == pytest.approx(aimed_m[0][plan.pixel] / (2 * focal_m), rel=1e-4)
     assert plan.y_rad == pytest.approx(aimed_m[1][plan.pixel] / (2 * focal_m), rel=1e-4)
-    requirements = Requirements.of(display.config)
-    limits = requirements.limits()
-    x_codes, y_codes = requirements.scale.codes(plan.x_rad), requirements.scale.codes(plan.y_rad)
+    requirements = BoardRequirements.from_config(display.config)
+    limits = requirements.build_limits()
+    x_codes, y_codes = requirements.scale.to_codes(plan.x_rad), requirements.scale.to_codes(plan.y_rad)
     assert limits.x_min <= x_codes.min() <= x_codes.max() <= limits.x_max
     assert limits.y_min <= y_codes.min() <= y_codes.max() <= limits.y_max
-    moves = display.machine.moves
-    for dx_rad, dy_rad, settle_s in zip(np.diff(plan.x_rad), np.diff(plan.y_rad), plan.settle_s[1:], strict=True):
-        assert settle_s * 1e6 >= moves.least_us(np.array([dx_rad]), np.array([dy_rad])) - 1
+    moves = display.scan_head.moves
+    for dx_rad, dy_rad, settle_s in zip(np.diff(plan.x_rad), np.diff(plan.y_rad), plan.settling_s[1:], strict=True):
+        assert settle_s * 1e6 >= moves.min_settling_us(np.array([dx_rad]), np.array([dy_rad])) - 1
 
 
 def test_the_dead_are_left_out_and_named(display):
-    prepared, admission = admit(display, everywhere(60e-6), *display.at_rest())
-    figures = summary(prepared, admission)
+    prepared, admission = check_feasibility(display, everywhere(60e-6), *display.build_cold_state())
+    figures = summarize_plan(prepared, admission)
     assert admission.fits
     assert figures["dead"] == {
         "pixels": [DEAD_PIXEL],
@@ -156,12 +158,16 @@ def test_the_dead_are_left_out_and_named(display):
     }
     alone = np.zeros(COUNT)
     alone[DEAD_PIXEL] = 5e-3  # out of anyone's reach
-    nothing, _ = admit(display, FrameSequence((TactileFrame("dead", 0.0, 1.0, alone),)), *display.at_rest())
+    nothing, _ = check_feasibility(
+        display, FrameSequence((TactileFrame("dead", 0.0, 1.0, alone),)), *display.build_cold_state()
+    )
     assert len(nothing.plan) == 0
-    assert summary(nothing)["dead"]["count"] == 1
+    assert summarize_plan(nothing)["dead"]["count"] == 1
     alive = np.where(np.arange(COUNT) == DEAD_PIXEL, 0.0, 60e-6)
-    fine, _ = admit(display, FrameSequence((TactileFrame("alive", 0.0, 1.0, alive),)), *display.at_rest())
-    assert summary(fine)["dead"] == {"pixels": [], "count": 0, "sentence": None}
+    fine, _ = check_feasibility(
+        display, FrameSequence((TactileFrame("alive", 0.0, 1.0, alive),)), *display.build_cold_state()
+    )
+    assert summarize_plan(fine)["dead"] == {"pixels": [], "count": 0, "sentence": None}
 
 
 @pytest.mark.parametrize(
@@ -174,35 +180,35 @@ def test_the_dead_are_left_out_and_named(display):
 def test_a_train_on_a_dead_pixel_is_refused(display, train):
     living = PulseTrain(LOW, 0.2, 0.1, 0.01, 0.01, 1.0)
     with pytest.raises(InputError, match=r"trains\[1\]\.pixel: got 12, expected a pixel that lives") as caught:
-        admit(display, FrameSequence((), (living, train)), *display.at_rest())
+        check_feasibility(display, FrameSequence((), (living, train)), *display.build_cold_state())
     assert caught.value.code == "dead_pixel"
 
 
 def test_reach_follows_the_gain(display):
-    too_much_m = 1.01 * float(display.reach_m[LOW])
-    assert too_much_m < PLAIN.reach_m[LOW]
+    too_much_m = 1.01 * float(display.max_displacement_m[LOW])
+    assert too_much_m < PLAIN.max_displacement_m[LOW]
     target_m = np.zeros(COUNT)
     target_m[LOW] = too_much_m
     with pytest.raises(InputError, match="target_um of pixel 0"):
-        prepare(display, FrameSequence((TactileFrame("high", 0.0, 1.0, target_m),)), *display.at_rest())
+        plan_sequence(display, FrameSequence((TactileFrame("high", 0.0, 1.0, target_m),)), *display.build_cold_state())
 
 
 def test_pictures_are_given_the_time_that_low_pixels_need(display):
     target_m = np.zeros(COUNT)
     target_m[[LOW, 1, 2, 3]] = 200e-6
-    plain, own = Beam(CONFIG), Beam(display.config)
-    assert own.picture_s(target_m) > plain.picture_s(target_m)
+    plain, own = BeamTimeEstimator(CONFIG), BeamTimeEstimator(display.config)
+    assert own.beam_time_s(target_m) > plain.beam_time_s(target_m)
     dead = np.where(np.arange(COUNT) == DEAD_PIXEL, 1e-4, 0.0)
-    assert own.picture_s(dead) == 0.0
-    assert len(Lattice.of(display.config).layout) == COUNT
+    assert own.beam_time_s(dead) == 0.0
+    assert len(Lattice.from_config(display.config).layout) == COUNT
 
 
 def test_all_is_warmed_up_where_the_first_pixel_is_dead(tmp_path):
     state = np.full(COUNT, MEASURED)
     state[0] = DEAD
-    warm_up(Display.of(mapped(tmp_path / "pixels.toml", replace(some_map(), state=state))))
+    warm_up(DisplayModel.from_config(write_and_use_map(tmp_path / "pixels.toml", replace(some_map(), state=state))))
 
 
 def test_without_a_map_nothing_moves():
-    assert np.array_equal(aimed_layout(CONFIG).x_m, PLAIN.layout.x_m)
+    assert np.array_equal(build_aim_layout(CONFIG).x_m, PLAIN.layout.x_m)
     assert not PLAIN.dead.any()

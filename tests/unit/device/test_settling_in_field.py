@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 from hidden_field import CONFIG, LAYOUT
 from optodrive.device import settling
 from optodrive.device.config import Config, PixelLayout
-from optodrive.device.gate_timing import servo_of, settled_s
-from optodrive.device.scan_field import IdealField, largest_step_rad, tolerance_share
-from optodrive.device.settling import CALM_SHARE, MoveModel
+from optodrive.device.gate_timing import build_servo, settling_s
+from optodrive.device.scan_field import IdealField, max_neighbour_step_rad, tolerance_ratio
+from optodrive.device.settling import LONG_DWELL_SHARE, SettlingTable
 
 
 class Askew:
@@ -37,14 +37,14 @@ CASES = {
     "overshooting": servo(damping=0.5, bandwidth_hz=400.0, slew_rad_per_s=300.0),
     "resonant": servo(damping=0.3, bandwidth_hz=400.0, slew_rad_per_s=30.0),  # some ramps end a swing, others feed it
 }
-MOVES = {name: MoveModel.of(config, Askew()) for name, config in CASES.items()}
+MOVES = {name: SettlingTable.from_config(config, Askew()) for name, config in CASES.items()}
 
 
 def needed_us(config, axis, way_rad):
     """What a calm move needs in this field, µs."""
-    tolerance_rad = tolerance_share(Askew(), LAYOUT, config) * config.tolerance_rad[axis]
-    room_rad = (1.0 - CALM_SHARE) * (tolerance_rad - 0.5 * config.scanner.code_rad) - config.scanner.code_rad
-    return 1e6 * settled_s(servo_of(config.scanner), way_rad, room_rad)
+    tolerance_rad = tolerance_ratio(Askew(), LAYOUT, config) * config.tolerance_rad[axis]
+    room_rad = (1.0 - LONG_DWELL_SHARE) * (tolerance_rad - 0.5 * config.scanner.code_rad) - config.scanner.code_rad
+    return 1e6 * settling_s(build_servo(config.scanner), way_rad, room_rad)
 
 
 @settings(max_examples=300)
@@ -53,7 +53,7 @@ def test_no_move_is_given_less_than_it_needs(name, axis, pitches):
     config, moves = CASES[name], MOVES[name]
     way_rad = pitches * moves.pitch_rad
     way = (way_rad, 0.0) if axis == 0 else (0.0, way_rad)
-    assert moves.time_us(*way, moves.calm_us) >= needed_us(config, axis, way_rad)
+    assert moves.settling_us(*way, moves.long_dwell_us) >= needed_us(config, axis, way_rad)
 
 
 def test_times_of_whole_pitches_alone_would_be_too_short():
@@ -68,36 +68,42 @@ def test_times_of_whole_pitches_alone_would_be_too_short():
 
 def test_every_move_between_pixels_is_in_the_tables():
     for field in (Askew(), Askew(1.03, -0.02, -0.3)):
-        moves = MoveModel.of(CONFIG, field)
+        moves = SettlingTable.from_config(CONFIG, field)
         x_rad, y_rad = field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
-        longest_us = moves.time_us(float(np.ptp(x_rad)), float(np.ptp(y_rad)))
-        assert longest_us <= moves.lead_us
+        longest_us = moves.settling_us(float(np.ptp(x_rad)), float(np.ptp(y_rad)))
+        assert longest_us <= moves.lead_in_us
         for at in (0, 10, len(LAYOUT) - 1):
-            assert moves.time_us(x_rad[at], y_rad[at]) <= moves.lead_us
+            assert moves.settling_us(x_rad[at], y_rad[at]) <= moves.lead_in_us
 
 
 def test_neighbours_are_one_pitch_apart_whatever_the_field():
     moves = MOVES["shipped"]
     x_rad, y_rad = Askew().angles_rad(LAYOUT.x_m, LAYOUT.y_m)
-    one_us = moves.time_us(moves.pitch_rad, moves.pitch_rad, moves.calm_us)
+    one_us = moves.settling_us(moves.pitch_rad, moves.pitch_rad, moves.long_dwell_us)
     for one in range(0, len(LAYOUT), 7):
         beside = (np.abs(LAYOUT.row - LAYOUT.row[one]) <= 1) & (np.abs(LAYOUT.column - LAYOUT.column[one]) <= 1)
         for other in np.flatnonzero(beside):
             if other != one:
-                assert moves.time_us(x_rad[other] - x_rad[one], y_rad[other] - y_rad[one], moves.calm_us) <= one_us
+                assert (
+                    moves.settling_us(x_rad[other] - x_rad[one], y_rad[other] - y_rad[one], moves.long_dwell_us)
+                    <= one_us
+                )
 
 
 def test_room_for_the_focus_in_a_field_askew():
     ideal = IdealField(CONFIG.scanner.focal_length_m)
-    assert tolerance_share(ideal, LAYOUT, CONFIG) == pytest.approx(1.0, abs=1e-9)
-    assert 0.9 < tolerance_share(Askew(), LAYOUT, CONFIG) < 0.98
+    assert tolerance_ratio(ideal, LAYOUT, CONFIG) == pytest.approx(1.0, abs=1e-9)
+    assert 0.9 < tolerance_ratio(Askew(), LAYOUT, CONFIG) < 0.98
 
 
 def test_a_single_pixel_off_the_middle_has_a_lead():
     """Where it lies is not where the mirrors rest."""
     one = replace_display(rows=1, columns=1, missing=[])
-    assert MoveModel.of(one, Shifted()).lead_us > 200
-    assert largest_step_rad(PixelLayout(*(np.zeros(1),) * 2, *(np.zeros(1, dtype=int),) * 2), *(np.zeros(1),) * 2) == 0
+    assert SettlingTable.from_config(one, Shifted()).lead_in_us > 200
+    assert (
+        max_neighbour_step_rad(PixelLayout(*(np.zeros(1),) * 2, *(np.zeros(1, dtype=int),) * 2), *(np.zeros(1),) * 2)
+        == 0
+    )
 
 
 class Shifted:
@@ -115,6 +121,6 @@ def test_giving_less_away_costs_more_looking_and_saves_little(monkeypatch):
     """What stands for all distances between costs a move few microseconds."""
     config = CASES["shipped"]
     moves = MOVES["shipped"]
-    monkeypatch.setattr(settling, "NARROWER", 0.005)
-    closer = MoveModel.of(config, Askew())
-    assert all(0 <= a - b <= 12 for a, b in zip(moves.calm[0], closer.calm[0], strict=True))
+    monkeypatch.setattr(settling, "INTERVAL_SHARE", 0.005)
+    closer = SettlingTable.from_config(config, Askew())
+    assert all(0 <= a - b <= 12 for a, b in zip(moves.after_long_dwell[0], closer.after_long_dwell[0], strict=True))

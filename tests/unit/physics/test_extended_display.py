@@ -6,17 +6,17 @@ import pytest
 from displays import DISPLAYS
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics import extended_display
-from optodrive.physics.extended_display import ExtendedHeat
-from optodrive.physics.nominal_display import DisplayHeat
+from optodrive.physics.extended_display import ExtendedThermalState
+from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.term_kernels import TERMS
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
-DRIVE = DriveRange.of(2.45, 5000.0, 0.050)
-SMALL = Neighbours.of(DISPLAYS["display-16"].config.display)
+DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
+SMALL = Neighbours.from_display(DISPLAYS["display-16"].config.display)
 ARRAY = PixelArray.uniform(PIXEL, 16)
 AMBIENT_K, FULL_W = 296.15, 2.45
 SINGLE = sorted(term.key for term in TERMS if any(term.kernels))
@@ -27,7 +27,7 @@ def values_of(*keys):
 
 
 def extended(*keys, at_s=0.0):
-    return ExtendedHeat(ARRAY, values_of(*keys), AMBIENT_K, FULL_W, SMALL, at_s)
+    return ExtendedThermalState(ARRAY, values_of(*keys), AMBIENT_K, FULL_W, SMALL, at_s)
 
 
 def some_pulses(seed, count=40, pixels=(0, 1, 5)):
@@ -41,27 +41,27 @@ def seen(keys, pixel, columns, until_s):
     """The pixel's own run through the same pulses, finely sampled: time, absorber, displacement."""
     index, start_s, width_s, power_w = columns
     t_s = np.unique(np.concatenate([np.arange(0.0, until_s, 2e-5), start_s]))
-    scene = Scene(
+    scene = PixelExperiment(
         np.column_stack([start_s, width_s, power_w, index]), pixel, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0
     )
-    absorber_k, displacement_m, _ = observe(scene, PIXEL, Active.of(values_of(*keys)))
+    absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(values_of(*keys)))
     return t_s, absorber_k, displacement_m
 
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_without_terms_it_is_the_nominal_display(seed):
     columns = some_pulses(seed)
-    ours, nominal = extended(), DisplayHeat(ARRAY)
-    peaks, expected = ours.pulses(*columns), nominal.pulses(*columns)
+    ours, nominal = extended(), NominalThermalState(ARRAY)
+    peaks, expected = ours.apply_pulses(*columns), nominal.apply_pulses(*columns)
     assert peaks.displacement_m == pytest.approx(expected.displacement_m, rel=2e-4)
     assert peaks.absorber_k == pytest.approx(expected.absorber_k, rel=2e-4)
     end_s = columns[1][-1] + 0.1
     for target_m in (2e-5, 1.5e-4, 9e-4):
-        periods, duty = ours.pulse_for_peak(1, end_s, target_m, DRIVE)
-        theirs = nominal.pulse_for_peak(1, end_s, target_m, DRIVE)
+        periods, duty = ours.solve_pulse(1, end_s, target_m, DRIVE)
+        theirs = nominal.solve_pulse(1, end_s, target_m, DRIVE)
         assert periods * duty == pytest.approx(theirs[0] * theirs[1], rel=1e-3)
         assert abs(periods - theirs[0]) <= 1
-    assert ours.reaches_m(DRIVE) == pytest.approx(nominal.reaches_m(DRIVE), rel=2e-4)
+    assert ours.max_displacement_m(DRIVE) == pytest.approx(nominal.max_displacement_m(DRIVE), rel=2e-4)
 
 
 @pytest.mark.parametrize("key", [*SINGLE, "laser_droop+membrane_creep"])
@@ -70,9 +70,9 @@ def test_each_pulse_brings_its_pixel_to_what_one_pixel_alone_does(key):
     near = "neighbour_crosstalk" in keys
     columns = some_pulses(3)
     index, start_s, *_ = columns
-    peaks = extended(*keys).pulses(*columns).displacement_m
+    peaks = extended(*keys).apply_pulses(*columns).displacement_m
     for pixel in (0, 1, 5):
-        felt = np.isin(index, [pixel, *SMALL.beside[pixel]]) if near else index == pixel
+        felt = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
         own = tuple(column[felt] for column in columns)
         t_s, _, displacement_m = seen(keys, pixel, own, start_s[-1] + 0.3)
         rows = np.flatnonzero(index == pixel)
@@ -88,9 +88,9 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
     for target_m in (8e-5, 2.5e-4, 4.5e-4):
         heat = extended(*keys)
         before = some_pulses(4, 10, pixels=(5,))
-        heat.pulses(*before)
+        heat.apply_pulses(*before)
         at_s = before[1][-1] + 0.06
-        periods, duty = heat.pulse_for_peak(5, at_s, target_m, DRIVE)
+        periods, duty = heat.solve_pulse(5, at_s, target_m, DRIVE)
         assert 0 < periods <= DRIVE.max_periods
         assert 0 < duty <= 1
         one = (np.array([5]), np.array([at_s]), np.array([periods * DRIVE.period_s]), np.array([duty * FULL_W]))
@@ -99,27 +99,27 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
         assert displacement_m[t_s >= at_s].max() == pytest.approx(target_m, rel=1e-3)
         if periods > 1:
             shorter = extended(*keys)
-            shorter.pulses(*before)
+            shorter.apply_pulses(*before)
             columns = (np.array([5]), np.array([at_s]), np.array([(periods - 1) * DRIVE.period_s]), np.array([FULL_W]))
-            assert shorter.pulses(*columns).displacement_m[0] < target_m
+            assert shorter.apply_pulses(*columns).displacement_m[0] < target_m
 
 
 @pytest.mark.parametrize("key", ["", "laser_turn_on+membrane_creep", "gas_leak"])
 def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
     keys = key.split("+")
     heat, before = extended(*keys), some_pulses(4, 10, pixels=(5,))
-    heat.pulses(*before)
+    heat.apply_pulses(*before)
     at_s = before[1][-1] + 0.06
     for least, from_s in ((60, 0.0), (20, 0.02), (1, 0.015)):
-        periods, duty = heat.pulse_for_peak(5, at_s, 1e-4, DRIVE, least, from_s)
+        periods, duty = heat.solve_pulse(5, at_s, 1e-4, DRIVE, least, from_s)
         assert periods >= least
         pulse = np.array([[at_s, periods * DRIVE.period_s, duty * FULL_W, 5.0]])
         t_s = at_s + max(from_s, 0.0) + np.linspace(0.0, 0.08, 1601)
-        assert heat.heights_m(pulse, 5, t_s).max() == pytest.approx(1e-4, rel=1e-3)
+        assert heat.simulate_displacement_m(pulse, 5, t_s).max() == pytest.approx(1e-4, rel=1e-3)
         if not key:
-            nominal = DisplayHeat(ARRAY)
-            nominal.pulses(*before)
-            theirs = nominal.pulse_for_peak(5, at_s, 1e-4, DRIVE, least, from_s)
+            nominal = NominalThermalState(ARRAY)
+            nominal.apply_pulses(*before)
+            theirs = nominal.solve_pulse(5, at_s, 1e-4, DRIVE, least, from_s)
             assert periods == theirs[0]
             assert duty == pytest.approx(theirs[1], rel=1e-2)
 
@@ -130,34 +130,34 @@ def test_heights_from_the_heat_there_are_those_of_the_whole_run(key):
     near = "neighbour_crosstalk" in keys
     index, *columns = some_pulses(9)
     for pixel in (0, 5):
-        felt = np.isin(index, [pixel, *SMALL.beside[pixel]]) if near else index == pixel
+        felt = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
         own = (index[felt], *(column[felt] for column in columns))
         half = len(own[0]) // 2
         heat = extended(*keys)
-        heat.pulses(*(column[:half] for column in own))
+        heat.apply_pulses(*(column[:half] for column in own))
         pulses = np.column_stack([*own[1:], own[0]])
         t_s, _, displacement_m = seen(keys, pixel, own, pulses[-1, 0] + 0.1)
         after = t_s > pulses[half - 1, :2].sum() + 1e-6
         untouched = heat.copy()
-        ours_m = heat.heights_m(pulses[half:], pixel, t_s[after])
+        ours_m = heat.simulate_displacement_m(pulses[half:], pixel, t_s[after])
         assert ours_m == pytest.approx(displacement_m[after], rel=1e-3, abs=5e-8)
-        assert heat.pulse_for_peak(pixel, t_s[-1], 4e-4, DRIVE) == untouched.pulse_for_peak(pixel, t_s[-1], 4e-4, DRIVE)
+        assert heat.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE) == untouched.solve_pulse(pixel, t_s[-1], 4e-4, DRIVE)
     with pytest.raises(ValueError, match="lies before it"):
-        heat.heights_m(pulses[half:], pixel, np.array([pulses[half - 1, 0]]))
+        heat.simulate_displacement_m(pulses[half:], pixel, np.array([pulses[half - 1, 0]]))
 
 
 def test_no_pulse_where_the_heat_left_reaches_the_height_and_the_longest_where_none_does():
     heat = extended("radiation")
-    heat.pulses(np.array([2]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
-    assert heat.pulse_for_peak(2, 0.051, 1e-4, DRIVE) is None
-    assert heat.pulse_for_peak(3, 0.051, 2 * heat.reaches_m(DRIVE)[3], DRIVE) == (DRIVE.max_periods, 1.0)
-    assert heat.reaches_m(DRIVE)[2] == heat.reaches_m(DRIVE)[3]
+    heat.apply_pulses(np.array([2]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
+    assert heat.solve_pulse(2, 0.051, 1e-4, DRIVE) is None
+    assert heat.solve_pulse(3, 0.051, 2 * heat.max_displacement_m(DRIVE)[3], DRIVE) == (DRIVE.max_periods, 1.0)
+    assert heat.max_displacement_m(DRIVE)[2] == heat.max_displacement_m(DRIVE)[3]
 
 
 def test_one_pixel_out_of_the_beam_reaches_less():
     values = values_of("beam_misalignment")
     values["beam_misalignment"]["pixel"] = 6.0
-    reaches_m = ExtendedHeat(ARRAY, values, AMBIENT_K, FULL_W, SMALL).reaches_m(DRIVE)
+    reaches_m = ExtendedThermalState(ARRAY, values, AMBIENT_K, FULL_W, SMALL).max_displacement_m(DRIVE)
     assert reaches_m[6] < 0.97 * reaches_m[5]
     assert np.delete(reaches_m, 6) == pytest.approx(reaches_m[5])
 
@@ -165,57 +165,57 @@ def test_one_pixel_out_of_the_beam_reaches_less():
 def test_a_neighbours_light_lifts_a_pixel_only_where_they_exchange_heat():
     for keys, least_m in ((("neighbour_crosstalk",), 1e-7), (("radiation",), 0.0)):
         heat = extended(*keys)
-        heat.pulses(np.array([5]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
-        beside = int(SMALL.beside[5][0])
+        heat.apply_pulses(np.array([5]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
+        beside = int(SMALL.indices[5][0])
         assert (np.abs(heat.copy()._states[beside]).max() > least_m) == (least_m > 0)
 
 
 def test_copies_and_shifts_stand_alone():
     heat, columns = extended("membrane_creep"), some_pulses(6)
     twin = heat.copy()
-    heat.pulses(*columns)
+    heat.apply_pulses(*columns)
     at_s = columns[1][-1] + 0.05
-    later = heat.shifted(-1.0)
+    later = heat.copy_shifted(-1.0)
     ask = (2.5e-4, DRIVE)
-    assert later.pulse_for_peak(1, at_s - 1.0, *ask) == pytest.approx(heat.pulse_for_peak(1, at_s, *ask), rel=1e-6)
-    assert twin.pulse_for_peak(1, 0.0, *ask) == pytest.approx(
-        extended("membrane_creep").pulse_for_peak(1, 0.0, *ask), rel=1e-12
+    assert later.solve_pulse(1, at_s - 1.0, *ask) == pytest.approx(heat.solve_pulse(1, at_s, *ask), rel=1e-6)
+    assert twin.solve_pulse(1, 0.0, *ask) == pytest.approx(
+        extended("membrane_creep").solve_pulse(1, 0.0, *ask), rel=1e-12
     )
 
 
 def test_what_comes_too_early_is_refused():
     heat = extended("radiation", at_s=5.0)
     with pytest.raises(ValueError, match=r"pixel 1 was advanced to 5\.0 s, 4\.0 s lies before it"):
-        heat.pulse_for_peak(1, 4.0, 1e-4, DRIVE)
+        heat.solve_pulse(1, 4.0, 1e-4, DRIVE)
     with pytest.raises(ValueError, match="pixel 1 was advanced"):
-        heat.pulses(np.array([1]), np.array([4.9]), np.array([0.01]), np.array([1.0]))
+        heat.apply_pulses(np.array([1]), np.array([4.9]), np.array([0.01]), np.array([1.0]))
     with pytest.raises(IndexError):
-        heat.pulses(np.array([16]), np.array([6.0]), np.array([0.01]), np.array([1.0]))
+        heat.apply_pulses(np.array([16]), np.array([6.0]), np.array([0.01]), np.array([1.0]))
 
 
 def test_traces_are_taken_from_rest_and_show_every_pixel_asked_for():
     heat, columns = extended("membrane_stiffening"), some_pulses(7)
     pulses = np.column_stack([*columns[1:], columns[0]])
     t_s = np.linspace(0.0, 0.4, 4001)
-    traced = heat.traces(pulses, [5, 0], t_s)
+    traced = heat.simulate_traces(pulses, [5, 0], t_s)
     assert traced.pixel.tolist() == [5, 0]
     own = columns[0] == 5
-    expected = heat.copy().pulses(*(column[own] for column in columns)).displacement_m.max()
+    expected = heat.copy().apply_pulses(*(column[own] for column in columns)).displacement_m.max()
     assert traced.displacement_m[:, 0].max() == pytest.approx(expected, rel=1e-3)
     stiff = traced.displacement_m[:, 0] < 0.995 * PIXEL.kappa_m_per_k * traced.gas_k[:, 0]
     assert stiff.any()
-    nominal = DisplayHeat(ARRAY).traces(pulses, [5, 0], t_s)
+    nominal = NominalThermalState(ARRAY).simulate_traces(pulses, [5, 0], t_s)
     assert traced.gas_k == pytest.approx(nominal.gas_k, rel=1e-3, abs=1e-3)
-    heat.pulses(*columns)
+    heat.apply_pulses(*columns)
     with pytest.raises(ValueError, match="from rest"):
-        heat.traces(pulses, [5], t_s)
+        heat.simulate_traces(pulses, [5], t_s)
 
 
 def test_it_ticks_while_it_works_and_pieces_change_nothing(monkeypatch):
     columns, ticks = some_pulses(8, count=300), []
-    whole = extended("gas_leak").pulses(*columns)
-    monkeypatch.setattr(extended_display, "PIECE", 7)
-    pieces = extended("gas_leak").pulses(*columns, lambda: ticks.append(1))
+    whole = extended("gas_leak").apply_pulses(*columns)
+    monkeypatch.setattr(extended_display, "BATCH", 7)
+    pieces = extended("gas_leak").apply_pulses(*columns, lambda: ticks.append(1))
     assert len(ticks) == 43 + 3
     assert pieces.displacement_m.tolist() == whole.displacement_m.tolist()
     assert pieces.absorber_k.tolist() == whole.absorber_k.tolist()

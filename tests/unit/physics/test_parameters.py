@@ -5,15 +5,15 @@ from math import pi
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config, shipped_path
-from optodrive.physics.parameters import display_pixels, load_parameters
+from optodrive.device.config import load_config, locate_shipped
+from optodrive.physics.parameters import build_display_pixels, load_parameters
 
 SETS = ["calibrated", "paper_s1_literal"]
 
 
 @pytest.fixture
 def text():
-    return shipped_path("parameters", "calibrated.toml").read_text(encoding="utf-8")
+    return locate_shipped("parameters", "calibrated.toml").read_text(encoding="utf-8")
 
 
 def loaded(tmp_path, text):
@@ -53,14 +53,14 @@ def test_fitted_values_carry_a_sigma():
 
 def test_a_width_in_the_table_has_its_row_and_another_the_law():
     calibrated = load_parameters("calibrated")
-    row, between = calibrated.pixel(0.40e-3), calibrated.pixel(0.30e-3)
+    row, between = calibrated.build_pixel(0.40e-3), calibrated.build_pixel(0.30e-3)
     assert (row.r_k_per_w, row.c_j_per_k) == (184.0, 126e-6)
     assert between.r_k_per_w == pytest.approx(73.3 / 0.30)
     assert between.c_j_per_k == 101e-6
 
 
 def test_a_displays_pixels():
-    assert len(display_pixels(load_config("display-437"), load_parameters("calibrated"))) == 437
+    assert len(build_display_pixels(load_config("display-437"), load_parameters("calibrated"))) == 437
 
 
 def test_an_own_file_reads_like_a_shipped_one(tmp_path, text):

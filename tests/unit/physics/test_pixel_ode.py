@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from optodrive.device.servo import Servo, follow
+from optodrive.device.servo import Servo, simulate_servo
 from optodrive.physics.numpy_model import Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel
-from optodrive.physics.pixel_ode import Active, Scene, observe
-from optodrive.physics.terms import known_terms
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 PULSES = np.array([[0.02, 0.05, 2.0, 0.0], [0.1, 0.01, 2.45, 0.0], [0.13, 0.03, 1.5, 1.0]])
@@ -50,7 +50,9 @@ def gas(theta, wall, gamma):
 
 
 def seen(terms, late_s=(0.0, 0.0, 0.0), **scene):
-    return observe(Scene(PULSES, 0, AMBIENT_K, (T_S, T_S, T_S), **scene), PIXEL, Active.of(terms), late_s)
+    return simulate_signals(
+        PixelExperiment(PULSES, 0, AMBIENT_K, (T_S, T_S, T_S), **scene), PIXEL, ActiveTerms.from_values(terms), late_s
+    )
 
 
 def nominal(t, y, lit=None, r=PIXEL.r_k_per_w, c=PIXEL.c_j_per_k, leaving=0.0, wall=0.0):
@@ -169,7 +171,7 @@ def test_agrees_with_scipy(name):
 
 def test_every_term_with_kernels_is_checked_here_or_below():
     below = {"sensor_scale", "ambient_drift", "power_nonlinearity", "absorber_ageing"}
-    hooked = {key for key, term in known_terms().items() if any(term.kernels)}
+    hooked = {key for key, term in discover_terms().items() if any(term.kernels)}
     assert hooked == (set(CASES) - {"none"}) | below
 
 
@@ -192,9 +194,9 @@ def test_the_power_curve_keeps_full_power():
     bent = {"power_nonlinearity": {"threshold": 0.245, "curvature": 0.2}}
     for watts in (2.45, 1.2, 0.2):
         pulses = np.array([[0.0, 0.05, watts, 0.0]])
-        scene = Scene(pulses, 0, AMBIENT_K, (T_S, T_S, T_S))
-        rise_k = observe(scene, PIXEL, Active.of({}))[0].max()
-        ours_k = observe(scene, PIXEL, Active.of(bent))[0].max()
+        scene = PixelExperiment(pulses, 0, AMBIENT_K, (T_S, T_S, T_S))
+        rise_k = simulate_signals(scene, PIXEL, ActiveTerms.from_values({}))[0].max()
+        ours_k = simulate_signals(scene, PIXEL, ActiveTerms.from_values(bent))[0].max()
         left = max(0.0, (watts / 2.45 - 0.1) / 0.9)
         assert ours_k == pytest.approx(rise_k * left * (1 + 0.2 * (1 - left)) / (watts / 2.45))
 
@@ -234,7 +236,7 @@ def test_the_whole_display_model_agrees_where_both_know_a_term():
 def test_a_servo_against_its_closed_form():
     servo = Servo(frequency=500.0, damping=0.6, delay=2e-4, slew=1e5)
     t_s = np.linspace(1e-4, 0.02, 300)
-    ours = follow(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, servo)
+    ours = simulate_servo(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, servo)
     omega, zeta = 2 * np.pi * 500.0, 0.6
     ringing, after = omega * np.sqrt(1 - zeta**2), np.maximum(0.0, t_s - 1.2e-3)
     wanted = 0.1 * (
@@ -243,4 +245,4 @@ def test_a_servo_against_its_closed_form():
         * (np.cos(ringing * after) + zeta / np.sqrt(1 - zeta**2) * np.sin(ringing * after))
     )
     assert np.abs(ours - wanted).max() < 2e-3 * 0.1
-    assert follow(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, None)[[0, -1]].tolist() == [0.0, 0.1]
+    assert simulate_servo(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, None)[[0, -1]].tolist() == [0.0, 0.1]

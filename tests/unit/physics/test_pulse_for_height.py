@@ -4,22 +4,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optodrive.physics.pixel import Pixel, advance
-from optodrive.physics.pulse_for_height import DriveRange, pulse_peak, reach_m, shortest
+from optodrive.physics.pulse_for_height import DriveRange, find_shortest_pulse, max_displacement_m, pulse_peak
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
-DRIVE = DriveRange.of(2.45, 5000.0, 0.050)
+DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
 
 
 def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, least_periods=1, from_s=0.0):
     goal_k = target_m / pixel.kappa_m_per_k
     span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
-    periods, duty = shortest(pixel, theta_k, gamma_k, goal_k, *span, from_s)
+    periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, goal_k, *span, from_s)
     return (periods, duty) if periods else None
 
 
 def test_range_counts_whole_periods():
     assert DRIVE.max_periods == 250
-    assert DriveRange.of(2.45, 5000.0, 0.0301).max_periods == 150
+    assert DriveRange.from_laser(2.45, 5000.0, 0.0301).max_periods == 150
 
 
 @given(
@@ -29,7 +29,7 @@ def test_range_counts_whole_periods():
 )
 def test_the_pulse_reaches_its_target_from_any_heat(share, theta, gas_share):
     gamma = 0.5 * theta * gas_share
-    target = share * reach_m(PIXEL, DRIVE)
+    target = share * max_displacement_m(PIXEL, DRIVE)
     pulse = pulse_for_peak(PIXEL, theta, gamma, target, DRIVE)
     dark_peak = pulse_peak(PIXEL, theta, gamma, 0.0, 1e-9)[0] * PIXEL.kappa_m_per_k
     if pulse is None:
@@ -61,12 +61,12 @@ def test_no_pulse_where_the_heat_is_enough():
 
 
 def test_a_target_out_of_reach_gets_the_longest_pulse():
-    assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * reach_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
+    assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * max_displacement_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
 
 
 @given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), least=st.integers(1, 300))
 def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, least):
-    target = share * reach_m(PIXEL, DRIVE)
+    target = share * max_displacement_m(PIXEL, DRIVE)
     narrow, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
     if narrow is None:
         assert wide is None
@@ -78,7 +78,7 @@ def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta,
 
 @given(share=st.floats(0.01, 0.5), least=st.integers(1, 40), from_s=st.floats(0.01, 0.04))
 def test_a_peak_may_count_only_from_a_time_on(share, least, from_s):
-    target = share * reach_m(PIXEL, DRIVE)
+    target = share * max_displacement_m(PIXEL, DRIVE)
     periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, target, DRIVE, least, from_s)
     width = periods * DRIVE.period_s
     lit = advance(PIXEL, 0.0, 0.0, duty * 2.45, width)

@@ -11,10 +11,12 @@ from optodrive.physics import terms
 from optodrive.physics.numpy_model import Drive, Model
 from optodrive.physics.parameters import PixelArray
 from optodrive.physics.pixel import Pixel, advance
-from optodrive.physics.terms import known_terms
+from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
-LATTICE = Neighbours.of(DisplaySection(rows=2, columns=3, pitch_m=4e-3, missing=((0, 0),), bridge_width_m=4e-4))
+LATTICE = Neighbours.from_display(
+    DisplaySection(rows=2, columns=3, pitch_m=4e-3, missing=((0, 0),), bridge_width_m=4e-4)
+)
 AMBIENT_K = 293.15
 VALUES = {
     "bridge_conductivity": {"exponent": 0.6},
@@ -134,7 +136,7 @@ def test_a_wall_that_hardly_resists_hardly_moves_the_pixel():
 def test_walls_as_good_as_one_share_the_mean_power():
     # The step must follow what neighbours exchange, far quicker here than anything a single pixel does.
     wall = {"wall_heating": {"resistance": 20.0, "capacity": 0.0025}}
-    whole = Neighbours.of(DisplaySection(rows=2, columns=3, pitch_m=4e-3, bridge_width_m=4e-4))
+    whole = Neighbours.from_display(DisplaySection(rows=2, columns=3, pitch_m=4e-3, bridge_width_m=4e-4))
     sides = {"lateral_conduction": {"resistance": 0.05, "frame_resistance": 1e12}}
     joined = Model(PixelArray.uniform(PIXEL, 6), wall | sides, AMBIENT_K, whole)
     alone = Model(PixelArray.uniform(PIXEL, 1), wall, AMBIENT_K)
@@ -178,7 +180,7 @@ def test_walls_far_apart_are_walls_alone():
 
 def test_the_membrane_balances_its_gas():
     made = model(["gas_membrane"])
-    state = made.at_rest()
+    state = made.cold_states()
     state[1] = [-5.0, 0.0, 1.0, 20.0, 250.0]
     z_m = made.outputs(state)[0]
     assert z_m[1] == 0.0
@@ -192,7 +194,7 @@ def test_the_membrane_balances_its_gas():
 
 def test_a_small_bulge_is_held_by_the_plate_and_the_gas_alone():
     made = model(["gas_membrane"])
-    state = made.at_rest()
+    state = made.cold_states()
     state[1] = 1e-6
     e, nu, h, r = 50e3, 0.49, 0.25e-3, 1.5e-3
     stiffness = 16 * e * h**3 / (3 * (1 - nu**2) * r**4) + 101_325 * 0.5 * np.pi * r**2 / 7.8e-9
@@ -202,7 +204,7 @@ def test_a_small_bulge_is_held_by_the_plate_and_the_gas_alone():
 def test_the_whole_aperture_at_half_the_rise_is_the_force_of_text_s1():
     aperture_m2 = np.pi * 1.5e-3**2
     made = Model(PixelArray.uniform(PIXEL, 1), {"force_area": {"area": aperture_m2, "share": 0.5}}, 300.0)
-    state = made.at_rest()
+    state = made.cold_states()
     state[1] = 116.0
     assert made.outputs(state)[1] == pytest.approx(2.387e-3 * 116.0, rel=1e-3)
 
@@ -227,7 +229,7 @@ def test_a_term_without_the_one_it_builds_on_is_refused():
 
 
 def test_every_file_of_the_package_is_a_term():
-    terms = known_terms()
+    terms = discover_terms()
     assert set(VALUES) <= set(terms)
     for key, term in terms.items():
         assert term.key == key
@@ -248,12 +250,12 @@ def test_a_new_term_is_a_new_file_and_nothing_else(tmp_path, monkeypatch):
         "TERM = Leak()\n"
     )
     monkeypatch.setattr(terms, "__path__", [*terms.__path__, str(tmp_path)])
-    known_terms.cache_clear()
+    discover_terms.cache_clear()
     try:
         leaky = Model(PixelArray.uniform(PIXEL, 1), {"leak": {"resistance": PIXEL.r_k_per_w}}, AMBIENT_K)
         traced = leaky.trace([Drive(0.0, np.array([2.0]))], np.array([0.5]))
     finally:
         monkeypatch.undo()
-        known_terms.cache_clear()
+        discover_terms.cache_clear()
     assert traced.rise_k["absorber_k"][0, 0] == pytest.approx(0.5 * PIXEL.epsilon * 2.0 * PIXEL.r_k_per_w)
     assert traced.absorbed_j == pytest.approx(traced.stored_j + traced.left_j)

@@ -8,12 +8,12 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.plans import PulsePlan
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.physics.parameters import Parameter, load_parameters
-from optodrive.physics.pixel_ode import Active, Scene, observe
-from optodrive.physics.term import Warming
-from optodrive.physics.terms import known_terms
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.term import HeatGainBound
+from optodrive.physics.terms import discover_terms
 from optodrive.planning import budget_setup
-from optodrive.planning.budget_setup import BOUNDED, budget_of, warming_of
-from optodrive.planning.limiter.limiter import fresh_state, limit
+from optodrive.planning.budget_setup import BOUNDED_TERMS, build_budget, compute_heat_gain_bound
+from optodrive.planning.limiter.limiter import cold_state, limit
 
 DISPLAY = DISPLAYS["display-16"]
 CONFIG = DISPLAY.config
@@ -28,7 +28,7 @@ LARGE = {
 
 
 def with_term(key, base="surroundings", **values):
-    term = known_terms()[key]
+    term = discover_terms()[key]
     own = {
         item.name: Parameter(value=values.get(item.name, max(item.default, item.low)), unit=item.unit, source="here")
         for item in term.parameters
@@ -38,26 +38,26 @@ def with_term(key, base="surroundings", **values):
 
 
 def budget_with(key, base="surroundings"):
-    return budget_of(CONFIG, with_term(key, base, **LARGE.get(key, {})), DISPLAY.pixels)
+    return build_budget(CONFIG, with_term(key, base, **LARGE.get(key, {})), DISPLAY.pixels)
 
 
-@pytest.mark.parametrize("key", sorted(known_terms()))
+@pytest.mark.parametrize("key", sorted(discover_terms()))
 def test_every_term_has_a_bound_but_crosstalk_that_touch_surfaces_would_not_bear(key):
     if key == "neighbour_crosstalk":
         with pytest.raises(InputError, match=r"limits\.touch_max_c: got 43\.0, expected more than .* may warm it"):
-            budget_of(CONFIG, with_term(key, share=0.15), DISPLAY.pixels)
+            build_budget(CONFIG, with_term(key, share=0.15), DISPLAY.pixels)
     budget_with(key)
 
 
 def test_light_absorbed_better_and_better_has_no_bound():
     with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter's bound holds for"):
-        budget_of(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
+        build_budget(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
 
 
 def test_terms_that_never_warm_change_no_bound():
-    plain = budget_of(CONFIG, load_parameters("surroundings"), DISPLAY.pixels)
-    for key, term in known_terms().items():
-        if term.never_warmer and key not in BOUNDED:
+    plain = build_budget(CONFIG, load_parameters("surroundings"), DISPLAY.pixels)
+    for key, term in discover_terms().items():
+        if term.cannot_add_heat and key not in BOUNDED_TERMS:
             with_it = budget_with(key)
             assert with_it.caps == plain.caps
             for ours, theirs in zip(with_it.heat, plain.heat, strict=True):
@@ -72,7 +72,7 @@ def hostile(power_w, seed):
     rest_s = generator.choice([5e-4, 5e-3, 0.03], count)
     start_s = 0.01 + np.cumsum(np.concatenate([[0.0], (width_s + rest_s)[:-1]]))
     pixel = generator.choice([5, 5, 5, 4, 6], count)
-    angles_rad = DISPLAY.machine.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
+    angles_rad = DISPLAY.scan_head.field.angles_rad(DISPLAY.layout.x_m, DISPLAY.layout.y_m)
     x_rad, y_rad = (angle_rad[pixel] for angle_rad in angles_rad)
     zero, nothing = np.zeros(count), np.full(count, np.nan)
     return PulsePlan(
@@ -82,14 +82,14 @@ def hostile(power_w, seed):
 
 def hottest_share(key, budget, plan):
     """How near the pixel's absorber comes to its cap, by the pixel with that term alone; 1 is the cap."""
-    limited, _ = limit(plan, fresh_state(len(DISPLAY.pixels)), budget)
+    limited, _ = limit(plan, cold_state(len(DISPLAY.pixels)), budget)
     pulses = np.column_stack([limited.start_s, limited.width_s, limited.power_w, limited.pixel])
     t_s = np.arange(0.0, float(plan.start_s[-1]) + 0.3, 1e-4)
     ambient_k = CONFIG.ambient_c + ZERO_CELSIUS_K
     dose = 0.0 if key == "absorber_ageing" else 1.0
-    scene = Scene(pulses, 5, ambient_k, (t_s, t_s[:0], t_s[:0]), dose_before=dose)
+    scene = PixelExperiment(pulses, 5, ambient_k, (t_s, t_s[:0], t_s[:0]), dose_before=dose)
     values = {key: LARGE[key]} if key != "ambient_drift" else {}
-    rise_k = observe(scene, DISPLAY.pixels.each[5], Active.of(values))[0].max()
+    rise_k = simulate_signals(scene, DISPLAY.pixels.elements[5], ActiveTerms.from_values(values))[0].max()
     drift_k = 4.5 if key == "ambient_drift" else 0.0
     return (rise_k + drift_k) / (CONFIG.limits.absorber_max_c - CONFIG.ambient_c)
 
@@ -116,13 +116,13 @@ def test_a_limiter_that_forgot_the_term_would_be_caught(key, monkeypatch):
         scale = (CONFIG.limits.absorber_max_c - CONFIG.ambient_c) / (160.0 - CONFIG.ambient_c)
         return max(hottest_share(key, budget, hostile(1.2, seed)) for seed in range(3)) * scale
 
-    assert share(budget_of(config, parameters, DISPLAY.pixels)) <= 1.0
-    monkeypatch.setattr(budget_setup, "warming_of", lambda *_: Warming())
-    assert share(budget_of(config, parameters, DISPLAY.pixels)) > 1.0
+    assert share(build_budget(config, parameters, DISPLAY.pixels)) <= 1.0
+    monkeypatch.setattr(budget_setup, "compute_heat_gain_bound", lambda *_: HeatGainBound())
+    assert share(build_budget(config, parameters, DISPLAY.pixels)) > 1.0
 
 
 def test_hot_graphite_that_stores_more_cools_more_slowly_in_the_bound():
-    plain = budget_of(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
+    plain = build_budget(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
     hot = budget_with("heat_capacity", "calibrated").heat
     cap_k = CONFIG.limits.absorber_max_c - CONFIG.ambient_c
     assert hot.c_low_j_per_k.tolist() == plain.c_low_j_per_k.tolist()
@@ -131,9 +131,9 @@ def test_hot_graphite_that_stores_more_cools_more_slowly_in_the_bound():
 
 def test_what_warms_everything_is_taken_off_every_cap_with_what_walls_and_touch_surfaces_pass_on():
     parameters = with_term("ambient_drift", **LARGE["ambient_drift"])
-    warming = warming_of(parameters, DISPLAY.pixels, CONFIG)
-    assert 4.5 < warming.everywhere_k < 4.7
-    plain = budget_of(CONFIG, load_parameters("surroundings"), DISPLAY.pixels).caps
-    caps = budget_of(CONFIG, parameters, DISPLAY.pixels).caps
+    warming = compute_heat_gain_bound(parameters, DISPLAY.pixels, CONFIG)
+    assert 4.5 < warming.uniform_rise_k < 4.7
+    plain = build_budget(CONFIG, load_parameters("surroundings"), DISPLAY.pixels).caps
+    caps = build_budget(CONFIG, parameters, DISPLAY.pixels).caps
     for name in ("absorber_k", "wall_k", "touch_k"):
-        assert getattr(plain, name) - getattr(caps, name) == pytest.approx(warming.everywhere_k, rel=0.01)
+        assert getattr(plain, name) - getattr(caps, name) == pytest.approx(warming.uniform_rise_k, rel=0.01)

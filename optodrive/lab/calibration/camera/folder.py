@@ -11,24 +11,24 @@ from pydantic import ValidationError, model_validator
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
-from optodrive.device.config import Section, check_format, input_error
+from optodrive.device.config import Section, build_input_error, check_format
 from optodrive.device.field_geometry import CODE_MAX
 
 FORMAT = "optodrive-pictures"
 VERSION = 1
-DESCRIPTION = "pictures.toml"
+DESCRIPTION_FILE = "pictures.toml"
 COLUMNS = ("file", "x_code", "y_code")
-NAMED = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
-SPOTS = "spots.csv"
+CODES_IN_NAME = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
+SPOTS_FILE = "spots.csv"
 """What is measured is kept in this file of the folder."""
-VIEWS_LEAST = 3
+VIEWS_MIN = 3
 """From fewer pictures of the grid the camera is not told from its place."""
-PITCH_M = (0.2e-3, 0.1)
+PITCH_RANGE_M = (0.2e-3, 0.1)
 """Distances of a grid that a camera sees as a whole."""
 
 Finite = Annotated[float, Item(allow_inf_nan=False)]
-Pair = tuple[Finite, Finite]
-Name = Annotated[str, Item(min_length=1)]
+FinitePair = tuple[Finite, Finite]
+FileName = Annotated[str, Item(min_length=1)]
 
 
 class GridSection(Section):
@@ -38,7 +38,7 @@ class GridSection(Section):
     rows: Annotated[int, Item(ge=3, le=200)]
     columns: Annotated[int, Item(ge=3, le=200)]
     pitch_m: Annotated[float, Item(gt=0)]
-    pictures: Annotated[tuple[Name, ...], Item(min_length=1)]
+    pictures: Annotated[tuple[FileName, ...], Item(min_length=1)]
 
 
 class OriginSection(Section):
@@ -49,30 +49,30 @@ class OriginSection(Section):
     first_m: where the first corner lies on the display, from its middle; turn_rad: of the rows, anticlockwise
     """
 
-    marks_px: tuple[Pair, Pair, Pair]
-    first_m: Pair
+    marks_px: tuple[FinitePair, FinitePair, FinitePair]
+    first_corner_m: FinitePair
     turn_rad: Annotated[float, Item(ge=-3.2, le=3.2)] = 0.0
 
 
 class SpotsSection(Section):
     """The pictures of spots: a table file,x_code,y_code, or a pattern of names that end with both codes."""
 
-    table: Name | None = None
-    pictures: Name | None = None
+    table: FileName | None = None
+    pictures: FileName | None = None
 
     @model_validator(mode="after")
-    def _one_of_both(self) -> Self:
+    def _require_exactly_one(self) -> Self:
         if (self.table is None) == (self.pictures is None):
             raise ValueError("either table or pictures, just one of both")
-        if self.table == SPOTS:
-            raise ValueError(f"another name than {SPOTS}, in which what is measured is kept")
+        if self.table == SPOTS_FILE:
+            raise ValueError(f"another name than {SPOTS_FILE}, in which what is measured is kept")
         return self
 
 
-class _File(Section):
+class _PicturesFile(Section):
     format: str
     version: int
-    dark: Name | None = None
+    dark: FileName | None = None
     grid: GridSection
     origin: OriginSection
     spots: SpotsSection
@@ -88,69 +88,75 @@ class SpotPicture:
 
 
 @dataclass(frozen=True)
-class Pictures:
+class PictureFolder:
     """A folder as described. dark: the plane without the beam, None where no such picture was taken."""
 
     path: Path
     grid: GridSection
     origin: OriginSection
-    views: tuple[Path, ...]
+    grid_views: tuple[Path, ...]
     dark: Path | None
-    spots: tuple[SpotPicture, ...]
+    spot_pictures: tuple[SpotPicture, ...]
 
 
-def read_folder(folder: Path) -> Pictures:
+def read_picture_folder(folder: Path) -> PictureFolder:
     """Read FOLDER/pictures.toml and what it names; every picture exists. InputError names file, key and value."""
-    path = folder / DESCRIPTION
+    path = folder / DESCRIPTION_FILE
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
     try:
-        content = _File.model_validate(table)
+        content = _PicturesFile.model_validate(table)
     except ValidationError as error:
-        raise input_error(error, str(path), _File) from None
+        raise build_input_error(error, str(path), _PicturesFile) from None
     _check_pitch(path, content.grid.pitch_m)
-    if 1 < len(content.grid.pictures) < VIEWS_LEAST:
-        expected = f"1, or at least {VIEWS_LEAST} from which the camera is told from its place"
+    if 1 < len(content.grid.pictures) < VIEWS_MIN:
+        expected = f"1, or at least {VIEWS_MIN} from which the camera is told from its place"
         raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)
-    views = tuple(_there(folder, name, f"{path}: grid.pictures") for name in content.grid.pictures)
-    dark = None if content.dark is None else _there(folder, content.dark, f"{path}: dark")
-    rows = _by_table(folder, content.spots.table) if content.spots.table else _by_name(folder, path, content.spots)
-    return Pictures(path, content.grid, content.origin, views, dark, rows)
+    views = tuple(_require_picture(folder, name, f"{path}: grid.pictures") for name in content.grid.pictures)
+    dark = None if content.dark is None else _require_picture(folder, content.dark, f"{path}: dark")
+    rows = (
+        _list_by_table(folder, content.spots.table)
+        if content.spots.table
+        else _list_by_name(folder, path, content.spots)
+    )
+    return PictureFolder(path, content.grid, content.origin, views, dark, rows)
 
 
 def _check_pitch(path: Path, pitch_m: float) -> None:
-    least, most = PITCH_M
-    if not least <= pitch_m <= most:
-        alike = [
-            name for name, unit in (("millimetres", 1e-3), ("micrometres", 1e-6)) if least <= pitch_m * unit <= most
+    pitch_min_m, pitch_max_m = PITCH_RANGE_M
+    if not pitch_min_m <= pitch_m <= pitch_max_m:
+        plausible_units = [
+            name
+            for name, unit in (("millimetres", 1e-3), ("micrometres", 1e-6))
+            if pitch_min_m <= pitch_m * unit <= pitch_max_m
         ]
-        looks = f"; this looks like {alike[0]}" if pitch_m > most and alike else ""
-        raise InputError(f"{path}: grid.pitch_m", pitch_m, f"{least:g} to {most:g} m{looks}")
+        hint = f"; this looks like {plausible_units[0]}" if pitch_m > pitch_max_m and plausible_units else ""
+        raise InputError(f"{path}: grid.pitch_m", pitch_m, f"{pitch_min_m:g} to {pitch_max_m:g} m{hint}")
 
 
-def _there(folder: Path, name: str, where: str) -> Path:
+def _require_picture(folder: Path, name: str, where: str) -> Path:
     if not (folder / name).is_file():
         raise InputError(where, name, f"a picture in {folder}")
     return folder / name
 
 
-def _by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[SpotPicture, ...]:
+def _list_by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[SpotPicture, ...]:
     where, pattern = f"{path}: spots.pictures", str(section.pictures)
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
         raise InputError(where, pattern, "a pattern of names inside the folder, as spot_*.png")
-    out = []
+    pictures = []
     for picture in sorted(folder.glob(pattern)):
-        codes = NAMED.search(picture.name)
+        codes = CODES_IN_NAME.search(picture.name)
         if codes is None:
             raise InputError(where, picture.name, "a name that ends with both codes, as spot_32768_17404.png")
-        x_code, y_code = (_code(f"{where}: {picture.name}", each) for each in codes.groups())
-        out.append(SpotPicture(picture, x_code, y_code))
-    if not out:
+        x_code, y_code = (_parse_code(f"{where}: {picture.name}", each) for each in codes.groups())
+        pictures.append(SpotPicture(picture, x_code, y_code))
+    if not pictures:
         raise InputError(where, pattern, f"a pattern that pictures in {folder} have")
-    return tuple(out)
+    return tuple(pictures)
 
 
-def _by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
+def _list_by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
     path = folder / name
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
@@ -159,19 +165,19 @@ def _by_table(folder: Path, name: str) -> tuple[SpotPicture, ...]:
         raise InputError(str(path), str(error), "a readable CSV file") from None
     if not rows or tuple(rows[0]) != COLUMNS:
         raise InputError(f"{path}: first line", ",".join(rows[0]) if rows else "", f"'{','.join(COLUMNS)}'")
-    out = []
+    pictures = []
     for number, row in enumerate(rows[1:], start=2):
         where = f"{path}: row {number}"
         if not row:
             continue
         if len(row) != len(COLUMNS):
             raise InputError(where, ",".join(row), ", ".join(COLUMNS))
-        codes = [_code(f"{where}: {column}", cell) for column, cell in zip(COLUMNS[1:], row[1:], strict=True)]
-        out.append(SpotPicture(_there(folder, row[0], f"{where}: file"), codes[0], codes[1]))
-    return tuple(out)
+        codes = [_parse_code(f"{where}: {column}", cell) for column, cell in zip(COLUMNS[1:], row[1:], strict=True)]
+        pictures.append(SpotPicture(_require_picture(folder, row[0], f"{where}: file"), codes[0], codes[1]))
+    return tuple(pictures)
 
 
-def _code(where: str, text: str) -> float:
+def _parse_code(where: str, text: str) -> float:
     try:
         code = float(text)
     except ValueError:

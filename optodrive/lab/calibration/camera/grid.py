@@ -8,29 +8,29 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.calibration.camera.folder import GridSection, OriginSection
-from optodrive.lab.calibration.camera.image import Image, opencv
+from optodrive.lab.calibration.camera.image import Image, import_opencv
 
-SMALLEST = 4
+FALLBACK_CORNERS_PER_SIDE = 4
 """What is looked for where the grid itself is not there: so many corners a side."""
-NEAR = 0.5
+MARK_TOLERANCE = 0.5
 """A mark lies nearer to its corner than so many of the shorter distances between the marked corners."""
 
 
 def find_grid(path: Path, image: Image, grid: GridSection) -> FloatArray:
     """Places in the picture, px, [rows, columns, 2]; which corner is first is open. InputError names the picture."""
-    grey = _eight_bits(image)
-    found = _chessboard(path, grey, grid) if grid.kind == "chessboard" else _circles(path, grey, grid)
+    grey = _to_eight_bits(image)
+    found = _find_chessboard(path, grey, grid) if grid.kind == "chessboard" else _find_circles(path, grey, grid)
     return found.reshape(grid.rows, grid.columns, 2).astype(np.float64)
 
 
-def turned_to_marks(where: str, found: FloatArray, origin: OriginSection) -> FloatArray:
+def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> FloatArray:
     """The same grid with the corner at the first mark first; InputError for marks elsewhere or a mirrored picture."""
     marks = np.array(origin.marks_px)
     corners = np.stack([found[0, 0], found[0, -1], found[-1, -1], found[-1, 0]])
     nearest = [int(np.argmin(np.hypot(*(corners - mark).T))) for mark in marks]
-    short = min(float(np.hypot(*(corners[at] - corners[at - 1]))) for at in range(4))
+    shortest_side_px = min(float(np.hypot(*(corners[at] - corners[at - 1]))) for at in range(4))
     for mark, at in zip(marks, nearest, strict=True):
-        if np.hypot(*(corners[at] - mark)) > NEAR * short:
+        if np.hypot(*(corners[at] - mark)) > MARK_TOLERANCE * shortest_side_px:
             listed = ", ".join(f"{x:.0f} {y:.0f}" for x, y in corners)
             raise InputError(f"{where}: origin.marks_px", mark.tolist(), f"near one of the grid's corners: {listed}")
     _, right, down = nearest
@@ -45,8 +45,8 @@ def turned_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
             "rows to the right and columns down as seen from the front: a flipped picture, or marks exchanged",
         )
     # Any of the eight orders the grid may have been found in.
-    for turned in (found, found[::-1], found[:, ::-1], found[::-1, ::-1]):
-        for order in (turned, turned.transpose(1, 0, 2)):
+    for flipped in (found, found[::-1], found[:, ::-1], found[::-1, ::-1]):
+        for order in (flipped, flipped.transpose(1, 0, 2)):
             ends = order[0, 0], order[0, -1], order[-1, 0]
             if all(np.array_equal(end, corners[at]) for end, at in zip(ends, nearest, strict=True)):
                 if order.shape == found.shape:
@@ -56,32 +56,32 @@ def turned_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
     raise AssertionError("three corners have an order")
 
 
-def grid_m(grid: GridSection, origin: OriginSection) -> FloatArray:
+def grid_corners_m(grid: GridSection, origin: OriginSection) -> FloatArray:
     """Where corners lie on the display, m, [rows, columns, 2]; rows go to the right, columns down, before the turn."""
     right, down = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     along = grid.pitch_m * np.stack([right, -down], axis=-1)
     cos, sin = np.cos(origin.turn_rad), np.sin(origin.turn_rad)
-    placed: FloatArray = along @ np.array([[cos, sin], [-sin, cos]]) + np.array(origin.first_m)
+    placed: FloatArray = along @ np.array([[cos, sin], [-sin, cos]]) + np.array(origin.first_corner_m)
     return placed
 
 
-def _eight_bits(image: Image) -> Any:
+def _to_eight_bits(image: Image) -> Any:
     if image.dtype == np.uint8:
         return image
     return np.clip(image * (255.0 / max(1.0, float(image.max()))), 0, 255).astype(np.uint8)
 
 
-def _chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
-    cv2 = opencv()
+def _find_chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
+    cv2 = import_opencv()
     # Found larger than asked for where it is: else a part of it would pass for all of it.
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_LARGER
     size = (grid.columns, grid.rows)
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, size, flags)
     if not found:
-        smallest = (min(SMALLEST, grid.columns), min(SMALLEST, grid.rows))
+        smallest = (min(FALLBACK_CORNERS_PER_SIDE, grid.columns), min(FALLBACK_CORNERS_PER_SIDE, grid.rows))
         found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, smallest, flags)
     if not found:
-        raise _not_found(path, grid)
+        raise _not_found_error(path, grid)
     places = np.asarray(corners).reshape(*meta.shape, 2)
     if (meta.shape[0] < meta.shape[1]) != (grid.rows < grid.columns):
         places = places.transpose(1, 0, 2)  # which way rows run is open as well
@@ -95,15 +95,15 @@ def _chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
     return places
 
 
-def _circles(path: Path, grey: Any, grid: GridSection) -> FloatArray:
-    cv2 = opencv()
+def _find_circles(path: Path, grey: Any, grid: GridSection) -> FloatArray:
+    cv2 = import_opencv()
     found, centres = cv2.findCirclesGrid(grey, (grid.columns, grid.rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
     if not found:
-        raise _not_found(path, grid)
+        raise _not_found_error(path, grid)
     return np.asarray(centres)
 
 
-def _not_found(path: Path, grid: GridSection) -> InputError:
-    what = "inner corners" if grid.kind == "chessboard" else "dots"
-    expected = f"a {grid.kind} of {grid.rows} rows × {grid.columns} columns of {what}, seen as a whole"
+def _not_found_error(path: Path, grid: GridSection) -> InputError:
+    features = "inner corners" if grid.kind == "chessboard" else "dots"
+    expected = f"a {grid.kind} of {grid.rows} rows × {grid.columns} columns of {features}, seen as a whole"
     return InputError(str(path), "no such grid in the picture", expected)

@@ -7,17 +7,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from optodrive.core.errors import InputError
-from optodrive.lab.calibration.camera.folder import Pictures
+from optodrive.lab.calibration.camera.folder import PictureFolder
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
-MEDIAN_OF = 15
+MEDIAN_PICTURES_MAX = 15
 """The plane without the beam is the median of so many pictures of spots, each of which lies elsewhere."""
-MEDIAN_LEAST = 3
-ROWS = 200
+MEDIAN_PICTURES_MIN = 3
+MEDIAN_BLOCK_ROWS = 200
 """Rows a median is taken of at a time."""
 
 
-def opencv() -> Any:
+def import_opencv() -> Any:
     """The library; InputError where it is not there."""
     try:
         import cv2
@@ -28,7 +28,7 @@ def opencv() -> Any:
 
 def read_image(path: Path) -> Image:
     """[rows, columns], 8 or 16 bits; of a picture in colour the blue part, in which the beam and its saturation are."""
-    cv2 = opencv()
+    cv2 = import_opencv()
     try:
         raw = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     except OSError as error:
@@ -45,11 +45,11 @@ def read_image(path: Path) -> Image:
     return blue
 
 
-class Reader:
+class PictureReader:
     """Reads the pictures of one folder, all of one size and depth."""
 
-    def __init__(self, pictures: Pictures) -> None:
-        self._first = pictures.views[0]
+    def __init__(self, pictures: PictureFolder) -> None:
+        self._first = pictures.grid_views[0]
         first = read_image(self._first)
         self.rows, self.columns = first.shape
         self._depth = first.dtype
@@ -64,16 +64,18 @@ class Reader:
             raise InputError(str(path), str(image.dtype), f"{self._depth}, as {self._first.name}")
         return image
 
-    def without_beam(self, pictures: Pictures) -> Image:
+    def read_background(self, pictures: PictureFolder) -> Image:
         """The plane without the beam: the dark picture, or else the median of pictures of spots."""
         if pictures.dark is not None:
             return self(pictures.dark)
-        if len(pictures.spots) < MEDIAN_LEAST:
-            found = f"{len(pictures.spots)} spots"
+        if len(pictures.spot_pictures) < MEDIAN_PICTURES_MIN:
+            found = f"{len(pictures.spot_pictures)} spots"
             raise InputError(f"{pictures.path}: dark", None, f"a picture without the beam, beside only {found}")
-        chosen = np.unique(np.linspace(0, len(pictures.spots) - 1, MEDIAN_OF).astype(int))
-        stack = np.stack([self(pictures.spots[at].path) for at in chosen])
-        out: Image = np.empty_like(stack[0])
-        for first in range(0, self.rows, ROWS):
-            out[first : first + ROWS] = np.median(stack[:, first : first + ROWS].astype(np.float32), axis=0)
-        return out
+        chosen = np.unique(np.linspace(0, len(pictures.spot_pictures) - 1, MEDIAN_PICTURES_MAX).astype(int))
+        stack = np.stack([self(pictures.spot_pictures[at].path) for at in chosen])
+        background: Image = np.empty_like(stack[0])
+        for first in range(0, self.rows, MEDIAN_BLOCK_ROWS):
+            background[first : first + MEDIAN_BLOCK_ROWS] = np.median(
+                stack[:, first : first + MEDIAN_BLOCK_ROWS].astype(np.float32), axis=0
+            )
+        return background

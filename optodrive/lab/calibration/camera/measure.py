@@ -7,73 +7,75 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
-from optodrive.lab.calibration.camera.folder import Pictures, read_folder
-from optodrive.lab.calibration.camera.grid import find_grid, grid_m, turned_to_marks
-from optodrive.lab.calibration.camera.image import Reader
-from optodrive.lab.calibration.camera.plane import Plane, fit_plane
-from optodrive.lab.calibration.camera.spot import Seen, find_spot
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.camera.folder import PictureFolder, read_picture_folder
+from optodrive.lab.calibration.camera.grid import find_grid, grid_corners_m, orient_to_marks
+from optodrive.lab.calibration.camera.image import PictureReader
+from optodrive.lab.calibration.camera.plane import DisplayPlane, fit_plane
+from optodrive.lab.calibration.camera.spot import DetectedSpot, find_spot
+from optodrive.lab.calibration.spots import MeasuredSpots
 
-CORNERS_MAX_PX = 0.5
+CORNER_RESIDUAL_MAX_PX = 0.5
 """A grid that is even and flat leaves less than this to the fit, rms on an axis."""
 
 
 @dataclass(frozen=True, eq=False)
-class Measured:
+class CameraMeasurement:
     """Spots as pictures show them.
 
     names: of the pictures, in the order of the spots; sigma_m: of each on an axis, [n]; scale_m: of a pixel
     where most spots are; saturated, outside: which spots have a saturated core, lie outside the grid, [n]
     """
 
-    spots: Spots
+    spots: MeasuredSpots
     names: tuple[str, ...]
     sigma_m: FloatArray
-    saturated: BoolArray
-    outside: BoolArray
-    plane: Plane
-    scale_m: float
-    views: int
+    is_saturated: BoolArray
+    is_outside: BoolArray
+    plane: DisplayPlane
+    pixel_scale_m: float
+    view_count: int
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
 
 
-def measure_folder(folder: Path) -> Measured:
+def measure_folder(folder: Path) -> CameraMeasurement:
     """Measure every spot of a folder; InputError names the picture and what is wrong in it."""
-    pictures = read_folder(folder)
-    reader = Reader(pictures)
-    plane = _plane(pictures, reader)
-    without = reader.without_beam(pictures)
-    seen = [find_spot(str(each.path), reader(each.path), without) for each in pictures.spots]
-    return _placed(pictures, plane, seen)
+    pictures = read_picture_folder(folder)
+    reader = PictureReader(pictures)
+    plane = _fit_grid_plane(pictures, reader)
+    background = reader.read_background(pictures)
+    detected = [find_spot(str(each.path), reader(each.path), background) for each in pictures.spot_pictures]
+    return _locate_spots(pictures, plane, detected)
 
 
-def _plane(pictures: Pictures, reader: Reader) -> Plane:
+def _fit_grid_plane(pictures: PictureFolder, reader: PictureReader) -> DisplayPlane:
     grid, origin = pictures.grid, pictures.origin
-    views = [find_grid(path, reader(path), grid) for path in pictures.views]
-    views[0] = turned_to_marks(str(pictures.path), views[0], origin)
-    plane = fit_plane(views, grid_m(grid, origin), grid.pitch_m, (reader.columns, reader.rows))
-    if plane.left_px > CORNERS_MAX_PX:
-        found = f"corners {plane.left_px:.2f} px off an even, flat grid, rms"
-        raise InputError(str(pictures.views[0]), found, f"{CORNERS_MAX_PX:g} px at most: is it flat, and sharp?")
+    views = [find_grid(path, reader(path), grid) for path in pictures.grid_views]
+    views[0] = orient_to_marks(str(pictures.path), views[0], origin)
+    plane = fit_plane(views, grid_corners_m(grid, origin), grid.pitch_m, (reader.columns, reader.rows))
+    if plane.residual_px > CORNER_RESIDUAL_MAX_PX:
+        found = f"corners {plane.residual_px:.2f} px off an even, flat grid, rms"
+        raise InputError(
+            str(pictures.grid_views[0]), found, f"{CORNER_RESIDUAL_MAX_PX:g} px at most: is it flat, and sharp?"
+        )
     return plane
 
 
-def _placed(pictures: Pictures, plane: Plane, seen: list[Seen]) -> Measured:
-    at_px = np.array([each.at_px for each in seen]).reshape(-1, 2)
-    places_m = plane.places_m(at_px)
+def _locate_spots(pictures: PictureFolder, plane: DisplayPlane, detected: list[DetectedSpot]) -> CameraMeasurement:
+    centre_px = np.array([each.centre_px for each in detected]).reshape(-1, 2)
+    places_m = plane.position_m(centre_px)
     # The square root of the mean square over both axes.
-    a_pixel_m = np.sqrt((plane.derivatives_m(at_px) ** 2).sum(axis=(1, 2)) / 2.0)
-    sigma_m = np.hypot(a_pixel_m * [each.sigma_px for each in seen], plane.sigma_m(at_px))
-    codes = np.array([(each.x_code, each.y_code) for each in pictures.spots]).reshape(-1, 2)
-    return Measured(
-        spots=Spots.of(np.column_stack([codes, places_m])),
-        names=tuple(each.path.name for each in pictures.spots),
+    scale_m = np.sqrt((plane.jacobian_m(centre_px) ** 2).sum(axis=(1, 2)) / 2.0)
+    sigma_m = np.hypot(scale_m * [each.sigma_px for each in detected], plane.sigma_m(centre_px))
+    codes = np.array([(each.x_code, each.y_code) for each in pictures.spot_pictures]).reshape(-1, 2)
+    return CameraMeasurement(
+        spots=MeasuredSpots.from_table(np.column_stack([codes, places_m])),
+        names=tuple(each.path.name for each in pictures.spot_pictures),
         sigma_m=sigma_m,
-        saturated=np.array([each.saturated > 0 for each in seen], dtype=bool),
-        outside=~plane.inside(places_m, 0.5 * pictures.grid.pitch_m),
+        is_saturated=np.array([each.saturated_pixels > 0 for each in detected], dtype=bool),
+        is_outside=~plane.is_inside_grid(places_m, 0.5 * pictures.grid.pitch_m),
         plane=plane,
-        scale_m=float(np.median(a_pixel_m)) if len(seen) else float("nan"),
-        views=len(pictures.views),
+        pixel_scale_m=float(np.median(scale_m)) if len(detected) else float("nan"),
+        view_count=len(pictures.grid_views),
     )

@@ -12,23 +12,23 @@ import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.device.config import Config
-from optodrive.device.pixel_map import DEAD, GAIN_LEAST, GAIN_MOST, MEASURED, NOT_MEASURED, offset_most_m
-from optodrive.lab.calibration.pixels.response import Response
+from optodrive.device.pixel_map import DEAD, GAIN_MAX, GAIN_MIN, MEASURED, NOT_MEASURED, max_aim_offset_m
+from optodrive.lab.calibration.pixels.response import PixelResponse
 
-SURELY = 3.0
+SIGNIFICANCE_SIGMAS = 3.0
 """So many sigmas make a response surely less, or more, than something."""
-GAIN_SIGMA_MOST = 0.1
-OFFSET_SIGMA_MOST_M = 1e-4
+GAIN_SIGMA_MAX = 0.1
+OFFSET_SIGMA_MAX_M = 1e-4
 """What is known less well is not used."""
-FOUND_SHARE = 0.02
+EDGE_FRACTION_MIN = 0.02
 """An aim is across an edge where so much of the focus lies on it, and so much beside it, at the least."""
-DISAGREE = 2.0
+REDUCED_CHI2_MAX = 2.0
 """Responses that are off by more than so many times their variance are less sure than they say."""
-PLACES = 41
-STEPS = 12
+GRID_OFFSETS = 41
+GAUSS_NEWTON_STEPS = 12
 
 
-class Found(NamedTuple):
+class PixelEstimate(NamedTuple):
     """One pixel as found. Sigmas are NaN where nothing was."""
 
     state: str
@@ -38,173 +38,184 @@ class Found(NamedTuple):
     offset_sigma_m: tuple[float, float]
 
 
-NOTHING = Found(NOT_MEASURED, 1.0, np.nan, (0.0, 0.0), (np.nan, np.nan))
+NO_ESTIMATE = PixelEstimate(NOT_MEASURED, 1.0, np.nan, (0.0, 0.0), (np.nan, np.nan))
 
 
 @dataclass(frozen=True)
 class Optics:
     """Half-widths of absorber and focus, and the farthest offset believed, x and y, m."""
 
-    absorber_m: tuple[float, float]
-    focus_m: tuple[float, float]
-    most_m: tuple[float, float]
+    absorber_half_m: tuple[float, float]
+    focus_half_m: tuple[float, float]
+    offset_max_m: tuple[float, float]
 
     @classmethod
-    def of(cls, config: Config) -> "Optics":
+    def from_config(cls, config: Config) -> "Optics":
         """Those of a configuration."""
         display, laser = config.display, config.laser
         return cls(
             (display.absorber_width_m / 2.0, display.absorber_height_m / 2.0),
             (laser.focus_width_m / 2.0, laser.focus_height_m / 2.0),
-            offset_most_m(config),
+            max_aim_offset_m(config),
         )
 
-    def share(self, axis: int, off_m: FloatArray) -> FloatArray:
+    def absorbed_fraction(self, axis: int, offset_m: FloatArray) -> FloatArray:
         """How much of the focus lies on the absorber, its middle off_m from the absorber's; any shape."""
-        focus_m = self.focus_m[axis]
-        over_m = self.absorber_m[axis] + focus_m - np.abs(off_m)
-        return np.asarray(np.clip(over_m / (2.0 * focus_m), 0.0, 1.0), dtype=np.float64)
+        focus_half_m = self.focus_half_m[axis]
+        overlap_m = self.absorber_half_m[axis] + focus_half_m - np.abs(offset_m)
+        return np.asarray(np.clip(overlap_m / (2.0 * focus_half_m), 0.0, 1.0), dtype=np.float64)
 
-    def slope_per_m(self, axis: int, off_m: FloatArray) -> FloatArray:
+    def slope_per_m(self, axis: int, offset_m: FloatArray) -> FloatArray:
         """How that changes with off_m."""
-        share = self.share(axis, off_m)
-        inside = (share > 0.0) & (share < 1.0)
-        return np.where(inside, -np.sign(off_m) / (2.0 * self.focus_m[axis]), 0.0)
+        fraction = self.absorbed_fraction(axis, offset_m)
+        is_on_edge = (fraction > 0.0) & (fraction < 1.0)
+        return np.where(is_on_edge, -np.sign(offset_m) / (2.0 * self.focus_half_m[axis]), 0.0)
 
-    def farthest_m(self, axis: int) -> float:
+    def search_range_m(self, axis: int) -> float:
         """Offsets are looked for so far either way: beyond it hardly any focus is left on the absorber."""
-        return min(self.most_m[axis], self.absorber_m[axis] + 0.6 * self.focus_m[axis])
+        return min(self.offset_max_m[axis], self.absorber_half_m[axis] + 0.6 * self.focus_half_m[axis])
 
 
 @dataclass(frozen=True, eq=False)
-class _Table:
+class _ResponseTable:
     """Responses of one pixel as columns [k]; aim_m [2, k]."""
 
     aim_m: FloatArray
-    value: FloatArray
+    ratio: FloatArray
     sigma: FloatArray
 
-    def rows(self, kept: BoolArray) -> "_Table":
-        return _Table(self.aim_m[:, kept], self.value[kept], self.sigma[kept])
+    def select(self, selected: BoolArray) -> "_ResponseTable":
+        return _ResponseTable(self.aim_m[:, selected], self.ratio[selected], self.sigma[selected])
 
 
-def fit_pixel(responses: list[Response], optics: Optics) -> Found:
+def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
     """What responses of one pixel, to any aims, say of it."""
     if not responses:
-        return NOTHING
-    table = _Table(
+        return NO_ESTIMATE
+    table = _ResponseTable(
         np.array([[item.aim_x_m for item in responses], [item.aim_y_m for item in responses]]),
-        np.array([item.value for item in responses]),
+        np.array([item.ratio for item in responses]),
         np.array([item.sigma for item in responses]),
     )
-    if is_dead(table.value, table.sigma, centred(table.aim_m, optics)):
-        return NOTHING._replace(state=DEAD)
-    free = [_across(table.aim_m[axis], optics, axis) for axis in range(2)]
+    if is_dead(table.ratio, table.sigma, select_centred(table.aim_m, optics)):
+        return NO_ESTIMATE._replace(state=DEAD)
+    is_offset_free = [_crosses_both_edges(table.aim_m[axis], optics, axis) for axis in range(2)]
     for axis in range(2):
-        if not free[axis]:  # nobody knows how much of the focus an aim near one edge leaves on the absorber
-            table = table.rows(optics.share(axis, table.aim_m[axis]) == 1.0)
-    if not len(table.value):
-        return NOTHING
-    gain, offset_m = _refined(table, optics, free, *_nearest(table, optics, free))
-    sigma = _sigmas(table, optics, free, gain, offset_m)
-    if not (sigma[0] <= GAIN_SIGMA_MOST and GAIN_LEAST <= gain <= GAIN_MOST):
-        return NOTHING
-    known = [
-        free[axis] and sigma[1 + axis] <= OFFSET_SIGMA_MOST_M and abs(offset_m[axis]) < optics.farthest_m(axis)
+        if not is_offset_free[axis]:  # nobody knows how much of the focus an aim near one edge leaves on the absorber
+            table = table.select(optics.absorbed_fraction(axis, table.aim_m[axis]) == 1.0)
+    if not len(table.ratio):
+        return NO_ESTIMATE
+    gain, offset_m = _refine(table, optics, is_offset_free, *_search_offsets(table, optics, is_offset_free))
+    sigma = _standard_errors(table, optics, is_offset_free, gain, offset_m)
+    if not (sigma[0] <= GAIN_SIGMA_MAX and GAIN_MIN <= gain <= GAIN_MAX):
+        return NO_ESTIMATE
+    is_offset_known = [
+        is_offset_free[axis]
+        and sigma[1 + axis] <= OFFSET_SIGMA_MAX_M
+        and abs(offset_m[axis]) < optics.search_range_m(axis)
         for axis in range(2)
     ]
-    x_m, y_m = (float(offset_m[axis]) if known[axis] else 0.0 for axis in range(2))
-    x_sigma_m, y_sigma_m = (float(sigma[1 + axis]) if known[axis] else float("nan") for axis in range(2))
-    return Found(MEASURED, gain, float(sigma[0]), (x_m, y_m), (x_sigma_m, y_sigma_m))
+    x_m, y_m = (float(offset_m[axis]) if is_offset_known[axis] else 0.0 for axis in range(2))
+    x_sigma_m, y_sigma_m = (float(sigma[1 + axis]) if is_offset_known[axis] else float("nan") for axis in range(2))
+    return PixelEstimate(MEASURED, gain, float(sigma[0]), (x_m, y_m), (x_sigma_m, y_sigma_m))
 
 
-def centred(aim_m: FloatArray, optics: Optics) -> BoolArray:
+def select_centred(aim_m: FloatArray, optics: Optics) -> BoolArray:
     """Aims [2, k] with the whole focus nominally on the absorber; without any, those with half of it."""
-    share = optics.share(0, aim_m[0]) * optics.share(1, aim_m[1])
-    whole = share > 1.0 - FOUND_SHARE
-    return np.asarray(whole if whole.any() else share >= 0.5, dtype=np.bool_)
+    fraction = optics.absorbed_fraction(0, aim_m[0]) * optics.absorbed_fraction(1, aim_m[1])
+    is_whole = fraction > 1.0 - EDGE_FRACTION_MIN
+    return np.asarray(is_whole if is_whole.any() else fraction >= 0.5, dtype=np.bool_)
 
 
-def mean_of(value: FloatArray, sigma: FloatArray) -> tuple[float, float]:
+def weighted_mean(value: FloatArray, sigma: FloatArray) -> tuple[float, float]:
     """Weighted mean and its sigma."""
     weight = 1.0 / sigma**2
     return float((weight * value).sum() / weight.sum()), float(weight.sum() ** -0.5)
 
 
-def is_dead(value: FloatArray, sigma: FloatArray, on_it: BoolArray) -> bool:
+def is_dead(ratio: FloatArray, sigma: FloatArray, is_centred: BoolArray) -> bool:
     """Whether a pixel surely responds to no aim, though some were on it."""
-    if not on_it.any():
+    if not is_centred.any():
         return False
-    mean, unsure = mean_of(value[on_it], sigma[on_it])
-    answers = np.any(value - SURELY * sigma > GAIN_LEAST)
-    return bool(mean + SURELY * unsure < GAIN_LEAST and not answers)
+    mean, mean_sigma = weighted_mean(ratio[is_centred], sigma[is_centred])
+    responds = np.any(ratio - SIGNIFICANCE_SIGMAS * sigma > GAIN_MIN)
+    return bool(mean + SIGNIFICANCE_SIGMAS * mean_sigma < GAIN_MIN and not responds)
 
 
-def _across(aim_m: FloatArray, optics: Optics, axis: int) -> bool:
-    share = optics.share(axis, aim_m)
-    edge = (share > FOUND_SHARE) & (share < 1.0 - FOUND_SHARE)
+def _crosses_both_edges(aim_m: FloatArray, optics: Optics, axis: int) -> bool:
+    fraction = optics.absorbed_fraction(axis, aim_m)
+    edge = (fraction > EDGE_FRACTION_MIN) & (fraction < 1.0 - EDGE_FRACTION_MIN)
     return bool(np.any(edge & (aim_m > 0)) and np.any(edge & (aim_m < 0)))
 
 
-def _nearest(table: _Table, optics: Optics, free: list[bool]) -> tuple[float, FloatArray]:
+def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[bool]) -> tuple[float, FloatArray]:
     """Gain and offset of the best of many offsets."""
-    tried = [
-        np.linspace(-1.0, 1.0, PLACES) * optics.farthest_m(axis) if free[axis] else np.zeros(1) for axis in range(2)
+    offsets_m = [
+        np.linspace(-1.0, 1.0, GRID_OFFSETS) * optics.search_range_m(axis) if is_offset_free[axis] else np.zeros(1)
+        for axis in range(2)
     ]
-    x_share, y_share = (optics.share(axis, table.aim_m[axis] - tried[axis][:, None]) for axis in range(2))
-    share = x_share[:, None] * y_share[None]
+    x_fraction, y_fraction = (
+        optics.absorbed_fraction(axis, table.aim_m[axis] - offsets_m[axis][:, None]) for axis in range(2)
+    )
+    fraction = x_fraction[:, None] * y_fraction[None]
     weight = 1.0 / table.sigma**2
-    gain = (share * weight * table.value).sum(-1) / np.maximum(1e-12, (share**2 * weight).sum(-1))
-    left = (weight * (table.value - gain[..., None] * share) ** 2).sum(-1)
-    x_at, y_at = np.unravel_index(int(left.argmin()), left.shape)
-    return float(gain[x_at, y_at]), np.array([tried[0][x_at], tried[1][y_at]])
+    gain = (fraction * weight * table.ratio).sum(-1) / np.maximum(1e-12, (fraction**2 * weight).sum(-1))
+    chi2 = (weight * (table.ratio - gain[..., None] * fraction) ** 2).sum(-1)
+    x_at, y_at = np.unravel_index(int(chi2.argmin()), chi2.shape)
+    return float(gain[x_at, y_at]), np.array([offsets_m[0][x_at], offsets_m[1][y_at]])
 
 
-def _modelled(table: _Table, optics: Optics, gain: float, offset_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _model_response(
+    table: _ResponseTable, optics: Optics, gain: float, offset_m: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Responses [k], and their derivatives by gain and both offsets [k, 3]."""
     x_off_m, y_off_m = table.aim_m - offset_m[:, None]
-    x_share, y_share = optics.share(0, x_off_m), optics.share(1, y_off_m)
-    by_x = -gain * optics.slope_per_m(0, x_off_m) * y_share
-    by_y = -gain * optics.slope_per_m(1, y_off_m) * x_share
-    return gain * x_share * y_share, np.column_stack([x_share * y_share, by_x, by_y])
+    x_fraction, y_fraction = optics.absorbed_fraction(0, x_off_m), optics.absorbed_fraction(1, y_off_m)
+    by_x = -gain * optics.slope_per_m(0, x_off_m) * y_fraction
+    by_y = -gain * optics.slope_per_m(1, y_off_m) * x_fraction
+    return gain * x_fraction * y_fraction, np.column_stack([x_fraction * y_fraction, by_x, by_y])
 
 
-def _badness(table: _Table, optics: Optics, gain: float, offset_m: FloatArray) -> float:
-    return float((((table.value - _modelled(table, optics, gain, offset_m)[0]) / table.sigma) ** 2).sum())
+def _compute_chi2(table: _ResponseTable, optics: Optics, gain: float, offset_m: FloatArray) -> float:
+    return float((((table.ratio - _model_response(table, optics, gain, offset_m)[0]) / table.sigma) ** 2).sum())
 
 
-def _refined(
-    table: _Table, optics: Optics, free: list[bool], gain: float, offset_m: FloatArray
+def _refine(
+    table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
 ) -> tuple[float, FloatArray]:
     """Gauss and Newton from the best place tried; a step that makes it worse is halved."""
-    columns = np.array([True, *free])
-    best = _badness(table, optics, gain, offset_m)
-    for _ in range(STEPS):
-        expected, derivative = _modelled(table, optics, gain, offset_m)
+    columns = np.array([True, *is_offset_free])
+    best_chi2 = _compute_chi2(table, optics, gain, offset_m)
+    for _ in range(GAUSS_NEWTON_STEPS):
+        expected, derivative = _model_response(table, optics, gain, offset_m)
         step = np.zeros(3)
         scaled = derivative[:, columns] / table.sigma[:, None]
-        step[columns] = np.linalg.lstsq(scaled, (table.value - expected) / table.sigma, rcond=None)[0]
-        for _ in range(STEPS):
+        step[columns] = np.linalg.lstsq(scaled, (table.ratio - expected) / table.sigma, rcond=None)[0]
+        for _ in range(GAUSS_NEWTON_STEPS):
             tried = gain + step[0], offset_m + step[1:]
-            badness = _badness(table, optics, *tried)
-            if badness < best:
+            chi2 = _compute_chi2(table, optics, *tried)
+            if chi2 < best_chi2:
                 break
             step *= 0.5
         else:
             break
-        (gain, offset_m), best = (float(tried[0]), tried[1]), badness
+        (gain, offset_m), best_chi2 = (float(tried[0]), tried[1]), chi2
     return gain, offset_m
 
 
-def _sigmas(table: _Table, optics: Optics, free: list[bool], gain: float, offset_m: FloatArray) -> FloatArray:
+def _standard_errors(
+    table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
+) -> FloatArray:
     """Standard uncertainties of gain and offsets, [3]; larger where the responses disagree more than they should."""
-    columns = np.array([True, *free])
-    scaled = _modelled(table, optics, gain, offset_m)[1][:, columns] / table.sigma[:, None]
+    columns = np.array([True, *is_offset_free])
+    scaled = _model_response(table, optics, gain, offset_m)[1][:, columns] / table.sigma[:, None]
     sigma = np.full(3, np.inf)
     information = scaled.T @ scaled
     if np.linalg.cond(information / np.sqrt(np.outer(information.diagonal(), information.diagonal()))) > 1e8:
         return sigma
-    spare = len(table.value) - int(columns.sum())
-    worse = _badness(table, optics, gain, offset_m) / spare if spare > 0 else 1.0
-    sigma[columns] = np.sqrt(np.linalg.inv(information).diagonal() * (worse if worse > DISAGREE else 1.0))
+    degrees_of_freedom = len(table.ratio) - int(columns.sum())
+    reduced_chi2 = _compute_chi2(table, optics, gain, offset_m) / degrees_of_freedom if degrees_of_freedom > 0 else 1.0
+    sigma[columns] = np.sqrt(
+        np.linalg.inv(information).diagonal() * (reduced_chi2 if reduced_chi2 > REDUCED_CHI2_MAX else 1.0)
+    )
     return sigma

@@ -8,65 +8,65 @@ import numpy as np
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Run
 from optodrive.core.units import m_to_um
-from optodrive.device.config import Config, pixel_layout
+from optodrive.device.config import Config, build_pixel_layout
 from optodrive.device.pixel_map import DEAD, MEASURED, NOT_MEASURED, PixelMap
 from optodrive.lab.calibration.pixels.checks import check_responses
 from optodrive.lab.calibration.pixels.fit import Optics, fit_pixel
-from optodrive.lab.calibration.pixels.response import Predict, Response, response_of
+from optodrive.lab.calibration.pixels.response import PixelResponse, PredictHeights, compute_response
 
 
 @dataclass
-class Responses:
+class PixelMapFitter:
     """What runs show, gathered run by run. predict: as the model of this display has it."""
 
     config: Config
-    predict: Predict
+    predict: PredictHeights
 
     def __post_init__(self) -> None:
-        self.by_pixel: dict[int, list[Response]] = {}
-        self.runs = 0
-        self._optics, self._count = Optics.of(self.config), len(pixel_layout(self.config.display))
+        self.by_pixel: dict[int, list[PixelResponse]] = {}
+        self.run_count = 0
+        self._optics, self._pixel_count = Optics.from_config(self.config), len(build_pixel_layout(self.config.display))
 
-    def add(self, where: str, run: Run) -> None:
+    def add_run(self, where: str, run: Run) -> None:
         """Take a run in; InputError for a pixel that the display does not have, or an aim that is none."""
         pitch_m = self.config.display.pitch_m
         for signal in run.signals.values():
-            if not 0 <= signal.pixel < self._count:
-                expected = f"a pixel of {self.config.name}, 0 to {self._count - 1}"
+            if not 0 <= signal.pixel < self._pixel_count:
+                expected = f"a pixel of {self.config.name}, 0 to {self._pixel_count - 1}"
                 raise InputError(f"{where}: /runs/{run.name}: pixel", signal.pixel, expected)
-        found = response_of(where, run, self.predict, (pitch_m, pitch_m))
-        if found is not None:
-            self.runs += 1
-            self.by_pixel.setdefault(found.pixel, []).append(found)
+        response = compute_response(where, run, self.predict, (pitch_m, pitch_m))
+        if response is not None:
+            self.run_count += 1
+            self.by_pixel.setdefault(response.pixel, []).append(response)
 
-    def fitted(self, where: str, model: str) -> PixelMap:
+    def fit(self, where: str, model: str) -> PixelMap:
         """The map; InputError where the heights are those of no display of this model."""
         check_responses(where, self.by_pixel, self._optics)
-        each = [fit_pixel(self.by_pixel.get(pixel, []), self._optics) for pixel in range(self._count)]
-        offset_m = np.array([found.offset_m for found in each]).T.copy()
-        sigma_m = np.array([found.offset_sigma_m for found in each]).T.copy()
+        estimates = [fit_pixel(self.by_pixel.get(pixel, []), self._optics) for pixel in range(self._pixel_count)]
+        offset_m = np.array([found.offset_m for found in estimates]).T.copy()
+        sigma_m = np.array([found.offset_sigma_m for found in estimates]).T.copy()
         return PixelMap(
-            gain=np.array([found.gain for found in each]),
-            gain_sigma=np.array([found.gain_sigma for found in each]),
+            gain=np.array([found.gain for found in estimates]),
+            gain_sigma=np.array([found.gain_sigma for found in estimates]),
             offset_x_m=offset_m[0].copy(),
             offset_y_m=offset_m[1].copy(),
             offset_x_sigma_m=sigma_m[0].copy(),
             offset_y_sigma_m=sigma_m[1].copy(),
-            state=np.array([found.state for found in each]),
+            state=np.array([found.state for found in estimates]),
             model=model,
         )
 
 
-def figures(known: PixelMap, runs: int) -> dict[str, Any]:
+def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
     """Counts, extremes and each pixel, for --json."""
-    measured = np.flatnonzero(known.state == MEASURED)
-    gain = known.gain[measured]
+    measured = np.flatnonzero(pixel_map.state == MEASURED)
+    gain = pixel_map.gain[measured]
     return {
-        "pixels": len(known),
+        "pixels": len(pixel_map),
         "runs": runs,
         "measured": len(measured),
-        "dead": np.flatnonzero(known.state == DEAD).tolist(),
-        "not_measured": np.flatnonzero(known.state == NOT_MEASURED).tolist(),
+        "dead": np.flatnonzero(pixel_map.state == DEAD).tolist(),
+        "not_measured": np.flatnonzero(pixel_map.state == NOT_MEASURED).tolist(),
         "gain": None
         if not len(measured)
         else {
@@ -75,40 +75,40 @@ def figures(known: PixelMap, runs: int) -> dict[str, Any]:
             "least_pixel": int(measured[gain.argmin()]),
             "most": float(gain.max()),
             "most_pixel": int(measured[gain.argmax()]),
-            "sigma_median": float(np.median(known.gain_sigma[measured])),
+            "sigma_median": float(np.median(pixel_map.gain_sigma[measured])),
         },
-        "offset_um": {axis: _offset(known, axis) for axis in "xy"},
+        "offset_um": {axis: _compute_offset_stats(pixel_map, axis) for axis in "xy"},
         "each": [
             {
                 "pixel": pixel,
-                "state": str(known.state[pixel]),
-                "gain": float(known.gain[pixel]),
-                "gain_sigma": _finite(known.gain_sigma[pixel]),
-                "offset_x_um": m_to_um(float(known.offset_x_m[pixel])),
-                "offset_x_sigma_um": _finite(m_to_um(known.offset_x_sigma_m[pixel])),
-                "offset_y_um": m_to_um(float(known.offset_y_m[pixel])),
-                "offset_y_sigma_um": _finite(m_to_um(known.offset_y_sigma_m[pixel])),
+                "state": str(pixel_map.state[pixel]),
+                "gain": float(pixel_map.gain[pixel]),
+                "gain_sigma": _finite_or_none(pixel_map.gain_sigma[pixel]),
+                "offset_x_um": m_to_um(float(pixel_map.offset_x_m[pixel])),
+                "offset_x_sigma_um": _finite_or_none(m_to_um(pixel_map.offset_x_sigma_m[pixel])),
+                "offset_y_um": m_to_um(float(pixel_map.offset_y_m[pixel])),
+                "offset_y_sigma_um": _finite_or_none(m_to_um(pixel_map.offset_y_sigma_m[pixel])),
             }
-            for pixel in range(len(known))
+            for pixel in range(len(pixel_map))
         ],
     }
 
 
-def _offset(known: PixelMap, axis: str) -> dict[str, Any] | None:
-    sigma_m = getattr(known, f"offset_{axis}_sigma_m")
-    there = np.flatnonzero(np.isfinite(sigma_m))
-    if not len(there):
+def _compute_offset_stats(pixel_map: PixelMap, axis: str) -> dict[str, Any] | None:
+    sigma_m = getattr(pixel_map, f"offset_{axis}_sigma_m")
+    measured = np.flatnonzero(np.isfinite(sigma_m))
+    if not len(measured):
         return None
-    offset_m = getattr(known, f"offset_{axis}_m")[there]
+    offset_m = getattr(pixel_map, f"offset_{axis}_m")[measured]
     farthest = int(np.abs(offset_m).argmax())
     return {
-        "measured": len(there),
+        "measured": len(measured),
         "median": m_to_um(float(np.median(offset_m))),
         "farthest": m_to_um(float(offset_m[farthest])),
-        "farthest_pixel": int(there[farthest]),
-        "sigma_median": m_to_um(float(np.median(sigma_m[there]))),
+        "farthest_pixel": int(measured[farthest]),
+        "sigma_median": m_to_um(float(np.median(sigma_m[measured]))),
     }
 
 
-def _finite(value: float) -> float | None:
+def _finite_or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None

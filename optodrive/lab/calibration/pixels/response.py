@@ -10,74 +10,76 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 
 SIGNAL = "displacement_m"
-Predict = Callable[[FloatArray, int, FloatArray], FloatArray]
+PredictHeights = Callable[[FloatArray, int, FloatArray], FloatArray]
 """Heights of a pixel, m, at times [m] under pulses [n, 4]."""
-SAMPLES_LEAST = 8
-ROUNDS = 5
-FAR = 5.0
+SAMPLES_MIN = 8
+CLIPPING_ITERATIONS_MAX = 5
+CLIPPING_SIGMAS = 5.0
 """A sample so many sigmas off the rest is left out."""
-NORMAL = 1.4826
+MAD_TO_SIGMA = 1.4826
 """Sigma over the median distance, of normal noise."""
-BEST = 1e-4
+RELATIVE_SIGMA_MIN = 1e-4
 """No response is believed better than this."""
-FEELS_M = 1e-7
+PREDICTED_RANGE_MIN_M = 1e-7
 """A run whose pulses lift the model's pixel by less says nothing of its gain."""
 
 
-class Response(NamedTuple):
+class PixelResponse(NamedTuple):
     """value: measured over predicted, one standard uncertainty sigma; aim: where the beam was sent, from the middle."""
 
     pixel: int
     aim_x_m: float
     aim_y_m: float
-    value: float
+    ratio: float
     sigma: float
 
 
-def response_of(where: str, run: Run, predict: Predict, aim_most_m: tuple[float, float]) -> Response | None:
+def compute_response(
+    where: str, run: Run, predict: PredictHeights, aim_max_m: tuple[float, float]
+) -> PixelResponse | None:
     """The response that a run shows; None without heights, pulses on the pixel, or enough samples.
 
     InputError for an aim that is no number, or farther off than aim_most_m.
     """
-    x_m, y_m = (_aim_m(where, run, axis, most_m) for axis, most_m in zip("xy", aim_most_m, strict=True))
+    x_m, y_m = (_read_aim_m(where, run, axis, most_m) for axis, most_m in zip("xy", aim_max_m, strict=True))
     signal = run.signals.get(SIGNAL)
     if signal is None:
         return None
-    kept = np.isfinite(signal.value)
-    if int(kept.sum()) < SAMPLES_LEAST or not np.any(run.pulses[:, 3] == signal.pixel):
+    is_finite = np.isfinite(signal.value)
+    if int(is_finite.sum()) < SAMPLES_MIN or not np.any(run.pulses[:, 3] == signal.pixel):
         return None
-    shape_m = predict(run.pulses, signal.pixel, np.array(signal.t_s[kept]))
-    if np.ptp(shape_m) < FEELS_M:
+    predicted_m = predict(run.pulses, signal.pixel, np.array(signal.t_s[is_finite]))
+    if np.ptp(predicted_m) < PREDICTED_RANGE_MIN_M:
         return None
-    found = _share(shape_m, signal.value[kept])
-    return None if found is None else Response(signal.pixel, x_m, y_m, *found)
+    ratio_and_sigma = _fit_ratio(predicted_m, signal.value[is_finite])
+    return None if ratio_and_sigma is None else PixelResponse(signal.pixel, x_m, y_m, *ratio_and_sigma)
 
 
-def _share(shape_m: FloatArray, value_m: FloatArray) -> tuple[float, float] | None:
+def _fit_ratio(predicted_m: FloatArray, measured_m: FloatArray) -> tuple[float, float] | None:
     """The factor on a shape, beside an unknown zero of the instrument, and its sigma; without samples far off."""
-    kept = np.ones(len(value_m), dtype=np.bool_)
-    design = np.column_stack([shape_m, np.ones(len(shape_m))])
-    for _ in range(ROUNDS):
-        solution = np.linalg.lstsq(design[kept], value_m[kept], rcond=None)[0]
-        left_m = value_m - design @ solution
-        typical_m = NORMAL * float(np.median(np.abs(left_m[kept])))
-        again = np.abs(left_m) <= FAR * typical_m if typical_m > 0.0 else kept
-        if np.array_equal(again, kept):
+    is_inlier = np.ones(len(measured_m), dtype=np.bool_)
+    design = np.column_stack([predicted_m, np.ones(len(predicted_m))])
+    for _ in range(CLIPPING_ITERATIONS_MAX):
+        solution = np.linalg.lstsq(design[is_inlier], measured_m[is_inlier], rcond=None)[0]
+        residual_m = measured_m - design @ solution
+        typical_m = MAD_TO_SIGMA * float(np.median(np.abs(residual_m[is_inlier])))
+        still_inlier = np.abs(residual_m) <= CLIPPING_SIGMAS * typical_m if typical_m > 0.0 else is_inlier
+        if np.array_equal(still_inlier, is_inlier):
             break
-        kept = again
-    count = int(kept.sum())
-    if count < SAMPLES_LEAST or np.ptp(shape_m[kept]) < FEELS_M:
+        is_inlier = still_inlier
+    count = int(is_inlier.sum())
+    if count < SAMPLES_MIN or np.ptp(predicted_m[is_inlier]) < PREDICTED_RANGE_MIN_M:
         return None
-    variance = float((left_m[kept] ** 2).sum()) / (count - 2)
-    spread = float(((shape_m[kept] - shape_m[kept].mean()) ** 2).sum())
-    value = float(solution[0])
-    return value, float(np.hypot(np.sqrt(variance / spread), BEST * max(1.0, abs(value))))
+    variance = float((residual_m[is_inlier] ** 2).sum()) / (count - 2)
+    sum_of_squares = float(((predicted_m[is_inlier] - predicted_m[is_inlier].mean()) ** 2).sum())
+    ratio = float(solution[0])
+    return ratio, float(np.hypot(np.sqrt(variance / sum_of_squares), RELATIVE_SIGMA_MIN * max(1.0, abs(ratio))))
 
 
-def _aim_m(where: str, run: Run, axis: str, most_m: float) -> float:
+def _read_aim_m(where: str, run: Run, axis: str, aim_max_m: float) -> float:
     key = f"aim_{axis}_m"
-    given = run.attributes.get(key, 0.0)
-    if isinstance(given, str) or not abs(given) <= most_m:
-        expected = f"a number of metres from the pixel's middle, {most_m:.6g} either way at most"
-        raise InputError(f"{where}: /runs/{run.name}: {key}", given, expected)
-    return float(given)
+    aim_m = run.attributes.get(key, 0.0)
+    if isinstance(aim_m, str) or not abs(aim_m) <= aim_max_m:
+        expected = f"a number of metres from the pixel's middle, {aim_max_m:.6g} either way at most"
+        raise InputError(f"{where}: /runs/{run.name}: {key}", aim_m, expected)
+    return float(aim_m)

@@ -8,26 +8,26 @@ import cv2
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, PRIOR, grid_codes, misses_m
+from hidden_field import CONFIG, PRIOR, field_errors_m, grid_codes
 from optodrive.cli.main import run
-from optodrive.device.field_file import read_field
+from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.spots import Spots, read_spots
+from optodrive.lab.calibration.spots import MeasuredSpots, read_spots
 from optodrive.link.simulator.true_geometry import Truth
 from rendered import GRID, PIXEL_M, describe, grid_light, marks_px, save, spot_light, taken
 
 TRUTH = Truth.drawn(4, CONFIG)
 CODES = grid_codes(5)
 PLACES = np.column_stack(TRUTH.position_m(*CODES.T))
-FALSE = 7
+OUTLIER = 7
 """This spot's picture was taken of another place."""
 PEAKS = (180.0, 700.0, 60.0)
-ROOM = 20.0
+AMBIENT_LIGHT = 20.0
 
 
 def spot_picture(place_m, peak, random, share=0.0):
     """With a reflection that has a share of its light, well aside."""
-    light = ROOM + peak * spot_light(place_m)
+    light = AMBIENT_LIGHT + peak * spot_light(place_m)
     aside = np.add(place_m, (0.012 if place_m[0] < 0 else -0.012, random.uniform(-5e-3, 5e-3)))
     return taken(light + share * peak * spot_light(aside), random)
 
@@ -37,10 +37,10 @@ def shared(tmp_path_factory):
     """A laboratory's folder: every third spot saturated, every third faint, every other with a reflection."""
     at, random = tmp_path_factory.mktemp("pictures"), np.random.default_rng(11)
     save(at / "grid.png", taken(180.0 * grid_light(), random))
-    save(at / "dark.png", taken(np.full((1200, 1600), ROOM), random))
+    save(at / "dark.png", taken(np.full((1200, 1600), AMBIENT_LIGHT), random))
     rows = ["file,x_code,y_code"]
     for index, (codes, place) in enumerate(zip(CODES, PLACES, strict=True)):
-        seen = np.add(place, (2e-3, 0.0)) if index == FALSE else place
+        seen = np.add(place, (2e-3, 0.0)) if index == OUTLIER else place
         name = f"spot_{codes[0]:.0f}_{codes[1]:.0f}.png"
         save(at / name, spot_picture(seen, PEAKS[index % 3], random, 0.3 * (index % 2)))
         rows.append(f"{name},{codes[0]:.0f},{codes[1]:.0f}")
@@ -71,17 +71,19 @@ def test_spots_within_10_um_and_a_field_as_good_as_from_a_file_of_spots(shared, 
     assert run(["calibrate", "--pictures", str(shared), "--out", f"{tmp_path}/field.toml", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     spots = read_spots(shared / "spots.csv")
-    true = np.arange(len(CODES)) != FALSE
+    true = np.arange(len(CODES)) != OUTLIER
     off = (np.column_stack([spots.x_m, spots.y_m]) - PLACES)[true]
     assert np.sqrt((off**2).sum(axis=1).mean()) < 10e-6
     assert told["pixel_um"] < 100
-    assert told["outlier_pictures"] == [f"spot_{CODES[FALSE][0]:.0f}_{CODES[FALSE][1]:.0f}.png"]
+    assert told["outlier_pictures"] == [f"spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png"]
     assert len(told["saturated_pictures"]) == 8
     assert told["outside_pictures"] == []
     assert told["spots_file"] == f"{shared}/spots.csv"
-    missed, _ = misses_m(TRUTH, read_field(tmp_path / "field.toml"))
+    missed, _ = field_errors_m(TRUTH, load_field(tmp_path / "field.toml"))
     noisy = np.random.default_rng(12).normal(PLACES, 10e-6)
-    by_file, _ = misses_m(TRUTH, fit_field(Spots.of(np.column_stack([CODES, noisy])), PRIOR).field)
+    by_file, _ = field_errors_m(
+        TRUTH, fit_field(MeasuredSpots.from_table(np.column_stack([CODES, noisy])), PRIOR).field
+    )
     assert np.sqrt((missed**2).mean()) < np.sqrt((by_file**2).mean())
 
 
@@ -89,9 +91,9 @@ def test_spots_within_10_um_and_a_field_as_good_as_from_a_file_of_spots(shared, 
 def test_what_it_wrote_gives_the_same_field_by_spots(shared, tmp_path, capsys):
     assert run(["calibrate", "--pictures", str(shared), "--out", f"{tmp_path}/a.toml"]) == 0
     said = capsys.readouterr().out
-    assert f"false pictures   spot_{CODES[FALSE][0]:.0f}_{CODES[FALSE][1]:.0f}.png\n" in said
+    assert f"false pictures   spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png\n" in said
     assert run(["calibrate", "--spots", f"{shared}/spots.csv", "--out", f"{tmp_path}/b.toml"]) == 0
-    a, b = (read_field(tmp_path / name).position_m(*CODES.T) for name in ("a.toml", "b.toml"))
+    a, b = (load_field(tmp_path / name).position_m(*CODES.T) for name in ("a.toml", "b.toml"))
     assert np.allclose(a, b, rtol=0.0, atol=1e-8)
 
 
@@ -103,7 +105,7 @@ def test_codes_from_names_and_no_dark_picture_give_the_same_spots(shared, folder
     order = np.lexsort((CODES[:, 1], CODES[:, 0]))
     by_name = np.lexsort((spots.y_code, spots.x_code))
     off = np.column_stack([spots.x_m, spots.y_m])[by_name] - PLACES[order]
-    assert np.sqrt((np.delete(off, np.flatnonzero(order == FALSE), axis=0) ** 2).sum(axis=1).mean()) < 10e-6
+    assert np.sqrt((np.delete(off, np.flatnonzero(order == OUTLIER), axis=0) ** 2).sum(axis=1).mean()) < 10e-6
 
 
 def test_a_spot_outside_the_grid_is_warned_of(folder, capsys):
@@ -118,59 +120,62 @@ def test_a_spot_outside_the_grid_is_warned_of(folder, capsys):
     assert "outside the grid" in said
 
 
-def no_grid(folder):
+def remove_grid(folder):
     replace_picture(folder, "grid.png", np.full((1200, 1600), 90, np.uint8))
 
 
-def flipped(folder):
+def flip_grid(folder):
     replace_picture(folder, "grid.png", cv2.imread(f"{folder}/grid.png", 0)[:, ::-1])
     describe(folder, marks=[1599.0, 0.0] + marks_px() * [-1.0, 1.0])
 
 
-def no_spot(folder):
+def remove_spot(folder):
     replace_picture(folder, "spot_32768_32768.png", cv2.imread(f"{folder}/dark.png", 0))
-    row("spot_32768_32768.png,32768,32768\n")(folder)
+    write_row("spot_32768_32768.png,32768,32768\n")(folder)
 
 
-def alike(folder):
+def two_equal_spots(folder):
     picture = spot_picture(np.array([0.0, 0.0]), 150.0, np.random.default_rng(1), 0.95)
     replace_picture(folder, "spot_32768_32768.png", picture)
-    row("spot_32768_32768.png,32768,32768\n")(folder)
+    write_row("spot_32768_32768.png,32768,32768\n")(folder)
 
 
-def other_size(folder):
+def resize_dark_picture(folder):
     replace_picture(folder, "dark.png", np.zeros((600, 800), np.uint8))
 
 
-def no_picture(folder):
+def corrupt_picture(folder):
     (folder / "grid.png").unlink()
     (folder / "grid.png").write_text("none")
 
 
-def row(text):
+def write_row(text):
     return lambda folder: (folder / "pictures.csv").write_text("file,x_code,y_code\n" + text)
 
 
 WRONG = {
-    "no grid": (no_grid, "grid.png: got 'no such grid in the picture', expected a chessboard of 10 rows × 13 columns"),
+    "no grid": (
+        remove_grid,
+        "grid.png: got 'no such grid in the picture', expected a chessboard of 10 rows × 13 columns",
+    ),
     "fewer corners": (lambda f: describe(f, GRID | {"rows": 8}, marks=marks_px()), "grid.png: corners: got '10 × 13'"),
     "squares counted": (
         lambda f: describe(f, GRID | {"rows": 11, "columns": 14}, marks=marks_px()),
         "grid.png: corners: got '10 × 13', expected 11 rows × 14 columns: inner corners, one fewer than squares",
     ),
-    "flipped": (flipped, "mirrored in the picture"),
+    "flipped": (flip_grid, "mirrored in the picture"),
     "marks anywhere": (lambda f: describe(f, marks=np.add(marks_px(), (0, 900))), "origin.marks_px"),
     "marks twice": (lambda f: describe(f, marks=marks_px()[[0, 1, 1]]), "three corners of the grid"),
     "millimetres": (lambda f: describe(f, GRID | {"pitch_m": 7.5}, marks=marks_px()), "this looks like millimetres"),
     "another pitch": (lambda f: describe(f, GRID | {"pitch_m": 5e-3}, marks=marks_px()), "× those asked for"),
-    "no spot": (no_spot, "spot_32768_32768.png: got 'nothing brighter than"),
-    "alike": (alike, "spot_32768_32768.png: got 'two spots alike, at"),
-    "other size": (other_size, "dark.png: got '800 × 600 pixels', expected 1600 × 1200, as grid.png"),
-    "no picture": (no_picture, "grid.png: got 'no picture'"),
-    "missing": (row("none.png,1,2\n"), "pictures.csv: row 2: file: got 'none.png', expected a picture in"),
+    "no spot": (remove_spot, "spot_32768_32768.png: got 'nothing brighter than"),
+    "alike": (two_equal_spots, "spot_32768_32768.png: got 'two spots alike, at"),
+    "other size": (resize_dark_picture, "dark.png: got '800 × 600 pixels', expected 1600 × 1200, as grid.png"),
+    "no picture": (corrupt_picture, "grid.png: got 'no picture'"),
+    "missing": (write_row("none.png,1,2\n"), "pictures.csv: row 2: file: got 'none.png', expected a picture in"),
     "missing grid": (lambda f: describe(f, views=("none.png",)), "grid.pictures: got 'none.png'"),
-    "metres": (row("grid.png,-0.01,2\n"), "row 2: x_code: got '-0.01', expected a code, 0 to 65535"),
-    "columns": (row("grid.png,1\n"), "row 2: got 'grid.png,1'"),
+    "metres": (write_row("grid.png,-0.01,2\n"), "row 2: x_code: got '-0.01', expected a code, 0 to 65535"),
+    "columns": (write_row("grid.png,1\n"), "row 2: got 'grid.png,1'"),
     "head": (lambda f: (f / "pictures.csv").write_text("a,b\n"), "first line"),
     "names": (lambda f: describe(f, spots='pictures = "grid.png"'), "a name that ends with both codes"),
     "both": (lambda f: describe(f, spots='table = "a"\npictures = "b"'), "just one of both"),

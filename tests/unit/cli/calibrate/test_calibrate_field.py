@@ -5,15 +5,20 @@ import json
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, HALF_M, grid_codes, seen
+from hidden_field import CONFIG, HALF_M, grid_codes, measure_spots
 from optodrive.cli.main import run
-from optodrive.device.field_file import read_field
-from optodrive.lab.calibration.correction_grid import CELL_CODES, NODES, corrections, read_grid
-from optodrive.lab.calibration.spots import Spots, write_spots
+from optodrive.device.field_file import load_field
+from optodrive.lab.calibration.correction_grid import (
+    NODE_SPACING_CODES,
+    NODES_PER_SIDE,
+    compute_corrections,
+    read_correction_grid,
+)
+from optodrive.lab.calibration.spots import MeasuredSpots, write_spots
 from optodrive.link.simulator.true_geometry import Truth
 
 TRUTH = Truth.drawn(4, CONFIG)
-SPOTS, FALSE = seen(TRUTH, grid_codes(17), np.random.default_rng(2))
+SPOTS, IS_OUTLIER = measure_spots(TRUTH, grid_codes(17), np.random.default_rng(2))
 
 
 @pytest.fixture(scope="module")
@@ -26,10 +31,10 @@ def folder(tmp_path_factory):
 
 
 def test_it_says_what_is_left_how_sure_it_is_and_which_spots_are_false(folder, capsys):
-    assert FALSE.any()
+    assert IS_OUTLIER.any()
     assert run(["calibrate", "--spots", f"{folder}/spots.csv", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
-    assert figures["outlier_rows"] == np.flatnonzero(FALSE).tolist()
+    assert figures["outlier_rows"] == np.flatnonzero(IS_OUTLIER).tolist()
     assert 12 < figures["residual_rms_um"] < 16
     assert figures["residual_max_um"] < 60
     assert np.shape(figures["sigma_um"]) == (3, 3)
@@ -41,7 +46,7 @@ def test_in_words_the_false_ones_are_named_by_their_line(folder, capsys):
     told = capsys.readouterr().out
     lines = (folder / "spots.csv").read_text().splitlines()
     named = [int(word) for word in told.splitlines()[1].replace(",", " ").split()[2:]]
-    assert named == (np.flatnonzero(FALSE) + 2).tolist()
+    assert named == (np.flatnonzero(IS_OUTLIER) + 2).tolist()
     for line in named:
         x_code, y_code, x_m, y_m = map(float, lines[line - 1].split(","))
         assert np.hypot(*np.subtract(TRUTH.position_m(x_code, y_code), (x_m, y_m))) > 1e-4
@@ -52,7 +57,7 @@ def test_the_report_stands_alone(folder):
     assert run(arguments) == 0
     html = (folder / "report.html").read_text()
     assert html.count("<svg") == 2
-    assert html.count("<title>row ") == FALSE.sum()
+    assert html.count("<title>row ") == IS_OUTLIER.sum()
     assert not any(word in html for word in ("http", "src=", "<script", "url("))
 
 
@@ -71,27 +76,27 @@ def test_codes_lead_to_within_the_figures_and_back_within_a_tenth_of_a_code(fold
     back = ["field", "--calibration", f"{folder}/field.toml", "--points", f"{folder}/codes.csv", "--inverse"]
     assert run([*back, "--out", f"{folder}/back.csv"]) == 0
     again = np.loadtxt(folder / "back.csv", delimiter=",", skiprows=1)
-    code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad
+    code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
     assert np.abs(again - wanted).max() < 0.1 * code_m
 
 
 def test_a_grid_there_and_back_within_a_code(folder):
     assert run(["field", "--calibration", f"{folder}/field.toml", "--export", f"{folder}/grid.cor"]) == 0
-    scale, moved = read_grid(folder / "grid.cor")
-    field = read_field(folder / "field.toml")
-    assert np.array_equal(moved, corrections(field))
-    assert scale == pytest.approx(1e-3 / (2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad))
+    scale, moved = read_correction_grid(folder / "grid.cor")
+    field = load_field(folder / "field.toml")
+    assert np.array_equal(moved, compute_corrections(field))
+    assert scale == pytest.approx(1e-3 / (2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code))
     assert run(["field", "--import", f"{folder}/grid.cor", "--out", f"{folder}/again.toml"]) == 0
     wanted = np.random.default_rng(1).uniform(-HALF_M, HALF_M, (2, 500))
-    assert np.abs(np.subtract(read_field(folder / "again.toml").codes(*wanted), field.codes(*wanted))).max() < 1.0
-    assert np.abs(np.subtract(as_a_board_would(scale, moved, *wanted), field.codes(*wanted))).max() < 1.0
+    assert np.abs(np.subtract(load_field(folder / "again.toml").codes(*wanted), field.codes(*wanted))).max() < 1.0
+    assert np.abs(np.subtract(interpolate_grid(scale, moved, *wanted), field.codes(*wanted))).max() < 1.0
 
 
-def as_a_board_would(scale, moved, x_m, y_m):
+def interpolate_grid(scale, moved, x_m, y_m):
     """Codes by the grid alone, straight between its nodes."""
     codes = np.array([x_m, y_m]) * 1e3 * scale + 32768
-    column, row = np.minimum((codes / CELL_CODES).astype(int), NODES - 2)
-    x, y = codes / CELL_CODES - [column, row]
+    column, row = np.minimum((codes / NODE_SPACING_CODES).astype(int), NODES_PER_SIDE - 2)
+    x, y = codes / NODE_SPACING_CODES - [column, row]
     low = moved[row, column].T * (1 - x) + moved[row, column + 1].T * x
     high = moved[row + 1, column].T * (1 - x) + moved[row + 1, column + 1].T * x
     return codes + low * (1 - y) + high * y
@@ -130,7 +135,7 @@ WRONG = {
 @pytest.mark.parametrize("case", sorted(WRONG))
 def test_wrong_spots_end_with_one_line_and_status_2(tmp_path, capsys, case):
     options, spoil, named = WRONG[case]
-    write_spots(tmp_path / "spots.csv", Spots.of(spoil(SPOTS.table())))
+    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(spoil(SPOTS.to_table())))
     arguments = ["calibrate", "--spots", f"{tmp_path}/spots.csv", "--out", f"{tmp_path}/field.toml", *options]
     assert run(arguments) == 2
     captured = capsys.readouterr()

@@ -12,9 +12,9 @@ import pytest
 from optodrive.cli.main import run
 from optodrive.device.config import load_config
 from optodrive.link.simulator.true_pixels import PixelTruth
-from pixel_lab import calibrated, off_by, said, shown_um, swept
+from pixel_lab import calibrate_map, map_errors, measured_um, record_sweep, run_json
 
-ASKED_UM = 80.0
+TARGET_UM = 80.0
 NOISE = 1.0
 """Times what the interferometer states, a quarter of a micrometre."""
 
@@ -30,27 +30,27 @@ NOISE = 1.0
 def test_heights_as_asked_once_the_pixels_are_known(capsys, tmp_path, display, seed):
     truth = PixelTruth.drawn(seed, load_config(display))
     lives = np.setdiff1d(np.arange(len(truth.lift)), truth.dead)
-    before_um, plain = shown_um(capsys, tmp_path, display, seed, ASKED_UM)
-    assert np.abs(before_um[lives] / ASKED_UM - 1.0).max() > 0.15
+    before_um, plain = measured_um(capsys, tmp_path, display, seed, TARGET_UM)
+    assert np.abs(before_um[lives] / TARGET_UM - 1.0).max() > 0.15
     assert plain["summary"]["dead"]["count"] == 0
 
-    path, told = calibrated(capsys, tmp_path, display, swept(capsys, tmp_path, display, seed, NOISE))
+    path, told = calibrate_map(capsys, tmp_path, display, record_sweep(capsys, tmp_path, display, seed, NOISE))
     assert told["dead"] == truth.dead.tolist()
     assert told["not_measured"] == []
-    off, sigmas = off_by(display, path, seed)
+    off, sigmas = map_errors(display, path, seed)
     assert np.nanmax(np.abs(off[1:])) < 30e-6
     known = np.isfinite(sigmas)
     assert known.sum() == 3 * len(lives)
     assert np.abs(sigmas[known]).max() < 4.5
 
-    after_um, answer = shown_um(capsys, tmp_path, display, seed, ASKED_UM, path)
-    assert np.abs(after_um[lives] / ASKED_UM - 1.0).max() < 0.03
+    after_um, answer = measured_um(capsys, tmp_path, display, seed, TARGET_UM, path)
+    assert np.abs(after_um[lives] / TARGET_UM - 1.0).max() < 0.03
     assert answer["summary"]["dead"]["pixels"] == truth.dead.tolist()
     assert after_um[truth.dead].max() == 0.0
 
 
 def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
-    told = said(capsys, "calibrate", "--pixels-sweep", tmp_path / "sweep", "--config", "display-437", "--json")
+    told = run_json(capsys, "calibrate", "--pixels-sweep", tmp_path / "sweep", "--config", "display-437", "--json")
     assert len(told["aims"]) == 9
     assert all(aim["pulse_width_s"] * aim["power_w"] <= 0.0126 for aim in told["aims"])
     assert all(aim["power_w"] < 0.05 for aim in told["aims"] if (aim["x_m"], aim["y_m"]) != (0, 0))
@@ -63,7 +63,7 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
     assert far == {(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)}
     name = told["aims"][1]["name"]
     played = tmp_path / "sweep" / name
-    plan = said(
+    plan = run_json(
         capsys, "plan", f"{played}.json", "--pixels-map", f"{played}.pixels.toml", "--config", "display-437", "--json"
     )
     assert plan["trimmed"]["pulses"] == 0
@@ -71,7 +71,7 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
 
 
 def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):
-    (middle,) = swept(capsys, tmp_path, "display-16", 11, aims=("middle",))
+    (middle,) = record_sweep(capsys, tmp_path, "display-16", 11, aims=("middle",))
     assert run(["calibrate", "--config", "display-16", "--pixels", str(middle)]) == 0
     told = capsys.readouterr().out
     dead = PixelTruth.drawn(11, load_config("display-16")).dead.tolist()

@@ -8,9 +8,9 @@ import pytest
 
 from hidden_servo import SIZES_RAD, Hidden, recording
 from optodrive.cli.main import run
-from optodrive.device.config import load_config, shipped_path
-from optodrive.device.field_loader import moves_of
-from optodrive.device.gate_timing import servo_of, settled_s
+from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.field_loader import build_settling_table
+from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.lab.recording import write_recording
 from optodrive.lab.servo_identification.common_servo import moves_rad
 
@@ -27,9 +27,9 @@ def folder(tmp_path_factory):
     return at
 
 
-def own_config(folder, name="mirrors.toml"):
+def write_config(folder, name="mirrors.toml"):
     own = folder / "own.toml"
-    text = shipped_path("display-437.toml").read_text()
+    text = locate_shipped("display-437.toml").read_text()
     own.write_text(text.replace("[scanner]\n", f'[scanner]\nmirrors = "{name}"\n'))
     return own
 
@@ -56,29 +56,29 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
                 assert row[key]["measured_s"] == pytest.approx(servo.settled_s(size_rad, tolerance_rad), rel=0.05)
                 low_s, high_s = row[key]["interval_s"]
                 assert low_s <= row[key]["measured_s"] <= high_s
-                configured_s = settled_s(servo_of(config.scanner), size_rad, tolerance_rad)
+                configured_s = settling_s(build_servo(config.scanner), size_rad, tolerance_rad)
                 assert row[key]["configured_s"] == pytest.approx(configured_s)
     assert any("one servo stands for both" in remark for remark in told["remarks"])
 
 
 def test_the_one_servo_settles_no_sooner_than_either_mirror(folder):
-    config = load_config(own_config(folder))
+    config = load_config(write_config(folder))
     for axis, hidden in enumerate(SERVOS):
         for move_rad in moves_rad(config, axis):
             tolerance_rad = config.tolerance_rad[axis]
-            common_s = settled_s(servo_of(config.scanner), move_rad, tolerance_rad)
+            common_s = settling_s(build_servo(config.scanner), move_rad, tolerance_rad)
             assert common_s > 0.995 * hidden.settled_s(move_rad, tolerance_rad)
 
 
 def test_a_configuration_with_mirrors_moves_by_them_and_keeps_the_galvo_cap_true(folder):
-    measured, stated = load_config(own_config(folder)), load_config("display-437")
+    measured, stated = load_config(write_config(folder)), load_config("display-437")
     table = tomllib.loads((folder / "mirrors.toml").read_text())
     assert measured.scanner.mirrors == str(folder / "mirrors.toml")
     assert measured.scanner.bandwidth_hz == table["scanner"]["bandwidth_hz"]
     assert 0.2 < table["galvo"]["share"] <= 1.0
     assert getattr(measured.limits, CAP) == pytest.approx(table["galvo"]["share"] * getattr(stated.limits, CAP))
-    moves, before = moves_of(measured), moves_of(stated)
-    assert moves.time_us(moves.pitch_rad, 0.0) > before.time_us(before.pitch_rad, 0.0)
+    moves, before = build_settling_table(measured), build_settling_table(stated)
+    assert moves.settling_us(moves.pitch_rad, 0.0) > before.settling_us(before.pitch_rad, 0.0)
 
 
 def test_a_plan_takes_longer_by_the_option_as_by_the_configuration(folder, capsys):
@@ -91,9 +91,9 @@ def test_a_plan_takes_longer_by_the_option_as_by_the_configuration(folder, capsy
 
     by_option = moves_s("--mirrors", f"{folder}/mirrors.toml")
     assert by_option > moves_s()
-    assert by_option == moves_s("--config", str(own_config(folder)))
+    assert by_option == moves_s("--config", str(write_config(folder)))
     # Asked for beside a configuration that names them too, the cap is lowered once.
-    assert by_option == moves_s("--config", str(own_config(folder)), "--mirrors", f"{folder}/mirrors.toml")
+    assert by_option == moves_s("--config", str(write_config(folder)), "--mirrors", f"{folder}/mirrors.toml")
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_wrong_file_of_mirrors_is_one_line(folder, capsys, old, new, words):
     text = (folder / "mirrors.toml").read_text()
     assert old in text
     (folder / "wrong.toml").write_text(text.replace(old, new, 1))
-    assert run(["config", "check", "--config", str(own_config(folder, "wrong.toml"))]) == 2
+    assert run(["config", "check", "--config", str(write_config(folder, "wrong.toml"))]) == 2
     said = capsys.readouterr().err
     assert words in said
     assert "wrong.toml" in said

@@ -2,11 +2,11 @@
 
 import asyncio
 
-from optodrive.daemon.engine.state_waiters import promise
+from optodrive.daemon.engine.state_waiters import uncancellable_future
 
 
 def test_a_waiter_that_is_cancelled_leaves_the_promise_as_it_is():
-    kept = promise()
+    kept = uncancellable_future()
 
     async def give_up():
         waiter = asyncio.create_task(asyncio.wait_for(asyncio.wrap_future(kept), 10))

@@ -7,24 +7,24 @@ from datetime import UTC, datetime
 import pytest
 
 from optodrive.daemon.web import audit as audit_module
-from optodrive.daemon.web.audit import Audit
+from optodrive.daemon.web.audit import AuditLog
 
 NOW = datetime(2026, 1, 2, 3, 4, 5, 678_900, tzinfo=UTC)
 
 
 @pytest.fixture
-def said():
+def reports():
     return []
 
 
 @pytest.fixture
 def audit(tmp_path, said):
-    audit = Audit(tmp_path / "audit.jsonl", said.append, lambda: NOW)
+    audit = AuditLog(tmp_path / "audit.jsonl", said.append, lambda: NOW)
     yield audit
     audit.close()
 
 
-def lines(folder):
+def read_entries(folder):
     return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines() if line.endswith("}")]
 
 
@@ -32,19 +32,19 @@ def test_lines_are_added_in_order_to_a_private_file(audit, tmp_path, said):
     (tmp_path / "audit.jsonl").write_text('{"event": "older"}\n')
     for number in range(5):
         audit.note({"event": "push", "number": number})
-    assert asyncio.run(audit.must({"event": "asked"})) is None
-    assert [line["event"] for line in lines(tmp_path)] == ["older", *["push"] * 5, "asked"]
-    assert lines(tmp_path)[1]["at"] == "2026-01-02T03:04:05.678+00:00"
+    assert asyncio.run(audit.record_durably({"event": "asked"})) is None
+    assert [line["event"] for line in read_entries(tmp_path)] == ["older", *["push"] * 5, "asked"]
+    assert read_entries(tmp_path)[1]["at"] == "2026-01-02T03:04:05.678+00:00"
     assert said == []
 
 
 def test_a_new_file_is_its_owners_alone(audit, tmp_path):
-    asyncio.run(audit.must({"event": "asked"}))
+    asyncio.run(audit.record_durably({"event": "asked"}))
     assert (tmp_path / "audit.jsonl").stat().st_mode & 0o777 == 0o600
 
 
 def test_one_event_is_one_line_whatever_it_holds(audit, tmp_path):
-    asyncio.run(audit.must({"call": 'POST /v1/patterns/a\n{"event": "armed"}\r\u2028'}))
+    asyncio.run(audit.record_durably({"call": 'POST /v1/patterns/a\n{"event": "armed"}\r\u2028'}))
     assert len((tmp_path / "audit.jsonl").read_text().splitlines()) == 1
 
 
@@ -52,16 +52,16 @@ def test_a_disk_that_is_full_is_said_once_and_again_when_it_is_not(audit, tmp_pa
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
     try:
-        assert asyncio.run(audit.must({"event": "asked"})) is None
+        assert asyncio.run(audit.record_durably({"event": "asked"})) is None
         for _ in range(3):
-            assert "large" in asyncio.run(audit.must({"event": "asked", "more": "x" * 50}))
+            assert "large" in asyncio.run(audit.record_durably({"event": "asked", "more": "x" * 50}))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert len(said) == 1
     assert "arming is refused" in said[0]
-    assert asyncio.run(audit.must({"event": "after"})) is None
+    assert asyncio.run(audit.record_durably({"event": "after"})) is None
     # The torn line stays by itself: what comes after it can be read.
-    assert [line["event"] for line in lines(tmp_path)] == ["asked", "after"]
+    assert [line["event"] for line in read_entries(tmp_path)] == ["asked", "after"]
     assert "again" in said[1]
 
 
@@ -69,9 +69,9 @@ def test_a_disk_that_stands_still_holds_nothing_up(audit, said, monkeypatch):
     go_on = threading.Event()
     monkeypatch.setattr(audit_module, "PATIENCE_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
-    for _ in range(3 * audit_module.WAITING_MAX):
+    for _ in range(3 * audit_module.QUEUE_MAX):
         audit.note({"event": "stop"})
-    assert "too many lines" in asyncio.run(audit.must({"event": "asked"}))
+    assert "too many lines" in asyncio.run(audit.record_durably({"event": "asked"}))
     go_on.set()
 
 
@@ -79,5 +79,5 @@ def test_arming_does_not_wait_for_ever(audit, monkeypatch):
     go_on = threading.Event()
     monkeypatch.setattr(audit_module, "PATIENCE_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
-    assert "not written within" in asyncio.run(audit.must({"event": "asked"}))
+    assert "not written within" in asyncio.run(audit.record_durably({"event": "asked"}))
     go_on.set()

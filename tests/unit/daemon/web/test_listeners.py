@@ -4,26 +4,26 @@ import stat
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.daemon.web.listeners import unix_listener
+from optodrive.daemon.web.listeners import open_unix_listener
 
 
 def test_a_socket_is_for_owner_and_group(tmp_path):
-    with unix_listener(tmp_path / "s"):
+    with open_unix_listener(tmp_path / "s"):
         assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o660
 
 
 def test_one_that_a_dead_daemon_left_is_taken_over(tmp_path):
-    unix_listener(tmp_path / "s").close()
-    with unix_listener(tmp_path / "s"), socket.socket(socket.AF_UNIX) as caller:
+    open_unix_listener(tmp_path / "s").close()
+    with open_unix_listener(tmp_path / "s"), socket.socket(socket.AF_UNIX) as caller:
         caller.connect(str(tmp_path / "s"))
 
 
 def test_one_that_is_answered_and_any_other_file_stay(tmp_path):
-    with unix_listener(tmp_path / "s"), pytest.raises(InputError, match=r"daemon\.socket"):
-        unix_listener(tmp_path / "s")
+    with open_unix_listener(tmp_path / "s"), pytest.raises(InputError, match=r"daemon\.socket"):
+        open_unix_listener(tmp_path / "s")
     (tmp_path / "file").write_text("kept")
     with pytest.raises(InputError, match=r"daemon\.socket"):
-        unix_listener(tmp_path / "file")
+        open_unix_listener(tmp_path / "file")
     assert (tmp_path / "file").read_text() == "kept"
     with pytest.raises(InputError, match="No such file"):
-        unix_listener(tmp_path / "nowhere" / "s")
+        open_unix_listener(tmp_path / "nowhere" / "s")

@@ -4,11 +4,11 @@ import jsonschema_rs
 import pytest
 
 from displays import DISPLAYS
-from optodrive.daemon.web.openapi_bodies import SEQUENCE, SHOWN
+from optodrive.daemon.web.openapi_bodies import SEQUENCE_EXAMPLE, SEQUENCE_SCHEMA
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
-SCHEMA = jsonschema_rs.validator_for(SEQUENCE)
+SCHEMA = jsonschema_rs.validator_for(SEQUENCE_SCHEMA)
 
 
 @pytest.mark.parametrize("name", ["showcase", "experiment-1", "experiment-6", "text", "vibration"])
@@ -20,8 +20,8 @@ def test_what_is_played_is_what_the_document_describes(name):
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
 def test_the_example_is_right_on_every_display(name):
-    SCHEMA.validate(SHOWN)
-    parse_sequence(copy.deepcopy(SHOWN), DISPLAYS[name].config, "body")
+    SCHEMA.validate(SEQUENCE_EXAMPLE)
+    parse_sequence(copy.deepcopy(SEQUENCE_EXAMPLE), DISPLAYS[name].config, "body")
 
 
 @pytest.mark.parametrize(
@@ -30,11 +30,11 @@ def test_the_example_is_right_on_every_display(name):
         {},
         {"frames": []},
         {"frames": [], "trains": []},
-        {"frames": SHOWN["frames"], "train": []},
-        {"frames": [{**SHOWN["frames"][0], "show_at_s": -1.0}]},
-        {"frames": [{**SHOWN["frames"][0], "target_um": {"00": 1}}]},
-        {"trains": [{**SHOWN["trains"][0], "period_s": 0.1}]},
-        {"trains": [{**SHOWN["trains"][0], "pixel": 1.5}]},
+        {"frames": SEQUENCE_EXAMPLE["frames"], "train": []},
+        {"frames": [{**SEQUENCE_EXAMPLE["frames"][0], "show_at_s": -1.0}]},
+        {"frames": [{**SEQUENCE_EXAMPLE["frames"][0], "target_um": {"00": 1}}]},
+        {"trains": [{**SEQUENCE_EXAMPLE["trains"][0], "period_s": 0.1}]},
+        {"trains": [{**SEQUENCE_EXAMPLE["trains"][0], "pixel": 1.5}]},
     ],
 )
 def test_what_the_document_refuses_is_refused(wrong):

@@ -1,12 +1,12 @@
 import pytest
 
-from optodrive.daemon.web.roles import ROLES, ROUTES, RouteTable, allows
-from optodrive.daemon.web.static_files import LOGIN
+from optodrive.daemon.web.roles import ROLES, ROUTES, RouteTable, is_role_sufficient
+from optodrive.daemon.web.static_files import LOGIN_PATHS
 
 
 def test_each_role_may_do_what_the_lesser_ones_may():
     for index, role in enumerate(ROLES):
-        assert [allows(role, least) for least in ROLES] == [place <= index for place in range(len(ROLES))]
+        assert [is_role_sufficient(role, least) for least in ROLES] == [place <= index for place in range(len(ROLES))]
 
 
 @pytest.mark.parametrize(
@@ -44,5 +44,5 @@ def test_stop_asks_for_the_least_role_and_arm_for_the_highest():
     assert ROUTES["POST /v1/arm"] == ROLES[-1]
     assert [key for key, least in ROUTES.items() if least is None] == [
         "GET /v1/health",
-        *(f"GET {path}" for path in LOGIN),
+        *(f"GET {path}" for path in LOGIN_PATHS),
     ]

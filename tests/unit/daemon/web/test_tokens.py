@@ -2,21 +2,21 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.daemon.web.tokens import (
-    FILE_VARIABLE,
-    VARIABLE,
+    TOKEN_VARIABLE,
+    TOKENS_FILE_VARIABLE,
     Tokens,
-    daemon_tokens,
-    make_tokens,
-    private_tokens,
+    build_tokens_path,
+    create_tokens,
+    load_daemon_tokens,
+    read_private_tokens,
     read_token,
     read_tokens,
-    token_path,
 )
 
 SECRET = "s3cret-s3cret-s3cret"
 
 
-def written(path, *entries, version=1):
+def write_tokens(path, *entries, version=1):
     lines = [f'format = "optodrive-tokens"\nversion = {version}\n']
     lines += [f'[[token]]\nname = "{name}"\nrole = "{role}"\nsecret = "{secret}"\n' for name, role, secret in entries]
     path.write_text("".join(lines))
@@ -27,45 +27,45 @@ def written(path, *entries, version=1):
 @pytest.fixture(autouse=True)
 def _own_place(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv(VARIABLE, raising=False)
-    monkeypatch.delenv(FILE_VARIABLE, raising=False)
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    monkeypatch.delenv(TOKENS_FILE_VARIABLE, raising=False)
 
 
 def test_a_fresh_token_for_each_role_which_only_its_user_may_read(tmp_path):
-    tokens, path = daemon_tokens("", 8450)
-    assert path == token_path(8450)
+    tokens, path = load_daemon_tokens("", 8450)
+    assert path == build_tokens_path(8450)
     assert path.stat().st_mode & 0o777 == 0o600
     assert [token.role for token in tokens.all] == ["viewer", "operator", "armer"]
     assert len({token.secret for token in tokens.all}) == 3
-    again, _ = daemon_tokens("", 8450)
+    again, _ = load_daemon_tokens("", 8450)
     assert not {token.secret for token in again.all} & {token.secret for token in tokens.all}
 
 
 def test_a_file_that_is_kept_outlives_the_daemon(tmp_path):
     kept = tmp_path / "state" / "tokens.toml"
-    tokens, _ = daemon_tokens(str(kept), 8450)
-    again, _ = daemon_tokens(str(kept), 8450)
+    tokens, _ = load_daemon_tokens(str(kept), 8450)
+    again, _ = load_daemon_tokens(str(kept), 8450)
     assert again.all == tokens.all
 
 
 def test_the_environment_gives_the_armers(monkeypatch):
-    monkeypatch.setenv(VARIABLE, SECRET)
-    tokens, path = daemon_tokens("", 1)
+    monkeypatch.setenv(TOKEN_VARIABLE, SECRET)
+    tokens, path = load_daemon_tokens("", 1)
     assert tokens.find(SECRET).role == "armer"
-    assert read_tokens(path).strongest.secret == SECRET
+    assert read_tokens(path).most_privileged.secret == SECRET
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o777])
 def test_a_daemons_file_that_others_may_read_is_refused(tmp_path, mode):
-    path = written(tmp_path / "tokens.toml", ("anna", "armer", SECRET))
-    assert private_tokens(path).find(SECRET).name == "anna"
+    path = write_tokens(tmp_path / "tokens.toml", ("anna", "armer", SECRET))
+    assert read_private_tokens(path).find(SECRET).name == "anna"
     path.chmod(mode)
     with pytest.raises(InputError, match="chmod 600"):
-        private_tokens(path)
+        read_private_tokens(path)
 
 
 def test_only_the_very_secret_is_found(tmp_path):
-    tokens = read_tokens(written(tmp_path / "t.toml", ("anna", "armer", SECRET), ("ben", "viewer", SECRET[::-1])))
+    tokens = read_tokens(write_tokens(tmp_path / "t.toml", ("anna", "armer", SECRET), ("ben", "viewer", SECRET[::-1])))
     assert tokens.find(SECRET).name == "anna"
     assert tokens.find(SECRET[::-1]).name == "ben"
     for wrong in ("", SECRET[:-1], SECRET + "x", SECRET.upper(), "ü" * 20):
@@ -73,15 +73,15 @@ def test_only_the_very_secret_is_found(tmp_path):
 
 
 def test_a_secret_shows_in_no_repr_and_no_error(tmp_path):
-    tokens = make_tokens(tmp_path / "t.toml")
+    tokens = create_tokens(tmp_path / "t.toml")
     assert all(token.secret not in repr(token) for token in tokens.all)
     short = "tooshort"
     cases = [
-        written(tmp_path / "a.toml", ("anna", "armer", short)),
-        written(tmp_path / "b.toml", ("anna", "chief", SECRET)),
-        written(tmp_path / "c.toml", ("anna", "armer", SECRET), ("anna", "viewer", SECRET + "2")),
-        written(tmp_path / "d.toml", ("anna", "armer", SECRET), ("ben", "viewer", SECRET)),
-        written(tmp_path / "e.toml"),
+        write_tokens(tmp_path / "a.toml", ("anna", "armer", short)),
+        write_tokens(tmp_path / "b.toml", ("anna", "chief", SECRET)),
+        write_tokens(tmp_path / "c.toml", ("anna", "armer", SECRET), ("anna", "viewer", SECRET + "2")),
+        write_tokens(tmp_path / "d.toml", ("anna", "armer", SECRET), ("ben", "viewer", SECRET)),
+        write_tokens(tmp_path / "e.toml"),
     ]
     for path in cases:
         with pytest.raises(InputError) as caught:
@@ -93,18 +93,18 @@ def test_a_secret_shows_in_no_repr_and_no_error(tmp_path):
 
 def test_another_version_is_refused_by_name(tmp_path):
     with pytest.raises(InputError, match="version: got 2"):
-        read_tokens(written(tmp_path / "t.toml", ("anna", "armer", SECRET), version=2))
+        read_tokens(write_tokens(tmp_path / "t.toml", ("anna", "armer", SECRET), version=2))
 
 
 def test_a_caller_uses_whichever_is_there(tmp_path, monkeypatch):
     with pytest.raises(InputError, match="set it"):
         read_token(8450)
-    tokens, _ = daemon_tokens("", 8450)
+    tokens, _ = load_daemon_tokens("", 8450)
     assert read_token(8450) == tokens.find(tokens.all[2].secret).secret == tokens.all[2].secret
-    given = written(tmp_path / "mine.toml", ("ben", "viewer", SECRET))
-    monkeypatch.setenv(FILE_VARIABLE, str(given))
+    given = write_tokens(tmp_path / "mine.toml", ("ben", "viewer", SECRET))
+    monkeypatch.setenv(TOKENS_FILE_VARIABLE, str(given))
     assert read_token(8450) == read_token(None) == SECRET
-    monkeypatch.setenv(VARIABLE, "another")
+    monkeypatch.setenv(TOKEN_VARIABLE, "another")
     assert read_token(8450) == "another"
 
 
@@ -114,10 +114,10 @@ def test_no_tokens_find_nobody():
 
 def test_a_given_secret_is_kept_as_it_is_or_refused_without_being_shown(tmp_path):
     sign = 'sixteen"\\signs-and#more'
-    assert make_tokens(tmp_path / "a.toml", sign).find(sign).role == "armer"
+    assert create_tokens(tmp_path / "a.toml", sign).find(sign).role == "armer"
     assert read_tokens(tmp_path / "a.toml").find(sign).role == "armer"
     for wrong in ("tooshort-token", "sixteen signs and more", "x" * 201, "sixteen-signs-ünd-more"):
-        with pytest.raises(InputError, match=VARIABLE) as caught:
-            make_tokens(tmp_path / "b.toml", wrong)
+        with pytest.raises(InputError, match=TOKEN_VARIABLE) as caught:
+            create_tokens(tmp_path / "b.toml", wrong)
         assert wrong not in str(caught.value)
         assert not (tmp_path / "b.toml").exists()

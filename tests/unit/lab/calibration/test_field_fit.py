@@ -5,69 +5,71 @@ from functools import cache
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, NOISE_M, PRIOR, grid_codes, misses_m, random_codes, seen
+from hidden_field import CONFIG, NOISE_M, PRIOR, field_errors_m, grid_codes, measure_spots, random_codes
 from optodrive.lab.calibration.field_fit import fit_field
-from optodrive.lab.calibration.next_spot import next_spot
-from optodrive.lab.calibration.spots import Spots
+from optodrive.lab.calibration.next_spot import select_next_spot
+from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import Truth
 
 GEOMETRIES = range(10)
 
 
 @cache
-def fitted(side, false_share=0.02):
+def fit_geometries(side, outlier_fraction=0.02):
     """For each geometry: misses in metres [2, k], the sigma stated there [k], the fit, which spots were false."""
     out = []
     for seed in GEOMETRIES:
         truth = Truth.drawn(seed, CONFIG)
-        spots, false = seen(truth, grid_codes(side), np.random.default_rng([seed, side]), false_share)
+        spots, is_outlier = measure_spots(
+            truth, grid_codes(side), np.random.default_rng([seed, side]), outlier_fraction
+        )
         fit = fit_field(spots, PRIOR)
-        miss_m, codes = misses_m(truth, fit.field)
-        out.append((miss_m, fit.field.sigma_m(*codes), fit, false))
+        error_m, codes = field_errors_m(truth, fit.field)
+        out.append((error_m, fit.field.sigma_m(*codes), fit, is_outlier))
     return out
 
 
-def axis_rms_m(miss_m):
-    return np.sqrt((miss_m**2).mean())
+def axis_rms_m(error_m):
+    return np.sqrt((error_m**2).mean())
 
 
-def lengths_m(miss_m):
-    return np.hypot(*miss_m)
+def lengths_m(error_m):
+    return np.hypot(*error_m)
 
 
 def test_from_289_spots_5_um_rms_and_25_um_at_most():
-    for miss_m, *_ in fitted(17):
+    for miss_m, *_ in fit_geometries(17):
         assert np.sqrt((lengths_m(miss_m) ** 2).mean()) <= 5e-6
         assert lengths_m(miss_m).max() <= 25e-6
 
 
 def test_from_25_spots_10_um_rms():
     """On an axis, as noise is given, for each geometry; in length for all of them together."""
-    results = fitted(5)
+    results = fit_geometries(5)
     for miss_m, *_ in results:
         assert axis_rms_m(miss_m) <= 10e-6
     assert np.sqrt(np.mean([(lengths_m(miss_m) ** 2).mean() for miss_m, *_ in results])) <= 10e-6
 
 
 def test_from_9_spots_25_um_rms():
-    for miss_m, *_ in fitted(3):
+    for miss_m, *_ in fit_geometries(3):
         assert np.sqrt((lengths_m(miss_m) ** 2).mean()) <= 25e-6
 
 
 @pytest.mark.parametrize("side", [17, 5, 3])
 def test_two_stated_sigmas_cover_the_truth_as_often_as_they_should(side):
-    covered = [np.abs(miss_m) <= 2.0 * sigma_m for miss_m, sigma_m, *_ in fitted(side)]
+    covered = [np.abs(miss_m) <= 2.0 * sigma_m for miss_m, sigma_m, *_ in fit_geometries(side)]
     assert 0.90 <= np.mean(covered) <= 0.98
 
 
 def test_false_detections_are_found_and_true_ones_kept():
     for share in (0.02, 0.2):
-        for *_, fit, false in fitted(17, share):
+        for *_, fit, false in fit_geometries(17, share):
             assert np.array_equal(fit.outlier, false)
 
 
 def test_with_a_fifth_of_289_false_the_field_is_still_as_good():
-    for miss_m, *_ in fitted(17, 0.2):
+    for miss_m, *_ in fit_geometries(17, 0.2):
         assert axis_rms_m(miss_m) <= 5e-6
         assert lengths_m(miss_m).max() <= 25e-6
 
@@ -75,16 +77,16 @@ def test_with_a_fifth_of_289_false_the_field_is_still_as_good():
 def test_without_rejection_false_detections_would_spoil_it():
     """The mutant: every spot believed."""
     truth = Truth.drawn(0, CONFIG)
-    spots, false = seen(truth, grid_codes(17), np.random.default_rng(3))
+    spots, false = measure_spots(truth, grid_codes(17), np.random.default_rng(3))
     assert false.any()
     believed = fit_field(spots, PRIOR, noise_m=10e-3)
-    assert lengths_m(misses_m(truth, believed.field)[0]).max() > 25e-6
+    assert lengths_m(field_errors_m(truth, believed.field)[0]).max() > 25e-6
 
 
 def test_noise_is_found_out():
     for noise_m in (3e-6, 10e-6, 30e-6):
         truth = Truth.drawn(1, CONFIG)
-        spots, _ = seen(truth, grid_codes(17), np.random.default_rng(5), noise_m=noise_m)
+        spots, _ = measure_spots(truth, grid_codes(17), np.random.default_rng(5), noise_m=noise_m)
         assert fit_field(spots, PRIOR).noise_m == pytest.approx(noise_m, rel=0.5)
 
 
@@ -92,12 +94,12 @@ def test_noise_is_found_out():
 def test_spots_anywhere_do_as_well_where_there_are_many():
     for seed in GEOMETRIES:
         truth, random = Truth.drawn(seed, CONFIG), np.random.default_rng([seed, 1])
-        spots, _ = seen(truth, random_codes(random, 289), random)
-        assert axis_rms_m(misses_m(truth, fit_field(spots, PRIOR).field)[0]) <= 5e-6
+        spots, _ = measure_spots(truth, random_codes(random, 289), random)
+        assert axis_rms_m(field_errors_m(truth, fit_field(spots, PRIOR).field)[0]) <= 5e-6
 
 
 def test_from_nothing_the_nominal_field_and_a_sigma_of_millimetres():
-    fit = fit_field(Spots.of(np.zeros((0, 4))), PRIOR)
+    fit = fit_field(MeasuredSpots.from_table(np.zeros((0, 4))), PRIOR)
     x_m, y_m = fit.field.position_m(32768.0 + 5000.0, 32768.0)
     assert x_m == pytest.approx(5000 * 2 * PRIOR.focal_length_m * PRIOR.rad_per_code, rel=0.01)
     assert abs(y_m) < 1e-6
@@ -105,24 +107,24 @@ def test_from_nothing_the_nominal_field_and_a_sigma_of_millimetres():
 
 
 def test_outside_what_it_was_made_for_nothing_is_claimed():
-    fit = fit_field(Spots.of(np.zeros((0, 4))), PRIOR)
+    fit = fit_field(MeasuredSpots.from_table(np.zeros((0, 4))), PRIOR)
     assert np.isinf(fit.field.sigma_m(np.array([65000.0, np.nan]), np.array([32768.0, np.nan]))).all()
 
 
 def test_the_next_spot_is_where_it_helps_most():
     """Against trying each, by what a measurement adds to the inverse of the covariance."""
     truth, random = Truth.drawn(2, CONFIG), np.random.default_rng(8)
-    fit = fit_field(seen(truth, grid_codes(3)[:6], random, 0.0)[0], PRIOR, NOISE_M)
+    fit = fit_field(measure_spots(truth, grid_codes(3)[:6], random, 0.0)[0], PRIOR, NOISE_M)
     candidates = grid_codes(5)
-    looked_at = fit.derivatives_m(*PRIOR.pixels.grid(9)).reshape(-1, len(fit.width))
+    looked_at = fit.jacobian_m(*PRIOR.display_extent.build_grid(9)).reshape(-1, len(fit.parameter_sigma))
 
     def variance(candidate):
-        asked = fit.derivatives_m(*candidates[candidate, :, None])[:, 0]
+        asked = fit.jacobian_m(*candidates[candidate, :, None])[:, 0]
         after = np.linalg.inv(np.linalg.inv(fit.covariance) + asked.T @ asked / NOISE_M**2)
         return np.trace(looked_at @ after @ looked_at.T)
 
     tried = [variance(candidate) for candidate in range(len(candidates))]
-    assert next_spot(fit, candidates) == np.argmin(tried)
+    assert select_next_spot(fit, candidates) == np.argmin(tried)
 
 
 @pytest.mark.slow
@@ -131,7 +133,7 @@ def test_spots_as_proposed_reach_10_um_with_25():
         truth, random = Truth.drawn(seed, CONFIG), np.random.default_rng([seed, 2])
         table, candidates = np.zeros((0, 4)), grid_codes(13)
         for _ in range(25):
-            proposed = next_spot(fit_field(Spots.of(table), PRIOR), candidates)
-            one, _ = seen(truth, candidates[proposed : proposed + 1], random)
-            table = np.vstack([table, one.table()])
-        assert axis_rms_m(misses_m(truth, fit_field(Spots.of(table), PRIOR).field)[0]) <= 10e-6
+            proposed = select_next_spot(fit_field(MeasuredSpots.from_table(table), PRIOR), candidates)
+            one, _ = measure_spots(truth, candidates[proposed : proposed + 1], random)
+            table = np.vstack([table, one.to_table()])
+        assert axis_rms_m(field_errors_m(truth, fit_field(MeasuredSpots.from_table(table), PRIOR).field)[0]) <= 10e-6

@@ -1,27 +1,27 @@
 import numpy as np
 import pytest
 
-from hidden_field import CONFIG, PRIOR, grid_codes, random_codes, seen
+from hidden_field import CONFIG, PRIOR, grid_codes, measure_spots, random_codes
 from optodrive.core.errors import InputError
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
-from optodrive.lab.calibration.spots import Spots, read_spots, write_spots
+from optodrive.lab.calibration.spots import MeasuredSpots, read_spots, write_spots
 from optodrive.link.simulator.true_geometry import Truth
 
 RANDOM = np.random.default_rng(4)
 MANY, NINE, SIX = (
-    seen(Truth.drawn(seed, CONFIG), codes, RANDOM, share)[0].table()
+    measure_spots(Truth.drawn(seed, CONFIG), codes, RANDOM, share)[0].to_table()
     for seed, codes, share in ((0, grid_codes(17), 0.2), (1, grid_codes(3), 0.0), (2, random_codes(RANDOM, 6), 0.0))
 )
 
 
-def at_one_place(table, noise_m):
+def collapse_to_one_place(table, noise_m):
     return np.column_stack(
         [table[:, :2], [1e-3, 2e-3] + noise_m * np.random.default_rng(1).standard_normal((len(table), 2))]
     )
 
 
-WRONG = {
+WRONG_TABLES = {
     "x mirrored": lambda t: t * [1, 1, -1, 1],
     "y mirrored": lambda t: t * [1, 1, 1, -1],
     "half a turn": lambda t: t * [1, 1, -1, -1],
@@ -31,7 +31,7 @@ WRONG = {
     "millimetres": lambda t: t * [1, 1, 1e3, 1e3],
     "micrometres": lambda t: t * [1, 1, 1e6, 1e6],
     "distances (2|1.99)": lambda t: t * [1, 1, 2, 2],
-    "all spots were seen at one place": lambda t: at_one_place(t, 1e-5),
+    "all spots were seen at one place": lambda t: collapse_to_one_place(t, 1e-5),
     "this mirror stands still": lambda t: np.column_stack([t[:, :2], np.full(len(t), 1e-3), t[:, 3]]),
     "on a line": lambda t: t[:, [0, 0, 2, 2]],
     "several places": lambda t: np.column_stack([np.full((len(t), 2), 3e4), t[:, 2:]]),
@@ -46,15 +46,15 @@ WRONG = {
 
 @pytest.mark.parametrize("table", [MANY, NINE, SIX], ids=["289", "9", "6"])
 def test_true_spots_pass(table):
-    check_spots("spots.csv", Spots.of(table), PRIOR)
-    check_fit("spots.csv", fit_field(Spots.of(table), PRIOR))
+    check_spots("spots.csv", MeasuredSpots.from_table(table), PRIOR)
+    check_fit("spots.csv", fit_field(MeasuredSpots.from_table(table), PRIOR))
 
 
-@pytest.mark.parametrize("named", WRONG)
+@pytest.mark.parametrize("named", WRONG_TABLES)
 @pytest.mark.parametrize("table", [MANY, NINE, SIX], ids=["289", "9", "6"])
 def test_wrong_spots_are_named_as_what_they_are(named, table):
     with pytest.raises(InputError, match=named) as caught:
-        check_spots("spots.csv", Spots.of(WRONG[named](table)), PRIOR)
+        check_spots("spots.csv", MeasuredSpots.from_table(WRONG_TABLES[named](table)), PRIOR)
     assert "\n" not in str(caught.value)
     assert "…" not in str(caught.value)
 
@@ -79,5 +79,5 @@ def test_a_file_that_is_none_of_spots_is_refused(tmp_path, text, named):
 
 
 def test_spots_there_and_back(tmp_path):
-    write_spots(tmp_path / "spots.csv", Spots.of(MANY))
-    assert np.allclose(read_spots(tmp_path / "spots.csv").table(), MANY, atol=1e-10)
+    write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(MANY))
+    assert np.allclose(read_spots(tmp_path / "spots.csv").to_table(), MANY, atol=1e-10)

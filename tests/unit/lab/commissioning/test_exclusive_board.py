@@ -10,7 +10,7 @@ from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.galvos import CENTRE_CODE, Mirrors
 from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.planning.pipeline import Display
+from optodrive.planning.pipeline import DisplayModel
 
 CENTRE = (CENTRE_CODE, CENTRE_CODE)
 
@@ -38,7 +38,7 @@ def rig(display):
 
 def limited(display, **caps):
     limits = display.config.limits.model_copy(update=caps)
-    return Display.of(display.config.model_copy(update={"limits": limits}))
+    return DisplayModel.from_config(display.config.model_copy(update={"limits": limits}))
 
 
 def test_a_spot_is_one_pulse_with_mirrors_at_rest(rig):
@@ -120,7 +120,7 @@ def test_widths_and_waits_are_whole_and_long_enough(any_display):
     periods = spot_width_s(config) * config.laser.pwm_hz
     assert periods == pytest.approx(round(periods))
     assert spot_width_s(config) <= config.limits.pulse_width_max_s
-    assert settle_s(config) * 1e6 >= any_display.machine.moves.lead_us
+    assert settle_s(config) * 1e6 >= any_display.scan_head.settling.lead_us
 
 
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])

@@ -36,7 +36,7 @@ def test_a_session_goes_on(tmp_path):
     save(session.path, session.text())
     again = SessionFile.beside(out, CONFIG)
     assert again.rows == session.rows
-    assert again.spots.table().tolist() == [[1.0, 2.0, 3e-3, 4e-3]]
+    assert again.spots.to_table().tolist() == [[1.0, 2.0, 3e-3, 4e-3]]
 
 
 @pytest.mark.parametrize(

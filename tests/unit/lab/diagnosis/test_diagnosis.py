@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from labs import lab
-from optodrive.lab.diagnosis.dataset import dataset
+from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.held_out_gain import split
-from optodrive.lab.diagnosis.model_file import model_toml
-from optodrive.lab.diagnosis.narrative import answer, quantity, story
-from optodrive.lab.diagnosis.omnibus_test import bins
-from optodrive.lab.diagnosis.report import report
+from optodrive.lab.diagnosis.held_out_gain import split_runs
+from optodrive.lab.diagnosis.model_file import build_model_toml
+from optodrive.lab.diagnosis.narrative import build_answer, build_narrative, format_quantity
+from optodrive.lab.diagnosis.omnibus_test import assign_bins
+from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.parameters import load_parameters
 
 DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}
@@ -33,8 +33,8 @@ def test_nothing_is_found_where_nothing_is(clean):
     assert clean.verdict == "none"
     assert clean.causes == ()
     assert clean.terms == {}
-    assert story(clean)[0].startswith("Nothing found")
-    assert any("laser_droop: share" in line for line in story(clean))
+    assert build_narrative(clean)[0].startswith("Nothing found")
+    assert any("laser_droop: share" in line for line in build_narrative(clean))
 
 
 def test_a_hidden_cause_is_named_measured_and_gains(droop):
@@ -43,9 +43,9 @@ def test_a_hidden_cause_is_named_measured_and_gains(droop):
     assert share.low <= 0.08 <= share.high
     assert droop.gain is not None
     assert droop.gain.reduction > 0.9
-    assert droop.gain.after["absorber_temperature_K"] < droop.gain.before["absorber_temperature_K"]
+    assert droop.gain.extended["absorber_temperature_K"] < droop.gain.nominal["absorber_temperature_K"]
     assert set(droop.held_out).isdisjoint(droop.fitted)
-    text = "\n".join(story(droop))
+    text = "\n".join(build_narrative(droop))
     assert "the laser's power falls while it is on" in text
     assert "Ruled out" in text
 
@@ -59,17 +59,17 @@ def test_two_hidden_causes_are_named_together():
 def test_without_repeats_nothing_is_named_for_certain():
     found = diagnose(lab(14, DROOP, repeats=1))
     assert found.verdict != "cause"
-    assert any("No run repeats another" in line for line in story(found))
+    assert any("No run repeats another" in line for line in build_narrative(found))
 
 
 def test_the_same_seed_gives_the_same_answer(droop):
-    again = answer(diagnose(lab(12, DROOP)))
-    first = answer(droop)
+    again = build_answer(diagnose(lab(12, DROOP)))
+    first = build_answer(droop)
     assert {**again, "seconds": 0} == {**first, "seconds": 0}
 
 
 def test_the_answer_is_json_of_the_format(droop):
-    document = json.loads(json.dumps(answer(droop), allow_nan=False))
+    document = json.loads(json.dumps(build_answer(droop), allow_nan=False))
     assert document["verdict"] == "cause"
     assert set(document["parameters"]["R"]) == {"value", "unit", "ci95"}
     assert set(document["gain"]) == {"heldout_rmse_before", "heldout_rmse_after", "noise_floor", "reduction", "ci95"}
@@ -80,25 +80,25 @@ def test_the_answer_is_json_of_the_format(droop):
 
 def test_the_model_file_loads_as_it_is(droop, tmp_path):
     path = tmp_path / "model.toml"
-    path.write_text(model_toml(droop, 'odd "name"\n.h5', 0.4e-3))
+    path.write_text(build_model_toml(droop, 'odd "name"\n.h5', 0.4e-3))
     loaded = load_parameters(path)
     assert loaded.terms["laser_droop"]["share"].value == droop.terms["laser_droop"]["share"]
-    pixel = loaded.pixel(0.4e-3)
+    pixel = loaded.build_pixel(0.4e-3)
     assert pixel.r_k_per_w == pytest.approx(droop.base["R"])
-    assert loaded.pixel(0.8e-3).r_k_per_w == pytest.approx(droop.base["R"] / 2)
+    assert loaded.build_pixel(0.8e-3).r_k_per_w == pytest.approx(droop.base["R"] / 2)
 
 
 def test_the_report_stands_alone_and_escapes(droop, clean):
     for found in (droop, clean):
-        text = report(found, "<script>.h5")
+        text = build_report(found, "<script>.h5")
         assert "<script>" not in text
         assert "http" not in text
         assert text.count("<svg") == text.count("</svg>") > 3
 
 
 def test_whole_groups_are_held_out_never_the_only_one_of_its_kind():
-    data = dataset(lab(15, {}))
-    fitted, held = split(data)
+    data = build_dataset(lab(15, {}))
+    fitted, held = split_runs(data)
     assert held
     groups = {data.runs[run].group for run in held}
     assert groups.isdisjoint({data.runs[run].group for run in fitted})
@@ -106,8 +106,8 @@ def test_whole_groups_are_held_out_never_the_only_one_of_its_kind():
 
 
 def test_bins_do_not_mix_groups_or_signals():
-    data = dataset(lab(16, {}))
-    labels = bins(data)
+    data = build_dataset(lab(16, {}))
+    labels = assign_bins(data)
     owner = {}
     for block in data.blocks:
         for label in np.unique(labels[block.part]):
@@ -120,4 +120,4 @@ def test_bins_do_not_mix_groups_or_signals():
     [(2e-6, "m", "2 µm"), (0.05, "s", "50 ms"), (0.3, "1", "0.3"), (0.0, "m", "0 m"), (12.5, "K", "12.5 K")],
 )
 def test_quantities_read_as_people_write_them(value, unit, text):
-    assert quantity(value, unit) == text
+    assert format_quantity(value, unit) == text

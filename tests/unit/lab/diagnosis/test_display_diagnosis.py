@@ -13,10 +13,10 @@ from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.device.config import load_config
-from optodrive.lab.diagnosis.dask_workers import crew, done
-from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, diagnose_pixel, warm
-from optodrive.lab.diagnosis.display_narrative import display_answer, display_story, ranges
-from optodrive.lab.diagnosis.display_report import display_report
+from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
+from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, compile_kernels, diagnose_pixel
+from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative, format_ranges
+from optodrive.lab.diagnosis.display_report import build_display_report
 from optodrive.lab.recording import DisplayRuns, read_recording, write_recording
 
 DROOP = {"laser_droop": {"share": 0.15, "time": 0.05, "spread": 1.0}}
@@ -64,14 +64,14 @@ def tasks_of(runs):
 @pytest.fixture(scope="module")
 def told(recording):
     """All pixels on two processes, of which one is killed at work, and one more by a task each time it is tried."""
-    warm()
+    compile_kernels()
     runs = DisplayRuns.open([recording])
     killer = PixelTask(KILLER, partial(signal.raise_signal, signal.SIGKILL))
     answers = {}
-    with crew(workers=2) as client:
+    with open_client(workers=2) as client:
         before = client.run(os.getpid)
         assert len(set(before.values())) == 2
-        for task, answer, error in done(client, diagnose_pixel, [*tasks_of(runs), killer]):
+        for task, answer, error in run_tasks(client, diagnose_pixel, [*tasks_of(runs), killer]):
             if not answers:
                 os.kill(next(iter(before.values())), signal.SIGKILL)
             answers[task.pixel] = (answer, error)
@@ -89,7 +89,7 @@ def test_every_pixel_has_its_answer_though_workers_were_killed(told):
 
 def test_answers_are_those_of_one_process(told, recording):
     for task in tasks_of(DisplayRuns.open([recording]))[:2]:
-        alone, there = diagnose_pixel(task).found, told[task.pixel][0].found
+        alone, there = diagnose_pixel(task).discrepancy, told[task.pixel][0].discrepancy
         assert alone.parameters == there.parameters
         assert alone.candidates == there.candidates
         assert alone.gain == there.gain
@@ -97,7 +97,7 @@ def test_answers_are_those_of_one_process(told, recording):
 
 def test_bad_data_are_that_pixels_error_alone(told):
     answer, _ = told[BAD]
-    assert answer.found is None
+    assert answer.discrepancy is None
     assert "pixel31-run/displacement_m/t_s[7]" in answer.error
     assert "\n" not in answer.error
 
@@ -111,12 +111,12 @@ def test_a_pixel_that_kills_its_workers_is_told_and_takes_no_other_with_it(told)
 def test_what_is_told_of_a_display(told):
     pixels = tuple(told[pixel][0] for pixel in [*HIDDEN, BAD])
     found = DisplayAnswer(pixels, None, 1.0)
-    lines = display_story(found)
+    lines = build_display_narrative(found)
     assert lines[0].startswith("Of 7 pixels, each diagnosed for itself, 2 show that the nominal model is wrong")
     assert any("2 pixels: the laser's power falls while it is on (laser_droop): 21, 25." in line for line in lines)
     assert any(line.startswith("  laser_droop.share: median 0.") for line in lines)
     assert lines[-1] == "Model of the display: medians over 4 of 7 pixels."
-    document = json.loads(json.dumps(display_answer(found)))
+    document = json.loads(json.dumps(build_display_answer(found)))
     assert document["summary"]["verdicts"] == {"none": 4, "cause": 2, "ambiguous": 0, "unexplained": 0}
     assert document["summary"]["errors"] == [BAD]
     assert document["pixels"]["21"]["causes"] == ["laser_droop"]
@@ -127,13 +127,13 @@ def test_what_is_told_of_a_display(told):
 
 def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(told):
     found = DisplayAnswer(tuple(told[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
-    html = display_report(found, "display.h5", load_config("display-437"))
+    html = build_display_report(found, "display.h5", load_config("display-437"))
     assert html.count("<title>pixel ") == 437
     assert "<title>pixel 21: the laser&#x27;s power falls while it is on (laser_droop); laser_droop.share 0." in html
     assert "pixel 0: not measured" in html
     for word in ("<script", "http", "url("):
         assert word not in html
-    small = display_report(found, "display.h5", load_config("display-16"))
+    small = build_display_report(found, "display.h5", load_config("display-16"))
     assert small.count("<title>pixel ") == 7
     assert "; display-16 has no pixel 31." in small
 
@@ -213,5 +213,5 @@ def test_folders_are_read_by_pixel_too(tmp_path):
 
 
 def test_pixels_in_words():
-    assert ranges([3, 7, 8, 12, 13, 14, 15]) == "3, 7, 8, 12 to 15"
-    assert ranges([4]) == "4"
+    assert format_ranges([3, 7, 8, 12, 13, 14, 15]) == "3, 7, 8, 12 to 15"
+    assert format_ranges([4]) == "4"

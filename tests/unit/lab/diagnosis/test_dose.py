@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.diagnosis.dataset import dataset
+from optodrive.lab.diagnosis.dataset import build_dataset
 
 
 def run(name, pixel, joules):
@@ -15,6 +15,6 @@ def run(name, pixel, joules):
 
 def test_doses_of_pixels_are_comparable():
     runs = (run("a", 0, 0.05), run("b", 1, 0.02), run("c", 0, 0.05), run("d", 1, 0.02))
-    scenes = [scene for scene, _ in dataset(Measurement(runs)).scenes]
+    scenes = [scene for scene, _ in build_dataset(Measurement(runs)).experiments]
     assert [scene.dose_before for scene in scenes] == pytest.approx([0.0, 0.0, 0.5, 0.2])
     assert [scene.dose_per_j for scene in scenes] == pytest.approx([10.0] * 4)

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from labs import PIXEL, lab
-from optodrive.lab.diagnosis.dataset import dataset
-from optodrive.lab.diagnosis.noise_model import Coloured, NoiseModel, whiten
-from optodrive.lab.diagnosis.nominal_fit import prepare
-from optodrive.lab.diagnosis.normal_equations import normal, projected, solve
+from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, whiten
+from optodrive.lab.diagnosis.nominal_fit import fit_nominal
+from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 
-NOISE = Coloured(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), swing_per_s=300.0)
+NOISE = ColouredNoise(white=0.3, sigma=(0.2, 0.4), tau_s=(0.01, 0.05), omega_rad_per_s=300.0)
 
 
 def dense(t_s, noise):
     gap = np.abs(t_s[:, None] - t_s)
     first = noise.sigma[0] ** 2 * np.exp(-gap / noise.tau_s[0])
-    second = noise.sigma[1] ** 2 * np.exp(-gap / noise.tau_s[1]) * np.cos(noise.swing_per_s * gap)
+    second = noise.sigma[1] ** 2 * np.exp(-gap / noise.tau_s[1]) * np.cos(noise.omega_rad_per_s * gap)
     return first + second + noise.white**2 * np.eye(len(t_s))
 
 
@@ -30,12 +30,12 @@ def test_whitening_is_the_inverse_of_the_covariance_on_any_times():
 
 
 def test_normal_equations_with_shared_jitters_are_those_of_the_dense_covariance():
-    data = dataset(lab(3, {}, groups=("short",), rate=400.0))
+    data = build_dataset(lab(3, {}, groups=("short",), rate=400.0))
     rng = np.random.default_rng(2)
     columns = rng.standard_normal((len(data.value), 2))
     power, timing = rng.standard_normal(len(data.value)), rng.standard_normal(len(data.value))
     noise = NoiseModel(dict.fromkeys(data.kinds(), NOISE), 0.7, 0.5, dict.fromkeys(data.kinds(), 0.4), True)
-    ours = normal(data, columns, noise, power, timing).gram
+    ours = compute_normal_equations(data, columns, noise, power, timing).gram
     for run in range(len(data.runs)):
         rows = [block for block in data.blocks if block.run == run]
         at = np.concatenate([np.arange(block.part.start, block.part.stop) for block in rows])
@@ -54,17 +54,17 @@ def test_projecting_out_leaves_what_least_squares_leaves():
     known, other = rng.standard_normal((50, 3)), rng.standard_normal((50, 2))
     gram = np.column_stack([known, other]).T @ np.column_stack([known, other])
     left = other - known @ np.linalg.lstsq(known, other, rcond=None)[0]
-    assert projected(gram, [0, 1, 2], [3, 4]) == pytest.approx(left.T @ left)
+    assert project_out(gram, [0, 1, 2], [3, 4]) == pytest.approx(left.T @ left)
     assert solve(gram, gram @ np.ones(5)) == pytest.approx(np.ones(5))
 
 
 def test_noise_and_base_are_recovered_from_repeats():
-    problem, base = prepare(dataset(lab(5, {})))
-    assert problem.noise.measured
+    problem, base = fit_nominal(build_dataset(lab(5, {})))
+    assert problem.noise.from_replicates
     for kind, white in ((0, 0.3), (1, 2e-6)):
         assert problem.noise.coloured[kind].white == pytest.approx(white, rel=0.1)
-    assert 0.002 < problem.noise.power < 0.01
-    assert problem.noise.uneven < 5.0
+    assert 0.002 < problem.noise.power_sigma < 0.01
+    assert problem.noise.replicate_excess < 5.0
     r, c, tau_g = np.exp(base.point.base[:3])
     assert r == pytest.approx(PIXEL.r_k_per_w, rel=0.01)
     assert c == pytest.approx(PIXEL.c_j_per_k, rel=0.01)
@@ -72,4 +72,4 @@ def test_noise_and_base_are_recovered_from_repeats():
 
 
 def test_without_repeats_the_noise_is_a_guess():
-    assert not prepare(dataset(lab(5, {}, repeats=1)))[0].noise.measured
+    assert not fit_nominal(build_dataset(lab(5, {}, repeats=1)))[0].noise.from_replicates

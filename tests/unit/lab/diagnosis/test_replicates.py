@@ -9,20 +9,20 @@ from labs import AMBIENT_K, PIXEL, lab
 from optodrive.core.types.discrepancy import CandidateCause, NextExperiment
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.lab.diagnosis import model_selection
-from optodrive.lab.diagnosis.dataset import dataset
-from optodrive.lab.diagnosis.detection import SURE, _surprise
+from optodrive.lab.diagnosis.dataset import build_dataset
+from optodrive.lab.diagnosis.detection import NOISE_KNOWN_DEGREES, _compute_surprisal
 from optodrive.lab.diagnosis.diagnose import diagnose
-from optodrive.lab.diagnosis.discrepancy_basis import bent
-from optodrive.lab.diagnosis.fitting import Fit, fit, jitter
-from optodrive.lab.diagnosis.held_out_gain import split
-from optodrive.lab.diagnosis.hypotheses import Free
-from optodrive.lab.diagnosis.narrative import answer, story
-from optodrive.lab.diagnosis.next_experiment import next_experiment
-from optodrive.lab.diagnosis.noise_model import Coloured
-from optodrive.lab.diagnosis.nominal_fit import prepare
-from optodrive.lab.diagnosis.omnibus_test import Binned, binned
-from optodrive.lab.diagnosis.prediction import Point, predict
-from optodrive.physics.pixel_ode import Active, Scene, observe
+from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
+from optodrive.lab.diagnosis.fitting import ModelFit, compute_jitter_sensitivity, fit
+from optodrive.lab.diagnosis.held_out_gain import split_runs
+from optodrive.lab.diagnosis.hypotheses import FreeParameter
+from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
+from optodrive.lab.diagnosis.next_experiment import propose_experiment
+from optodrive.lab.diagnosis.noise_model import ColouredNoise
+from optodrive.lab.diagnosis.nominal_fit import fit_nominal
+from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
+from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
 CLOCKS = ("temperature", "displacement", "force", "mirrors")
 TEMPERATURE = "absorber_temperature_K"
@@ -44,7 +44,9 @@ def hopping_lab(seed, size=0.05):
     for run in lab(seed, {}).runs:
         t_s = run.signals[TEMPERATURE].t_s
         real, meant = (
-            observe(Scene(pulses, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, Active.of({}))
+            simulate_signals(
+                PixelExperiment(pulses, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values({})
+            )
             for pulses in (pieces(rng, run.pulses, size), run.pulses)
         )
         signals = {
@@ -64,50 +66,55 @@ def hopping():
 def test_the_omnibus_keeps_its_level_whatever_the_noise_really_is(scale):
     rng = np.random.default_rng(1)
     draws = scale * rng.chisquare(150, 4000), scale * rng.chisquare(80, 4000)
-    p = np.array([Binned(a, 150, b, 80).p_value() for a, b in zip(*draws, strict=True)])
+    p = np.array([OmnibusStatistic(a, 150, b, 80).p_value() for a, b in zip(*draws, strict=True)])
     assert np.mean(p < 0.05) < 0.06
     assert np.mean(p < 0.001) < 0.003
-    assert Binned(150.0 + 300.0, 150, 80.0, 80).p_value() < 1e-5
-    assert Binned(150.0 + 50.0, 150, 0.0, 0).p_value() < 0.01
+    assert OmnibusStatistic(150.0 + 300.0, 150, 80.0, 80).p_value() < 1e-5
+    assert OmnibusStatistic(150.0 + 50.0, 150, 0.0, 0).p_value() < 0.01
 
 
 def test_a_ratio_is_judged_by_how_many_contrasts_the_noise_comes_from():
     rng = np.random.default_rng(2)
     ratios = rng.chisquare(1, 40_000) / (rng.chisquare(10, 40_000) / 10)
-    ours = np.array([_surprise(ratio, 1, 10) for ratio in ratios])
+    ours = np.array([_compute_surprisal(ratio, 1, 10) for ratio in ratios])
     assert np.mean(ours > -np.log(0.01)) == pytest.approx(0.01, abs=0.002)
-    assert _surprise(25.0, 1, 10) < 0.6 * _surprise(25.0, 1, SURE)
+    assert _compute_surprisal(25.0, 1, 10) < 0.6 * _compute_surprisal(25.0, 1, NOISE_KNOWN_DEGREES)
 
 
 def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
-    problem, base = prepare(dataset(lab(21, {}, repeats=2)))
+    problem, base = fit_nominal(build_dataset(lab(21, {}, repeats=2)))
     data, noise = problem.data, problem.noise
-    plain = {kind: Coloured(own.white, (1e-9 * own.white,) * 2, (1e-2, 1.0)) for kind, own in noise.coloured.items()}
+    plain = {
+        kind: ColouredNoise(own.white, (1e-9 * own.white,) * 2, (1e-2, 1.0)) for kind, own in noise.coloured.items()
+    }
     problem = replace(problem, noise=replace(noise, coloured=plain))
-    shared = jitter(data, base.point, problem.epsilon, base.prediction)
+    shared = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
     rng = np.random.default_rng(3)
     residual, swing = np.zeros(len(data.value)), np.zeros(len(data.value))
     for block in data.blocks:
         white = plain[block.kind].white
         residual[block.part] = white * rng.standard_normal(len(block.t_s))
         swing[block.part] = white * np.sin(2.0 * np.pi * block.t_s / 0.03)
-    found = binned(problem, residual[:, None], shared)
+    found = compute_omnibus(problem, residual[:, None], shared)
     assert found.degrees > 60
     for chi2, degrees in ((found.chi2, found.degrees), (found.noise_chi2, found.noise_degrees)):
         assert abs(chi2 - degrees) < 4.5 * np.sqrt(2.0 * degrees)
     # Noise half as strong again as the model has it is no effect; what all repeats share is one.
-    assert binned(problem, 1.5 * residual[:, None], shared).p_value() > 1e-3
-    assert binned(problem, (residual + 1.5 * swing)[:, None], shared).p_value() < 1e-4
+    assert compute_omnibus(problem, 1.5 * residual[:, None], shared).p_value() > 1e-3
+    assert compute_omnibus(problem, (residual + 1.5 * swing)[:, None], shared).p_value() < 1e-4
 
 
 def test_power_that_hops_within_pulses_is_not_named(hopping):
     assert (hopping.verdict, hopping.causes) == ("unexplained", ())
-    assert any("the power is unsteady within pulses" in line for line in story(hopping))
+    assert any("the power is unsteady within pulses" in line for line in build_narrative(hopping))
 
 
 def test_steady_power_is_steady_and_hops_are_far_from_it():
-    assert prepare(dataset(lab(23, {})))[0].noise.unsteady < 5.0
-    assert prepare(dataset(hopping_lab(23)))[0].noise.unsteady > 2.0 * model_selection.UNSTEADY
+    assert fit_nominal(build_dataset(lab(23, {})))[0].noise.intra_pulse_power_excess < 5.0
+    assert (
+        fit_nominal(build_dataset(hopping_lab(23)))[0].noise.intra_pulse_power_excess
+        > 2.0 * model_selection.MAX_INTRA_PULSE_POWER_EXCESS
+    )
 
 
 def test_a_droop_that_does_not_follow_the_power_is_still_a_droop():
@@ -121,8 +128,8 @@ def test_a_droop_that_does_not_follow_the_power_is_still_a_droop():
 
 
 def test_no_cause_has_no_other_form():
-    problem, base = prepare(dataset(lab(25, {}, ("short", "strong"))))
-    assert bent(problem, base, (), ()).shape == (len(problem.data.value), 0)
+    problem, base = fit_nominal(build_dataset(lab(25, {}, ("short", "strong"))))
+    assert compute_discrepancy_basis(problem, base, (), ()).shape == (len(problem.data.value), 0)
 
 
 @pytest.mark.slow
@@ -134,49 +141,49 @@ def test_what_only_the_runs_held_out_show_is_not_overlooked():
         runs.append(
             replace(run, signals={**run.signals, TEMPERATURE: Signal(0, old.t_s, np.minimum(old.value, limit_k))})
         )
-    data = dataset(Measurement(tuple(runs)))
+    data = build_dataset(Measurement(tuple(runs)))
     hot = {data.runs[b.run].group for b in data.blocks if b.kind == 0 and data.value[b.part].max() > 219.9}
-    assert hot == {data.runs[run].group for run in split(data)[1]} == {"strong"}
+    assert hot == {data.runs[run].group for run in split_runs(data)[1]} == {"strong"}
     found = diagnose(Measurement(tuple(runs)))
     assert found.verdict != "none"
-    assert found.held_out == ()
+    assert found.held_out_runs == ()
 
 
 def test_a_lag_at_the_end_of_its_range_is_no_rival_of_a_late_clock():
-    problem, base = prepare(dataset(lab(27, {}, ("short", "strong"))))
+    problem, base = fit_nominal(build_dataset(lab(27, {}, ("short", "strong"))))
 
     def candidate(terms, *names):
-        point, key = Point(base.point.base, terms), next(iter(terms))
-        free = tuple(Free(key, (name,)) for name in names)
-        fitted = Fit(point, free, 0.0, base.covariance, base.gram, predict(problem.data, point))
-        return model_selection.Candidate((), fitted, 0.0)
+        point, key = ParameterPoint(base.point.base, terms), next(iter(terms))
+        free = tuple(FreeParameter(key, (name,)) for name in names)
+        fitted = ModelFit(point, free, 0.0, base.covariance, base.gram, predict(problem.data, point))
+        return model_selection.RefittedCandidate((), fitted, 0.0)
 
     clock = candidate({"clock_offset": dict.fromkeys(CLOCKS, 0.0) | {"temperature": 8e-5}}, "temperature")
     lags = [
         candidate({"sensor_lag": {"time": time_s, "delay_share": share}}, "time", "delay_share")
         for time_s, share in ((4e-5, 1.0), (1e-3, 1.0), (4e-5, 0.9))
     ]
-    assert [model_selection._imitates(problem, lag, clock) for lag in lags] == [True, False, False]
+    assert [model_selection._is_imitation(problem, lag, clock) for lag in lags] == [True, False, False]
 
 
 def test_the_experiment_says_which_pixel_and_no_size_is_said_twice(hopping):
     ask = NextExperiment("why", np.array([[0.0, 0.01, 1.0, 1.0]]), 4, 3, ("force_N",), 9.0, 6.0)
-    told = answer(replace(hopping, next_experiment=ask))["next_experiment"]
+    told = build_answer(replace(hopping, next_experiment=ask))["next_experiment"]
     assert (told["pixel"], told["repeats"]) == (4, 3)
     twice = tuple(CandidateCause("gas_leak", "gas_leak", 1.0, 1.0, None, "", size) for size in ("rate 1", "rate 2"))
-    lines = story(replace(hopping, verdict="none", candidates=twice))
+    lines = build_narrative(replace(hopping, verdict="none", candidates=twice))
     assert [line for line in lines if "gas_leak" in line] == ["- gas_leak: rate 1"]
 
 
 def rivals_of(runs, near, far):
     """Two models beside one quiet recording, as candidates that fit it alike."""
-    problem, base = prepare(dataset(runs))
+    problem, base = fit_nominal(build_dataset(runs))
     fits = []
     for terms in (near, far):
-        point, key = Point(base.point.base, terms), next(iter(terms))
-        free = tuple(Free(key, (name,)) for name in terms[key])
+        point, key = ParameterPoint(base.point.base, terms), next(iter(terms))
+        free = tuple(FreeParameter(key, (name,)) for name in terms[key])
         fits.append(fit(problem, point, free, iterations=1))
-    return next_experiment(problem, *fits, ("the one", "the other"))
+    return propose_experiment(problem, *fits, ("the one", "the other"))
 
 
 def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_must():
@@ -186,4 +193,4 @@ def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_
     told = rivals_of(quiet, {"gas_leak": {"rate": 0.02}}, {"wall_heating": {"resistance": 6.0, "capacity": 0.05}})
     assert told.separation >= 12.0
     assert 3 <= told.repeats <= 30
-    assert f"{told.repeats} times" in told.why
+    assert f"{told.repeats} times" in told.rationale

@@ -141,7 +141,7 @@ def test_refused_in_one_line_that_names_the_place(kind, folder):
 
 
 def test_too_many_numbers_are_refused_while_they_are_counted(folder, monkeypatch):
-    monkeypatch.setattr(csv_folder, "Room", lambda: storage.Room(100))
+    monkeypatch.setattr(csv_folder, "MemoryBudget", lambda: storage.MemoryBudget(100))
     with pytest.raises(InputError, match="at most"):
         read_recording(folder)
 

@@ -29,23 +29,23 @@ def test_what_an_index_tells(path):
     index = RecordingIndex.open(path)
     assert (index.path, index.instrument_notes) == (path, "a camera")
     first, second = index.runs
-    assert (first.name, first.ambient_k, first.pulses, first.lit) == ("run2", 293.15, 2, (17, 18))
+    assert (first.name, first.ambient_k, first.pulse_count, first.pulsed_pixels) == ("run2", 293.15, 2, (17, 18))
     assert first.attributes == recording().runs[0].attributes
     assert first.signals == {
         "absorber_temperature_K": SignalIndex(17, 101, None),
         "displacement_m": SignalIndex(17, 101, 1e-7 / 3),
     }
-    assert (first.measured, first.has_commands) == ((17,), False)
-    assert (second.measured, second.has_commands, second.pulses, second.lit) == ((), True, 0, ())
-    assert index.by_pixel() == {17: ("run2",)}
+    assert (first.measured_pixels, first.has_commands) == ((17,), False)
+    assert (second.measured_pixels, second.has_commands, second.pulse_count, second.pulsed_pixels) == ((), True, 0, ())
+    assert index.group_runs_by_pixel() == {17: ("run2",)}
 
 
 def test_samples_are_not_read(path, monkeypatch):
     def fail(*_):
         raise AssertionError("samples were read")
 
-    monkeypatch.setattr(hdf5.Hdf5Tree, "samples", fail)
-    monkeypatch.setattr(csv_folder.CsvTree, "samples", fail)
+    monkeypatch.setattr(hdf5.Hdf5Tree, "read_samples", fail)
+    monkeypatch.setattr(csv_folder.CsvTree, "read_samples", fail)
     assert len(RecordingIndex.open(path).runs) == 2
 
 
@@ -75,7 +75,7 @@ def test_pixels_of_a_whole_display_are_listed_in_order(tmp_path):
         for pixel in range(11, -1, -1)
     ]
     write_recording(tmp_path / "r.h5", Measurement(tuple(runs)))
-    by_pixel = RecordingIndex.open(tmp_path / "r.h5").by_pixel()
+    by_pixel = RecordingIndex.open(tmp_path / "r.h5").group_runs_by_pixel()
     assert list(by_pixel) == list(range(12))
     assert by_pixel[10] == ("p10-0", "p10-1")
 

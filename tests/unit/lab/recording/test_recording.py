@@ -11,7 +11,7 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import convert_recording, hdf5, read_recording, sandboxed_probe, write_recording
-from optodrive.lab.recording.storage import naturally
+from optodrive.lab.recording.storage import natural_sort_key
 from recording_samples import T_S, assert_same, recording, sorted_attributes
 
 
@@ -72,7 +72,7 @@ def test_runs_come_in_their_natural_order(tmp_path):
     renamed = [Run(name, one.ambient_k, one.pulses, one.signals) for name in names]
     write_recording(tmp_path / "r.h5", Measurement(tuple(renamed)))
     read = [run.name for run in read_recording(tmp_path / "r.h5").runs]
-    assert read == sorted(names, key=naturally) == ["9", "b", "run1", "run1a", "run02", "run2", "run10"]
+    assert read == sorted(names, key=natural_sort_key) == ["9", "b", "run1", "run1a", "run02", "run2", "run10"]
 
 
 def test_attributes_of_any_tool_become_text_and_numbers(path):
@@ -294,7 +294,7 @@ REFUSALS = {
 
 @pytest.mark.parametrize("kind", REFUSALS)
 def test_refused_in_one_line_that_names_the_place(kind, path, monkeypatch):
-    monkeypatch.setattr(hdf5, "try_out", lambda path: None)  # the library itself is sure of these files
+    monkeypatch.setattr(hdf5, "probe_in_sandbox", lambda path: None)  # the library itself is sure of these files
     damage, words = REFUSALS[kind]
     with h5py.File(path, "r+") as file:
         damage(file)
@@ -323,7 +323,7 @@ def test_truncated_files_are_refused(path, share):
 
 
 def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_S", 1)
+    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
     for program in ("_confine(1)\nwhile True: pass", "import os; os.abort()"):
         monkeypatch.setattr(
             sandboxed_probe, "_PROGRAM", f"from optodrive.lab.recording.sandboxed_probe import _confine\n{program}"
@@ -332,9 +332,9 @@ def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
 
 
 def test_a_sound_file_of_many_runs_may_take_its_time(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_S", 1)
+    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
     write_recording(path, Measurement(tuple(dataclasses.replace(ONE, name=f"run-{number}") for number in range(900))))
-    sandboxed_probe.try_out(path)
+    sandboxed_probe.probe_in_sandbox(path)
 
 
 def test_a_file_is_tried_out_once(path, monkeypatch):
@@ -344,7 +344,7 @@ def test_a_file_is_tried_out_once(path, monkeypatch):
 
 
 def test_damage_on_which_hdf5_2_0_searches_for_ever_comes_to_an_end(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_S", 2)
+    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 2)
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL") + 24] = 255  # the length of the first text of the file
     path.write_bytes(content)

@@ -13,8 +13,8 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
 from optodrive.lab.recording.merge import merge_session
-from optodrive.lab.recording.session_recorder import WAITING_MAX, SessionRecorder
-from optodrive.lab.recording.session_writer import REST_S
+from optodrive.lab.recording.session_recorder import QUEUE_MAX, SessionRecorder
+from optodrive.lab.recording.session_writer import COLD_AFTER_S
 
 ABOUT = {"display": "d", "optodrive": "0", "ambient_K": 293.15, "bridge_width_m": 4e-4, "config": "{}"}
 
@@ -32,7 +32,7 @@ def note(plan, start_s, pulses=3, padding=0):
 def recorded(path, notes, said):
     recorder = SessionRecorder(path, ABOUT, said.append)
     for each in notes:
-        recorder.note(lambda each=each: each)
+        recorder.record(lambda each=each: each)
     recorder.close()
     return recorder
 
@@ -46,7 +46,7 @@ def until(condition):
 
 def test_plans_are_kept_and_a_rest_begins_a_new_run(tmp_path):
     path, said = tmp_path / "a.h5", []
-    after = 1.0 + REST_S + 0.1
+    after = 1.0 + COLD_AFTER_S + 0.1
     empty = ({**note("p3", 0.0)[0], "status": "cancelled", "error": "why"}, {"planned": np.zeros((0, 5))})
     recorded(path, [note("p1", 0.5), note("p2", 0.7), empty, note("p4", after), note("p5", 0.2)], said)
     assert said == []
@@ -69,9 +69,9 @@ def test_a_full_disk_is_told_in_one_line_and_what_was_written_stays(tmp_path):
     recorder = SessionRecorder(path, ABOUT, said.append)
     resource.prlimit(recorder._writer.pid, resource.RLIMIT_FSIZE, (1_500_000, 1_500_000))
     for k in range(30):
-        recorder.note(lambda k=k: note(f"p{k}", 0.1 * k, padding=10_000))
-    until(lambda: not recorder.recording)
-    recorder.note(lambda: pytest.fail("nothing is made for a recording that has ended"))
+        recorder.record(lambda k=k: note(f"p{k}", 0.1 * k, padding=10_000))
+    until(lambda: not recorder.is_recording)
+    recorder.record(lambda: pytest.fail("nothing is made for a recording that has ended"))
     recorder.close()
     assert len(said) == 1
     assert "File too large" in said[0]
@@ -88,8 +88,8 @@ def test_a_writer_that_ends_or_hangs_holds_nobody_up(tmp_path, number):
     recorder = SessionRecorder(tmp_path / "a.h5", ABOUT, said.append)
     os.kill(recorder._writer.pid, number)
     began_s = time.monotonic()
-    for k in range(2 * WAITING_MAX):
-        recorder.note(lambda k=k: note(f"p{k}", 0.1 * k))
+    for k in range(2 * QUEUE_MAX):
+        recorder.record(lambda k=k: note(f"p{k}", 0.1 * k))
     assert time.monotonic() - began_s < 5.0
     until(lambda: said)
     recorder._writer.kill()
@@ -102,8 +102,8 @@ def test_its_feeder_ending_ends_the_writer_with_all_that_came(tmp_path):
     """As after kill -9 of the daemon: the pipe closes in the middle of a note."""
     said = []
     recorder = SessionRecorder(tmp_path / "a.h5", ABOUT, said.append)
-    recorder.note(lambda: note("p1", 0.0))
-    until(lambda: (tmp_path / "a.h5").stat().st_size and recorder._waiting.empty())
+    recorder.record(lambda: note("p1", 0.0))
+    until(lambda: (tmp_path / "a.h5").stat().st_size and recorder._queue.empty())
     recorder.close()
     assert recorder._writer.returncode == 0
     with h5py.File(tmp_path / "a.h5") as file:
@@ -114,7 +114,7 @@ def test_a_note_that_cannot_be_made_is_told(tmp_path):
     said = []
     recorder = recorded(tmp_path / "a.h5", [], said)
     recorder = SessionRecorder(tmp_path / "b.h5", ABOUT, said.append)
-    recorder.note(lambda: 1 / 0)
+    recorder.record(lambda: 1 / 0)
     until(lambda: said)
     recorder.close()
     assert "ZeroDivisionError" in said[0]

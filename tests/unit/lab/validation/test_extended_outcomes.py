@@ -2,12 +2,12 @@
 
 import pytest
 
-from optodrive.lab.validation.extended_outcomes import outcomes
+from optodrive.lab.validation.extended_outcomes import simulate_outcomes
 from optodrive.lab.validation.paper_outcomes import OUTCOMES
 from optodrive.physics.parameters import load_parameters
 
 CALIBRATED = load_parameters("calibrated")
-SIMULATED = outcomes(CALIBRATED)
+SIMULATED = simulate_outcomes(CALIBRATED)
 FROM_THE_FORCE = {"dT_air_isometric", "dQ_air", "eta_qt", "eta_tm"}
 """Here the simulation follows the paper's own way to its gas."""
 

@@ -5,26 +5,33 @@ from math import exp, pi
 
 import pytest
 
-from optodrive.device.config import shipped_path
-from optodrive.lab.validation.paper_outcomes import FITTED_ON, INPUTS, OUTCOMES, REMARKS, SILENT, STANDS_ON_FITTED
+from optodrive.device.config import locate_shipped
+from optodrive.lab.validation.paper_outcomes import (
+    DERIVED_FROM_FITTED,
+    FITTED_ON,
+    INPUTS,
+    NOT_MODELLED,
+    OUTCOMES,
+    REMARKS,
+)
 from optodrive.lab.validation.stimulus_response import pulse_peak_k, width_to_reach_s
-from optodrive.physics.paper_facts import Fact, paper_facts
+from optodrive.physics.paper_facts import PaperFact, load_paper_facts
 from optodrive.physics.parameters import load_parameters
 
 CALIBRATED = load_parameters("calibrated")
 LITERAL = load_parameters("paper_s1_literal")
-FACTS = paper_facts()
+FACTS = load_paper_facts()
 
 
 def test_every_fact_is_spoken_to_or_passed_over_once():
-    named = [*INPUTS, *OUTCOMES, *SILENT]
+    named = [*INPUTS, *OUTCOMES, *NOT_MODELLED]
     assert sorted(named) == sorted(FACTS)
-    assert all(len(reason) > 10 for reason in SILENT.values())
+    assert all(len(reason) > 10 for reason in NOT_MODELLED.values())
 
 
 def test_fitted_and_remarked_facts_are_outcomes():
     assert set(FITTED_ON) == {"kappa", "tau_g", "phi"}
-    assert {*FITTED_ON.values(), *STANDS_ON_FITTED, *REMARKS} <= set(OUTCOMES)
+    assert {*FITTED_ON.values(), *DERIVED_FROM_FITTED, *REMARKS} <= set(OUTCOMES)
 
 
 @pytest.mark.parametrize("fact", FITTED_ON.values())
@@ -39,7 +46,7 @@ def test_inputs_are_the_papers_own(name, parameters):
 
 
 def test_every_miss_has_its_word_and_no_word_is_left_without_a_miss():
-    missed = {name for name, model in OUTCOMES.items() if FACTS[name].missed(model(CALIBRATED), 0.15)}
+    missed = {name for name, model in OUTCOMES.items() if FACTS[name].is_contradicted(model(CALIBRATED), 0.15)}
     assert missed == set(REMARKS)
 
 
@@ -92,17 +99,17 @@ def test_figures_in_the_remarks_are_so():
 
 
 def test_heights_at_the_papers_display_rates():
-    kappa, pixel = CALIBRATED.kappa.value, CALIBRATED.pixel(0.55e-3)
+    kappa, pixel = CALIBRATED.kappa.value, CALIBRATED.build_pixel(0.55e-3)
     heights = {name: kappa * pulse_peak_k(pixel, 2.45, 1 / FACTS[name].value) for name in ("N_50um", "N_400um")}
     assert heights["N_50um"] / 50e-6 == pytest.approx(2.0, abs=0.05)
     assert heights["N_400um"] / 400e-6 == pytest.approx(1.07, abs=0.005)
-    slowest = max(width_to_reach_s(CALIBRATED.pixel(row.width_m), 2.45, 50e-6) for row in CALIBRATED.bridge)
+    slowest = max(width_to_reach_s(CALIBRATED.build_pixel(row.width_m), 2.45, 50e-6) for row in CALIBRATED.bridge)
     assert format(1 / slowest, ".0f") == "374"
     assert "374/s" in REMARKS["N_50um"]
 
 
 def fact(value, unit="m", relation="="):
-    return Fact("x", "", relation, value, unit, None, "", "")
+    return PaperFact("x", "", relation, value, unit, None, "", "")
 
 
 def test_ratios_of_values_temperatures_and_bounds():
@@ -116,10 +123,10 @@ def test_ratios_of_values_temperatures_and_bounds():
     [("=", 1.14, False), ("=", 1.16, True), ("=", 0.84, True), ("<", 0.1, False), ("<", 1.01, True)],
 )
 def test_what_counts_as_a_miss(relation, model, missed):
-    assert fact(1.0, relation=relation).missed(model, 0.15) is missed
+    assert fact(1.0, relation=relation).is_contradicted(model, 0.15) is missed
 
 
 def test_the_file_has_one_row_a_fact():
-    with shipped_path("paper_facts.csv").open(encoding="utf-8", newline="") as file:
+    with locate_shipped("paper_facts.csv").open(encoding="utf-8", newline="") as file:
         ids = [row["id"] for row in csv.DictReader(file)]
     assert len(ids) == len(set(ids)) == len(FACTS)

@@ -5,7 +5,7 @@ from math import exp, inf
 import numpy as np
 import pytest
 
-from optodrive.lab.validation.stimulus_response import pulse_peak_k, steady_train, width_to_reach_s
+from optodrive.lab.validation.stimulus_response import compute_steady_train, pulse_peak_k, width_to_reach_s
 from optodrive.physics.pixel import Pixel, advance
 
 PIXEL = Pixel(145.0, 99e-6, 0.66, 3e-3, 4e-6, 2e-4)
@@ -43,14 +43,14 @@ def test_steady_train_meets_a_long_dense_run(width_s, gap_s):
     on = [advance(PIXEL, *state, 2.45, t)[1] for t in on_s]
     off = [advance(PIXEL, *lit, 0.0, t)[1] for t in off_s]
     mean = (area(on_s, on) + area(off_s, off)) / (width_s + gap_s)
-    train = steady_train(PIXEL, 2.45, width_s, gap_s)
-    assert train.largest_k == pytest.approx(max(on + off), rel=1e-6)
-    assert train.least_k == pytest.approx(min(on + off), rel=1e-6, abs=1e-9)
+    train = compute_steady_train(PIXEL, 2.45, width_s, gap_s)
+    assert train.max_k == pytest.approx(max(on + off), rel=1e-6)
+    assert train.min_k == pytest.approx(min(on + off), rel=1e-6, abs=1e-9)
     assert train.mean_k == pytest.approx(mean, rel=1e-5)
 
 
 def test_without_lag_a_train_follows_the_geometric_series():
     tau = QUICK.tau_s
-    train, first_k = steady_train(QUICK, 2.45, tau, tau), pulse_peak_k(QUICK, 2.45, tau)
-    assert (train.largest_k - train.least_k) / first_k == pytest.approx((1 - exp(-1)) / (1 - exp(-2)), rel=1e-3)
+    train, first_k = compute_steady_train(QUICK, 2.45, tau, tau), pulse_peak_k(QUICK, 2.45, tau)
+    assert (train.max_k - train.min_k) / first_k == pytest.approx((1 - exp(-1)) / (1 - exp(-2)), rel=1e-3)
     assert train.mean_k / first_k == pytest.approx(0.5 / (1 - exp(-1)), rel=1e-3)

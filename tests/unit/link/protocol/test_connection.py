@@ -14,7 +14,7 @@ def hello_reply(nonce, session=SESSION):
 
 
 def wire(message, session=SESSION, seq=0):
-    return encode_frame(Frame(message.TYPE, seq, session, message.body()))
+    return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
 
 def frames(data):
@@ -32,7 +32,7 @@ def data(number):
 @pytest.fixture
 def host():
     connection = HostConnection()
-    connection.hello(77)
+    connection.send_hello(77)
     connection.bytes_to_send(0.0, PLENTY)
     connection.receive_bytes(wire(hello_reply(77)), 0.0)
     return connection
@@ -56,10 +56,10 @@ def fill(host, count):
 
 def test_hello_goes_out_without_a_session_and_nothing_sequenced_before_the_reply():
     host = HostConnection()
-    host.hello(5)
+    host.send_hello(5)
     host.send(data(0))
     sent = frames(host.bytes_to_send(0.0, PLENTY))
-    assert sent == [Frame(m.Hello.TYPE, 0, 0, m.Hello(m.MAJOR, m.MINOR, 5).body())]
+    assert sent == [Frame(m.Hello.TYPE, 0, 0, m.Hello(m.MAJOR, m.MINOR, 5).encode_body())]
     assert host.bytes_to_send(9.0, PLENTY) == b""
     assert host.outstanding == 1
     host.receive_bytes(wire(hello_reply(5)), 9.0)
@@ -68,8 +68,8 @@ def test_hello_goes_out_without_a_session_and_nothing_sequenced_before_the_reply
 
 def test_hello_repeated_with_a_new_nonce_takes_only_the_newest_reply():
     host = HostConnection()
-    host.hello(5)
-    host.hello(6)
+    host.send_hello(5)
+    host.send_hello(6)
     assert host.receive_bytes(wire(hello_reply(5, 111), session=111), 0.0) == []
     assert host.session == 0
     assert host.receive_bytes(wire(hello_reply(6, 222), session=222), 0.0) == [hello_reply(6, 222)]
@@ -81,11 +81,11 @@ def test_hello_repeated_with_a_new_nonce_takes_only_the_newest_reply():
 def test_a_new_hello_forgets_the_window(host):
     fill(host, 3)
     host.bytes_to_send(0.0, PLENTY)
-    host.hello(78)
+    host.send_hello(78)
     host.bytes_to_send(0.0, PLENTY)
     host.receive_bytes(wire(hello_reply(78, 9), session=9), 0.0)
     host.send(data(50))
-    assert frames(host.bytes_to_send(1.0, PLENTY)) == [Frame(m.Data.TYPE, 0, 9, data(50).body())]
+    assert frames(host.bytes_to_send(1.0, PLENTY)) == [Frame(m.Data.TYPE, 0, 9, data(50).encode_body())]
 
 
 # --- window and flight budget ---------------------------------------------------------------------------------------
@@ -238,9 +238,9 @@ def test_abort_goes_ahead_of_all_and_nothing_else_follows(host):
 
 
 def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_begins(host):
-    event = m.Event(state=m.STATES.index("DISARMED"), reason=m.REASONS.index("abort"), fault=0, tick=7)
+    event = m.Event(state=m.STATES.index("DISARMED"), reason=m.EVENT_REASONS.index("abort"), fault=0, tick=7)
     host.abort()
-    host.hello(3)
+    host.send_hello(3)
     assert host.receive_bytes(wire(event), 0.0) == [event]
     assert host.receive_bytes(wire(event, session=SESSION ^ 1), 0.0) == []
     assert host.receive_bytes(wire(m.Ack(0, 0, 0, 0)), 0.0) == []
@@ -252,7 +252,7 @@ def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_beg
 
 def test_what_is_queued_for_the_next_session_waits_through_repeated_hellos(host):
     host.abort()
-    host.hello(3)
+    host.send_hello(3)
     host.send(data(0))
     host.hello(4)
     host.receive_bytes(wire(hello_reply(4, 222), session=222), 0.0)
@@ -264,7 +264,7 @@ def test_what_is_queued_for_the_next_session_waits_through_repeated_hellos(host)
 def test_abort_then_hello_keep_their_order(host):
     host.send(m.Get())
     host.abort()
-    host.hello(3)
+    host.send_hello(3)
     assert [frame.type for frame in frames(host.bytes_to_send(0.0, PLENTY))] == [m.Abort.TYPE, m.Hello.TYPE]
 
 
@@ -274,14 +274,14 @@ def test_abort_then_hello_keep_their_order(host):
 @pytest.fixture
 def link():
     board = BoardLink()
-    board.begin(SESSION)
+    board.begin_session(SESSION)
     return board
 
 
 def test_frames_in_order_are_taken_once(link):
     for seq in [*range(256), 0, 1]:
         assert link.accept(seq) == (True, None)
-        link.consumed(None)
+        link.mark_consumed(None)
     assert link.expected_seq == 2
     assert link.seq_errors == 0
 
@@ -290,7 +290,7 @@ def test_duplicates_are_answered_as_the_last_frame_was(link):
     for refusal in (None, m.NAK_REASONS.index("STATE")):
         seq = link.expected_seq
         link.accept(seq)
-        link.consumed(refusal)
+        link.mark_consumed(refusal)
         assert link.accept(seq) == (False, refusal)
         assert link.accept((seq - 7) % 256) == (False, refusal)
     assert link.seq_errors == 0

@@ -17,7 +17,13 @@ PAGE = (CONTRACT / "PROTOCOL.md").read_text()
 TOML = tomllib.loads((CONTRACT / "messages.toml").read_text())
 STRUCTS = TOML["struct"]
 CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i16": "h", "bytes12": "12s"}
-ENUMS = {"state": m.STATES, "fault": m.FAULTS, "nak_reason": m.NAK_REASONS, "reason": m.REASONS, "input_bit": m.INPUTS}
+ENUMS = {
+    "state": m.STATES,
+    "fault": m.FAULTS,
+    "nak_reason": m.NAK_REASONS,
+    "reason": m.EVENT_REASONS,
+    "input_bit": m.INPUTS,
+}
 STATED = {entry["name"]: entry for entry in TOML["message"]}
 VECTORS = {path.stem: tomllib.loads(path.read_text()) for path in sorted((CONTRACT / "vectors").glob("*.toml"))}
 REFUSED = tomllib.loads((CONTRACT / "refused.toml").read_text())["case"]
@@ -41,7 +47,7 @@ def names(entries):
 
 def test_every_message_is_stated_on_both_sides():
     assert {entry["id"]: python_name(entry["name"]) for entry in TOML["message"]} == {
-        kind: message.__name__ for kind, message in m.BY_TYPE.items()
+        kind: message.__name__ for kind, message in m.MESSAGES_BY_TYPE.items()
     }
     assert len(TOML["message"]) == len(STATED) == len(m.HOST_MESSAGES) + len(m.BOARD_MESSAGES)
 
@@ -162,7 +168,7 @@ def test_every_message_has_a_vector():
 def test_vector_encodes(stem):
     vector = VECTORS[stem]
     message = build(vector["message"], vector["fields"])
-    frame = framing.Frame(message.TYPE, vector["seq"], vector["session"], message.body())
+    frame = framing.Frame(message.TYPE, vector["seq"], vector["session"], message.encode_body())
     assert vector["type"] == message.TYPE
     assert framing.encode_frame(frame).hex() == vector["wire"]
     assert framing.cobs_encode(bytes.fromhex(vector["raw"])).hex() + "00" == vector["wire"]
@@ -192,14 +198,14 @@ def test_refused_frames_only_count(case):
 @pytest.mark.parametrize("stem", VECTORS)
 def test_every_other_length_of_body_is_refused(stem):
     vector = VECTORS[stem]
-    body = build(vector["message"], vector["fields"]).body()
+    body = build(vector["message"], vector["fields"]).encode_body()
     for length in range(len(body)):
         try:
             shorter = m.parse_message(vector["type"], body[:length])
         except RemoteProtocolError:
             continue
         assert vector["message"] in ("DATA", "EXECUTED")  # fewer points, but whole ones
-        assert shorter.body() == body[:length]
+        assert shorter.encode_body() == body[:length]
     with pytest.raises(RemoteProtocolError):
         m.parse_message(vector["type"], body + b"\x01")
 
@@ -207,7 +213,7 @@ def test_every_other_length_of_body_is_refused(stem):
 def test_names_beyond_the_enumerations_are_refused():
     for message in (m.Nak(0, 8), m.Ack(0, 0, 0, 7), m.Event(0, 13, 0, 0), m.Event(0, 0, 17, 0)):
         with pytest.raises(RemoteProtocolError, match="has no meaning"):
-            m.parse_message(message.TYPE, message.body())
+            m.parse_message(message.TYPE, message.encode_body())
 
 
 def test_unknown_type_is_refused():

@@ -5,7 +5,7 @@ import pytest
 
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN, LimitedPlan
-from optodrive.link.protocol.quantisation import CENTRE_CODE, DARK_STEP_TICKS, WireScale, decode, quantise
+from optodrive.link.protocol.quantisation import CENTRE_CODE, GATE_OFF_STEP_TICKS, WireScale, decode, quantise
 
 SCALE = WireScale(rad_per_code=0.1745 / 32767, full_power_w=2.45, tick_s=1e-6)
 
@@ -32,7 +32,7 @@ def plan(*pulses):
 
 
 def payload(points):
-    return points.payload()
+    return points.encode_payload()
 
 
 def back(limited):
@@ -88,8 +88,8 @@ def test_index_counts_points_and_row_the_pulses():
 def test_a_long_gap_becomes_dark_points_at_the_next_position():
     points = quantise(plan((0.0, 0.001, 0.1, 0, 1), (0.301, 0.001, -0.1, 0, 1)), SCALE)
     first, *dark, last = points.table.tolist()
-    assert dark == [[last[0], last[1], DARK_STEP_TICKS, 0, 0]] * 4
-    assert last[2] == 300_000 - 4 * DARK_STEP_TICKS
+    assert dark == [[last[0], last[1], GATE_OFF_STEP_TICKS, 0, 0]] * 4
+    assert last[2] == 300_000 - 4 * GATE_OFF_STEP_TICKS
     assert first[0] > CENTRE_CODE > last[0]
 
 
@@ -110,23 +110,23 @@ def test_a_pulse_of_no_power_is_dark_for_as_long():
 
 def test_payloads_hold_whole_points():
     points = quantise(random_plan(100), SCALE)
-    assert len(points.payload()) == 10 * len(points)
-    assert points.payload(3, 4) == points.payload()[30:70]
-    assert points.payload()[:10] == points.table[0].astype("<u2").tobytes()
+    assert len(points.encode_payload()) == 10 * len(points)
+    assert points.encode_payload(3, 4) == points.encode_payload()[30:70]
+    assert points.encode_payload()[:10] == points.table[0].astype("<u2").tobytes()
 
 
 def test_points_know_where_they_end_and_where_a_pulse_begins():
     limited = plan((0.001, 0.05, 0.1, 0, 1.0), (0.3, 0.05, 0.1, 0, 0.0), (0.4, 0.05, 0.1, 0, 1.0))
     points = quantise(limited, SCALE)
     assert points.row.tolist() == [0, -1, -1, -1, -1, 1, 2]
-    assert points.ends()[[0, 5, 6]].tolist() == [51_000, 350_000, 450_000]
-    assert [points.up_to(row) for row in range(4)] == [0, 1, 6, 7]
+    assert points.compute_end_ticks()[[0, 5, 6]].tolist() == [51_000, 350_000, 450_000]
+    assert [points.count_before(row) for row in range(4)] == [0, 1, 6, 7]
 
 
 def test_an_empty_plan_has_no_points():
     points = quantise(plan(), SCALE)
     assert len(points) == 0
-    assert points.payload() == b""
+    assert points.encode_payload() == b""
     assert len(decode(b"", SCALE).index) == 0
 
 
@@ -164,15 +164,15 @@ def test_decoding_sees_a_changed_byte():
 
 def test_codes_and_angles_are_inverse():
     codes = np.arange(0, 65536, 7)
-    assert SCALE.codes(SCALE.angles(codes)).tolist() == codes.tolist()
+    assert SCALE.to_codes(SCALE.to_angles_rad(codes)).tolist() == codes.tolist()
     coarse = replace(SCALE, rad_per_code=1e-3)
-    assert coarse.codes(np.array([0.0, 0.0006])).tolist() == [CENTRE_CODE, CENTRE_CODE + 1]
+    assert coarse.to_codes(np.array([0.0, 0.0006])).tolist() == [CENTRE_CODE, CENTRE_CODE + 1]
 
 
 def test_mirrors_do_not_go_to_a_pulse_that_was_trimmed_to_nothing():
     limited = plan((0.001, 0.002, 0.01, 0.0, 1.0), (0.004, 0.002, 0.15, 0.1, 0.0), (0.008, 0.002, 0.02, 0.0, 1.0))
     points = quantise(limited, SCALE)
-    x_rad = SCALE.angles(points.table[:, 0].astype(np.int64))
+    x_rad = SCALE.to_angles_rad(points.table[:, 0].astype(np.int64))
     assert x_rad == pytest.approx([0.01, 0.02, 0.02], abs=1e-5)
     last = quantise(plan((0.001, 0.002, 0.01, 0.0, 1.0), (0.004, 0.002, 0.15, 0.1, 0.0)), SCALE)
-    assert SCALE.angles(last.table[:, 0].astype(np.int64)) == pytest.approx([0.01, 0.01], abs=1e-5)
+    assert SCALE.to_angles_rad(last.table[:, 0].astype(np.int64)) == pytest.approx([0.01, 0.01], abs=1e-5)

@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optodrive.link.protocol import messages as m
-from optodrive.link.protocol.describe import describe, name_of, reset_cause
+from optodrive.link.protocol.describe import describe, describe_reset_cause, message_name
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.protocol.transcript import PENDING_MAX, Transcript
 
@@ -12,11 +12,11 @@ STATUS = m.Status(4, 1, 0b101, 99, 3, 2, 1, 0, 0, 0, 12, 253)
 
 
 def wire(message, seq=0, session=5):
-    return encode_frame(Frame(message.TYPE, seq, session, message.body()))
+    return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
 
 def test_messages_in_words_and_units():
-    assert name_of(m.HelloReply(*[0] * 5, b"", *[0] * 6, None)) == "HELLO_REPLY"
+    assert message_name(m.HelloReply(*[0] * 5, b"", *[0] * 6, None)) == "HELLO_REPLY"
     words = describe(STATUS)
     assert words["state"] == "RUNNING"
     assert words["fault"] == "LINK"
@@ -46,7 +46,7 @@ def test_messages_in_words_and_units():
     reply = m.HelloReply(1, 0, 1, 2, 0x10000, bytes(12), 0, 1_000_000, 256, 8, 300, 3, m.Limits(*range(1, 15)))
     assert (describe(reply)["reset_cause"], describe(reply)["firmware"]) == ("watchdog", "1.0")
     assert describe(reply)["limits"] == limits
-    assert reset_cause(8) == "unknown cause 8"
+    assert describe_reset_cause(8) == "unknown cause 8"
 
 
 @given(st.lists(st.integers(1, 40), max_size=20))
@@ -54,11 +54,11 @@ def test_lines_do_not_depend_on_how_the_bytes_came(cuts):
     stream = wire(m.Get()) + b"\x03xx\0" + wire(DATA, 0) + b"\0" + wire(STATUS)
     transcript, lines, at = Transcript(), [], 0
     for k, cut in enumerate([*cuts, len(stream)]):
-        lines += transcript.take(float(k), True, stream[at : at + cut])
+        lines += transcript.feed(float(k), True, stream[at : at + cut])
         at += cut
     assert [type(line.message) for line in lines] == [m.Get, type(None), m.Data, type(None)]
     assert lines[1].raw == b"\x03xx"
-    assert "echo" in lines[3].bad
+    assert "echo" in lines[3].error
     assert transcript.totals.bad_frames_to_board == 2
     assert transcript.totals.bad_bytes == 3 + len(wire(STATUS)) - 1
 
@@ -66,7 +66,7 @@ def test_lines_do_not_depend_on_how_the_bytes_came(cuts):
 @given(st.binary(max_size=2000))
 def test_any_bytes_are_counted_as_the_decoder_counts_them(data):
     transcript, decoder = Transcript(), FrameDecoder()
-    lines = transcript.take(0.0, False, data + b"\0")
+    lines = transcript.feed(0.0, False, data + b"\0")
     whole = [piece for piece in data.split(b"\0") if piece]
     assert [line.raw for line in lines if len(line.raw) < PENDING_MAX] == [
         piece for piece in whole if len(piece) < PENDING_MAX
@@ -80,16 +80,16 @@ def test_a_damaged_frame_says_what_is_wrong():
     crc = bytearray(good)
     crc[-2] ^= 2
     unknown = encode_frame(Frame(0x77, 0, 5, b""))
-    lines = transcript.take(0.0, True, bytes(crc) + unknown)
-    assert lines[0].bad == "wrong CRC"
-    assert lines[1].bad == "unknown message type 0x77"
+    lines = transcript.feed(0.0, True, bytes(crc) + unknown)
+    assert lines[0].error == "wrong CRC"
+    assert lines[1].error == "unknown message type 0x77"
 
 
 def test_endless_bytes_without_a_delimiter_cost_bounded_memory():
     transcript = Transcript()
-    lines = [line for k in range(50) for line in transcript.take(float(k), False, b"\x07" * 100)]
+    lines = [line for k in range(50) for line in transcript.feed(float(k), False, b"\x07" * 100)]
     assert sum(len(line.raw) for line in lines) >= 5000 - PENDING_MAX
-    assert all(line.bad for line in lines)
+    assert all(line.error for line in lines)
 
 
 def test_silences_and_retransmissions_and_round_trips():
@@ -103,13 +103,13 @@ def test_silences_and_retransmissions_and_round_trips():
         (1.9, True, m.End(1, 9), 1),
         (2.9, False, m.Nak(2, 0), 0),
     ]:
-        (line,) = transcript.take(at_s, to_board, wire(message, seq))
-        assert line.again == (at_s == 1.8)
-    totals = transcript.totals.figures()
+        (line,) = transcript.feed(at_s, to_board, wire(message, seq))
+        assert line.retransmitted == (at_s == 1.8)
+    totals = transcript.totals.to_dict()
     assert totals["retransmissions"] == totals["naks"] == 1
     assert totals["round_trip_median_s"] == pytest.approx(0.1)
     assert totals["host_silence_s"] == pytest.approx(0.5)
     assert totals["board_silence_s"] == pytest.approx(1.2)
-    transcript.broken_off()
-    transcript.take(100.0, False, wire(STATUS))
+    transcript.reset_link()
+    transcript.feed(100.0, False, wire(STATUS))
     assert transcript.totals.board_silence_s == pytest.approx(1.2)

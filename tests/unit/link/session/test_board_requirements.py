@@ -5,7 +5,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.device.config import Config
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.simulator.board_limits import OWN, tightened
 
 
@@ -16,38 +16,43 @@ def board_us(limits, codes):
 
 def moves_between(display, rng, count=400):
     """Codes and planned times of calm moves between pixels, straight and diagonal, and of the first from the middle."""
-    scale, moves = Requirements.of(display.config).scale, display.machine.moves
+    scale, moves = BoardRequirements.from_config(display.config).scale, display.scan_head.settling
     x_rad, y_rad = display.machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
     pairs = rng.integers(len(display.layout), size=(count, 2))
     pairs = np.concatenate([pairs, [[k, min(k + 1, len(x_rad) - 1)] for k in range(len(x_rad))]])
-    codes = [np.abs(np.diff(scale.codes(angle_rad)[pairs], axis=1)[:, 0]) for angle_rad in (x_rad, y_rad)]
+    codes = [np.abs(np.diff(scale.to_codes(angle_rad)[pairs], axis=1)[:, 0]) for angle_rad in (x_rad, y_rad)]
     steps = zip(x_rad[pairs], y_rad[pairs], strict=True)
-    planned = [moves.time_us(x[1] - x[0], y[1] - y[0], moves.calm_us) for x, y in steps]
-    first = np.maximum(np.abs(scale.codes(x_rad) - 32768), np.abs(scale.codes(y_rad) - 32768))
+    planned = [moves.time_us(x[1] - x[0], y[1] - y[0], moves.long_dwell_us) for x, y in steps]
+    first = np.maximum(np.abs(scale.to_codes(x_rad) - 32768), np.abs(scale.to_codes(y_rad) - 32768))
     return np.append(np.maximum(*codes), first), np.append(planned, np.full(len(x_rad), moves.lead_us))
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
 def test_the_board_settles_no_longer_than_planned_and_nearly_as_long(name):
     display = DISPLAYS[name]
-    limits = tightened(OWN, Requirements.of(display.config).limits())
+    limits = tightened(OWN, BoardRequirements.from_config(display.config).build_limits())
     codes, planned_us = moves_between(display, np.random.default_rng(1))
     assert np.all(board_us(limits, codes) <= planned_us)
-    pitch = Requirements.of(display.config).scale.codes(np.array([display.machine.moves.pitch_rad]))[0] - 32768
-    moves = display.machine.moves
-    assert board_us(limits, pitch) >= moves.time_us(moves.pitch_rad, 0.0, moves.calm_us) - 20
+    pitch = (
+        BoardRequirements.from_config(display.config).scale.to_codes(np.array([display.scan_head.settling.pitch_rad]))[
+            0
+        ]
+        - 32768
+    )
+    moves = display.scan_head.settling
+    assert board_us(limits, pitch) >= moves.settling_us(moves.pitch_rad, 0.0, moves.long_dwell_us) - 20
 
 
 def test_a_single_pixel_beside_the_middle_is_planned_with_the_way_to_it():
     table = DISPLAYS["display-16"].config.model_dump()
     table["display"] |= {"rows": 2, "columns": 2, "missing": [[0, 0], [0, 1], [1, 0]]}
-    display = type(DISPLAYS["display-16"]).of(Config.model_validate(table))
+    display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
     codes, planned_us = moves_between(display, np.random.default_rng(1), 1)
-    assert np.all(board_us(Requirements.of(display.config).limits(), codes) <= planned_us)
+    assert np.all(board_us(BoardRequirements.from_config(display.config).build_limits(), codes) <= planned_us)
 
 
 def test_the_simulated_board_is_quick_enough_for_every_shipped_display():
     for display in DISPLAYS.values():
-        asked = Requirements.of(display.config).limits()
+        asked = BoardRequirements.from_config(display.config).build_limits()
         assert OWN.settle_us <= asked.settle_us
         assert OWN.settle_ns_per_code <= asked.settle_ns_per_code

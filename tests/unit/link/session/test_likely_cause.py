@@ -10,22 +10,22 @@ import pytest
 from test_session import CONFIG, Rig, plan
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.likely_cause import (
-    STALL_SHARE,
-    Evidence,
-    port_cause,
-    why_lease_lapsed,
-    why_lost,
-    why_restarted,
+    STALL_LEASE_FRACTION,
+    LinkEvidence,
+    describe_restart,
+    diagnose_lease_expiry,
+    diagnose_link_loss,
+    diagnose_port,
 )
-from optodrive.link.session.link_watch import RECENT_S, Counts, LinkWatch
-from optodrive.link.session.session import Session
+from optodrive.link.session.link_watch import EVIDENCE_WINDOW_S, LinkErrorCounts, LinkWatch
+from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.faulty_link import FaultyLink
-from optodrive.link.transport.port_state import Holder, PortState
+from optodrive.link.transport.port_state import PortHolder, PortState
 
 LEASE_S = CONFIG.board.lease_s
-QUIET = Evidence("/dev/ttyACM0", PortState("there"), silent=True, lease_s=LEASE_S)
+QUIET = LinkEvidence("/dev/ttyACM0", PortState("there"), silent=True, lease_s=LEASE_S)
 
 
 class Damaged(Rig):
@@ -40,14 +40,14 @@ class Damaged(Rig):
 
 
 def cause(rig):
-    return rig.session.link_figures()["likely_cause"]
+    return rig.session.collect_link_stats()["likely_cause"]
 
 
 def lost(rig, lease=True):
     """Run until the link is given up; what is told."""
     with pytest.raises(LinkError) as caught:
         rig.run(30.0, lease)
-    told = rig.session.lost(caught.value)
+    told = rig.session.on_lost(caught.value)
     assert told.endswith(cause(rig))
     return told
 
@@ -55,7 +55,7 @@ def lost(rig, lease=True):
 def test_a_link_that_stands_has_no_cause_and_counts_its_turns():
     rig = Rig().connect().arm()
     rig.run(1.0)
-    figures = rig.session.link_figures()
+    figures = rig.session.collect_link_stats()
     assert figures["likely_cause"] is None
     assert figures["likely_cause_ago_s"] is None
     assert 1.9 < figures["longest_stall_ms"] < 3.0
@@ -69,7 +69,7 @@ def test_a_host_that_stood_still_is_told_so():
     rig.until(lambda: rig.session.board.state == "FAULT")
     assert "this computer stood still for 35" in cause(rig)
     assert f"the lease is {LEASE_S * 1e3:.0f} ms" in cause(rig)
-    assert rig.session.link_figures()["longest_stall_ms"] == pytest.approx(350, abs=5)
+    assert rig.session.collect_link_stats()["longest_stall_ms"] == pytest.approx(350, abs=5)
 
 
 def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
@@ -83,7 +83,7 @@ def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
         return read(timeout_s)
 
     rig.link.read = stopped
-    rig.session.step(0.002, lease=True)
+    rig.session.step(0.002, renew_lease=True)
     assert rig.session.board.fault == "LINK"
     assert "this computer stood still for 35" in cause(rig)
 
@@ -91,7 +91,7 @@ def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
 def test_a_stall_of_long_ago_explains_nothing():
     rig = Rig().connect()
     rig.clock.sleep(0.5)
-    rig.run(RECENT_S + 1.0)
+    rig.run(EVIDENCE_WINDOW_S + 1.0)
     rig.arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
     assert "stood still" not in cause(rig)
@@ -120,7 +120,7 @@ def test_a_link_that_comes_back_to_the_same_board_does_not_blame_a_restart():
     rig.link.cut = False
     rig.connect()
     assert "restarted" not in cause(rig)
-    assert rig.session.link_figures()["likely_cause_ago_s"] > 0
+    assert rig.session.collect_link_stats()["likely_cause_ago_s"] > 0
 
 
 def test_damage_of_what_the_board_sends_is_told_at_once():
@@ -150,43 +150,43 @@ def test_a_board_that_hears_only_damage_lets_the_lease_lapse():
 
 
 def test_lost_frames_without_damage_are_told_as_lost_bytes():
-    evidence = replace(QUIET, naks=3, sent_again=9)
-    assert "bytes are lost on the way (9 frames sent again, 3 refused)" in why_lost(evidence)
-    assert why_lease_lapsed(evidence) == why_lost(evidence)
-    assert "kept its time" in why_lease_lapsed(QUIET)
+    evidence = replace(QUIET, naks=3, retransmitted=9)
+    assert "bytes are lost on the way (9 frames sent again, 3 refused)" in diagnose_link_loss(evidence)
+    assert diagnose_lease_expiry(evidence) == diagnose_link_loss(evidence)
+    assert "kept its time" in diagnose_lease_expiry(QUIET)
 
 
 def test_the_port_tells_first():
-    gone = PortState("gone", others=("/dev/ttyACM1",))
-    evidence = replace(QUIET, port_state=gone, bad_here=5, stall_s=9.0)
-    assert why_lost(evidence).startswith("/dev/ttyACM0 is gone")
-    assert "/dev/ttyACM1 there instead" in why_lost(evidence)
-    assert "dialout" in port_cause("/dev/ttyACM0", PortState("denied"))
-    held = PortState("held", (Holder(12, "ModemManager"),))
-    assert "held by ModemManager, process 12" in why_lost(replace(QUIET, port_state=held))
-    assert port_cause("/dev/ttyACM0", PortState("there")) is None
-    assert "is there again: replugged" in why_lost(replace(QUIET, silent=False))
+    gone = PortState("gone", other_ports=("/dev/ttyACM1",))
+    evidence = replace(QUIET, port_state=gone, host_bad_frames=5, stall_s=9.0)
+    assert diagnose_link_loss(evidence).startswith("/dev/ttyACM0 is gone")
+    assert "/dev/ttyACM1 there instead" in diagnose_link_loss(evidence)
+    assert "dialout" in diagnose_port("/dev/ttyACM0", PortState("denied"))
+    held = PortState("held", (PortHolder(12, "ModemManager"),))
+    assert "held by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=held))
+    assert diagnose_port("/dev/ttyACM0", PortState("there")) is None
+    assert "is there again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
 
 
 def test_a_stall_counts_from_where_it_costs_the_lease():
-    enough_s = STALL_SHARE * LEASE_S
-    assert "stood still" in why_lease_lapsed(replace(QUIET, stall_s=enough_s))
-    assert "stood still" not in why_lease_lapsed(replace(QUIET, stall_s=0.99 * enough_s))
+    enough_s = STALL_LEASE_FRACTION * LEASE_S
+    assert "stood still" in diagnose_lease_expiry(replace(QUIET, stall_s=enough_s))
+    assert "stood still" not in diagnose_lease_expiry(replace(QUIET, stall_s=0.99 * enough_s))
 
 
 def test_an_unknown_reset_cause_is_said_as_it_is():
-    assert "(unknown cause 9)" in why_restarted(9, 1.0)
+    assert "(unknown cause 9)" in describe_restart(9, 1.0)
 
 
 def test_counters_of_an_earlier_link_do_not_count():
     watch = LinkWatch("/dev/none", LEASE_S)
-    watch.turn(1.0, True, Counts(bad_here=50))
-    watch.opened()
-    watch.turn(2.0, True, Counts())
-    watch.heard("LINK", 2.01, Counts())
-    assert "kept its time" in watch.cause.sentence
+    watch.on_loop(1.0, True, LinkErrorCounts(host_bad_frames=50))
+    watch.on_opened()
+    watch.on_loop(2.0, True, LinkErrorCounts())
+    watch.on_status("LINK", 2.01, LinkErrorCounts())
+    assert "kept its time" in watch.cause.message
     before = watch.cause
-    watch.heard("LINK", 2.2, Counts(bad_here=9))
+    watch.on_status("LINK", 2.2, LinkErrorCounts(host_bad_frames=9))
     assert watch.cause is before, "told once a fault"
 
 
@@ -194,16 +194,16 @@ def test_a_board_found_in_a_fault_of_another_time_is_not_explained():
     rig = Rig().connect().arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
     rig.session.close()
-    other = Session(rig.link, rig.clock, Requirements.of(CONFIG))
+    other = BoardSession(rig.link, rig.clock, BoardRequirements.from_config(CONFIG))
     other.connect()
     assert other.board.fault == "LINK"
-    other.step(0.002, lease=True)
+    other.step(0.002, renew_lease=True)
     assert other.likely_cause is None
 
 
 def test_a_board_that_does_not_fit_is_no_failure_of_the_link():
     rig = Rig().connect()
-    told = rig.session.lost(InputError("board.uid", "1", "2", "board"))
+    told = rig.session.on_lost(InputError("board.uid", "1", "2", "board"))
     assert "likely cause" not in told
     assert cause(rig) is None
 
@@ -214,18 +214,18 @@ def test_a_pty_that_is_taken_away_is_gone(tmp_path):
     name.symlink_to(os.ttyname(slave))
     watch = LinkWatch(str(name), LEASE_S)
     os.close(slave)
-    watch.not_back(1.0)
+    watch.on_reconnect_failed(1.0)
     assert watch.cause is None
     device = Path(name).readlink()
     os.close(master)
     assert not device.exists()
-    watch.not_back(2.0)
-    assert watch.cause.sentence.startswith(f"{name} is gone")
+    watch.on_reconnect_failed(2.0)
+    assert watch.cause.message.startswith(f"{name} is gone")
     first = watch.cause
-    watch.not_back(3.0)
+    watch.on_reconnect_failed(3.0)
     assert watch.cause is first
-    watch.back(4.0, 0, 100.0, Counts())
-    assert "is there again: replugged" in watch.cause.sentence
+    watch.on_reconnected(4.0, 0, 100.0, LinkErrorCounts())
+    assert "is there again: replugged" in watch.cause.message
 
 
 def test_a_port_that_another_program_took_names_it(tmp_path):
@@ -236,7 +236,7 @@ def test_a_port_that_another_program_took_names_it(tmp_path):
     command = [sys.executable, "-c", code, watch._port]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        watch.not_back(1.0)
+        watch.on_reconnect_failed(1.0)
         process.stdin.close()
     os.close(master)
-    assert f"process {process.pid}: end that program" in watch.cause.sentence
+    assert f"process {process.pid}: end that program" in watch.cause.message

@@ -7,13 +7,20 @@ from optodrive.core.clock import ManualClock
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.protocol.transcript import Transcript
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.replay import Replay, clock_shift_s, compare
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.replay import Replay, clock_shift_s, compare_traces
+from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, TO_BOARD, Entry, Tape, TapeWriter
-from optodrive.link.transport.recorded import RecordedTransport
+from optodrive.link.transport.link_capture import (
+    CLOSED,
+    FROM_BOARD,
+    TO_BOARD,
+    CaptureEntry,
+    LinkCapture,
+    LinkCaptureWriter,
+)
+from optodrive.link.transport.recorded import CapturingTransport
 
 SEED = 2
 
@@ -23,9 +30,9 @@ class Recorded(Rig):
 
     def __init__(self, path):
         super().__init__()
-        self.tape = TapeWriter(path, self.clock.now_s(), pytest.fail)
-        link = RecordedTransport(MemoryLink(self.core, self.clock), self.tape, self.clock)
-        self.session = Session(link, self.clock, Requirements.of(CONFIG))
+        self.tape = LinkCaptureWriter(path, self.clock.now_s(), pytest.fail)
+        link = CapturingTransport(MemoryLink(self.core, self.clock), self.tape, self.clock)
+        self.session = BoardSession(link, self.clock, BoardRequirements.from_config(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +41,8 @@ def recorded(tmp_path_factory):
     rig = Recorded(tmp_path_factory.mktemp("tape") / "a")
     rig.connect().arm()
     job = rig.play(plan(300))
-    rig.until(lambda: job.finished)
-    rig.session.drop()
+    rig.until(lambda: job.is_finished)
+    rig.session.disconnect()
     rig.clock.sleep(0.3)
     rig.connect().arm()
     rig.play(plan(200))
@@ -48,9 +55,11 @@ def recorded(tmp_path_factory):
 
 
 def replayed(path, seed, may_arm=True, link=MemoryLink):
-    tape, log, clock = Tape(path), [], ManualClock(5.0)
-    replay = Replay(link(BoardCore(sink=log.append, seed=seed), clock), clock, clock_shift_s(tape.entries()), may_arm)
-    replay.run(tape.entries())
+    tape, log, clock = LinkCapture(path), [], ManualClock(5.0)
+    replay = Replay(
+        link(BoardCore(sink=log.append, seed=seed), clock), clock, clock_shift_s(tape.read_entries()), may_arm
+    )
+    replay.run(tape.read_entries())
     return replay, log
 
 
@@ -61,7 +70,7 @@ def stays_dark(log):
 def test_the_same_seed_gives_the_same_states_gate_edges_and_reports(recorded):
     replay, log = replayed(recorded.path, SEED)
     assert log == recorded.log
-    verdict = compare(replay.recorded, replay.replayed)
+    verdict = compare_traces(replay.recorded, replay.replayed)
     assert verdict["same"], verdict
     assert verdict["executed"]["recorded"] == len([e for e in recorded.log if e["event"] == "pulse"]) > 300
     assert verdict["states"]["recorded"] == verdict["states"]["replayed"]
@@ -71,7 +80,7 @@ def test_the_same_seed_gives_the_same_states_gate_edges_and_reports(recorded):
 def test_another_seed_never_arms(recorded):
     replay, log = replayed(recorded.path, SEED + 1)
     assert stays_dark(log)
-    verdict = compare(replay.recorded, replay.replayed)
+    verdict = compare_traces(replay.recorded, replay.replayed)
     assert not verdict["same"]
     assert verdict["executed"]["missing"] == verdict["executed"]["recorded"]
     assert verdict["states"]["first_difference"] is not None
@@ -93,12 +102,16 @@ def test_what_is_no_frame_of_a_host_never_leaves(tmp_path):
             sent.append(data)
             super().write(data)
 
-    hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 9).body()))
-    reply = encode_frame(Frame(m.Ack.TYPE, 0, 0, m.Ack(0, 0, 0, 0).body()))
+    hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 9).encode_body()))
+    reply = encode_frame(Frame(m.Ack.TYPE, 0, 0, m.Ack(0, 0, 0, 0).encode_body()))
     path = tmp_path / "a"
-    writer = TapeWriter(path, 5.0, pytest.fail)
-    for entry in (Entry("opened", 5.0), Entry(TO_BOARD, 5.1, b"\x05garbage\0" + reply + hello), Entry(CLOSED, 5.3)):
-        writer.note(entry)
+    writer = LinkCaptureWriter(path, 5.0, pytest.fail)
+    for entry in (
+        CaptureEntry("opened", 5.0),
+        CaptureEntry(TO_BOARD, 5.1, b"\x05garbage\0" + reply + hello),
+        CaptureEntry(CLOSED, 5.3),
+    ):
+        writer.record(entry)
     writer.close()
     replayed(path, 1, link=Heard)
     assert sent == [b"\0" + hello]
@@ -112,20 +125,20 @@ def test_the_board_that_began_at_another_time_is_replayed_on_its_own_clock(tmp_p
             return super()._now_us() + 3_200_000
 
     rig = Recorded(tmp_path / "a")
-    link = RecordedTransport(Ahead(rig.core, rig.clock), rig.tape, rig.clock)
-    rig.session = Session(link, rig.clock, Requirements.of(CONFIG))
+    link = CapturingTransport(Ahead(rig.core, rig.clock), rig.tape, rig.clock)
+    rig.session = BoardSession(link, rig.clock, BoardRequirements.from_config(CONFIG))
     rig.connect().arm()
     job = rig.play(plan(50))
-    rig.until(lambda: job.finished)
+    rig.until(lambda: job.is_finished)
     rig.session.close()
-    tape = Tape(rig.tape.path)
-    assert clock_shift_s(tape.entries()) == pytest.approx(3.2, abs=1e-3)
+    tape = LinkCapture(rig.tape.path)
+    assert clock_shift_s(tape.read_entries()) == pytest.approx(3.2, abs=1e-3)
     log, clock = [], ManualClock(8.2)
     replay = Replay(
-        MemoryLink(BoardCore(sink=log.append, seed=SEED), clock), clock, clock_shift_s(tape.entries()), True
+        MemoryLink(BoardCore(sink=log.append, seed=SEED), clock), clock, clock_shift_s(tape.read_entries()), True
     )
-    replay.run(tape.entries())
-    assert compare(replay.recorded, replay.replayed)["same"]
+    replay.run(tape.read_entries())
+    assert compare_traces(replay.recorded, replay.replayed)["same"]
     edges = [[(e["t_us"], e["on"]) for e in events if e["event"] == "gate"] for events in (log, rig.log)]
     assert edges[0] == edges[1]
     assert len(edges[0]) == 100
@@ -142,7 +155,7 @@ def test_a_board_that_does_otherwise_is_found_out(recorded, what):
         replay.replayed.executed[key] = tick, on + 1, duty
     else:
         replay.replayed.executed.popitem()
-    verdict = compare(replay.recorded, replay.replayed)
+    verdict = compare_traces(replay.recorded, replay.replayed)
     assert not verdict["same"]
     assert verdict["states"]["first_difference"] == (3 if what == "state" else None)
     assert (verdict["executed"]["changed"], verdict["executed"]["missing"]) == (what == "width", what == "missing")
@@ -151,19 +164,21 @@ def test_a_board_that_does_otherwise_is_found_out(recorded, what):
 def test_the_transcript_counts_as_the_host_did(tmp_path):
     """Frames are lost on purpose; what the tape says of that is what the host's own counters say."""
     rig = Rig()
-    tape = TapeWriter(tmp_path / "a", 5.0, pytest.fail)
-    rig.session = Session(RecordedTransport(rig.link, tape, rig.clock), rig.clock, Requirements.of(CONFIG))
+    tape = LinkCaptureWriter(tmp_path / "a", 5.0, pytest.fail)
+    rig.session = BoardSession(
+        CapturingTransport(rig.link, tape, rig.clock), rig.clock, BoardRequirements.from_config(CONFIG)
+    )
     count = iter(range(10**9))
     rig.connect().arm()
     rig.link.keep_back = lambda frame: frame.type == m.Data.TYPE and next(count) % 5 == 2
     job = rig.play(plan(300))
-    rig.until(lambda: job.finished)
-    figures = rig.session.link_figures()
+    rig.until(lambda: job.is_finished)
+    figures = rig.session.collect_link_stats()
     rig.session.close()
     transcript, received = Transcript(), 0
-    for entry in Tape(tmp_path / "a").entries():
+    for entry in LinkCapture(tmp_path / "a").read_entries():
         if entry.kind in (TO_BOARD, FROM_BOARD):
-            received += len(transcript.take(entry.host_s, entry.kind == TO_BOARD, entry.data))
+            received += len(transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data))
     totals = transcript.totals
     assert totals.retransmissions == figures["retransmitted"] > 0
     assert totals.naks == figures["naks"] > 0

@@ -15,10 +15,10 @@ from optodrive.device.config import Config
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_requirements import Requirements
+from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
-from optodrive.link.session.fault_hints import HINTS, hint
-from optodrive.link.session.session import CONNECT_TIMEOUT_S, SILENCE_S, Session
+from optodrive.link.session.fault_hints import FAULT_HINTS, get_fault_hint
+from optodrive.link.session.session import CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S, BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import OWN, BoardSettings
 from optodrive.link.simulator.memory_link import MemoryLink
@@ -56,7 +56,7 @@ class Rig:
         self.clock = ManualClock(start_s)
         self.core = BoardCore(settings, self.log.append, seed=2)
         self.link = Wire(self.core, self.clock)
-        self.session = Session(self.link, self.clock, Requirements.of(config))
+        self.session = BoardSession(self.link, self.clock, BoardRequirements.from_config(config))
 
     def connect(self):
         self.session.connect()
@@ -75,7 +75,7 @@ class Rig:
 
     def arm(self):
         self.session.arm()
-        self.until(lambda: self.session.ready)
+        self.until(lambda: self.session.is_ready)
         return self
 
     def play(self, plan):
@@ -115,12 +115,12 @@ def rig():
 def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     session = rig.session
     assert session.connected
-    assert session.quiet
+    assert session.is_acknowledged
     assert session.board.state == "DISARMED"
     assert session.board.uid == BoardSettings().uid
-    assert rig.core._limits.spot_uj == session._requirements.limits().spot_uj < OWN.spot_uj
+    assert rig.core._limits.spot_uj == session._requirements.build_limits().spot_uj < OWN.spot_uj
     assert session.board_s() == pytest.approx(rig.clock.now_s(), abs=0.003)
-    assert session.link_figures()["round_trip_ms"] > 0
+    assert session.collect_link_stats()["round_trip_ms"] > 0
 
 
 def test_hello_is_repeated_until_the_board_hears():
@@ -175,12 +175,12 @@ def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config
 
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
 def test_another_protocol_or_clock_is_refused(field, value):
-    requirements = Requirements.of(CONFIG)
+    requirements = BoardRequirements.from_config(CONFIG)
     fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
     fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=OWN)
-    requirements.check(m.HelloReply(**fits))
+    requirements.check_board(m.HelloReply(**fits))
     with pytest.raises(InputError, match=f"{value}"):
-        requirements.check(m.HelloReply(**{**fits, field: value}))
+        requirements.check_board(m.HelloReply(**{**fits, field: value}))
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
@@ -215,8 +215,8 @@ def test_what_is_executed_is_what_was_planned(rig):
     rig.arm()
     asked = plan(500)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
-    done = job.executed(asked, 2.45, 1e-6)
+    rig.until(lambda: job.is_finished)
+    done = job.build_executed(asked, 2.45, 1e-6)
     assert done.complete
     assert done.pixel.tolist() == asked.pixel.tolist()
     assert np.abs(done.start_s - asked.start_s).max() < 1e-12
@@ -226,26 +226,26 @@ def test_what_is_executed_is_what_was_planned(rig):
     assert [entry["on_us"] for entry in log] == done.on_tick.tolist()
     assert [entry["off_us"] - entry["on_us"] for entry in log] == done.width_ticks.tolist()
     assert rig.states()[-2:] == ["RUNNING", "ARMED"]
-    assert (rig.session.board.underruns, rig.session.link_figures()["retransmitted"]) == (0, 0)
+    assert (rig.session.board.underruns, rig.session.collect_link_stats()["retransmitted"]) == (0, 0)
 
 
 def test_more_points_than_the_queue_holds():
     rig = Rig(BoardSettings(queue_points=60)).connect().arm()
     asked = plan(400)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
-    assert job.executed(asked, 2.45, 1e-6).complete
-    assert rig.session.link_figures()["naks"] == 0, "credits kept the host from asking for room that is not there"
+    rig.until(lambda: job.is_finished)
+    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert rig.session.collect_link_stats()["naks"] == 0, "credits kept the host from asking for room that is not there"
     assert rig.session.board.underruns == 0
 
 
 def test_one_job_after_another(rig):
     rig.arm()
     for n in (1, 30, 7):
-        rig.until(lambda: rig.session.ready)
+        rig.until(lambda: rig.session.is_ready)
         asked = plan(n)
         job = rig.play(asked)
-        rig.until(lambda job=job: job.finished)
+        rig.until(lambda job=job: job.is_finished)
         assert job.executed(asked, 2.45, 1e-6).complete
     assert len(rig.pulses()) == 38
 
@@ -256,9 +256,9 @@ def test_lost_reports_are_asked_for_again(rig):
     rig.link.keep_back = lambda frame: frame.type == m.Executed.TYPE and len(lost) < 30 and not lost.append(frame)
     asked = plan(200)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
+    rig.until(lambda: job.is_finished)
     assert len(lost) == 30
-    assert job.executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(asked, 2.45, 1e-6).complete
     assert job.executed(asked, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
     assert m.GetExecuted.TYPE in {frame.type for frame in rig.link.sent}
 
@@ -269,9 +269,9 @@ def test_a_lossy_link_slows_but_does_not_change_what_is_done(rig):
     rig.link.keep_back = lambda frame: rng.random() < 0.1
     asked = plan(300)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
-    assert job.executed(asked, 2.45, 1e-6).complete
-    assert rig.session.link_figures()["retransmitted"] > 0
+    rig.until(lambda: job.is_finished)
+    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert rig.session.collect_link_stats()["retransmitted"] > 0
 
 
 # --- lease, silence, faults -----------------------------------------------------------------------------------------
@@ -296,7 +296,7 @@ def test_without_proof_of_the_planner_the_board_ends_within_its_lease(rig):
     assert fault["fault"] == "LINK"
     assert fault["t_us"] - stopped_us <= 100_000
     assert not rig.core.gate
-    assert rig.session.board.figures()["hint"] == HINTS["LINK"]
+    assert rig.session.board.to_dict()["hint"] == FAULT_HINTS["LINK"]
     lit = len(rig.pulses())
     rig.run(1.0)
     assert len(rig.pulses()) == lit, "a lease alone brings nothing back"
@@ -307,7 +307,7 @@ def test_silence_is_a_link_error_that_says_what_was_counted(rig):
     began_s = rig.clock.now_s()
     with pytest.raises(LinkError, match=r"fell silent for 2 s; 0 bad frames here"):
         rig.run(10.0)
-    assert SILENCE_S < rig.clock.now_s() - began_s < SILENCE_S + 0.1
+    assert SILENCE_TIMEOUT_S < rig.clock.now_s() - began_s < SILENCE_TIMEOUT_S + 0.1
 
 
 def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
@@ -315,7 +315,7 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
     rig.core.reset(round(rig.clock.now_s() * 1e6))
     with pytest.raises(LinkError):
         rig.run(10.0)
-    rig.session.drop()
+    rig.session.disconnect()
     rig.connect()
     assert rig.session.board.state == "DISARMED"
     assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
@@ -325,7 +325,7 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
 def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
     """Heat is kept in the board's time: it would move by all the time that the board has run."""
     rig.run(3.0)
-    rig.session.drop()
+    rig.session.disconnect()
     rig.link.keep_back = lambda frame: frame.type == kind
     with pytest.raises(LinkError):
         rig.connect()
@@ -344,7 +344,7 @@ def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
     rig.core.set_input("interlock", False, round(rig.clock.now_s() * 1e6))
     rig.until(lambda: rig.session.board.state == "FAULT")
     rig.run(0.1)
-    done = job.executed(asked, 2.45, 1e-6)
+    done = job.build_executed(asked, 2.45, 1e-6)
     assert len(done) == len(rig.pulses())
     assert not done.complete
     assert done.width_s[-1] < asked.width_s[0]
@@ -353,9 +353,9 @@ def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
         rig.session.arm()
     rig.session.disarm()
     rig.run(0.05)
-    assert rig.session.take_refusal() == "INPUT"
-    assert rig.session.take_refusal() is None
-    assert hint("INTERLOCK") == rig.session.board.figures()["hint"]
+    assert rig.session.pop_refusal() == "INPUT"
+    assert rig.session.pop_refusal() is None
+    assert get_fault_hint("INTERLOCK") == rig.session.board.to_dict()["hint"]
 
 
 def test_nothing_more_of_a_job_is_sent_after_a_fault():
@@ -370,8 +370,8 @@ def test_nothing_more_of_a_job_is_sent_after_a_fault():
 
 
 def test_every_fault_of_the_board_has_a_hint_but_those_of_its_own_electronics():
-    assert set(m.FAULTS) - set(HINTS) == {"", "TICK", "READBACK"}
-    assert "no likely cause" in hint("TICK")
+    assert set(m.FAULTS) - set(FAULT_HINTS) == {"", "TICK", "READBACK"}
+    assert "no likely cause" in get_fault_hint("TICK")
 
 
 # --- breaking off ---------------------------------------------------------------------------------------------------
@@ -386,7 +386,7 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     rig.session.step(STEP_S, lease=True)
     assert not rig.core.gate
     assert rig.core.state == "DISARMED"
-    rig.until(lambda: rig.session.quiet and rig.session.board.state == "DISARMED")
+    rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
     rig.run(0.5)
     assert len(rig.pulses()) <= lit + 1
     assert rig.core._limits.spot_uj < OWN.spot_uj, "the new session tightens again"
@@ -409,10 +409,10 @@ def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_
 
     rig.link.keep_back = keep_back
     rig.session.abort()
-    assert not rig.session.aborted
-    rig.until(lambda: rig.session.aborted)
+    assert not rig.session.abort_confirmed
+    rig.until(lambda: rig.session.abort_confirmed)
     assert rig.core.state == rig.session.board.state == "DISARMED"
-    assert not rig.session.quiet
+    assert not rig.session.is_acknowledged
     rig.arm()
     assert len(hellos) == 2
     told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
@@ -425,8 +425,8 @@ def test_flush_in_mid_job_stays_armed_for_the_next(rig):
     cut = rig.play(plan(500))
     rig.run(0.3)
     rig.session.flush()
-    rig.until(lambda: rig.session.ready)
-    assert not cut.finished
+    rig.until(lambda: rig.session.is_ready)
+    assert not cut.is_finished
     asked = plan(50)
     job = rig.play(asked)
     rig.until(lambda: job.finished)
@@ -438,13 +438,13 @@ def test_a_board_that_gave_a_hold_up_can_be_armed_again(rig):
     rig.link.keep_back = lambda frame: frame.type in (m.Data.TYPE, m.End.TYPE) and frame.seq >= 8
     rig.play(plan(500))
     rig.until(lambda: rig.session.board.state == "DISARMED")
-    assert rig.session.last_reason == "hold too long"
+    assert rig.session.last_event_reason == "hold too long"
     rig.link.keep_back = lambda frame: False
     rig.run(0.2)
     rig.arm()
     asked = plan(50)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
+    rig.until(lambda: job.is_finished)
     assert job.executed(asked, 2.45, 1e-6).complete
 
 
@@ -453,11 +453,11 @@ def test_a_rejected_start_is_told(rig):
     job = rig.play(plan(5))
     job.first_index += 1  # START will name a point that is not the first queued
     rig.run(0.1)
-    assert rig.session.take_refusal() == "INDEX"
+    assert rig.session.pop_refusal() == "INDEX"
     assert rig.core.state == "ARMED"
     assert rig.pulses() == []
     rig.session.flush()
-    rig.until(lambda: rig.session.ready)
+    rig.until(lambda: rig.session.is_ready)
 
 
 def test_close_says_abort_and_a_reconnect_does_not_arm(rig):
@@ -480,7 +480,7 @@ def test_close_says_abort_and_a_reconnect_does_not_arm(rig):
 def test_clock_goes_by_the_narrowest_bracket():
     sync = ClockSync()
     assert sync.board_s(5.0) == 0.0
-    assert not sync.known
+    assert not sync.is_synchronised
     assert sync.round_trip_s is None
     sync.add(10.000, 10.010, 110.009)  # wide, and off by 4 ms
     sync.add(10.020, 10.021, 110.0205)  # narrow, and right
@@ -504,9 +504,9 @@ def test_another_thread_may_always_ask():
     def ask():
         try:
             while not over.is_set():
-                rig.session.link_figures()
+                rig.session.collect_link_stats()
                 rig.session.board_s()
-                rig.session.board.figures()
+                rig.session.board.to_dict()
         except Exception as error:
             errors.append(error)
 
@@ -517,7 +517,7 @@ def test_another_thread_may_always_ask():
     try:
         for _ in range(300):
             rig.connect()
-            rig.session.drop()
+            rig.session.disconnect()
     finally:
         over.set()
         asker.join()

@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from test_session import Rig, plan
 
-from optodrive.link.session.timing_error import TimingTotals, timing_error
+from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.link.simulator.board_limits import BoardSettings
 
 PLANNED_S = np.arange(1, 101) * 0.01
@@ -14,7 +14,7 @@ PLANNED_S = np.arange(1, 101) * 0.01
 @given(st.floats(-0.1, 0.1), st.floats(-500, 500))
 def test_a_delay_and_a_drift_are_told_apart(delay_s, drift_ppm):
     executed_s = PLANNED_S + delay_s + drift_ppm * 1e-6 * (PLANNED_S - PLANNED_S[0])
-    error = timing_error(PLANNED_S, executed_s)
+    error = compute_timing_error(PLANNED_S, executed_s)
     assert error.pulses == 100
     assert error.start_delay_s == pytest.approx(delay_s, abs=1e-12)
     assert error.drift_ppm == pytest.approx(drift_ppm, abs=1e-5)
@@ -23,22 +23,22 @@ def test_a_delay_and_a_drift_are_told_apart(delay_s, drift_ppm):
 
 @given(arrays(float, 100, elements=st.floats(-1e-3, 1e-3)))
 def test_the_largest_is_the_one_farthest_from_the_plan_with_its_sign(off_s):
-    error = timing_error(PLANNED_S, PLANNED_S + off_s)
+    error = compute_timing_error(PLANNED_S, PLANNED_S + off_s)
     assert abs(error.largest_s) == pytest.approx(np.abs(off_s).max(), abs=1e-12)
     assert np.abs(off_s - error.largest_s).min() < 1e-12
 
 
 def test_no_pulse_has_no_error_and_one_has_no_drift():
-    assert timing_error(np.zeros(0), np.zeros(0)) is None
-    assert timing_error(np.array([0.1]), np.array([0.3])).drift_ppm == 0.0
+    assert compute_timing_error(np.zeros(0), np.zeros(0)) is None
+    assert compute_timing_error(np.array([0.1]), np.array([0.3])).drift_ppm == 0.0
 
 
 def test_totals_keep_the_worst_either_way():
     totals = TimingTotals()
-    assert totals.figures() is None
+    assert totals.to_dict() is None
     for off_s in (1e-5, -3e-5, 2e-5):
-        totals.add(timing_error(PLANNED_S, PLANNED_S + off_s))
-    figures = totals.figures()
+        totals.add(compute_timing_error(PLANNED_S, PLANNED_S + off_s))
+    figures = totals.to_dict()
     assert figures["pulses"] == 300
     assert (figures["largest_s"], figures["median_s"]) == pytest.approx((-3e-5, -3e-5))
     assert figures["drift_ppm"] == pytest.approx(0.0, abs=1e-6)
@@ -50,19 +50,19 @@ def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
     scale = rig.session.scale
 
     def error_of(job):
-        executed = job.executed(limited, scale.full_power_w, scale.tick_s)
-        return timing_error(limited.start_s[job.rows_executed()], executed.start_s)
+        executed = job.build_executed(limited, scale.full_power_w, scale.tick_s)
+        return compute_timing_error(limited.start_s[job.list_executed_rows()], executed.start_s)
 
     job = rig.play(limited)
-    rig.until(lambda: job.finished)
+    rig.until(lambda: job.is_finished)
     assert error_of(job).largest_s == pytest.approx(0.0, abs=1e-6)
     job = rig.play(limited)
     rig.run(0.15)
     rig.link.keep_back = lambda frame: frame.type == 0x10
-    rig.until(lambda: rig.session.board.state == "HOLD" or job.finished)
+    rig.until(lambda: rig.session.board.state == "HOLD" or job.is_finished)
     rig.run(0.02)
     rig.link.keep_back = lambda frame: False
-    rig.until(lambda: job.finished)
+    rig.until(lambda: job.is_finished)
     assert rig.session.board.underruns == 1
     error = error_of(job)
     assert error.start_delay_s == pytest.approx(0.0, abs=1e-6)

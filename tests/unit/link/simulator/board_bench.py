@@ -41,7 +41,7 @@ class Bench:
             seq = self.seq if message.SEQUENCED else 0
             self.seq = (self.seq + message.SEQUENCED) % 256
         session = self.session if session is None else session
-        return encode_frame(Frame(message.TYPE, seq, session, message.body()))
+        return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
     def say(self, *messages):
         """Messages arrive together."""

@@ -488,7 +488,7 @@ def test_status_counts(bench):
 
 def test_events_tell_every_change(bench):
     answers = bench.play(*dim(1)) + bench.wait(20_000)
-    events = [(m.STATES[x.state], m.REASONS[x.reason], x.tick) for x in answers if isinstance(x, m.Event)]
+    events = [(m.STATES[x.state], m.EVENT_REASONS[x.reason], x.tick) for x in answers if isinstance(x, m.Event)]
     assert events == [(entry["state"], entry["reason"], entry["t_us"]) for entry in bench.of("state")[-2:]]
 
 

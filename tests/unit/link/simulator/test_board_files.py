@@ -54,7 +54,7 @@ def test_limits_file_that_cannot_be_meant(file, text, says):
 def test_every_limit_takes_the_ends_of_its_field(file, name):
     for value in RANGES[name]:
         limits = load_settings(file(f"{name} = {value}")).limits
-        assert limits.parse(limits.body()) == limits
+        assert limits.parse(limits.encode_body()) == limits
         assert getattr(limits, name) == value
 
 

@@ -99,7 +99,7 @@ def check_b3(make):
             b.frame(m.Lease(100), session=b.session ^ 1),
             b.frame(m.Lease(100), session=0),
             b.frame(m.Lease(100))[:-3] + b"\0",
-            encode_frame(Frame(m.Lease.TYPE | 0x80, 0, b.session, m.Lease(100).body())),
+            encode_frame(Frame(m.Lease.TYPE | 0x80, 0, b.session, m.Lease(100).encode_body())),
             b.frame(m.Get()),
             b.frame(m.Clock(1)),
         ]
@@ -518,7 +518,7 @@ def b11_predictable(patch):
         def getrandbits(self, bits):
             return 4
 
-    patch.setattr(core_module, "random", SimpleNamespace(Random=Constant))
+    patch.setattr(core_module, "rng", SimpleNamespace(Random=Constant))
 
 
 def b11_key_may_stay(patch):
@@ -608,7 +608,7 @@ def b13_no_crc(patch):
             return None
         return Frame(*HEADER.unpack(raw[: HEADER.size]), raw[HEADER.size : -CRC.size])
 
-    patch.setattr(FrameDecoder, "_frame", frame)
+    patch.setattr(FrameDecoder, "_decode_frame", frame)
 
 
 def b13_lengths_do_not_matter(patch):

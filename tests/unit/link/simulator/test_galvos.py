@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.device.gate_timing import servo_of
-from optodrive.device.servo import STEPS, follow
+from optodrive.device.gate_timing import build_servo
+from optodrive.device.servo import STEPS_PER_TIME_CONSTANT, simulate_servo
 from optodrive.link.simulator.galvos import CENTRE_CODE, Mirrors
 
 CONFIG = DISPLAYS["display-437"].config
@@ -16,12 +16,12 @@ def test_a_move_follows_the_servo():
     mirrors.go(CENTRE_CODE + 12_000, CENTRE_CODE - 500, 1000)
     # The integration moves the servo's target on by whole steps; the closed form does not.
     scanner = CONFIG.scanner
-    step_rad = scanner.slew_rad_per_s * 2.0 / (STEPS * 2.0 * np.pi * scanner.bandwidth_hz)
+    step_rad = scanner.slew_rad_per_s * 2.0 / (STEPS_PER_TIME_CONSTANT * 2.0 * np.pi * scanner.bandwidth_hz)
     t_us = np.arange(900, 12_000, 37)
     stood = np.array([mirrors.angles_rad(at) for at in t_us.tolist()])
     for axis, codes in enumerate((12_000, -500)):
-        commands = np.array([0.0, codes * CONFIG.scanner.code_rad])
-        servo = follow(np.array([0.0, 1e-3]), commands, t_us * 1e-6, servo_of(CONFIG.scanner))
+        commands = np.array([0.0, codes * CONFIG.scanner.rad_per_code])
+        servo = simulate_servo(np.array([0.0, 1e-3]), commands, t_us * 1e-6, build_servo(CONFIG.scanner))
         assert np.abs(stood[:, axis] - servo).max() < step_rad
         assert np.abs(stood[-50:, axis] - commands[1]).max() < 1e-9
 
@@ -42,5 +42,5 @@ def test_a_stuck_mirror_stands_and_outputs_tell_it():
     assert mirrors.codes(100_000) == pytest.approx((CENTRE_CODE + 1000, CENTRE_CODE - 5000), abs=0.1)
     mirrors.inverted = True
     x_rad, y_rad = mirrors.output_rad(100_000)
-    assert x_rad == pytest.approx(-1000 * CONFIG.scanner.code_rad, abs=1e-4)
-    assert y_rad == pytest.approx(5000 * CONFIG.scanner.code_rad, abs=1e-4)
+    assert x_rad == pytest.approx(-1000 * CONFIG.scanner.rad_per_code, abs=1e-4)
+    assert y_rad == pytest.approx(5000 * CONFIG.scanner.rad_per_code, abs=1e-4)

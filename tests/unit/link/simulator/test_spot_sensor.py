@@ -73,6 +73,6 @@ def test_mirrors_and_words_it_does_not_know():
     sensor, _ = looking()
     word, x_rad, _ = sensor.answer("mirrors", SETTLED_US).split()
     assert word == "mirrors"
-    assert float(x_rad) == pytest.approx(9000 * CONFIG.scanner.code_rad, abs=1e-4)
+    assert float(x_rad) == pytest.approx(9000 * CONFIG.scanner.rad_per_code, abs=1e-4)
     assert looking(outputs=False)[0].answer("mirrors", 0) == "mirrors none"
     assert sensor.answer("spots", 0).startswith("error")

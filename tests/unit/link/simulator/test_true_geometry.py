@@ -1,20 +1,20 @@
 import numpy as np
 import pytest
 
-from optodrive.device.config import load_config, pixel_layout
+from optodrive.device.config import build_pixel_layout, load_config
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
 
 CONFIG = load_config()
-LAYOUT = pixel_layout(CONFIG.display)
-CODE_M = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.code_rad
+LAYOUT = build_pixel_layout(CONFIG.display)
+CODE_M = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
 X_CODE, Y_CODE = CENTRE_CODE + LAYOUT.x_m / CODE_M, CENTRE_CODE + LAYOUT.y_m / CODE_M
 
 
 @pytest.mark.parametrize("name", ["display-1", "display-16", "display-437", "display-1511"])
 def test_an_uncorrected_beam_misses_by_half_a_millimetre_to_three(name):
     config = load_config(name)
-    layout = pixel_layout(config.display)
-    code_m = 2.0 * config.scanner.focal_length_m * config.scanner.code_rad
+    layout = build_pixel_layout(config.display)
+    code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
     for seed in range(20):
         x_m, y_m = Truth.drawn(seed, config).position_m(
             CENTRE_CODE + layout.x_m / code_m, CENTRE_CODE + layout.y_m / code_m

@@ -5,7 +5,7 @@ from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA, measure
 from optodrive.link.simulator.traces import trace
 from optodrive.link.simulator.virtual_run import execute
-from optodrive.planning.pipeline import prepare
+from optodrive.planning.pipeline import plan_sequence
 
 
 def sequence(display, count=30, height_m=50e-6):
@@ -15,7 +15,7 @@ def sequence(display, count=30, height_m=50e-6):
 
 
 def test_what_is_planned_is_executed_on_every_display(any_display):
-    prepared = prepare(any_display, sequence(any_display), *any_display.at_rest())
+    prepared = plan_sequence(any_display, sequence(any_display), *any_display.build_cold_state())
     executed = execute(any_display, prepared)
     plan = prepared.plan
     assert executed.complete
@@ -30,14 +30,14 @@ def test_what_is_planned_is_executed_on_every_display(any_display):
 )
 def test_what_the_limiter_passes_is_no_fault_on_the_board(any_display, width_s, gap_s):
     train = PulseTrain(0, 0.0, 1.5, width_s, gap_s, any_display.config.laser.max_power_w)
-    prepared = prepare(any_display, FrameSequence((), (train,)), *any_display.at_rest())
+    prepared = plan_sequence(any_display, FrameSequence((), (train,)), *any_display.build_cold_state())
     assert execute(any_display, prepared).complete
 
 
 def test_instruments_read_the_trace_with_their_stated_noise(display):
-    prepared = prepare(display, sequence(display, 3), *display.at_rest())
+    prepared = plan_sequence(display, sequence(display, 3), *display.build_cold_state())
     executed = execute(display, prepared)
-    traced = trace(display.heat_at_rest(), executed, [0, 2], 1e-3)
+    traced = trace(display.build_cold_heat(), executed, [0, 2], 1e-3)
     pulses = np.zeros((1, 4))
     exact = measure(traced, pulses, 293.15, 4e-4, 0.0, 0)
     assert [run.name for run in exact.runs] == ["pixel-0", "pixel-2"]

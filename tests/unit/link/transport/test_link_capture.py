@@ -18,52 +18,53 @@ from optodrive.link.transport.link_capture import (
     CRC,
     ENTRY,
     FROM_BOARD,
-    HEAD,
+    HEADER,
     KINDS,
     MAGIC,
     OPENED,
+    QUEUE_MAX,
     TO_BOARD,
     VERSION,
-    WAITING_MAX,
-    Entry,
-    Tape,
-    TapeWriter,
-    pack,
+    CaptureEntry,
+    LinkCapture,
+    LinkCaptureWriter,
+    pack_entry,
 )
-from optodrive.link.transport.recorded import RecordedTransport
+from optodrive.link.transport.recorded import CapturingTransport
 
 ENTRIES = st.lists(
-    st.builds(Entry, st.sampled_from(KINDS), st.floats(0, 1e9, allow_nan=False), st.binary(max_size=300)), max_size=12
+    st.builds(CaptureEntry, st.sampled_from(KINDS), st.floats(0, 1e9, allow_nan=False), st.binary(max_size=300)),
+    max_size=12,
 )
 
 
 def written(path, entries, said=None):
-    writer = TapeWriter(path, 3.5, (said if said is not None else []).append)
+    writer = LinkCaptureWriter(path, 3.5, (said if said is not None else []).append)
     for entry in entries:
-        writer.note(entry)
+        writer.record(entry)
     writer.close()
-    return Tape(path)
+    return LinkCapture(path)
 
 
 def test_what_passes_is_on_the_tape_with_its_time_and_the_link_does_not_notice(tmp_path):
     clock = ManualClock(5.0)
-    writer = TapeWriter(tmp_path / "a", clock.now_s(), pytest.fail)
-    link = RecordedTransport(MemoryLink(BoardCore(seed=3), clock), writer, clock)
+    writer = LinkCaptureWriter(tmp_path / "a", clock.now_s(), pytest.fail)
+    link = CapturingTransport(MemoryLink(BoardCore(seed=3), clock), writer, clock)
     link.open()
-    hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 7).body()))
+    hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 7).encode_body()))
     link.write(hello)
     reply = link.read(0.01)
     assert link.read(0.01) == b""
     link.close()
     link.release()
-    tape = Tape(tmp_path / "a")
-    assert list(tape.entries()) == [
-        Entry(OPENED, 5.0),
-        Entry(TO_BOARD, 5.0, hello),
-        Entry(FROM_BOARD, 5.0 + 1e-4, reply),
-        Entry(CLOSED, pytest.approx(5.0 + 1e-4 + 0.01)),
+    tape = LinkCapture(tmp_path / "a")
+    assert list(tape.read_entries()) == [
+        CaptureEntry(OPENED, 5.0),
+        CaptureEntry(TO_BOARD, 5.0, hello),
+        CaptureEntry(FROM_BOARD, 5.0 + 1e-4, reply),
+        CaptureEntry(CLOSED, pytest.approx(5.0 + 1e-4 + 0.01)),
     ]
-    assert (tape.host_s, tape.ignored) == (5.0, 0)
+    assert (tape.host_s, tape.ignored_bytes) == (5.0, 0)
 
 
 @given(ENTRIES, st.data())
@@ -71,37 +72,37 @@ def test_a_tape_cut_or_damaged_anywhere_gives_the_whole_entries_before_that(tmp_
     path = tmp_path_factory.mktemp("tape") / "a"
     written(path, entries)
     whole = path.read_bytes()
-    cut = data.draw(st.integers(HEAD.size, len(whole)))
-    ends = [HEAD.size]
+    cut = data.draw(st.integers(HEADER.size, len(whole)))
+    ends = [HEADER.size]
     for entry in entries:
-        ends.append(ends[-1] + len(pack(entry)))
+        ends.append(ends[-1] + len(pack_entry(entry)))
     kept = max(k for k, end in enumerate(ends) if end <= cut)
     path.write_bytes(whole[:cut])
-    tape = Tape(path)
-    assert list(tape.entries()) == entries[:kept]
-    assert tape.ignored == cut - ends[kept]
+    tape = LinkCapture(path)
+    assert list(tape.read_entries()) == entries[:kept]
+    assert tape.ignored_bytes == cut - ends[kept]
     if cut < len(whole):
         damaged = bytearray(whole)
         damaged[cut] ^= 1 << data.draw(st.integers(0, 7))
         path.write_bytes(damaged)
-        assert list(Tape(path).entries()) == entries[:kept]
+        assert list(LinkCapture(path).read_entries()) == entries[:kept]
 
 
 def test_nothing_is_overwritten_and_other_files_are_refused_by_name(tmp_path):
     path = tmp_path / "a"
     written(path, [])
     with pytest.raises(InputError, match=r"--record.*name that is free"):
-        TapeWriter(path, 0.0, print)
+        LinkCaptureWriter(path, 0.0, print)
     with pytest.raises(InputError, match="can be written"):
-        TapeWriter(tmp_path / "no" / "b", 0.0, print)
+        LinkCaptureWriter(tmp_path / "no" / "b", 0.0, print)
     with pytest.raises(InputError, match="can be read"):
-        Tape(tmp_path / "c")
+        LinkCapture(tmp_path / "c")
     path.write_bytes(b"some text that is none of ours, and long enough")
     with pytest.raises(InputError, match="recording of a link"):
-        Tape(path)
-    path.write_bytes(HEAD.pack(MAGIC, VERSION + 1, 0.0, 0.0))
+        LinkCapture(path)
+    path.write_bytes(HEADER.pack(MAGIC, VERSION + 1, 0.0, 0.0))
     with pytest.raises(InputError, match=f"version.*{VERSION}, the one"):
-        Tape(path)
+        LinkCapture(path)
 
 
 FULL = """
@@ -125,24 +126,24 @@ assert len(said) == 1 and "stopped" in said[0] and "the session goes on" in said
 def test_a_full_disk_is_said_once_and_what_was_written_can_be_read(tmp_path):
     path = tmp_path / "a"
     subprocess.run([sys.executable, "-c", FULL, path], check=True)
-    entries = list(Tape(path).entries())
-    assert len(entries) == (2000 - HEAD.size) // (ENTRY.size + 100 + CRC.size)
+    entries = list(LinkCapture(path).read_entries())
+    assert len(entries) == (2000 - HEADER.size) // (ENTRY.size + 100 + CRC.size)
     assert [entry.host_s for entry in entries] == list(range(len(entries)))
 
 
 def test_a_disk_that_does_not_answer_costs_bounded_memory_and_no_time(tmp_path):
     """A pipe that nobody reads stands for the disk: its writer hangs, whoever notes goes on."""
     said = []
-    writer = TapeWriter(tmp_path / "a", 0.0, said.append)
+    writer = LinkCaptureWriter(tmp_path / "a", 0.0, said.append)
     reading, writing = os.pipe()
     os.dup2(writing, writer._file.fileno())
     assert stat.S_ISFIFO(os.fstat(writer._file.fileno()).st_mode)
-    entry = Entry(TO_BOARD, 0.0, bytes(200))
-    for _ in range(2 * WAITING_MAX):
-        writer.note(entry)
+    entry = CaptureEntry(TO_BOARD, 0.0, bytes(200))
+    for _ in range(2 * QUEUE_MAX):
+        writer.record(entry)
     assert len(said) == 1
     assert "too slow" in said[0]
-    assert writer._waiting.qsize() <= WAITING_MAX
+    assert writer._queue.qsize() <= QUEUE_MAX
     os.close(writing)
     os.close(reading)  # the writer's thread gets an error and ends
     writer._thread.join(10)

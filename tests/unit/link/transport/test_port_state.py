@@ -7,7 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from optodrive.link.transport.port_state import Holder, PortState, device_name, port_state, serial_ports
+from optodrive.link.transport.port_state import (
+    PortHolder,
+    PortState,
+    list_serial_ports,
+    read_port_state,
+    resolve_device,
+)
 
 
 @pytest.fixture
@@ -45,19 +51,19 @@ def as_nobody():
 
 
 def test_a_port_that_is_there_and_one_that_is_gone(tty):
-    assert port_state(str(tty)) == PortState("there")
-    assert device_name(str(tty)).startswith("/dev/pts/")
-    assert port_state(f"{tty}2").fate == "gone"
-    assert port_state("simulated board, virtual time") == PortState("no file")
+    assert read_port_state(str(tty)) == PortState("there")
+    assert resolve_device(str(tty)).startswith("/dev/pts/")
+    assert read_port_state(f"{tty}2").status == "gone"
+    assert read_port_state("simulated board, virtual time") == PortState("no file")
 
 
 def test_a_port_without_permission(tty):
-    device = device_name(str(tty))
+    device = resolve_device(str(tty))
     mode = Path(device).stat().st_mode
     Path(device).chmod(0o000)
     try:
         with as_nobody():
-            assert port_state(str(tty)).fate == "denied"
+            assert read_port_state(str(tty)).status == "denied"
     finally:
         Path(device).chmod(mode)
 
@@ -66,13 +72,13 @@ def test_a_port_that_another_process_holds(tty):
     code = "import os, sys; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", code, tty], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
-        state = port_state(str(tty))
+        state = read_port_state(str(tty))
         process.stdin.close()
-    assert state.fate == "held"
+    assert state.status == "held"
     (holder,) = state.holders
     assert holder.pid == process.pid
     assert str(process.pid) in str(holder)
-    assert port_state(str(tty)).fate == "there"
+    assert read_port_state(str(tty)).status == "there"
 
 
 def test_a_tree_of_files_stands_for_the_system(tmp_path):
@@ -83,15 +89,15 @@ def test_a_tree_of_files_stands_for_the_system(tmp_path):
     (tmp_path / "dev/serial/by-id/usb-board").symlink_to("../../ttyACM0")
     (tmp_path / "proc/77/fd/4").symlink_to("/dev/ttyACM0")
     (tmp_path / "proc/77/comm").write_text("minicom\n")
-    assert serial_ports(tmp_path) == ("/dev/ttyACM0", "/dev/ttyUSB1")
-    held = PortState("held", (Holder(77, "minicom"),))
-    assert port_state("/dev/serial/by-id/usb-board", tmp_path) == held
-    assert port_state("/dev/ttyACM0", tmp_path) == held
-    assert port_state("/dev/ttyACM1", tmp_path) == PortState("gone", (), ("/dev/ttyACM0", "/dev/ttyUSB1"))
+    assert list_serial_ports(tmp_path) == ("/dev/ttyACM0", "/dev/ttyUSB1")
+    held = PortState("held", (PortHolder(77, "minicom"),))
+    assert read_port_state("/dev/serial/by-id/usb-board", tmp_path) == held
+    assert read_port_state("/dev/ttyACM0", tmp_path) == held
+    assert read_port_state("/dev/ttyACM1", tmp_path) == PortState("gone", (), ("/dev/ttyACM0", "/dev/ttyUSB1"))
 
 
 def test_a_port_in_a_folder_that_may_not_be_looked_into(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o700)
     with as_nobody():
-        assert port_state(str(closed / "tty")).fate == "denied"
+        assert read_port_state(str(closed / "tty")).status == "denied"

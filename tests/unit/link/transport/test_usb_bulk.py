@@ -11,12 +11,12 @@ from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import BoardSection
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_requirements import Requirements
-from optodrive.link.session.session import Session
+from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.transport.registry import TRANSPORTS, transport_maker
+from optodrive.link.transport.registry import TRANSPORTS, find_transport_factory
 from optodrive.link.transport.usb_bulk import UsbBulk
-from optodrive.planning.pipeline import prepare
+from optodrive.planning.pipeline import plan_sequence
 
 STEP_S = 0.005
 DISPLAY = DISPLAYS["display-16"]
@@ -28,7 +28,7 @@ class Rig:
         self.core = BoardCore(sink=self.log.append, seed=2)
         self.usb = UsbBridge(self.core, self.clock, **bridge)
         self.link = UsbBulk(0x1209, 0x0001, serial_number, self.usb)
-        self.session = Session(self.link, self.clock, Requirements.of(DISPLAY.config))
+        self.session = BoardSession(self.link, self.clock, BoardRequirements.from_config(DISPLAY.config))
 
     def until(self, condition, patience_s=20.0, lease=True):
         give_up_s = self.clock.now_s() + patience_s
@@ -41,10 +41,10 @@ class Rig:
         from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 
         sequence = FrameSequence(trains=(PulseTrain(5, 0.0, 1.0, 0.004, 0.02, 1.0),))
-        self.plan = prepare(DISPLAY, sequence, *DISPLAY.at_rest()).plan
+        self.plan = plan_sequence(DISPLAY, sequence, *DISPLAY.build_cold_state()).plan
         self.session.connect()
         self.session.arm()
-        self.until(lambda: self.session.ready)
+        self.until(lambda: self.session.is_ready)
         points = quantise(self.plan, self.session.scale)
         self.job = self.session.begin(points, self.session.board_s() + 0.05)
         self.until(lambda: len(self.pulses()) > 5)
@@ -56,9 +56,9 @@ class Rig:
 
 def test_a_plan_is_armed_streamed_and_reported_over_usb():
     rig = Rig().streaming()
-    rig.until(lambda: rig.job.finished)
+    rig.until(lambda: rig.job.is_finished)
     scale = rig.session.scale
-    executed = rig.job.executed(rig.plan, scale.full_power_w, scale.tick_s)
+    executed = rig.job.build_executed(rig.plan, scale.full_power_w, scale.tick_s)
     assert executed.complete
     assert executed.start_s == pytest.approx(rig.plan.start_s)
     rig.session.close()
@@ -70,8 +70,8 @@ def test_unplugged_in_mid_plan_the_board_goes_dark_and_it_is_told():
     rig = Rig().streaming()
     rig.usb.unplug()
     with pytest.raises(LinkError, match=r"link to usb 1209:0001 lost: .*unplugged, or without power"):
-        rig.session.step(STEP_S, lease=True)
-    rig.session.drop()
+        rig.session.step(STEP_S, renew_lease=True)
+    rig.session.disconnect()
     assert not rig.core.gate
     assert rig.core.state == "DISARMED"
     with pytest.raises(InputError, match="a USB device that is plugged in"):
@@ -154,8 +154,8 @@ def test_without_libusb_it_says_so(monkeypatch):
 
 def test_the_registry_makes_what_the_configuration_names():
     board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
-    assert transport_maker(board)().name == "usb 1209:0001 A1"
-    assert transport_maker(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
+    assert find_transport_factory(board)().name == "usb 1209:0001 A1"
+    assert find_transport_factory(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
     assert set(TRANSPORTS) == {"serial", "simulated", "usb"}
     with pytest.raises(InputError, match="a Helios cannot serve a daemon"):
-        transport_maker(BoardSection(transport="helios"))
+        find_transport_factory(BoardSection(transport="helios"))

@@ -9,34 +9,48 @@ import pytest
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.core.types.plans import PulsePlan
-from optodrive.planning.limiter.budget import Budget, Mirrors
-from optodrive.planning.limiter.energy_windows import Chains, Pulses, allowed_w, append
-from optodrive.planning.limiter.limiter import fired, fresh_state, limit, shifted, verify, wait_s
-from optodrive.planning.limiter.worst_case import Declared, Touch, Uncertainty, Walls, heat_bound, spread
+from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append, max_window_power_w
+from optodrive.planning.limiter.limiter import cold_state, commit_until, compute_wait_s, limit, shift_state, verify
+from optodrive.planning.limiter.worst_case import (
+    NominalThermalModel,
+    NominalTouch,
+    NominalWalls,
+    Uncertainty,
+    build_heat_bound,
+    specht_ratio,
+)
 from warmth import NO_CAPS
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
-MODEL = Declared(
+MODEL = NominalThermalModel(
     epsilon=np.full(3, 0.66),
     r_k_per_w=np.full(3, 120.0 / 0.66),
     c_j_per_k=np.full(3, 0.023 / 120.0 * 0.66),
     tau_g_s=3e-3,
     ambient_k=293.15,
     exponent=0.0,
-    beside=np.array([[-1, 1, -1, -1], [0, 2, -1, -1], [1, -1, -1, -1]]),
+    neighbours=np.array([[-1, 1, -1, -1], [0, 2, -1, -1], [1, -1, -1, -1]]),
     frame_edges=np.zeros(3, dtype=np.int64),
-    walls=Walls(20.0, 0.06, 430.0, 430.0),
-    touch=Touch(0.3, 0.4, 1.2),
+    walls=NominalWalls(20.0, 0.06, 430.0, 430.0),
+    touch=NominalTouch(0.3, 0.4, 1.2),
 )
-SERVO = Mirrors(
-    omega_per_s=1e4, damping=0.7, delay_s=3e-5, slew_rad_per_s=100.0, lead_s=1e-3, mean_s=1.0, code_rad=0.0, early_s=0.0
+SERVO = GalvoModel(
+    omega_rad_per_s=1e4,
+    damping=0.7,
+    delay_s=3e-5,
+    slew_rad_per_s=100.0,
+    lead_in_s=1e-3,
+    averaging_s=1.0,
+    code_step_rad=0.0,
+    interval_shrink_s=0.0,
 )
 
 
 def roomy(**caps):
     """No cap binds but those given."""
     caps = NO_CAPS._replace(**caps)
-    return Budget(caps, heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
+    return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
 
 
 ROOMY = roomy()
@@ -53,15 +67,15 @@ def pulses(*rows):
         y_rad=zero,
         power_w=power,
         pixel=pixel.astype(np.int64),
-        settle_s=zero,
+        settling_s=zero,
         target_m=np.full(len(rows), np.nan),
-        nominal_s=start,
+        requested_start_s=start,
         source=np.zeros(len(rows), dtype=np.int64),
     )
 
 
 def run(budget, *rows, policy="trim"):
-    return limit(pulses(*rows), fresh_state(3), budget, policy)[0]
+    return limit(pulses(*rows), cold_state(3), budget, policy)[0]
 
 
 CASES = {
@@ -117,9 +131,9 @@ def test_refuse_names_pixel_and_cap(cause):
 
 def test_refuse_says_when_the_whole_would_fit():
     budget = roomy(touch_k=2.0)
-    _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), fresh_state(3), budget)
+    _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), cold_state(3), budget)
     again = pulses((1, 0.1, 0.05, 2.45))
-    later_s = wait_s(again, warm, budget)
+    later_s = compute_wait_s(again, warm, budget)
     assert 0.01 < later_s < 10.0
     with pytest.raises(OverBudgetError, match=f"the whole fits {later_s:.3f} s later"):
         limit(again, warm, budget, "refuse")
@@ -144,7 +158,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
     budget = roomy(absorber_k=150.0)
     limited = run(budget, (1, 0.0, 0.050, 2.45))
     own_k = 120.0 * limited.power_w[0] * (1 - np.exp(-0.050 / 0.023))
-    wall_k = budget.heat.wall_k_per_j[0] * limited.energy_j[0] * budget.heat.absorber_wall
+    wall_k = budget.heat.wall_k_per_j[0] * limited.energy_j[0] * budget.heat.absorber_wall_factor
     assert 149.95 < own_k + wall_k < 150.0  # the rest is what neighbours may send
     assert limited.headroom_k == pytest.approx([150.0, 0.0, 150.0], abs=1e-6)
 
@@ -152,7 +166,7 @@ def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
 def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
     caps = NO_CAPS._replace(absorber_k=150.0)
     bare = replace(MODEL, walls=None, touch=None)
-    budget = Budget(caps, heat_bound(bare, CERTAIN, caps, 2.45), SERVO)
+    budget = Budget(caps, build_heat_bound(bare, CERTAIN, caps, 2.45), SERVO)
     gentle = run(budget, (1, 0.0, 0.050, 1.0), (1, 9.0, 0.050, 1.0))
     assert gentle.trimmed_j.sum() == 0
     limited = run(budget, (1, 0.0, 0.050, 2.45), (0, 100.0, 0.050, 2.45))
@@ -169,7 +183,7 @@ def test_state_goes_on_over_plans_and_pauses():
     budget = roomy(absorber_k=200.0, display_mean_w=0.5)
     rows = [(k % 3, 0.06 * k + (0.3 if k > 5 else 0.0), 0.05, 2.45) for k in range(12)]
     whole = run(budget, *rows)
-    state, power = fresh_state(3), []
+    state, power = cold_state(3), []
     for row in rows:
         piece, state = limit(pulses(row), state, budget)
         power += piece.power_w.tolist()
@@ -178,14 +192,14 @@ def test_state_goes_on_over_plans_and_pauses():
 
 def test_a_state_moved_in_time_limits_the_same():
     budget = roomy(absorber_k=150.0, pixel_mean_w=0.6)
-    _, state = limit(pulses((0, 0.0, 0.05, 2.45)), fresh_state(3), budget)
+    _, state = limit(pulses((0, 0.0, 0.05, 2.45)), cold_state(3), budget)
     here, _ = limit(pulses((0, 0.07, 0.05, 2.45)), state, budget)
-    there, _ = limit(pulses((0, 5.07, 0.05, 2.45)), shifted(state, 5.0), budget)
+    there, _ = limit(pulses((0, 5.07, 0.05, 2.45)), shift_state(state, 5.0), budget)
     assert there.power_w == pytest.approx(here.power_w)
 
 
 def test_a_plan_may_not_start_in_the_past_of_the_budget():
-    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), fresh_state(3), ROOMY)
+    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), cold_state(3), ROOMY)
     with pytest.raises(RefusedError, match="before the budget's time"):
         limit(pulses((1, 0.5, 0.05, 1.0)), state, ROOMY)
 
@@ -198,22 +212,22 @@ def beam(plan, power_w):
 def test_proof_before_emission_passes_what_was_limited_and_catches_what_was_not():
     budget = roomy(absorber_k=150.0)
     plan = run(budget, (0, 0.0, 0.05, 2.45), (1, 0.06, 0.05, 2.45))
-    verify(plan, np.arange(2), beam(plan, plan.power_w), fresh_state(3), budget)
+    verify(plan, np.arange(2), beam(plan, plan.power_w), cold_state(3), budget)
     with pytest.raises(LocalProtocolError, match="encoded pulse 1 on pixel 1 passes a cap"):
-        verify(plan, np.arange(2), beam(plan, plan.power_w * [1.0, 1.001]), fresh_state(3), budget)
+        verify(plan, np.arange(2), beam(plan, plan.power_w * [1.0, 1.001]), cold_state(3), budget)
 
 
 def test_pulses_that_were_not_fired_are_forgotten_and_the_others_count():
     budget = roomy(touch_k=5.0)
-    plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), fresh_state(3), budget)
-    first_only = fired(plan, 0.1, fresh_state(3), budget)
+    plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), cold_state(3), budget)
+    first_only = commit_until(plan, 0.1, cold_state(3), budget)
     assert first_only.touch_k[0].max() > 0.5
     assert first_only.touch_k[1].max() == 0.0
     assert after.touch_k[1].max() > 0.5
 
 
 def test_state_stays_as_large_however_many_pulses_went_by():
-    budget, state = roomy(pixel_mean_w=1.3, touch_k=20.0), fresh_state(3)
+    budget, state = roomy(pixel_mean_w=1.3, touch_k=20.0), cold_state(3)
     sizes = []
     for k in range(30):
         train = pulses(*[(n % 3, 100.0 * k + 0.01 * n, 0.005, 2.45) for n in range(1000)])
@@ -229,7 +243,7 @@ def test_a_sum_of_decays_never_exceeds_its_ends_by_more_than_the_spread():
         for _ in range(50):
             ages, energies = rng.uniform(0, 6, 8), rng.uniform(0, 1, 8)
             rise = (energies / capacities[:, None] * np.exp(-ages / capacities[:, None])).sum(axis=1)
-            assert rise.max() <= spread((1 + half) / (1 - half)) * max(rise[0], rise[-1])
+            assert rise.max() <= specht_ratio((1 + half) / (1 - half)) * max(rise[0], rise[-1])
 
 
 def brute_allowed(window_s, cap_j, rows, start, width):
@@ -245,13 +259,13 @@ def brute_allowed(window_s, cap_j, rows, start, width):
 def test_energy_window_agrees_with_trying_every_window():
     rng = np.random.default_rng(5)
     for _ in range(15):
-        fired_pulses = Pulses(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
-        chain = Chains(np.full(1, -1), np.full(1, -1), np.zeros(1), np.full(12, -1), np.zeros(12))
+        fired_pulses = PulseHistory(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        chain = WindowChains(np.full(1, -1), np.full(1, -1), np.zeros(1), np.full(12, -1), np.zeros(12))
         time, rows = 0.0, []
         for row in range(12):
             time += rng.uniform(0.0, 0.1)
             width, power = rng.uniform(0.001, 0.05), rng.uniform(0.0, 4.0)
-            exact = allowed_w(chain, 0, fired_pulses, time, width, 0.5, 1.0)
+            exact = max_window_power_w(chain, 0, fired_pulses, time, width, 0.5, 1.0)
             tried = brute_allowed(0.5, 0.5, rows, time, width)
             assert exact <= tried * (1 + 1e-9) + 1e-9
             assert exact == pytest.approx(tried, rel=2e-2, abs=2e-2)

@@ -10,9 +10,15 @@ from hypothesis import strategies as st
 from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, TactileFrame
-from optodrive.planning.pipeline import prepare
-from optodrive.planning.plan_summary import summary
-from optodrive.planning.scheduler.interleaving import ROUNDS, Rehearsal, best, rested, slices
+from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.plan_summary import summarize_plan
+from optodrive.planning.scheduler.interleaving import (
+    ROUND_COUNTS,
+    CandidateSchedule,
+    has_min_rest,
+    select_schedule,
+    split_pulses,
+)
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
 DISPLAY = DISPLAYS["display-437"]
@@ -26,7 +32,7 @@ def frame(heights_um, duration_s=0.5, together=True, show_at_s=0.0):
 
 
 def prepared(*frames, trains=(), display=DISPLAY):
-    return prepare(display, FrameSequence(tuple(frames), tuple(trains)), *display.at_rest())
+    return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state())
 
 
 def shares(result, heights_um):
@@ -34,20 +40,20 @@ def shares(result, heights_um):
     plan = result.plan
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
     t_s = np.arange(plan.start_s[0], result.duration_s + 0.03, 5e-5)
-    height_um = DISPLAY.heat_at_rest().traces(pulses, list(heights_um), t_s).displacement_m * 1e6
+    height_um = DISPLAY.build_cold_heat().simulate_traces(pulses, list(heights_um), t_s).displacement_m * 1e6
     return height_um / np.array(list(heights_um.values()))
 
 
 def test_four_pixels_stand_up_together_better_in_rounds():
     split, plain = prepared(frame(FOUR)), prepared(frame(FOUR, together=False))
-    (told,) = split.together
-    assert told.rounds > 1
-    assert len(split.plan) == 4 * told.rounds
+    (told,) = split.simultaneous
+    assert told.interleaved_rounds > 1
+    assert len(split.plan) == 4 * told.interleaved_rounds
     assert shares(split, FOUR).min(axis=1).max() == pytest.approx(told.simultaneity, rel=0.01)
-    assert shares(plain, FOUR).min(axis=1).max() == pytest.approx(told.simultaneity_unsplit, rel=0.01)
-    assert told.simultaneity > 1.15 * told.simultaneity_unsplit
+    assert shares(plain, FOUR).min(axis=1).max() == pytest.approx(told.simultaneity_single_pulse, rel=0.01)
+    assert told.simultaneity > 1.15 * told.simultaneity_single_pulse
     assert told.extra_s == pytest.approx(split.duration_s - plain.duration_s, abs=1e-6)
-    assert not plain.together
+    assert not plain.simultaneous
 
 
 @settings(max_examples=15)
@@ -59,34 +65,35 @@ def test_sliced_pixels_reach_their_heights(heights_um):
     assert shares(result, heights_um).max(axis=0) == pytest.approx(np.ones(len(heights_um)), rel=0.03)
     last = np.isfinite(result.plan.target_m)
     assert sorted(result.plan.pixel[last]) == sorted(heights_um)
-    assert rested(result.plan, DISPLAY.machine.rest_s)
+    assert has_min_rest(result.plan, DISPLAY.scan_head.pulse_rest_s)
 
 
 def test_it_ends_in_time_or_is_not_split():
     plain_s = prepared(frame(FOUR, together=False)).duration_s
     roomy, tight, late = (prepared(frame(FOUR, duration_s=plain_s + more_s)) for more_s in (0.1, 0.005, -0.01))
-    assert roomy.together[0].rounds > tight.together[0].rounds > 1
+    assert roomy.simultaneous[0].interleaved_rounds > tight.simultaneous[0].interleaved_rounds > 1
     assert tight.frames[0].late_s == 0.0
-    assert late.together[0].rounds == 1
+    assert late.simultaneous[0].interleaved_rounds == 1
     assert late.frames[0].late_s > 0.0
 
 
 def test_slices_have_no_height_of_their_own_to_answer_for():
     result = prepared(frame(FOUR))
-    told = summary(result)
+    told = summarize_plan(result)
     assert np.isnan(result.plan.target_m[:4]).all()
     assert told["asked_max_um"] == pytest.approx(100.0)
     assert told["predicted_max_um"] == pytest.approx(100.0, rel=0.01)
     assert told["frames"][0]["together"] == {
-        key: getattr(result.together[0], key) for key in ("rounds", "simultaneity", "simultaneity_unsplit", "extra_s")
+        key: getattr(result.simultaneous[0], key)
+        for key in ("rounds", "simultaneity", "simultaneity_unsplit", "extra_s")
     }
-    assert summary(prepared(frame(FOUR, together=False)))["frames"][0]["together"] is None
+    assert summarize_plan(prepared(frame(FOUR, together=False)))["frames"][0]["together"] is None
 
 
 def test_heat_that_is_there_counts_and_a_frame_after_another_is_split_too():
     first, second = frame(FOUR, duration_s=0.06), frame(FOUR, duration_s=0.5, show_at_s=0.06)
     result = prepared(first, second)
-    assert [item.source for item in result.together] == [0, 1]
+    assert [item.source for item in result.simultaneous] == [0, 1]
     last = np.isfinite(result.plan.target_m)
     assert result.predicted_m[last] == pytest.approx(np.full(8, 100e-6), rel=0.01)
     assert result.plan.energy_j[result.plan.source == 1].sum() < result.plan.energy_j[result.plan.source == 0].sum()
@@ -95,8 +102,8 @@ def test_heat_that_is_there_counts_and_a_frame_after_another_is_split_too():
 def test_a_train_keeps_its_times_through_the_rounds():
     train = HeightTrain(30, 0.0, 0.2, 0.01, 20e-6)
     result = prepared(frame(FOUR), trains=[train])
-    assert result.together[0].rounds > 1
-    assert result.train_late_s < 1e-9
+    assert result.simultaneous[0].interleaved_rounds > 1
+    assert result.train_lateness_max_s < 1e-9
     last = np.isfinite(result.plan.target_m) & (result.plan.source == 0)
     assert result.predicted_m[last] == pytest.approx(np.full(4, 100e-6), rel=0.01)
 
@@ -104,50 +111,50 @@ def test_a_train_keeps_its_times_through_the_rounds():
 def test_one_pixel_is_together_by_itself():
     result = prepared(frame({7: 200}))
     assert len(result.plan) == 1
-    assert not result.together
+    assert not result.simultaneous
 
 
 def test_what_the_limiter_takes_from_a_slice_the_last_round_makes_up():
     caps = DISPLAY.budget.caps._replace(pulse_energy_j=0.002)
     cold = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
     result = prepared(frame(FOUR), display=cold)
-    heat, plan = DISPLAY.heat_at_rest(), result.plan
+    heat, plan = DISPLAY.build_cold_heat(), result.plan
     last = np.flatnonzero(np.isfinite(plan.target_m))
     assert plan.trimmed_j[: last[0]].any()
     for row in range(len(plan)):
         if row in last:
-            periods, duty = heat.pulse_for_peak(int(plan.pixel[row]), plan.start_s[row], 100e-6, DISPLAY.machine.drive)
-            asked_j = periods * 2e-4 * duty * DISPLAY.machine.drive.max_power_w
+            periods, duty = heat.solve_pulse(int(plan.pixel[row]), plan.start_s[row], 100e-6, DISPLAY.scan_head.drive)
+            asked_j = periods * 2e-4 * duty * DISPLAY.scan_head.drive.max_power_w
             assert plan.energy_j[row] + plan.trimmed_j[row] == pytest.approx(asked_j, rel=1e-6)
-        heat.pulse(int(plan.pixel[row]), plan.start_s[row], plan.width_s[row], plan.power_w[row])
+        heat.apply_pulse(int(plan.pixel[row]), plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 
 def test_shares_are_whole_periods_and_never_none():
-    assert slices({1: (10, 1.0), 2: (7, 0.9)}, 3) == {1: 3, 2: 2}
-    assert slices({1: (10, 1.0), 2: (3, 0.9)}, 3) is None
-    assert slices({1: (1, 0.1)}, 1) is not None
-    assert ROUNDS[0] == 1
+    assert split_pulses({1: (10, 1.0), 2: (7, 0.9)}, 3) == {1: 3, 2: 2}
+    assert split_pulses({1: (10, 1.0), 2: (3, 0.9)}, 3) is None
+    assert split_pulses({1: (1, 0.1)}, 1) is not None
+    assert ROUND_COUNTS[0] == 1
 
 
 def test_the_best_that_ends_in_time_and_rests():
-    one, two, four = (Rehearsal(k, 0.1 * k, 0.1 * k, True) for k in (1, 2, 4))
-    assert best([one, two, four], 1.0) == four
-    assert best([one, two, four], 0.3) == two
-    assert best([one, two, four], 0.01) == one
-    assert best([one, two, replace(four, rested=False)], 1.0) == two
+    one, two, four = (CandidateSchedule(k, 0.1 * k, 0.1 * k, True) for k in (1, 2, 4))
+    assert select_schedule([one, two, four], 1.0) == four
+    assert select_schedule([one, two, four], 0.3) == two
+    assert select_schedule([one, two, four], 0.01) == one
+    assert select_schedule([one, two, replace(four, has_min_rest=False)], 1.0) == two
 
 
 def test_a_short_rest_between_slices_is_no_rest():
-    far = replace(DISPLAY, machine=replace(DISPLAY.machine, rest_s=0.01))
+    far = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_rest_s=0.01))
     two = frame({200: 100, 201: 100})
-    assert prepared(two).together[0].rounds > 1
-    assert prepared(two, display=far).together[0].rounds == 1
+    assert prepared(two).simultaneous[0].interleaved_rounds > 1
+    assert prepared(two, display=far).simultaneous[0].interleaved_rounds == 1
 
 
 def test_together_is_read_written_and_checked():
     entry = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}, "together": True}
     once = parse_sequence({"frames": [entry, {**entry, "show_at_s": 1.0, "together": False}]}, DISPLAY.config, "f")
     again = parse_sequence(sequence_to_json(once), DISPLAY.config, "f")
-    assert [item.together for item in again.frames] == [item.together for item in once.frames] == [True, False]
+    assert [item.simultaneous for item in again.frames] == [item.simultaneous for item in once.frames] == [True, False]
     with pytest.raises(InputError, match=r"frames\[0\].together: got 1, expected true or false"):
         parse_sequence({"frames": [{**entry, "together": 1}]}, DISPLAY.config, "f")

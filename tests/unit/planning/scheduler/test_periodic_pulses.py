@@ -9,26 +9,31 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import Display, prepare
-from optodrive.planning.plan_summary import summary
+from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.scheduler import periodic_pulses
-from optodrive.planning.scheduler.periodic_pulses import at_target, cycle_of, steady, with_room
+from optodrive.planning.scheduler.periodic_pulses import (
+    build_pulse_recipe,
+    compute_steady_state,
+    limit_pulse_width,
+    solve_steady_state,
+)
 
 DISPLAY = DISPLAYS["display-437"]
 SAMPLES = 400
 
 
 def prepared(*trains, frames=(), display=DISPLAY, policy="trim"):
-    return prepare(display, FrameSequence(tuple(frames), tuple(trains)), *display.at_rest(), policy)
+    return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state(), policy)
 
 
 def felt(result, train, display=DISPLAY):
     """Peak and trough of each cycle, µm, [cycles] each, by the traces of a display that starts at rest."""
     plan = result.plan
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
-    starts_s = train.pulse_starts_s() + result.lead_s
+    starts_s = train.pulse_starts_s() + result.lead_in_s
     t_s = np.linspace(starts_s[0], starts_s[-1] + train.period_s, SAMPLES * len(starts_s) + 1)
-    height_um = display.heat_at_rest().traces(pulses, [train.pixel], t_s).displacement_m[:, 0] * 1e6
+    height_um = display.build_cold_heat().simulate_traces(pulses, [train.pixel], t_s).displacement_m[:, 0] * 1e6
     each = np.array([height_um[k * SAMPLES : (k + 1) * SAMPLES + 1] for k in range(len(starts_s))])
     return each.max(axis=1), each.min(axis=1)
 
@@ -109,7 +114,7 @@ def test_four_interleaved_trains_keep_their_times_and_heights():
         for k in range(4)
     ]
     result = prepared(*trains)
-    assert result.train_late_s < 1e-9
+    assert result.train_lateness_max_s < 1e-9
     for train in trains:
         peaks_um, troughs_um = felt(result, train)
         assert peaks_um[1:] == pytest.approx(np.full(14, train.target_m * 1e6), rel=0.02)
@@ -122,8 +127,8 @@ def test_a_pulse_never_grows_beyond_its_slot():
     other = PulseTrain(300, 0.205, 0.001, 0.002, 0.001, 1.0)
     result = prepared(tall, other)
     plan = result.plan
-    assert result.train_late_s < 1e-9
-    (short,) = np.flatnonzero(np.isclose(plan.start_s - result.lead_s, 0.2))
+    assert result.train_lateness_max_s < 1e-9
+    (short,) = np.flatnonzero(np.isclose(plan.start_s - result.lead_in_s, 0.2))
     assert plan.width_s[short] <= 0.005
     assert result.predicted_m[short] < 0.8 * 300e-6
     assert result.predicted_m[short + 2 :] == pytest.approx(300e-6, rel=0.01)
@@ -135,13 +140,13 @@ def test_what_the_limiter_takes_is_known_to_the_next_pulse():
     train = HeightTrain(17, 0.0, 0.4, 0.04, 200e-6)
     plan = prepared(train, display=cold).plan
     assert plan.reason[0] == "pulse_energy"
-    heat = DISPLAY.heat_at_rest()
-    drive = with_room(DISPLAY.machine.drive, 39_500)
+    heat = DISPLAY.build_cold_heat()
+    drive = limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
     for row in range(len(plan)):
-        periods, duty = heat.pulse_for_peak(17, plan.start_s[row], 200e-6, drive)
+        periods, duty = heat.solve_pulse(17, plan.start_s[row], 200e-6, drive)
         asked_j = plan.energy_j[row] + plan.trimmed_j[row]
         assert asked_j == pytest.approx(periods * drive.period_s * duty * drive.max_power_w, rel=1e-6)
-        heat.pulse(17, plan.start_s[row], plan.width_s[row], plan.power_w[row])
+        heat.apply_pulse(17, plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 
 def test_under_delay_a_train_by_height_waits_and_peaks_no_lower():
@@ -159,7 +164,7 @@ def test_frames_fill_the_gaps_and_share_a_pixel():
     train = HeightTrain(17, 0.0, 0.4, 0.1, 80e-6)
     result = prepared(train, frames=[TactileFrame("f", 0.0, 0.4, target_m)])
     plan = result.plan
-    assert result.train_late_s < 1e-9
+    assert result.train_lateness_max_s < 1e-9
     assert len(plan) + len(result.skipped) == 8
     of_frame = (plan.source == 0) & (plan.pixel != 17)
     assert result.predicted_m[of_frame] == pytest.approx(np.full(3, 60e-6), rel=0.01)
@@ -173,7 +178,7 @@ def test_a_cycle_whose_height_is_still_there_has_no_pulse_and_is_named():
     train = HeightTrain(17, 0.06, 0.2, 0.04, 40e-6)
     result = prepared(train, frames=[TactileFrame("f", 0.0, 0.06, target_m)])
     assert [(item.source, item.pixel) for item in result.skipped] == [(1, 17)]
-    assert summary(result)["skipped"][0]["frame"] == "train 0"
+    assert summarize_plan(result)["skipped"][0]["frame"] == "train 0"
     assert len(result.plan) == 5
 
 
@@ -206,17 +211,17 @@ def test_starts_too_close_for_a_move_are_refused():
 
 
 def test_the_steady_cycle_is_where_many_cycles_end():
-    at_rest, drive = DISPLAY.heat_at_rest(), with_room(DISPLAY.machine.drive, 39_500)
+    at_rest, drive = DISPLAY.build_cold_heat(), limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
     train = HeightTrain(17, 0.0, 1.0, 0.04, 250e-6, 100e-6)
-    shape = cycle_of(train, at_rest, drive, "t")
-    assert shape.goal_m == 250e-6
-    found = at_target(train, at_rest, drive, shape.least_periods)
+    shape = build_pulse_recipe(train, at_rest, drive, "t")
+    assert shape.target_m == 250e-6
+    found = solve_steady_state(train, at_rest, drive, shape.min_periods)
     assert found.peak_m == pytest.approx(250e-6, rel=1e-3)
     assert found.peak_to_peak_m == pytest.approx(100e-6, rel=0.02)
-    wider = at_target(train, at_rest, drive, shape.least_periods + 20)
+    wider = solve_steady_state(train, at_rest, drive, shape.min_periods + 20)
     assert wider.peak_to_peak_m < found.peak_to_peak_m
-    assert steady(train, at_rest, drive, 10, 0.5).peak_m == pytest.approx(
-        0.5 * steady(train, at_rest, drive, 10, 1.0).peak_m
+    assert compute_steady_state(train, at_rest, drive, 10, 0.5).peak_m == pytest.approx(
+        0.5 * compute_steady_state(train, at_rest, drive, 10, 1.0).peak_m
     )
 
 
@@ -257,7 +262,7 @@ def test_cycles_planned_with_terms(period_s, swing_um, terms, tmp_path):
     path.write_text(MODEL.replace("{terms}", terms))
     config = load_config("display-16")
     model = config.pixel_model.model_copy(update={"parameters": str(path)})
-    display = Display.of(config.model_copy(update={"pixel_model": model}))
+    display = DisplayModel.from_config(config.model_copy(update={"pixel_model": model}))
     train = HeightTrain(5, 0.0, 12 * period_s, period_s, 100e-6, None if swing_um is None else swing_um * 1e-6)
     peaks_um, troughs_um = felt(prepared(train, display=display), train, display)
     assert peaks_um[4:] == pytest.approx(np.full(8, 100.0), rel=0.03)

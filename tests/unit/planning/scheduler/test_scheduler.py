@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.planning.pipeline import prepare
+from optodrive.planning.pipeline import plan_sequence
 
 
 def frame(display, heights_um, show_at=0.0, duration=1.0, name="f"):
@@ -13,7 +13,7 @@ def frame(display, heights_um, show_at=0.0, duration=1.0, name="f"):
 
 
 def prepared(display, *frames, trains=()):
-    return prepare(display, FrameSequence(tuple(frames), tuple(trains)), *display.at_rest())
+    return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state())
 
 
 def gaps(plan):
@@ -23,7 +23,7 @@ def gaps(plan):
 def test_one_beam_with_time_for_every_move(any_display):
     result = prepared(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
     plan = result.plan
-    moves = any_display.machine.moves
+    moves = any_display.scan_head.moves
     lit_us = np.rint(plan.width_s[:-1] * 1e6)
     steps = zip(np.diff(plan.x_rad), np.diff(plan.y_rad), lit_us, strict=True)
     needed = [moves.time_us(*step) * 1e-6 for step in steps]
@@ -42,7 +42,7 @@ def test_a_train_keeps_its_times_and_a_frame_fills_the_gaps(display):
     result = prepared(display, frame(display, dict.fromkeys(range(20), 100), duration=0.4), trains=[train])
     of_train = result.plan.source == 1
     assert of_train.sum() == 8
-    assert result.train_late_s < 1e-9
+    assert result.train_lateness_max_s < 1e-9
     assert np.allclose(np.diff(result.plan.start_s[of_train]), 0.05)
     assert (~of_train).sum() == 20
 
@@ -51,15 +51,15 @@ def test_abutting_trains_slip_by_the_moves_only(display):
     trains = [PulseTrain(200 + k, 0.015 * k, 0.06, 0.015, 0.045, 2.45) for k in range(4)]
     result = prepared(display, trains=trains)
     plan = result.plan
-    assert np.allclose(gaps(plan), plan.settle_s[1:])
-    assert result.train_late_s == pytest.approx(plan.settle_s[1:].sum(), abs=1e-9)
+    assert np.allclose(gaps(plan), plan.settling_s[1:])
+    assert result.train_lateness_max_s == pytest.approx(plan.settling_s[1:].sum(), abs=1e-9)
 
 
 def test_a_frame_that_does_not_fit_says_by_how_much(display):
     result = prepared(display, frame(display, dict.fromkeys(range(100), 100), duration=0.1))
     timing = result.frames[0]
-    assert timing.late_s == pytest.approx(timing.finished_s - timing.due_s)
-    assert 0 < timing.in_time < timing.pulses == 100
+    assert timing.late_s == pytest.approx(timing.end_s - timing.deadline_s)
+    assert 0 < timing.on_time < timing.pulses == 100
 
 
 def test_heat_left_in_a_pixel_is_used(display):
@@ -80,16 +80,16 @@ def test_a_blank_frame_plans_no_pulse(display):
 
 
 def test_a_plan_leaves_time_to_come_from_any_pixel_to_its_first(any_display):
-    layout, field, moves = any_display.layout, any_display.machine.field, any_display.machine.moves
+    layout, field, moves = any_display.layout, any_display.scan_head.field, any_display.scan_head.settling
     last = len(layout) - 1
     result = prepared(any_display, frame(any_display, {last: 40}))
     x_rad, y_rad = field.angles_rad(layout.x_m, layout.y_m)
     longest = max(moves.time_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
     assert result.plan.start_s[0] >= longest * 1e-6 - 1e-12
-    assert result.lead_s == pytest.approx(result.plan.start_s[0])
+    assert result.lead_in_s == pytest.approx(result.plan.start_s[0])
 
 
 def test_an_order_that_is_given_is_kept(display):
     sequence = FrameSequence((frame(display, dict.fromkeys((3, 4, 5), 50)),))
-    result = prepare(display, sequence, *display.at_rest(), orders={0: np.array([4, 3, 5])})
+    result = plan_sequence(display, sequence, *display.build_cold_state(), visiting_orders={0: np.array([4, 3, 5])})
     assert result.plan.pixel.tolist() == [4, 3, 5]

@@ -9,17 +9,22 @@ from hypothesis import strategies as st
 
 from displays import DISPLAYS
 from optodrive.planning.scheduler import visiting_path
-from optodrive.planning.scheduler.visiting_path import path_rad, serpentine, visiting_order, warm
+from optodrive.planning.scheduler.visiting_path import (
+    compile_kernels,
+    compute_serpentine_order,
+    compute_visiting_order,
+    path_rad,
+)
 
 DISPLAY = DISPLAYS["display-437"]
-LAYOUT, FIELD = DISPLAY.layout, DISPLAY.machine.field
+LAYOUT, FIELD = DISPLAY.layout, DISPLAY.scan_head.field
 X_RAD, Y_RAD = FIELD.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
 PITCH_RAD = float(np.diff(np.unique(X_RAD)).min())
 COUNT = len(LAYOUT)
 
 
 def ordered(active, origin=None):
-    return visiting_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column, X_RAD, Y_RAD, origin)
+    return compute_visiting_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column, X_RAD, Y_RAD, origin)
 
 
 def length(tour, origin=None):
@@ -36,7 +41,7 @@ def length(tour, origin=None):
 def test_every_pixel_once_and_never_longer_than_row_by_row(active, origin):
     tour = ordered(active, origin)
     assert sorted(tour.tolist()) == sorted(active)
-    rows = serpentine(np.array(sorted(active)), LAYOUT.row, LAYOUT.column)
+    rows = compute_serpentine_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column)
     # Two pixels have nothing to choose but which comes first, which no frame says.
     if len(active) > 2:
         assert length(tour, origin) <= length(rows, origin) + 1e-9
@@ -89,8 +94,12 @@ def test_the_path_begins_where_the_mirrors_stand():
 
 def test_after_warming_up_nothing_is_left_to_compile():
     """A planner that compiles shows no progress, and would cost the lease."""
-    warm()
-    compiled = (visiting_path.path_rad, visiting_path._near, visiting_path._improve)  # those that Python calls
+    compile_kernels()
+    compiled = (
+        visiting_path.path_rad,
+        visiting_path._find_neighbours,
+        visiting_path._improve,
+    )  # those that Python calls
     before = [len(kernel.signatures) for kernel in compiled]
     assert min(before) > 0
     ordered(np.random.default_rng(1).choice(COUNT, 60, replace=False).tolist(), 7)

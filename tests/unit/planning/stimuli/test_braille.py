@@ -1,13 +1,13 @@
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.planning.stimuli.braille import braille_lines, word_cells
+from optodrive.planning.stimuli.braille import encode_lines, encode_word
 
 
-def signs(text):
+def to_unicode_braille(text):
     """Cells as the characters of the Unicode block of braille, dot n on bit n - 1."""
     return " ".join(
-        "".join(chr(0x2800 + sum(1 << dot - 1 for dot in cell)) for cell in word_cells(w)) for w in text.split()
+        "".join(chr(0x2800 + sum(1 << dot - 1 for dot in cell)) for cell in encode_word(w)) for w in text.split()
     )
 
 
@@ -35,16 +35,16 @@ def signs(text):
     ],
 )
 def test_text_is_written_as_in_unified_english_braille(text, braille):
-    assert signs(text) == braille
+    assert to_unicode_braille(text) == braille
 
 
 def test_letters_differ_from_each_other():
-    cells = word_cells("abcdefghijklmnopqrstuvwxyz")
+    cells = encode_word("abcdefghijklmnopqrstuvwxyz")
     assert len(set(cells)) == 26
 
 
 def test_lines_end_at_line_breaks_and_words_at_blanks():
-    lines = braille_lines("a  b\tc\r\n\nd", "text")
+    lines = encode_lines("a  b\tc\r\n\nd", "text")
     assert [len(words) for words in lines] == [3, 0, 1]
 
 
@@ -64,6 +64,6 @@ def test_lines_end_at_line_breaks_and_words_at_blanks():
 )
 def test_a_character_without_a_cell_is_named(text, says):
     with pytest.raises(InputError) as caught:
-        braille_lines(text, "text")
+        encode_lines(text, "text")
     assert caught.value.code == "bad_text"
     assert says in str(caught.value)

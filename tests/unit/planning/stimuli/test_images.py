@@ -9,11 +9,11 @@ from PIL import Image, ImageDraw, PngImagePlugin
 from optodrive.core.errors import InputError
 from optodrive.device.config import load_config
 from optodrive.planning.stimuli import images
-from optodrive.planning.stimuli.images import animation_frames, image_frames, lattice_brightness
+from optodrive.planning.stimuli.images import build_animation, build_image, compute_lattice_brightness
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 CONFIG = load_config("display-437")
-LATTICE = Lattice.of(CONFIG)
+LATTICE = Lattice.from_config(CONFIG)
 
 
 def encoded(*pictures, kind="PNG", **options):
@@ -29,7 +29,7 @@ def grey(array):
 
 def shown(file, invert=False):
     """Brightness at every place, [rows from the top, columns], NaN in the corners."""
-    target = image_frames(CONFIG, "t", file, 1.0, 0.0, invert).frames[0].target_m
+    target = build_image(CONFIG, "t", file, 1.0, 0.0, invert).frames[0].target_m
     return np.where(LATTICE.index >= 0, target[LATTICE.index], np.nan)[::-1]
 
 
@@ -45,7 +45,7 @@ def test_left_is_left_and_top_is_top():
     values[1, 5] = 255
     place = np.argwhere(shown(encoded(grey(values))) > 0)
     assert place.tolist() == [[1, 5]]
-    (pixel,) = np.flatnonzero(image_frames(CONFIG, "t", encoded(grey(values)), 1.0, 0.0, False).frames[0].target_m)
+    (pixel,) = np.flatnonzero(build_image(CONFIG, "t", encoded(grey(values)), 1.0, 0.0, False).frames[0].target_m)
     assert LATTICE.layout.x_m[pixel] == pytest.approx(-5 * 3.6e-3)
     assert LATTICE.layout.y_m[pixel] == pytest.approx(9 * 3.6e-3)
 
@@ -115,12 +115,12 @@ def test_jpeg_is_read_upright():
 
 
 def test_nearly_black_is_not_driven():
-    assert not image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 9)), 1.0, 0.0, False).frames[0].target_m.any()
-    assert image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 12)), 1.0, 0.0, False).frames[0].target_m.all()
+    assert not build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 9)), 1.0, 0.0, False).frames[0].target_m.any()
+    assert build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 12)), 1.0, 0.0, False).frames[0].target_m.all()
 
 
 def test_white_is_the_height_asked_for():
-    frame = image_frames(CONFIG, "t", encoded(Image.new("L", (9, 9), 255)), 50e-6, 0.0, False).frames[0]
+    frame = build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 255)), 50e-6, 0.0, False).frames[0]
     assert frame.target_m == pytest.approx(50e-6)
     assert frame.duration_s > 437 * 3e-3
 
@@ -135,7 +135,7 @@ def dots(count):
 @pytest.mark.parametrize("kind", ["GIF", "PNG"])
 def test_an_animation_moves_at_the_pace_of_its_file(kind):
     file = encoded(*dots(4), kind=kind, duration=[50, 120, 10, 80], **({"disposal": 2} if kind == "GIF" else {}))
-    frames = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    frames = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
     assert [frame.duration_s for frame in frames] == pytest.approx([0.05, 0.12, 0.02, 0.08])
     assert [frame.show_at_s for frame in frames] == pytest.approx([0.0, 0.05, 0.17, 0.19])
     assert [np.flatnonzero(frame.target_m).tolist() for frame in frames] == [
@@ -145,28 +145,28 @@ def test_an_animation_moves_at_the_pace_of_its_file(kind):
 
 def test_a_picture_that_takes_the_beam_longer_is_given_the_time_unless_a_rate_is_asked_for():
     file = encoded(Image.new("L", (21, 21), 255), *dots(1), kind="GIF", duration=50)
-    slow = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    slow = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
     assert slow[0].duration_s > 437 * 3e-3
     assert slow[1].duration_s == pytest.approx(0.05)
     assert slow[1].show_at_s == slow[0].duration_s
-    fast = animation_frames(CONFIG, "t", file, 50e-6, 25.0, False).frames
+    fast = build_animation(CONFIG, "t", file, 50e-6, 25.0, False).frames
     assert [frame.show_at_s for frame in fast] == pytest.approx([0.0, 0.04])
 
 
 def test_the_first_picture_of_an_animation_is_its_picture():
-    frame = image_frames(CONFIG, "t", encoded(*dots(3), kind="GIF", duration=50), 50e-6, 0.0, False).frames[0]
+    frame = build_image(CONFIG, "t", encoded(*dots(3), kind="GIF", duration=50), 50e-6, 0.0, False).frames[0]
     assert np.flatnonzero(frame.target_m).tolist() == [int(LATTICE.index[10, 5])]
 
 
 def test_a_still_picture_is_an_animation_of_one():
-    (frame,) = animation_frames(CONFIG, "t", encoded(*dots(1)), 50e-6, None, False).frames
+    (frame,) = build_animation(CONFIG, "t", encoded(*dots(1)), 50e-6, None, False).frames
     assert frame.duration_s == pytest.approx(0.1)
 
 
 def test_the_poster_of_a_png_is_no_part_of_its_animation():
     poster, *moving = dots(4)
     file = encoded(poster, *moving, default_image=True, duration=100)
-    frames = animation_frames(CONFIG, "t", file, 50e-6, None, False).frames
+    frames = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
     assert [np.flatnonzero(frame.target_m).tolist() for frame in frames] == [
         [int(LATTICE.index[10, 5 + k])] for k in (1, 2, 3)
     ]
@@ -176,11 +176,11 @@ def test_the_poster_of_a_png_is_no_part_of_its_animation():
 def test_a_note_called_duration_is_not_a_duration(text):
     notes = PngImagePlugin.PngInfo()
     notes.add_text("duration", text)
-    (frame,) = animation_frames(CONFIG, "t", encoded(*dots(1), pnginfo=notes), 50e-6, None, False).frames
+    (frame,) = build_animation(CONFIG, "t", encoded(*dots(1), pnginfo=notes), 50e-6, None, False).frames
     assert frame.duration_s == pytest.approx(0.1)
 
 
-def refusal(file, build=image_frames):
+def refusal(file, build=build_image):
     with pytest.raises(InputError) as caught:
         build(CONFIG, "image", file, 50e-6, 1.0, False)
     assert "\n" not in str(caught.value)
@@ -191,7 +191,7 @@ def refusal(file, build=image_frames):
     "file",
     [b"", b"no picture", b"%PDF-1.4", b"\x89PNG\r\n\x1a\n", b"GIF89a", encoded(Image.new("L", (9, 9)), kind="BMP")],
 )
-@pytest.mark.parametrize("build", [image_frames, animation_frames])
+@pytest.mark.parametrize("build", [build_image, build_animation])
 def test_a_picture_that_is_no_picture_is_refused(file, build):
     code, message = refusal(file, build)
     assert code == "bad_picture"
@@ -212,7 +212,7 @@ def test_a_picture_cut_short_is_refused(kind):
 def test_an_animation_cut_short_is_refused():
     noise = [grey(np.random.default_rng(k).integers(0, 256, (64, 64))) for k in range(4)]
     file = encoded(*noise, kind="GIF", duration=50)
-    assert refusal(file[: len(file) // 2], animation_frames)[0] == "bad_picture"
+    assert refusal(file[: len(file) // 2], build_animation)[0] == "bad_picture"
 
 
 def test_large_pictures_are_refused_before_they_are_unpacked(monkeypatch):
@@ -227,19 +227,19 @@ def test_large_pictures_are_refused_before_they_are_unpacked(monkeypatch):
 def test_long_animations_are_refused(monkeypatch):
     file = encoded(*dots(5), kind="GIF", duration=50)
     monkeypatch.setattr(images, "ANIMATION_FRAMES_MAX", 4)
-    assert refusal(file, animation_frames) == ("too_many", "image: file: got '5 pictures', expected at most 4")
+    assert refusal(file, build_animation) == ("too_many", "image: file: got '5 pictures', expected at most 4")
     monkeypatch.setattr(images, "ANIMATION_FRAMES_MAX", 5)
-    assert len(animation_frames(CONFIG, "t", file, 50e-6, None, False).frames) == 5
+    assert len(build_animation(CONFIG, "t", file, 50e-6, None, False).frames) == 5
     monkeypatch.setattr(images, "ANIMATION_PIXELS_MAX", 5 * 21 * 21 - 1)
-    assert refusal(file, animation_frames)[0] == "too_many"
+    assert refusal(file, build_animation)[0] == "too_many"
 
 
 def test_a_drawing_keeps_its_shape_on_every_display():
     picture = Image.new("L", (300, 300), 0)
     ImageDraw.Draw(picture).ellipse((30, 30, 270, 270), fill=255)
     for name in ("display-16", "display-357", "display-1511"):
-        lattice = Lattice.of(load_config(name))
-        bright = lattice_brightness(picture, lattice, False)
+        lattice = Lattice.from_config(load_config(name))
+        bright = compute_lattice_brightness(picture, lattice, False)
         radius = np.hypot(lattice.layout.x_m, lattice.layout.y_m) / 4e-3
         half = lattice.index.shape[0] / 2
         assert bright[radius < 0.8 * half - 1].min(initial=1.0) > 1 - 1e-5

@@ -65,7 +65,7 @@ def test_the_description_is_json():
 def test_defaults_lie_within_their_own_bounds(name):
     pattern = find_pattern(name)
     given = {p.name: p.default for p in pattern.parameters if p.default is not None}
-    pattern.arguments({**given, **NEEDED.get(name, {})}, CONFIG)
+    pattern.resolve_arguments({**given, **NEEDED.get(name, {})}, CONFIG)
 
 
 def test_text_from_a_command_line_and_numbers_mean_the_same():

@@ -10,11 +10,11 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import load_config
 from optodrive.planning.stimuli import sequence_file, train_json
 from optodrive.planning.stimuli.sequence_file import (
-    checked_sequence,
     load_sequence,
     parse_json,
     parse_sequence,
     sequence_to_json,
+    validate_sequence,
 )
 
 CONFIG = load_config("display-437")
@@ -222,7 +222,7 @@ def test_too_many_frames_or_trains_are_refused(monkeypatch):
     assert refusal(body([], [{}, {"start_s": 1.0}]))[0] == "too_many"
     frame = TactileFrame("x", 0.0, 1.0, np.zeros(437))
     with pytest.raises(InputError, match="at most 2"):
-        checked_sequence(FrameSequence(frames=(frame,) * 3), "pattern", CONFIG)
+        validate_sequence(FrameSequence(frames=(frame,) * 3), "pattern", CONFIG)
 
 
 def test_the_bounds_hold_as_stated():

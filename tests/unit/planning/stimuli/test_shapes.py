@@ -4,17 +4,32 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config, shipped_configs
+from optodrive.device.config import list_shipped_configs, load_config
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel import advance, cooling_peak
-from optodrive.planning.stimuli.experiments import intensity
+from optodrive.planning.stimuli.experiments import build_intensity
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.refresh import RESERVE, Beam, end_s, hold, steps
-from optodrive.planning.stimuli.shapes import checker, circle, dot, edge, everything, ring_pixels, single, square
-from optodrive.planning.stimuli.showcase import one_after_the_other, showcase
+from optodrive.planning.stimuli.refresh import (
+    BEAM_TIME_MARGIN,
+    BeamTimeEstimator,
+    build_steps,
+    hold_picture,
+    sequence_end_s,
+)
+from optodrive.planning.stimuli.shapes import (
+    build_all_pixels,
+    build_checkerboard,
+    build_moving_dot,
+    build_moving_edge,
+    build_ring,
+    build_single_pixel,
+    build_square_outline,
+    find_ring_pixels,
+)
+from optodrive.planning.stimuli.showcase import build_showcase, concatenate_sequences
 
 CONFIG = load_config("display-437")
-LAYOUT = Lattice.of(CONFIG).layout
+LAYOUT = Lattice.from_config(CONFIG).layout
 PITCH_M = 3.6e-3
 PITCH_MOVE_S = 317e-6
 
@@ -24,20 +39,22 @@ def raised(frame):
 
 
 def test_lattice_and_layout_are_inverse():
-    for name in shipped_configs():
-        lattice = Lattice.of(load_config(name))
-        found = [lattice.at(int(r), int(c)) for r, c in zip(lattice.layout.row, lattice.layout.column, strict=True)]
+    for name in list_shipped_configs():
+        lattice = Lattice.from_config(load_config(name))
+        found = [
+            lattice.pixel_at(int(r), int(c)) for r, c in zip(lattice.layout.row, lattice.layout.column, strict=True)
+        ]
         assert found == list(range(len(lattice.layout)))
-    lattice = Lattice.of(CONFIG)
-    assert lattice.at(0, 0) is None
-    assert lattice.at(-1, 5) is None
-    assert lattice.at(5, 21) is None
+    lattice = Lattice.from_config(CONFIG)
+    assert lattice.pixel_at(0, 0) is None
+    assert lattice.pixel_at(-1, 5) is None
+    assert lattice.pixel_at(5, 21) is None
 
 
 @pytest.mark.parametrize("target_um", [5, 50, 150, 400])
 def test_the_shortest_pulse_that_reaches_a_height(target_um):
-    pixel = load_parameters(CONFIG.pixel_model.parameters).pixel(CONFIG.display.bridge_width_m)
-    width_s = Beam(CONFIG).pulse_s(target_um * 1e-6)
+    pixel = load_parameters(CONFIG.pixel_model.parameters).build_pixel(CONFIG.display.bridge_width_m)
+    width_s = BeamTimeEstimator(CONFIG).min_pulse_s(target_um * 1e-6)
 
     def peak_m(seconds):
         return pixel.kappa_m_per_k * cooling_peak(pixel, *advance(pixel, 0.0, 0.0, 2.45, seconds))[0]
@@ -47,51 +64,53 @@ def test_the_shortest_pulse_that_reaches_a_height(target_um):
 
 
 def test_a_height_out_of_reach_counts_as_the_longest_pulse():
-    assert Beam(CONFIG).pulse_s(1.0) == pytest.approx(0.05)
+    assert BeamTimeEstimator(CONFIG).min_pulse_s(1.0) == pytest.approx(0.05)
 
 
 def test_beam_time_is_pulses_and_moves():
-    beam, target_m = Beam(CONFIG), np.zeros(437)
-    assert beam.picture_s(target_m) == 0.0
+    beam, target_m = BeamTimeEstimator(CONFIG), np.zeros(437)
+    assert beam.beam_time_s(target_m) == 0.0
     target_m[200] = 50e-6
-    alone_s = beam.picture_s(target_m)
-    assert alone_s == pytest.approx(RESERVE * (beam.pulse_s(50e-6) + PITCH_MOVE_S), abs=1e-3)
+    alone_s = beam.beam_time_s(target_m)
+    assert alone_s == pytest.approx(BEAM_TIME_MARGIN * (beam.min_pulse_s(50e-6) + PITCH_MOVE_S), abs=1e-3)
     target_m[:] = 50e-6
-    assert beam.picture_s(target_m) == pytest.approx(RESERVE * 437 * (beam.pulse_s(50e-6) + PITCH_MOVE_S), rel=0.01)
+    assert beam.beam_time_s(target_m) == pytest.approx(
+        BEAM_TIME_MARGIN * 437 * (beam.min_pulse_s(50e-6) + PITCH_MOVE_S), rel=0.01
+    )
 
 
 def test_a_picture_is_held_by_drawing_it_again():
-    beam, target_m = Beam(CONFIG), np.full(437, 50e-6)
-    frames = hold(beam, target_m, 4.0, "x", start_s=1.0)
-    each_s = beam.picture_s(target_m)
+    beam, target_m = BeamTimeEstimator(CONFIG), np.full(437, 50e-6)
+    frames = hold_picture(beam, target_m, 4.0, "x", start_s=1.0)
+    each_s = beam.beam_time_s(target_m)
     assert [frame.frame_id for frame in frames] == ["x-0", "x-1", "x-2"]
     assert [frame.show_at_s for frame in frames] == pytest.approx([1.0, 1.0 + each_s, 1.0 + 2 * each_s])
     assert frames[-1].show_at_s + each_s >= 5.0
-    assert len(hold(beam, target_m, 0.0, "x")) == 1
-    assert len(hold(beam, np.zeros(437), 0.5, "x")) == 5
+    assert len(hold_picture(beam, target_m, 0.0, "x")) == 1
+    assert len(hold_picture(beam, np.zeros(437), 0.5, "x")) == 5
 
 
 def test_steps_last_as_asked_or_as_the_beam_needs():
-    beam, full, none = Beam(CONFIG), np.full(437, 50e-6), np.zeros(437)
-    first, second, third = steps(beam, [none, full, none], 0.2, "s")
+    beam, full, none = BeamTimeEstimator(CONFIG), np.full(437, 50e-6), np.zeros(437)
+    first, second, third = build_steps(beam, [none, full, none], 0.2, "s")
     assert (first.duration_s, third.duration_s) == (0.2, 0.2)
-    assert second.duration_s == beam.picture_s(full) > 1.0
+    assert second.duration_s == beam.beam_time_s(full) > 1.0
     assert third.show_at_s == pytest.approx(0.2 + second.duration_s)
 
 
 def test_all_raises_every_pixel():
-    for frame in everything(CONFIG, "t", 50e-6, 1.0).frames:
+    for frame in build_all_pixels(CONFIG, "t", 50e-6, 1.0).frames:
         assert frame.target_m == pytest.approx(50e-6)
 
 
 def test_single_raises_one():
-    assert raised(single(CONFIG, "t", 17, 1e-4, 0.3).frames[0]).tolist() == [17]
-    assert raised(single(CONFIG, "t", None, 1e-4, 0.3).frames[0]).tolist() == [218]
-    assert len(single(CONFIG, "t", 17, 1e-4, 0.3).frames) == 3
+    assert raised(build_single_pixel(CONFIG, "t", 17, 1e-4, 0.3).frames[0]).tolist() == [17]
+    assert raised(build_single_pixel(CONFIG, "t", None, 1e-4, 0.3).frames[0]).tolist() == [218]
+    assert len(build_single_pixel(CONFIG, "t", 17, 1e-4, 0.3).frames) == 3
 
 
 def test_checker_leaves_every_neighbour_down():
-    up = checker(CONFIG, "t", 50e-6, 0.0).frames[0].target_m > 0
+    up = build_checkerboard(CONFIG, "t", 50e-6, 0.0).frames[0].target_m > 0
     for one, two in ((LAYOUT.row, LAYOUT.column), (LAYOUT.column, LAYOUT.row)):
         order = np.lexsort((two, one))
         for a, b in pairwise(order):
@@ -100,7 +119,7 @@ def test_checker_leaves_every_neighbour_down():
 
 
 def test_circle_is_a_closed_ring_of_its_radius():
-    ring = raised(circle(CONFIG, "t", 20e-3, 1e-4, 0.0).frames[0])
+    ring = raised(build_ring(CONFIG, "t", 20e-3, 1e-4, 0.0).frames[0])
     radius_m = np.hypot(LAYOUT.x_m[ring], LAYOUT.y_m[ring])
     assert np.all(np.abs(radius_m - 20e-3) <= PITCH_M / 2)
     angle = np.sort(np.arctan2(LAYOUT.y_m[ring], LAYOUT.x_m[ring]))
@@ -108,7 +127,7 @@ def test_circle_is_a_closed_ring_of_its_radius():
 
 
 def test_square_is_an_outline():
-    outline = raised(square(CONFIG, "t", 12 * PITCH_M, 1e-4, 0.0).frames[0])
+    outline = raised(build_square_outline(CONFIG, "t", 12 * PITCH_M, 1e-4, 0.0).frames[0])
     assert len(outline) == 4 * 12
     assert np.maximum(np.abs(LAYOUT.x_m[outline]), np.abs(LAYOUT.y_m[outline])) == pytest.approx(6 * PITCH_M)
 
@@ -117,7 +136,7 @@ def test_square_is_an_outline():
     ("direction", "axis", "sign"), [("right", "x_m", 1), ("left", "x_m", -1), ("up", "y_m", 1), ("down", "y_m", -1)]
 )
 def test_edge_moves_line_by_line(direction, axis, sign):
-    frames = edge(CONFIG, "t", direction, 50e-6, 0.1).frames
+    frames = build_moving_edge(CONFIG, "t", direction, 50e-6, 0.1).frames
     along = [set(np.round(getattr(LAYOUT, axis)[raised(frame)], 9)) for frame in frames]
     assert [len(line) for line in along] == [1] * 21
     assert np.diff([line.pop() for line in along]) == pytest.approx(sign * PITCH_M)
@@ -125,9 +144,9 @@ def test_edge_moves_line_by_line(direction, axis, sign):
 
 
 def test_dot_visits_the_ring_clockwise():
-    frames = dot(CONFIG, "t", None, 2e-4, 0.06, 2).frames
+    frames = build_moving_dot(CONFIG, "t", None, 2e-4, 0.06, 2).frames
     path = [int(raised(frame)[0]) for frame in frames]
-    ring = ring_pixels(CONFIG, "t", None)
+    ring = find_ring_pixels(CONFIG, "t", None)
     assert all(len(raised(frame)) == 1 for frame in frames)
     assert path[: len(ring)] == path[len(ring) :]
     assert set(path) == set(ring)
@@ -135,7 +154,7 @@ def test_dot_visits_the_ring_clockwise():
     assert np.all(np.diff(angle) < 0)
 
 
-@pytest.mark.parametrize("build", [circle, square])
+@pytest.mark.parametrize("build", [build_ring, build_square_outline])
 def test_a_shape_beyond_the_display_is_refused(build):
     with pytest.raises(InputError, match=r"t: (radius|side)_mm: got .* 72 × 72 mm from centre to centre") as caught:
         build(CONFIG, "t", 0.5, 1e-4, 1.0)
@@ -143,17 +162,17 @@ def test_a_shape_beyond_the_display_is_refused(build):
 
 
 def test_sequences_are_joined_with_pauses():
-    first, second = everything(CONFIG, "t", 50e-6, 0.0), intensity(CONFIG, "t", 5, None)
-    joined = one_after_the_other(first, second, first)
-    assert joined.trains[0].start_s == pytest.approx(end_s(first) + 0.3)
-    assert joined.frames[1].show_at_s == pytest.approx(end_s(first) + 0.3 + 0.975 + 0.3)
-    assert end_s(joined) == pytest.approx(2 * end_s(first) + 0.6 + 0.975)
+    first, second = build_all_pixels(CONFIG, "t", 50e-6, 0.0), build_intensity(CONFIG, "t", 5, None)
+    joined = concatenate_sequences(first, second, first)
+    assert joined.trains[0].start_s == pytest.approx(sequence_end_s(first) + 0.3)
+    assert joined.frames[1].show_at_s == pytest.approx(sequence_end_s(first) + 0.3 + 0.975 + 0.3)
+    assert sequence_end_s(joined) == pytest.approx(2 * sequence_end_s(first) + 0.6 + 0.975)
 
 
 @pytest.mark.parametrize("name", ["display-357", "display-437", "display-1511"])
 def test_the_showcase_is_short_and_has_everything(name):
-    sequence = showcase(load_config(name), "showcase")
-    assert 7.0 < end_s(sequence) < 10.5
+    sequence = build_showcase(load_config(name), "showcase")
+    assert 7.0 < sequence_end_s(sequence) < 10.5
     assert {frame.frame_id.split("-")[0] for frame in sequence.frames} == {"dot", "circle", "page"}
     assert len(sequence.trains) == 16
     assert all(a.show_at_s + a.duration_s <= b.show_at_s + 1e-9 for a, b in pairwise(sequence.frames))

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.planning.stimuli.streamed_frame import parse_live_frame, unseen_first
+from optodrive.planning.stimuli.streamed_frame import parse_live_frame, stale_pixels_first
 
 
 def binary(heights, number=7, magic=b"ODF1"):
@@ -59,7 +59,7 @@ def test_every_pixel_has_its_turn_however_fast_frames_come(data):
     wanted = set(np.flatnonzero(active))
     for height_m in range(1, len(wanted) + 1):
         target_m = 1e-5 * height_m * active
-        parts = unseen_first(FrameSequence((TactileFrame("1", 0.0, 1.0, target_m),)), seen).frames
+        parts = stale_pixels_first(FrameSequence((TactileFrame("1", 0.0, 1.0, target_m),)), seen).frames
         assert sum(part.target_m for part in parts) == pytest.approx(target_m)
         first = data.draw(st.sampled_from(np.flatnonzero(parts[0].target_m).tolist()))
         assert first in wanted
@@ -70,4 +70,4 @@ def test_every_pixel_has_its_turn_however_fast_frames_come(data):
 
 def test_an_empty_frame_stays_one():
     sequence = FrameSequence((TactileFrame("1", 0.0, 1.0, np.zeros(2)),))
-    assert unseen_first(sequence, np.zeros(2, dtype=bool)) == sequence
+    assert stale_pixels_first(sequence, np.zeros(2, dtype=bool)) == sequence

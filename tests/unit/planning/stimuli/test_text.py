@@ -4,23 +4,23 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config, shipped_configs
-from optodrive.planning.stimuli.braille import SPACE, word_cells
+from optodrive.device.config import list_shipped_configs, load_config
+from optodrive.planning.stimuli.braille import SPACE, encode_word
 from optodrive.planning.stimuli.pixel_lattice import Lattice
-from optodrive.planning.stimuli.text import Spacing, line_slots, text_frames, wrapped
+from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots, wrap_words
 
 CONFIG = load_config("display-437")
 
 
 def picture(frame, config=CONFIG):
     """Rows of # and blanks, from the top."""
-    lattice = Lattice.of(config)
+    lattice = Lattice.from_config(config)
     raised = np.where(lattice.index >= 0, frame.target_m[lattice.index] > 0, False)[::-1]
     return ["".join("#" if dot else " " for dot in row).rstrip() for row in raised]
 
 
 def test_words_stand_on_the_lattice():
-    frame = text_frames(CONFIG, "t", "hi you", 1e-4, 1.0).frames[0]
+    frame = build_text(CONFIG, "t", "hi you", 1e-4, 1.0).frames[0]
     assert picture(frame)[:5] == [
         "",
         "#   #    ## #  #",
@@ -32,7 +32,7 @@ def test_words_stand_on_the_lattice():
 
 
 def test_a_page_is_drawn_again_until_its_time_is_over():
-    frames = text_frames(CONFIG, "t", "hi", 1e-4, 2.0).frames
+    frames = build_text(CONFIG, "t", "hi", 1e-4, 2.0).frames
     assert frames[-1].show_at_s + frames[-1].duration_s >= 2.0
     assert frames[0].duration_s == pytest.approx(0.1)
     assert len(frames) == 20
@@ -41,19 +41,19 @@ def test_a_page_is_drawn_again_until_its_time_is_over():
 
 
 def test_text_too_long_for_a_page_goes_on():
-    frames = text_frames(CONFIG, "t", "one two three four five six seven eight nine ten", 1e-4, 0.0).frames
+    frames = build_text(CONFIG, "t", "one two three four five six seven eight nine ten", 1e-4, 0.0).frames
     assert [frame.frame_id for frame in frames] == ["page-1-0", "page-2-0"]
     assert picture(frames[0]) != picture(frames[1])
     assert all(a.show_at_s + a.duration_s <= b.show_at_s + 1e-9 for a, b in pairwise(frames))
 
 
 def test_words_wrap_and_the_longest_are_cut():
-    cells = {letter: word_cells(letter)[0] for letter in "abcdefghi"}
+    cells = {letter: encode_word(letter)[0] for letter in "abcdefghi"}
     back = {cell: letter for letter, cell in cells.items()} | {SPACE: " "}
 
     def rows(text, widths):
         words = [[[cells[letter] for letter in word] for word in line.split()] for line in text.split("\n")]
-        return ["".join(back[cell] for cell in row) for row in wrapped(words, widths)]
+        return ["".join(back[cell] for cell in row) for row in wrap_words(words, widths)]
 
     assert rows("ab cd ef", [5]) == ["ab cd", "ef"]
     assert rows("abcdefghi ab", [4]) == ["abcd", "efgh", "i ab"]
@@ -64,25 +64,27 @@ def test_words_wrap_and_the_longest_are_cut():
     assert rows("abc", [1]) == ["a", "b", "c"]
 
 
-@pytest.mark.parametrize("name", [name for name in shipped_configs() if name != "display-1"])
+@pytest.mark.parametrize("name", [name for name in list_shipped_configs() if name != "display-1"])
 @pytest.mark.parametrize("spacing", [Spacing(1, 1, 1), Spacing(1, 0, 0), Spacing(1, 2, 3)])
 def test_no_two_dots_share_a_pixel_and_none_falls_into_a_hole(name, spacing):
-    lattice = Lattice.of(load_config(name))
-    pixels = [pixel for line in line_slots(lattice, spacing) for slot in line for pixel in slot.values()]
+    lattice = Lattice.from_config(load_config(name))
+    pixels = [pixel for line in find_line_slots(lattice, spacing) for slot in line for pixel in slot.values()]
     assert pixels
     assert len(set(pixels)) == len(pixels)
     assert min(pixels) >= 0
 
 
 def test_lines_go_round_the_missing_corners():
-    lengths = [len(line) for line in line_slots(Lattice.of(load_config("display-1511")), Spacing(1, 1, 1))]
+    lengths = [
+        len(line) for line in find_line_slots(Lattice.from_config(load_config("display-1511")), Spacing(1, 1, 1))
+    ]
     assert lengths == [11, *[13] * 8, 11]
-    assert [len(line) for line in line_slots(Lattice.of(CONFIG), Spacing(1, 1, 1))] == [7] * 5
+    assert [len(line) for line in find_line_slots(Lattice.from_config(CONFIG), Spacing(1, 1, 1))] == [7] * 5
 
 
 def test_dots_lie_as_in_a_cell():
-    lattice = Lattice.of(CONFIG)
-    slot = line_slots(lattice, Spacing(2, 1, 1))[0][0]
+    lattice = Lattice.from_config(CONFIG)
+    slot = find_line_slots(lattice, Spacing(2, 1, 1))[0][0]
     x_m, y_m = lattice.layout.x_m, lattice.layout.y_m
     for left, right in ((1, 4), (2, 5), (3, 6)):
         assert x_m[slot[right]] - x_m[slot[left]] == pytest.approx(2 * 3.6e-3)
@@ -93,11 +95,11 @@ def test_dots_lie_as_in_a_cell():
 @pytest.mark.parametrize("text", [" ", "\n\n"])
 def test_blank_text_is_refused(text):
     with pytest.raises(InputError, match="at least one character"):
-        text_frames(CONFIG, "t", text, 1e-4, 1.0)
+        build_text(CONFIG, "t", text, 1e-4, 1.0)
 
 
 def test_a_display_too_small_for_a_cell_is_refused():
     with pytest.raises(InputError, match="display-1: got '1 × 1', expected a display with 3 × 2 pixels"):
-        text_frames(load_config("display-1"), "t", "a", 1e-4, 1.0)
+        build_text(load_config("display-1"), "t", "a", 1e-4, 1.0)
     with pytest.raises(InputError, match="5 × 3 pixels"):
-        text_frames(load_config("display-16"), "t", "a", 1e-4, 1.0, dot_step=2)
+        build_text(load_config("display-16"), "t", "a", 1e-4, 1.0, dot_step=2)

@@ -8,7 +8,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain
 from optodrive.device.config import load_config
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
-from optodrive.planning.stimuli.train_json import check_trains, checked_train, pulse_count
+from optodrive.planning.stimuli.train_json import check_trains, count_pulses, validate_train
 
 CONFIG = load_config("display-437")
 TRAIN = {"pixel": 17, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.020, "gap_s": 0.060, "power_w": 2.45}
@@ -68,7 +68,7 @@ HEIGHTS = {"pixel": 17, "start_s": 0.0, "duration_s": 1.0, "period_s": 0.04, "ta
 def test_a_train_by_height_is_told_by_its_keys():
     (train,) = parse_sequence({"trains": [HEIGHTS]}, CONFIG, "f").trains
     assert train == HeightTrain(17, 0.0, 1.0, 0.04, pytest.approx(300e-6), pytest.approx(120e-6))
-    assert len(train.pulse_starts_s()) == pulse_count(train) == 25
+    assert len(train.pulse_starts_s()) == count_pulses(train) == 25
     (free,) = parse_sequence({"trains": [{**HEIGHTS, "peak_to_peak_um": None}]}, CONFIG, "f").trains
     assert free.peak_to_peak_m is None
 
@@ -166,7 +166,7 @@ def test_too_many_pulses_are_refused_before_they_are_made():
 def test_pulses_are_counted_as_they_are_made():
     for duration_s in (0.001, 0.08, 0.0800001, 0.3, 1.0):
         train = PulseTrain(0, 0.0, duration_s, 0.02, 0.06, 1.0)
-        assert pulse_count(train) == len(train.pulse_starts_s())
+        assert count_pulses(train) == len(train.pulse_starts_s())
 
 
 def test_a_hundred_thousand_pulses_are_checked_quickly():
@@ -175,7 +175,7 @@ def test_a_hundred_thousand_pulses_are_checked_quickly():
     start_s = time.process_time()
     check_trains(many, "trains", CONFIG)
     assert time.process_time() - start_s < 0.5
-    assert sum(map(pulse_count, many)) == 100_000
+    assert sum(map(count_pulses, many)) == 100_000
     late = replace(train, pixel=9, start_s=49.9996, duration_s=0.001)
     with pytest.raises(InputError, match="one beam"):
         check_trains([*many, late], "trains", CONFIG)
@@ -185,5 +185,5 @@ def test_another_laser_has_other_periods():
     config = CONFIG.model_copy(update={"laser": CONFIG.laser.model_copy(update={"pwm_hz": 1000.0})})
     train = PulseTrain(0, 0.0, 1.0, 0.0152, 0.1, 1.0)
     with pytest.raises(InputError, match=r"whole PWM periods of 0.001 s, nearest is 0.015"):
-        checked_train(train, "t", config)
-    assert np.isclose(checked_train(train, "t", CONFIG).pulse_width_s, 0.0152)
+        validate_train(train, "t", config)
+    assert np.isclose(validate_train(train, "t", CONFIG).pulse_width_s, 0.0152)

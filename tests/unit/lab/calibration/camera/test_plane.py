@@ -8,14 +8,14 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.lab.calibration.camera.folder import GridSection, OriginSection
-from optodrive.lab.calibration.camera.grid import find_grid, grid_m, turned_to_marks
+from optodrive.lab.calibration.camera.grid import find_grid, grid_corners_m, orient_to_marks
 from optodrive.lab.calibration.camera.plane import fit_plane
 from rendered import CAMERA, FIRST_M, GRID, SIZE, TILTED, TURN_RAD, Camera, corners_m, grid_light, marks_px, taken
 
 DOTS = GRID | {"kind": "circles"}
-WIDE = Camera(off_m=(0.03, 0.05), away_m=0.21, focal_px=2700.0, middle_px=(790.0, 607.0), k1=-0.2, k2=0.06)
-TURNED = replace(CAMERA, roll_rad=np.pi + 0.1)
-UPRIGHT = replace(CAMERA, roll_rad=0.5 * np.pi, focal_px=4400.0)
+WIDE_ANGLE = Camera(off_m=(0.03, 0.05), away_m=0.21, focal_px=2700.0, middle_px=(790.0, 607.0), k1=-0.2, k2=0.06)
+UPSIDE_DOWN = replace(CAMERA, roll_rad=np.pi + 0.1)
+PORTRAIT = replace(CAMERA, roll_rad=0.5 * np.pi, focal_px=4400.0)
 PLACES_M = np.random.default_rng(5).uniform(-36e-3, 36e-3, (500, 2))
 
 
@@ -25,48 +25,48 @@ def section(grid):
 
 def origin(camera=CAMERA):
     marks = tuple((float(x), float(y)) for x, y in marks_px(camera=camera))
-    return OriginSection(marks_px=marks, first_m=FIRST_M, turn_rad=TURN_RAD)
+    return OriginSection(marks_px=marks, first_corner_m=FIRST_M, turn_rad=TURN_RAD)
 
 
-def found(camera, grid, seed, noise=2.0):
+def find_rendered_grid(camera, grid, seed, noise=2.0):
     picture = taken(180.0 * grid_light(camera, grid), np.random.default_rng(seed), noise)
     return find_grid(Path("grid.png"), picture, section(grid))
 
 
-def plane_of(cameras, grid=GRID, noise=2.0):
-    views = [found(camera, grid, seed, noise) for seed, camera in enumerate(cameras)]
-    views[0] = turned_to_marks("it", views[0], origin(cameras[0]))
-    return fit_plane(views, grid_m(section(grid), origin()), grid["pitch_m"], SIZE)
+def fit_rendered_plane(cameras, grid=GRID, noise=2.0):
+    views = [find_rendered_grid(camera, grid, seed, noise) for seed, camera in enumerate(cameras)]
+    views[0] = orient_to_marks("it", views[0], origin(cameras[0]))
+    return fit_plane(views, grid_corners_m(section(grid), origin()), grid["pitch_m"], SIZE)
 
 
-def off_m(plane, camera):
-    return np.hypot(*(plane.places_m(camera.pixel(PLACES_M)) - PLACES_M).T)
+def position_errors_m(plane, camera):
+    return np.hypot(*(plane.position_m(camera.pixel(PLACES_M)) - PLACES_M).T)
 
 
 def test_the_grid_lies_where_first_corner_and_turn_say():
-    assert np.allclose(grid_m(section(GRID), origin()), corners_m(), rtol=0.0, atol=1e-12)
+    assert np.allclose(grid_corners_m(section(GRID), origin()), corners_m(), rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("cameras", "grid"),
-    [((CAMERA,), GRID), ((CAMERA,), DOTS), ((WIDE,), GRID), ((TURNED,), GRID), ((UPRIGHT,), GRID)],
+    [((CAMERA,), GRID), ((CAMERA,), DOTS), ((WIDE_ANGLE,), GRID), ((UPSIDE_DOWN,), GRID), ((PORTRAIT,), GRID)],
     ids=["chessboard", "dots", "wide lens", "upside down", "upright"],
 )
 def test_one_picture_of_the_grid_is_enough_for_5_um(cameras, grid):
-    plane = plane_of(cameras, grid)
-    off = off_m(plane, cameras[0])
+    plane = fit_rendered_plane(cameras, grid)
+    off = position_errors_m(plane, cameras[0])
     assert np.sqrt((off**2).mean()) < 5e-6
     assert off.max() < 15e-6
-    assert plane.left_px < 0.05
+    assert plane.residual_px < 0.05
 
 
 @pytest.mark.slow
 def test_several_give_the_camera():
-    plane = plane_of((CAMERA, *TILTED))
+    plane = fit_rendered_plane((CAMERA, *TILTED))
     assert plane.camera is not None
     matrix, _ = plane.camera
     assert matrix[0, 0] == pytest.approx(CAMERA.focal_px, rel=0.01)
-    assert np.sqrt((off_m(plane, CAMERA) ** 2).mean()) < 5e-6
+    assert np.sqrt((position_errors_m(plane, CAMERA) ** 2).mean()) < 5e-6
 
 
 def test_corners_that_are_off_make_the_plane_less_sure_as_much_as_they_do():
@@ -76,9 +76,9 @@ def test_corners_that_are_off_make_the_plane_less_sure_as_much_as_they_do():
     for _ in range(30):
         moved = (exact + random.normal(0.0, 0.2, exact.shape)).reshape(*corners_m().shape)
         plane = fit_plane([moved], corners_m(), GRID["pitch_m"], SIZE)
-        off.append(plane.places_m(CAMERA.pixel(PLACES_M)) - PLACES_M)
+        off.append(plane.position_m(CAMERA.pixel(PLACES_M)) - PLACES_M)
         stated.append(plane.sigma_m(CAMERA.pixel(PLACES_M)))
-        assert 0.17 < plane.left_px < 0.23
+        assert 0.17 < plane.residual_px < 0.23
     assert 0.7 < np.sqrt(np.mean(np.square(off))) / np.sqrt(np.mean(np.square(stated))) < 1.4
 
 
@@ -100,7 +100,7 @@ def test_without_the_lens_it_would_miss():
 def test_marks_put_the_grid_right_in_whatever_order_it_was_found(turn):
     exact = CAMERA.pixel(corners_m().reshape(-1, 2)).reshape(*corners_m().shape)
     given = exact[:: 1 - 2 * (turn & 1), :: 1 - (turn & 2)]
-    assert np.array_equal(turned_to_marks("it", given, origin()), exact)
+    assert np.array_equal(orient_to_marks("it", given, origin()), exact)
 
 
 def test_marks_along_a_column_are_named():
@@ -109,4 +109,4 @@ def test_marks_along_a_column_are_named():
     along_column = (right, right + down - first, first)
     marks = tuple((float(x), float(y)) for x, y in along_column)
     with pytest.raises(InputError, match="a first row of 10 and 13 rows"):
-        turned_to_marks("it", exact, origin().model_copy(update={"marks_px": marks}))
+        orient_to_marks("it", exact, origin().model_copy(update={"marks_px": marks}))

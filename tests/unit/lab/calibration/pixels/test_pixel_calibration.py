@@ -11,22 +11,22 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Run, Signal
 from optodrive.lab.calibration.pixels.fit import Optics, fit_pixel
-from optodrive.lab.calibration.pixels.map_fit import Responses, figures
-from optodrive.lab.calibration.pixels.response import Response, response_of
-from optodrive.lab.calibration.pixels.sweep import aims, pulse
+from optodrive.lab.calibration.pixels.map_fit import PixelMapFitter, compute_stats
+from optodrive.lab.calibration.pixels.response import PixelResponse, compute_response
+from optodrive.lab.calibration.pixels.sweep import compute_pulse, list_aims
 
 DISPLAY = DISPLAYS["display-16"]
-CONFIG, OPTICS = DISPLAY.config, Optics.of(DISPLAY.config)
+CONFIG, OPTICS = DISPLAY.config, Optics.from_config(DISPLAY.config)
 PULSES = np.array([[0.02, 0.005, 2.45, 3]])
 T_S = np.arange(0.0, 0.12, 1e-3)
-PREDICT = DISPLAY.heat_at_rest().heights_m
-SHAPE_M = PREDICT(PULSES, 3, T_S)
+PREDICT = DISPLAY.build_cold_heat().simulate_displacement_m
+PREDICTED_M = PREDICT(PULSES, 3, T_S)
 SIGMA_M = 2e-6
-MOST_M = (4e-3, 4e-3)
-EACH_AIM = [(aim.x_m, aim.y_m) for aim in aims(CONFIG)]
+AIM_MAX_M = (4e-3, 4e-3)
+EACH_AIM = [(aim.x_m, aim.y_m) for aim in list_aims(CONFIG)]
 
 
-def lit(aim_m, offset_m):
+def absorbed_fraction(aim_m, offset_m):
     """How much of a 1 × 0.5 mm focus lies on a 2 × 1.5 mm absorber, by counting points of it."""
     x, y = (
         np.abs(np.linspace(-half, half, 2001) + a - o)
@@ -35,17 +35,17 @@ def lit(aim_m, offset_m):
     return float(np.mean(x <= 1e-3) * np.mean(y <= 7.5e-4))
 
 
-def run_of(gain, aim_m=(0.0, 0.0), offset_m=(0.0, 0.0), random=None, scale=1.0, pixel=3, zero_m=1e-5):
+def simulate_run(gain, aim_m=(0.0, 0.0), offset_m=(0.0, 0.0), random=None, scale=1.0, pixel=3, zero_m=1e-5):
     noise_m = 0.0 if random is None else SIGMA_M * random.standard_normal(len(T_S))
-    value_m = scale * (gain * lit(aim_m, offset_m) * SHAPE_M + zero_m + noise_m)
+    value_m = scale * (gain * absorbed_fraction(aim_m, offset_m) * PREDICTED_M + zero_m + noise_m)
     pulses = PULSES.copy()
     pulses[:, 3] = pixel
     attributes = {"aim_x_m": aim_m[0], "aim_y_m": aim_m[1]}
     return Run("r", 293.0, pulses, {"displacement_m": Signal(pixel, T_S, value_m)}, attributes)
 
 
-def found(runs):
-    responses = [response_of("test", run, PREDICT, MOST_M) for run in runs]
+def estimate_pixel(runs):
+    responses = [compute_response("test", run, PREDICT, AIM_MAX_M) for run in runs]
     return fit_pixel([each for each in responses if each is not None], OPTICS)
 
 
@@ -53,7 +53,7 @@ def test_gain_and_offset_as_sure_as_they_say():
     random, off = np.random.default_rng(17), []
     for _ in range(150):
         gain, offset_m = random.uniform(0.5, 1.6), random.uniform(-1.5e-4, 1.5e-4, 2)
-        pixel = found([run_of(gain, aim_m, offset_m, random) for aim_m in EACH_AIM])
+        pixel = estimate_pixel([simulate_run(gain, aim_m, offset_m, random) for aim_m in EACH_AIM])
         assert pixel.state == "measured"
         off.append(
             [(pixel.gain - gain) / pixel.gain_sigma, *(np.subtract(pixel.offset_m, offset_m) / pixel.offset_sigma_m)]
@@ -66,45 +66,50 @@ def test_gain_and_offset_as_sure_as_they_say():
 
 
 def test_only_the_middle_gives_the_gain_and_no_offset():
-    pixel = found([run_of(0.8, random=np.random.default_rng(k)) for k in range(3)])
+    pixel = estimate_pixel([simulate_run(0.8, random=np.random.default_rng(k)) for k in range(3)])
     assert pixel.gain == pytest.approx(0.8, abs=4 * pixel.gain_sigma)
     assert pixel.offset_m == (0.0, 0.0)
     assert np.all(np.isnan(pixel.offset_sigma_m))
 
 
 def test_aims_across_one_edge_only_are_not_taken_for_a_low_gain():
-    pixel = found([run_of(0.9, aim_m, (1e-4, 0.0)) for aim_m in ((0.0, 0.0), (-8e-4, 0.0))])
+    pixel = estimate_pixel([simulate_run(0.9, aim_m, (1e-4, 0.0)) for aim_m in ((0.0, 0.0), (-8e-4, 0.0))])
     assert pixel.gain == pytest.approx(0.9, rel=1e-3)
     assert pixel.offset_m == (0.0, 0.0)
 
 
 def test_a_dead_pixel_is_told_from_one_that_is_not_seen():
     random = np.random.default_rng(3)
-    assert found([run_of(0.03, aim_m, random=random) for aim_m in EACH_AIM]).state == "dead"
-    loud = [response._replace(sigma=0.3) for response in [Response(3, 0.0, 0.0, 0.05, 0.0)] * 2]
+    assert estimate_pixel([simulate_run(0.03, aim_m, random=random) for aim_m in EACH_AIM]).state == "dead"
+    loud = [response._replace(sigma=0.3) for response in [PixelResponse(3, 0.0, 0.0, 0.05, 0.0)] * 2]
     assert fit_pixel(loud, OPTICS).state == "not measured"
-    assert found([]).state == "not measured"
-    assert found([run_of(0.5, aim_m, random=random) for aim_m in EACH_AIM]).state == "measured"
+    assert estimate_pixel([]).state == "not measured"
+    assert estimate_pixel([simulate_run(0.5, aim_m, random=random) for aim_m in EACH_AIM]).state == "measured"
 
 
 @given(st.sets(st.integers(0, len(T_S) - 1), max_size=60), st.sets(st.integers(0, len(T_S) - 1), max_size=6))
 def test_missing_samples_and_a_few_wild_ones_change_little(missing, wild):
-    run = run_of(1.2, random=np.random.default_rng(1))
+    run = simulate_run(1.2, random=np.random.default_rng(1))
     value_m = run.signals["displacement_m"].value.copy()
     value_m[list(wild)] += 1e-3
     value_m[list(missing)] = np.nan
-    answer = response_of("test", replace(run, signals={"displacement_m": Signal(3, T_S, value_m)}), PREDICT, MOST_M)
-    assert answer is None or answer.value == pytest.approx(1.2, abs=6 * answer.sigma)
+    answer = compute_response(
+        "test", replace(run, signals={"displacement_m": Signal(3, T_S, value_m)}), PREDICT, AIM_MAX_M
+    )
+    assert answer is None or answer.ratio == pytest.approx(1.2, abs=6 * answer.sigma)
 
 
 def test_too_little_is_not_measured():
-    run = run_of(1.0)
+    run = simulate_run(1.0)
     nothing = np.full(len(T_S), np.nan)
     nothing[:5] = 0.0
-    assert response_of("t", replace(run, signals={"displacement_m": Signal(3, T_S, nothing)}), PREDICT, MOST_M) is None
-    assert response_of("t", replace(run, signals={}), PREDICT, MOST_M) is None
+    assert (
+        compute_response("t", replace(run, signals={"displacement_m": Signal(3, T_S, nothing)}), PREDICT, AIM_MAX_M)
+        is None
+    )
+    assert compute_response("t", replace(run, signals={}), PREDICT, AIM_MAX_M) is None
     dark = replace(run, pulses=np.zeros((0, 4)))
-    assert response_of("t", dark, PREDICT, MOST_M) is None
+    assert compute_response("t", dark, PREDICT, AIM_MAX_M) is None
 
 
 @pytest.mark.parametrize(
@@ -121,35 +126,35 @@ def test_too_little_is_not_measured():
     ],
 )
 def test_a_whole_display_in_other_units_is_named(scale, says):
-    random, responses = np.random.default_rng(4), Responses(CONFIG, PREDICT)
+    random, responses = np.random.default_rng(4), PixelMapFitter(CONFIG, PREDICT)
     for pixel in range(16):
         gain = 0.0 if pixel == 5 else random.uniform(0.9, 1.1)
-        responses.add("rec.h5", run_of(gain, random=random, scale=scale, pixel=pixel))
+        responses.add_run("rec.h5", simulate_run(gain, random=random, scale=scale, pixel=pixel))
     with pytest.raises(InputError, match=r"rec\.h5: displacement_m: got ") as caught:
-        responses.fitted("rec.h5", "surroundings")
+        responses.fit("rec.h5", "surroundings")
     assert says in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
 def test_what_no_run_can_say_is_refused():
-    responses = Responses(CONFIG, PREDICT)
+    responses = PixelMapFitter(CONFIG, PREDICT)
     with pytest.raises(InputError, match="pixel: got 16, expected a pixel of display-16, 0 to 15"):
-        responses.add("rec.h5", run_of(1.0, pixel=16))
+        responses.add_run("rec.h5", simulate_run(1.0, pixel=16))
     for aim in (0.3, "left", float("nan")):
-        bad = replace(run_of(1.0), attributes={"aim_x_m": aim})
+        bad = replace(simulate_run(1.0), attributes={"aim_x_m": aim})
         with pytest.raises(InputError, match=r"rec\.h5: /runs/r: aim_x_m: got"):
-            responses.add("rec.h5", bad)
+            responses.add_run("rec.h5", bad)
     with pytest.raises(InputError, match="heights of 0 pixels"):
-        responses.fitted("rec.h5", "surroundings")
+        responses.fit("rec.h5", "surroundings")
 
 
 def test_figures_name_what_is_dead_and_what_was_not_measured():
-    random, responses = np.random.default_rng(8), Responses(CONFIG, PREDICT)
+    random, responses = np.random.default_rng(8), PixelMapFitter(CONFIG, PREDICT)
     for pixel in range(15):
         for aim_m in EACH_AIM:
             gain = 0.01 if pixel in (4, 9) else 1.0 + 0.01 * pixel
-            responses.add("rec.h5", run_of(gain, aim_m, (5e-5, -1e-5), random, pixel=pixel))
-    told = figures(responses.fitted("rec.h5", "surroundings"), responses.runs)
+            responses.add_run("rec.h5", simulate_run(gain, aim_m, (5e-5, -1e-5), random, pixel=pixel))
+    told = compute_stats(responses.fit("rec.h5", "surroundings"), responses.run_count)
     assert told["dead"] == [4, 9]
     assert told["not_measured"] == [15]
     assert told["measured"] == 13
@@ -160,7 +165,7 @@ def test_figures_name_what_is_dead_and_what_was_not_measured():
 def test_light_that_misses_leaves_a_black_wall_below_its_cap():
     """A half-space of acrylic that takes in the whole focus, pulse by pulse of the PWM, by superposition."""
     laser = CONFIG.laser
-    faint = [pulse(CONFIG, aim) for aim in aims(CONFIG)[1:]]
+    faint = [compute_pulse(CONFIG, aim) for aim in list_aims(CONFIG)[1:]]
     assert len(set(faint)) == 1
     width_s, power_w = faint[0]
     on_s, period_s = power_w / laser.max_power_w / laser.pwm_hz, 1.0 / laser.pwm_hz
