@@ -14,7 +14,7 @@ from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.field_writer import write_field
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
+from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 GEOMETRIES, POINTS, RUNS = 10, 1_000_000, 7
 NOISE_M, OUTLIER_SHARE = 10e-6, 0.02
@@ -31,7 +31,7 @@ class HiddenGeometryLab:
 
     def fit_spots(self, seed, side):
         """A grid of spots with noise and false detections, fitted."""
-        truth, random = Truth.drawn(seed, self.config), np.random.default_rng([seed, side])
+        truth, random = GroundTruthGeometry.sample(seed, self.config), np.random.default_rng([seed, side])
         axis_codes = np.rint(CENTRE_CODE + np.linspace(-self.half_m, self.half_m, side) / self.code_m)
         codes = np.stack(np.meshgrid(axis_codes, axis_codes), axis=-1).reshape(-1, 2)
         positions = np.column_stack(truth.position_m(*codes.T)) + NOISE_M * random.standard_normal(codes.shape)

@@ -6,7 +6,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from optodrive.device.config import load_config
-from optodrive.link.simulator.traces import trace
+from optodrive.link.simulator.traces import compute_traces
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.planning.pipeline import DisplayModel, plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
@@ -81,7 +81,7 @@ def main():
     draw_display(draw, font, display.layout, peaks_um, (MARGIN, MARGIN))
     pulses = list(zip(executed.start_s[is_of_pixel], executed.width_s[is_of_pixel], strict=True))
     box = (MARGIN + 21 * SCALE + 70, MARGIN + 40, image.width - MARGIN, image.height_factor - MARGIN - 40)
-    draw_trace(draw, font, trace(display.build_cold_heat(), executed, [pixel], 5e-4), pulses, box)
+    draw_trace(draw, font, compute_traces(display.build_cold_heat(), executed, [pixel], 5e-4), pulses, box)
     OUT.mkdir(parents=True, exist_ok=True)
     image.save(OUT / "braille.png", optimize=True)
     print(f"written {OUT / 'braille.png'}")

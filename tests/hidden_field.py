@@ -7,7 +7,7 @@ from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.field_writer import write_field
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
+from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 CONFIG = load_config()
 LAYOUT = build_pixel_layout(CONFIG.display)
@@ -37,7 +37,7 @@ def measure_spots(truth, codes, random, outlier_fraction=0.02, noise_m=NOISE_M):
     return MeasuredSpots.from_table(np.column_stack([codes, places])), is_outlier
 
 
-def field_errors_m(truth: Truth, field, count=1500):
+def field_errors_m(truth: GroundTruthGeometry, field, count=1500):
     """How far off the beam lands where the field sends it, anywhere on the display's square, [2, count]; codes too."""
     target_m = np.random.default_rng(99).uniform(-HALF_M, HALF_M, (2, count))
     codes = field.codes(*target_m)
@@ -46,7 +46,7 @@ def field_errors_m(truth: Truth, field, count=1500):
 
 def calibrate_hidden_field(path, seed=0, side=17):
     """Calibrate a hidden geometry as a user would and write its field; the geometry, and a configuration with it."""
-    truth = Truth.drawn(seed, CONFIG)
+    truth = GroundTruthGeometry.sample(seed, CONFIG)
     spots, _ = measure_spots(truth, grid_codes(side), np.random.default_rng([seed, side]))
     write_field(path, fit_field(spots, PRIOR))
     return truth, config_with_field(path)

@@ -15,7 +15,7 @@ SETTLING_S = np.linspace(0.0, 0.03, 60_001)
 
 
 @dataclass(frozen=True)
-class Hidden:
+class HiddenServo:
     """bandwidth in Hz, damping of critical, delay in s, slew in rad/s."""
 
     hz: float
@@ -24,7 +24,7 @@ class Hidden:
     slew: float
 
     @classmethod
-    def drawn(cls, random):
+    def sample(cls, random):
         hz, slew = (float(np.exp(random.uniform(*np.log(ends)))) for ends in ((300.0, 3000.0), (30.0, 300.0)))
         return cls(hz, random.uniform(0.3, 1.0), random.uniform(0.0, 1e-4), slew)
 

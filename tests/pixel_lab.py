@@ -8,7 +8,7 @@ import numpy as np
 from optodrive.cli.main import run
 from optodrive.device.config import load_config
 from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
-from optodrive.link.simulator.true_pixels import PixelTruth
+from optodrive.link.simulator.true_pixels import GroundTruthPixels
 
 COOLDOWN_S = 5.0
 """Times between frames in which every pixel is cold again, s."""
@@ -49,7 +49,7 @@ def calibrate_map(capsys, folder, display, recordings):
 
 def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
     """Heights that hidden pixels reach when all are asked for one, [p], and the answer."""
-    count = len(PixelTruth.drawn(seed, load_config(display)).lift)
+    count = len(GroundTruthPixels.sample(seed, load_config(display)).displacement_gain)
     frame = {
         "id": "all",
         "show_at_s": 0.0,
@@ -70,7 +70,11 @@ def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
 def map_errors(display, path, seed):
     """Gains, relative, and offsets, m, off the truth over their stated sigmas too: [3, p] each, NaN where not known."""
     config = replace_pixel_map(load_config(display), path)
-    known, truth = load_pixel_map(config), PixelTruth.drawn(seed, config)
+    known, truth = load_pixel_map(config), GroundTruthPixels.sample(seed, config)
     lives = ~known.dead
-    off = np.where(lives, [known.gain - truth.lift, known.offset_x_m - truth.x_m, known.offset_y_m - truth.y_m], np.nan)
+    off = np.where(
+        lives,
+        [known.gain - truth.displacement_gain, known.offset_x_m - truth.x_m, known.offset_y_m - truth.y_m],
+        np.nan,
+    )
     return off, off / [known.gain_sigma, known.offset_x_sigma_m, known.offset_y_sigma_m]

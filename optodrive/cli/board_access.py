@@ -9,8 +9,8 @@ from optodrive.cli.options import announce_compilation
 from optodrive.core.errors import LinkError
 
 if TYPE_CHECKING:
-    from optodrive.lab.commissioning.exclusive_board import HeldBoard
-    from optodrive.lab.commissioning.spot_reader import Eyes
+    from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+    from optodrive.lab.commissioning.spot_reader import SpotReader
 
 SENSOR_BAUD = 115_200
 
@@ -18,8 +18,8 @@ SENSOR_BAUD = 115_200
 class BoardAccess(NamedTuple):
     """A board, not yet connected, and what sees the spot, None without a sensor."""
 
-    board: "HeldBoard"
-    spot_reader: "Eyes | None"
+    board: "ExclusiveBoard"
+    spot_reader: "SpotReader | None"
 
 
 @contextmanager
@@ -27,9 +27,9 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     """The configured board and sensor; told to abort and closed whatever happens within."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.device.config import DEFAULT_CONFIG, load_config
-    from optodrive.lab.commissioning.exclusive_board import HeldBoard
-    from optodrive.lab.commissioning.spot_reader import Eyes
-    from optodrive.lab.commissioning.spot_sensor_client import SpotSensor
+    from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+    from optodrive.lab.commissioning.spot_reader import SpotReader
+    from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient
     from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort
     from optodrive.planning.pipeline import DisplayModel
@@ -42,11 +42,11 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     transport, sensor_port = build_bench_transport(board, config or DEFAULT_CONFIG)
     for signal_number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(signal_number, signal.default_int_handler)
-    with HeldBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
+    with ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:
         spot_reader = None
         if loaded.sensor is not None or sensor_port:
             port, baud = (loaded.sensor.port, loaded.sensor.baud) if loaded.sensor else (sensor_port, SENSOR_BAUD)
-            spot_reader = Eyes(exclusive_board, SpotSensor(SerialPort(port, baud, "sensor.port")), clock)
+            spot_reader = SpotReader(exclusive_board, SpotSensorClient(SerialPort(port, baud, "sensor.port")), clock)
         try:
             yield BoardAccess(exclusive_board, spot_reader)
         except LinkError as error:

@@ -8,7 +8,7 @@ from optodrive.cli.options import ConfigOption, JsonOption, print_json
 from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
-    from optodrive.lab.commissioning.homing import Done
+    from optodrive.lab.commissioning.homing import HomingResult
 
 
 def register(app: typer.Typer) -> None:
@@ -29,21 +29,21 @@ def home(
 ) -> None:
     """Bring the mirrors to their middle, look at travel, position outputs, interlock, key, stop, indicator."""
     from optodrive.cli.board_access import open_board
-    from optodrive.lab.commissioning.exclusive_board import check_power
+    from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
 
-    results: list[Done] = []
+    results: list[HomingResult] = []
 
-    def report_step(step: "Done") -> None:
+    def report_step(step: "HomingResult") -> None:
         results.append(step)
         if not json:
-            print(f"{step.step:<11} {step.words}", flush=True)
+            print(f"{step.step:<11} {step.message}", flush=True)
 
     failure = "interrupted"
     try:
         with open_board(config) as (board, spot_reader):
             if spot_power_mw:
-                check_power(board.config, spot_power_mw * 1e-3)
+                check_spot_power(board.config, spot_power_mw * 1e-3)
             Homing(board, spot_reader, spot_power_mw * 1e-3, acknowledge).run(report_step)
         failure = ""
     except OptodriveError as error:
@@ -51,5 +51,5 @@ def home(
         raise
     finally:
         if json:
-            steps = [{"step": step.step, "ok": True, "says": step.words, **step.figures} for step in results]
+            steps = [{"step": step.step, "ok": True, "says": step.message, **step.details} for step in results]
             print_json({"home": not failure, "steps": steps, "failure": failure or None})

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from optodrive.core.types.measurements import PixelTrace
     from optodrive.core.types.plans import ExecutedPulses
     from optodrive.device.config import Config
-    from optodrive.link.simulator.true_pixels import PixelTruth
+    from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.physics.thermal_state import ThermalState
     from optodrive.planning.feasibility import FeasibilityReport
     from optodrive.planning.pipeline import DisplayModel, PlannedSequence
@@ -70,8 +70,8 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and measure what the pixels do."""
-    from optodrive.link.simulator.traces import trace, trace_near
-    from optodrive.link.simulator.true_pixels import PixelTruth
+    from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
+    from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
     from optodrive.planning.feasibility import check_feasibility
     from optodrive.planning.pipeline import DisplayModel
@@ -84,7 +84,7 @@ def simulate(
     if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
         raise InputError("--near", post_pulse_s, "a time between 0.001 and 10 s")
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
-    sampled_pixels = None if pixel_seed is None else PixelTruth.drawn(pixel_seed, display.config)
+    sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None
     true_display = (
         display.build_cold_heat()
@@ -100,12 +100,12 @@ def simulate(
         )
     with show_progress("simulating") as on_progress:
         executed = execute(display, planned_sequence, on_progress)
-    incident = executed if sampled_pixels is None else sampled_pixels.hit(executed, display.config)
+    incident = executed if sampled_pixels is None else sampled_pixels.attenuate(executed, display.config)
     recorded = _select_tallest(planned_sequence) if selected is None else selected
     traces = (
-        [trace(true_display, incident, recorded, dt)]
+        [compute_traces(true_display, incident, recorded, dt)]
         if post_pulse_s is None
-        else [trace_near(true_display, incident, pixel, dt, post_pulse_s) for pixel in recorded]
+        else [compute_pixel_trace(true_display, incident, pixel, dt, post_pulse_s) for pixel in recorded]
     )
     if out is not None:
         _write_recording(out, display, executed, traces, noise, seed)
@@ -125,7 +125,7 @@ def simulate(
         print(f"written          {out}")
 
 
-def _build_true_display(config: "Config", sampled_pixels: "PixelTruth | None") -> "ThermalState":
+def _build_true_display(config: "Config", sampled_pixels: "GroundTruthPixels | None") -> "ThermalState":
     """The display as it is: of the configuration's model, its pixels as drawn, or all alike; no map says what is."""
     from optodrive.device.pixel_map import remove_pixel_map
     from optodrive.physics.parameters import build_display_pixels, load_parameters
@@ -134,7 +134,7 @@ def _build_true_display(config: "Config", sampled_pixels: "PixelTruth | None") -
     parameters = load_parameters(config.pixel_model.parameters)
     nominal_pixels = build_display_pixels(remove_pixel_map(config), parameters)
     return build_cold_state(
-        config, parameters, nominal_pixels if sampled_pixels is None else sampled_pixels.pixels(nominal_pixels)
+        config, parameters, nominal_pixels if sampled_pixels is None else sampled_pixels.apply_to(nominal_pixels)
     )
 
 

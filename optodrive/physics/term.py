@@ -155,7 +155,7 @@ class Term:
     @property
     def is_display_term(self) -> bool:
         """Whether the term acts in the model of a whole display, not in the compiled single pixel alone."""
-        hooks = ("bridge_k_per_w", "flow", "rates_k_per_s", "displacement_m", "force_n")
+        hooks = ("bridge_k_per_w", "add_flows", "rates_k_per_s", "displacement_m", "force_n")
         return any(getattr(type(self), name) is not getattr(Term, name) for name in hooks)
 
     @property

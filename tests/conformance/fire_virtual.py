@@ -10,7 +10,7 @@ from optodrive.link.session.board_requirements import BITS_PER_BYTE, BoardRequir
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
-from optodrive.link.simulator.memory_link import PASSAGE_S, MemoryLink
+from optodrive.link.simulator.memory_link import EXCHANGE_MIN_S, MemoryLink
 
 
 class Line:
@@ -64,7 +64,7 @@ class FireLink(MemoryLink):
 
     def read(self, timeout_s):
         """What has come through, as soon as something has; time passes."""
-        until_s, wait_s = self._clock.now_s() + timeout_s, PASSAGE_S
+        until_s, wait_s = self._clock.now_s() + timeout_s, EXCHANGE_MIN_S
         while not self._broken:
             sent = super().read(wait_s)
             self._to_board()
@@ -72,7 +72,7 @@ class FireLink(MemoryLink):
             data = self.down.carry(self._down_line.carry(sent, now_s), now_s)
             if data or now_s >= until_s:
                 return data
-            wait_s = PASSAGE_S if self._bytes_per_s else until_s - now_s
+            wait_s = EXCHANGE_MIN_S if self._bytes_per_s else until_s - now_s
         raise LinkError("the link is broken")
 
     def break_down(self):

@@ -10,18 +10,18 @@ from optodrive.link.protocol.framing import CRC, HEADER, Frame, FrameDecoder, co
 from optodrive.link.simulator import board_core as core_module
 from optodrive.link.simulator import board_process
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import OWN
-from optodrive.link.simulator.guards import Guards
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import EmissionGuards
 
 # Each function gives what is patched: (owner, name, what takes its place).
 
 
 def b1_states_do_not_darken():
-    return BoardCore, "_go_dark", lambda self, reason: setattr(self, "_current", None)
+    return BoardCore, "_go_dark", lambda self, reason: setattr(self, "_current_point", None)
 
 
 def b1_start_tick_is_not_awaited():
-    start = BoardCore._start
+    start = BoardCore._on_start
     return BoardCore, "_start", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
 
 
@@ -42,12 +42,12 @@ def b3_no_lease():
 
 
 def b3_any_session_renews():
-    take = BoardCore._take
+    take = BoardCore._handle_frame
     return BoardCore, "_take", lambda self, frame: take(self, frame._replace(session=self._link.session))
 
 
 def b3_anything_renews():
-    obey = BoardCore._obey_now
+    obey = BoardCore._handle_unsequenced
 
     def renew(self, message):
         self._lease_until_us = self._now_us + 1000 * self._limits.lease_ms
@@ -57,7 +57,7 @@ def b3_anything_renews():
 
 
 def b3_host_says_how_long():
-    obey = BoardCore._obey_now
+    obey = BoardCore._handle_unsequenced
 
     def believe(self, message):
         if isinstance(message, m.Lease):
@@ -69,7 +69,7 @@ def b3_host_says_how_long():
 
 
 def b3_a_short_lease_takes_time_back():
-    obey = BoardCore._obey_now
+    obey = BoardCore._handle_unsequenced
 
     def shorten(self, message):
         if isinstance(message, m.Lease):
@@ -81,58 +81,58 @@ def b3_a_short_lease_takes_time_back():
 
 
 def b4_points_are_not_looked_at():
-    static = BoardCore._static_fault
+    static = BoardCore._check_point
     return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(on_us=0))
 
 
 def b4_no_account_of_cells():
-    return Guards, "on_time_us", lambda self, limits, cell, at_us: 0
+    return EmissionGuards, "on_time_us", lambda self, limits, cell, at_us: 0
 
 
 def b4_by_position_and_not_by_cell():
-    return Guards, "cells", lambda self, x, y: [(0, x, y)]
+    return EmissionGuards, "cells", lambda self, x, y: [(0, x, y)]
 
 
 def b4_one_grid_whose_borders_hide():
-    cells = Guards.cells
-    return Guards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+    cells = EmissionGuards.find_cells
+    return EmissionGuards, "cells", lambda self, x, y: cells(self, x, y)[:1]
 
 
 def b4_light_elsewhere_is_rest():
-    fire = Guards.fire
+    fire = EmissionGuards.record_pulse
 
     def forget(self, limits, x, y, start_us, on_us, duty):
         mine = self.cells(x, y)
-        self._on = {cell: account for cell, account in self._on.items() if cell in mine}
+        self._on = {cell: account for cell, account in self._on_time.items() if cell in mine}
         fire(self, limits, x, y, start_us, on_us, duty)
 
-    return Guards, "fire", forget
+    return EmissionGuards, "fire", forget
 
 
 def b5_any_duty():
-    static = BoardCore._static_fault
+    static = BoardCore._check_point
     return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(duty=0))
 
 
 def b5_no_mean():
-    return Guards, "mean_account", lambda self, start_us, on_us, duty: 0
+    return EmissionGuards, "mean_account", lambda self, start_us, on_us, duty: 0
 
 
 def b6_no_bucket():
-    return Guards, "bucket_uj", lambda self, limits, cell, at_us: 0
+    return EmissionGuards, "bucket_uj", lambda self, limits, cell, at_us: 0
 
 
 def b6_bucket_never_leaks():
-    return Guards, "bucket_uj", lambda self, limits, cell, at_us: self._bucket.get(cell, (0, 0))[0]
+    return EmissionGuards, "bucket_uj", lambda self, limits, cell, at_us: self._bucket.get(cell, (0, 0))[0]
 
 
 def b6_one_bucket_for_all():
-    return Guards, "cells", lambda self, x, y: [(0, 0, 0)]
+    return EmissionGuards, "cells", lambda self, x, y: [(0, 0, 0)]
 
 
 def b6_one_grid_whose_borders_hide():
-    cells = Guards.cells
-    return Guards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+    cells = EmissionGuards.find_cells
+    return EmissionGuards, "cells", lambda self, x, y: cells(self, x, y)[:1]
 
 
 def _begin(due):
@@ -162,7 +162,7 @@ def b8_no_field():
 
 
 def b8_lit_points_only():
-    static = BoardCore._static_fault
+    static = BoardCore._check_point
     return BoardCore, "_static_fault", lambda self, point: static(self, point) if point.on_us else ""
 
 
@@ -176,7 +176,7 @@ def b9_not_latched():
     def forgive(self, name, value, now_us):
         set_input(self, name, value, now_us)
         if self.inputs == core_module.SAFE_INPUTS and self.state == "FAULT":
-            self._clear(m.ClearFault())
+            self._on_clear_fault(m.ClearFault())
 
     return BoardCore, "set_input", forgive
 
@@ -195,8 +195,8 @@ def b10_takes_what_it_is_told():
 
 
 def b10_against_the_first_only():
-    tightened = core_module.tightened
-    return core_module, "tightened", lambda own, asked: tightened(OWN, asked)
+    tightened = core_module.tighten
+    return core_module, "tightened", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
 
 
 def b11_any_echo():
@@ -223,7 +223,7 @@ def b11_predictable():
 
 
 def b11_key_may_stay():
-    confirm = BoardCore._confirm
+    confirm = BoardCore._on_arm_confirm
 
     def keep(self, message):
         refusal = confirm(self, message)
@@ -246,7 +246,7 @@ def b12_duplicates_are_taken():
 
 
 def b12_number_is_not_looked_at():
-    data = BoardCore._data
+    data = BoardCore._on_data
     return BoardCore, "_data", lambda self, message: data(self, m.Data(self._next_index, message.points))
 
 

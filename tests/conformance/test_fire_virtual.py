@@ -13,7 +13,7 @@ from spoken import HOST
 from optodrive.link.session import board_requirements
 from optodrive.link.session import session as session_module
 from optodrive.link.session.board_requirements import BITS_PER_BYTE, FRAME_BYTES
-from optodrive.link.simulator.board_limits import OWN
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 
 STORMS = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
 FAULTS_EACH = 25_000
@@ -120,7 +120,7 @@ def filled_in_s(baud, loss, seed):
 
     With a lease of half a second: of 100 ms, 115,200 baud lose one after the other too often.
     """
-    config, limits = configured(0.5, baud), replace(OWN, lease_ms=500)
+    config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
     rig = FireRig(seed, paced=True, config=config, queue_points=30_000, limits=limits)
     rig.session.connect()
     assert rig.armed()
@@ -154,7 +154,7 @@ def dark_after_abort_s(baud):
 
 
 def dark_after_abort_at_s(baud, executed):
-    config, limits = configured(0.5, baud), replace(OWN, lease_ms=500)
+    config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
     rig = FireRig(1, paced=True, config=config, limits=limits)
     rig.session.connect()
     assert rig.armed()
@@ -190,7 +190,7 @@ def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
 
 def stalled(for_s, ahead_s):
     """A host with a lease of half a second does nothing for a while in mid-job; the rig and the job, then."""
-    rig = FireRig(1, config=configured(lease_s=0.5), limits=replace(OWN, lease_ms=500))
+    rig = FireRig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(2000, dark_us=900, ahead_s=ahead_s)

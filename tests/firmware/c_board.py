@@ -9,7 +9,7 @@ from board_bench import Bench
 
 from firmware_ports import require
 from optodrive.link.protocol import messages as m
-from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 FIRMWARE = Path(__file__).parents[2] / "firmware_protocol"
 INPUT_BITS = {name: 1 << k for k, name in enumerate(m.INPUTS)}
@@ -222,7 +222,7 @@ class CBench(Bench):
     def __init__(self, library, limits=None, **settings):
         super().__init__(limits, **settings)
         self.log.clear()
-        own = m.Limits(**{**vars(OWN), **(limits or {})})
+        own = m.Limits(**{**vars(DEFAULT_LIMITS), **(limits or {})})
         self.core = CBoard(library, BoardSettings(limits=own, **settings), self.log.append)
 
     def condition(self):

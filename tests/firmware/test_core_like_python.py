@@ -6,13 +6,15 @@ from same import LikePython
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
-from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 CENTRE = 32768
 PATIENT = {"lease_ms": 60_000}
 BOARDS = st.sampled_from(
     [
-        BoardSettings(m.Limits(**{**vars(OWN), **limits}), cell_codes=cell_codes, queue_points=queue, key_edge=edge)
+        BoardSettings(
+            m.Limits(**{**vars(DEFAULT_LIMITS), **limits}), cell_codes=cell_codes, queue_points=queue, key_edge=edge
+        )
         for limits, cell_codes, queue, edge in (
             (PATIENT, 1300, 4096, False),
             ({**PATIENT, "mean_duty": 3000, "settle_us": 0, "settle_ns_per_code": 0}, 1300, 4096, False),
@@ -44,10 +46,10 @@ POINTS = st.one_of(
     st.tuples(st.lists(TAME, max_size=4), POINT).map(lambda pair: [*pair[0], pair[1]]),
 )
 LIMITS = st.dictionaries(
-    st.sampled_from([name for name in vars(OWN) if name != "lease_ms"]),
+    st.sampled_from([name for name in vars(DEFAULT_LIMITS) if name != "lease_ms"]),
     st.sampled_from([100, 5000, 20_000, 40_000, 65_535]),
     max_size=2,
-).map(lambda changed: m.Limits(**{**vars(OWN), **PATIENT, **changed}))
+).map(lambda changed: m.Limits(**{**vars(DEFAULT_LIMITS), **PATIENT, **changed}))
 KINDS = st.sampled_from(m.HOST_MESSAGES + m.BOARD_MESSAGES)
 DAMAGE = st.tuples(st.sampled_from(["flip", "cut", "double", "split", "junk", "long"]), st.floats(0, 1))
 WAIT = st.tuples(st.just("wait"), st.sampled_from([1, 10, 100, 1000, 7777, 60_000]))
@@ -85,7 +87,7 @@ def messages(core, what, detail):
         return [data, m.Start(1, first, 0, 3), m.End(1, end)] if what == "play" else [data]
     return {
         "start": [m.Start(1, first, 0, 2)],
-        "start later": [m.Start(1, first, core._tick() + 50_000, 1)],
+        "start later": [m.Start(1, first, core._current_tick() + 50_000, 1)],
         "end": [m.End(1, core._next_index)],
         "clear": [m.ClearFault()],
         "lease": [m.Lease(60_000)],
@@ -188,7 +190,7 @@ def test_more_records_than_are_kept(library):
 
 
 def test_a_report_over_more_than_32_bits_of_time_is_two(library):
-    both = LikePython(library, BoardSettings(m.Limits(**{**vars(OWN), **PATIENT})))
+    both = LikePython(library, BoardSettings(m.Limits(**{**vars(DEFAULT_LIMITS), **PATIENT})))
     arm(both)
     point = m.POINT.pack(CENTRE, CENTRE, 0, 100, 999)
     both.say(m.Data(0, point), m.Start(1, 0, 0, 1), m.End(1, 1))

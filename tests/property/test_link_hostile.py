@@ -9,13 +9,13 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 TURN_US = 2000
 FLIGHT_BYTES = 600
 FRAMES, POINTS = 20, 8
 TOTAL = FRAMES * POINTS
-PATIENT = BoardSettings(limits=m.Limits(**{**vars(OWN), "lease_ms": 60_000}))
+PATIENT = BoardSettings(limits=m.Limits(**{**vars(DEFAULT_LIMITS), "lease_ms": 60_000}))
 
 
 class Rig:
@@ -172,7 +172,7 @@ def said(core, what, detail):
         messages = [m.Data(core._next_index, b"".join(m.POINT.pack(*point) for point in detail))]
         messages += [m.Start(1, first, 0, 1), m.End(1, end)] if what == "play" else []
     else:
-        confirm = m.ArmConfirm(core._armed_by or 0, core._nonce or 0)
+        confirm = m.ArmConfirm(core._arming_host_nonce or 0, core._nonce or 0)
         messages = {
             "start": [m.Start(1, first, 0, 1)],
             "end": [m.End(1, core._next_index)],
@@ -201,6 +201,6 @@ def test_a_board_survives_a_host_that_says_anything(steps):
         for answer in FrameDecoder().feed(core.bytes_to_send()):
             m.parse_message(answer.type, answer.body)
     pulses = [entry for entry in rig.log if entry["event"] == "pulse"]
-    assert all(entry["off_us"] - entry["on_us"] <= OWN.max_on_us for entry in pulses)
+    assert all(entry["off_us"] - entry["on_us"] <= DEFAULT_LIMITS.max_on_us for entry in pulses)
     assert all(one["off_us"] <= other["on_us"] for one, other in pairwise(pulses))
     event(f"{min(len(pulses), 5)} pulses, 5 meaning more")

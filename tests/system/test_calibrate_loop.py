@@ -10,9 +10,9 @@ import pytest
 from optodrive.device.config import load_config
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
-from optodrive.lab.commissioning.predicted_error import display_codes
-from optodrive.link.simulator.board_limits import OWN
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.lab.commissioning.predicted_error import build_code_grid
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from rig import wait_for
 from test_home import LATENESS_US, LEASE_US, assert_dark, step_of
 
@@ -26,8 +26,8 @@ def since_light(kind, name):
 
 def missed_m(field, geometry):
     """How far a field is off the truth over the display, lengths."""
-    codes = display_codes(CONFIG, 0.0, 41)
-    truth = Truth.drawn(geometry, CONFIG)
+    codes = build_code_grid(CONFIG, 0.0, 41)
+    truth = GroundTruthGeometry.sample(geometry, CONFIG)
     return np.hypot(*(np.array(field.position_m(*codes.T)) - np.array(truth.position_m(*codes.T))))
 
 
@@ -64,7 +64,7 @@ def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, mo
     assert not session_spots(out)
     pulses = assert_dark(board).of("pulse")
     assert len(pulses) <= 3 * 25 + 3
-    assert max(pulse["duty"] for pulse in pulses) / 65535 * OWN.full_power_uw * 1e-6 <= 5e-3
+    assert max(pulse["duty"] for pulse in pulses) / 65535 * DEFAULT_LIMITS.full_power_uw * 1e-6 <= 5e-3
     assert max(pulse["off_us"] - pulse["on_us"] for pulse in pulses) == 20_000
 
 
@@ -158,7 +158,7 @@ def test_nudged_by_a_person(make_board, start, tmp_path):
     """The person sees where the spot is, 20 µm well, and says how far it is off the mark."""
     board, out = make_board(sensor=("--geometry", "4")), tmp_path / "field.toml"
     command = start(board, "calibrate", "--nudge", "--spots-max", "9", "--out", out, "--json")
-    truth, random = Truth.drawn(4, CONFIG), np.random.default_rng(0)
+    truth, random = GroundTruthGeometry.sample(4, CONFIG), np.random.default_rng(0)
     for line in command.process.stderr:
         mark = re.match(r"pixel \d+, (\S+) (\S+) mm", line)
         if not mark:

@@ -6,7 +6,7 @@ import signal
 import pytest
 
 from optodrive.lab.commissioning.exclusive_board import SPOT_POWER_MAX_W
-from optodrive.link.simulator.board_limits import OWN
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 from rig import PATIENT_LEASE_S, wait_for
 
 STEPS = ["link", "status", "inputs", "indicator", "zero", "travel x", "travel y", "readback", "zero again"]
@@ -47,7 +47,9 @@ def test_with_a_spot_and_no_position_outputs(make_board, start):
     assert "seen by spot" in out
     pulses = assert_dark(board).of("pulse")
     assert len(pulses) == 15
-    assert max(pulse["duty"] for pulse in pulses) / 65535 * OWN.full_power_uw * 1e-6 <= 5e-3 < SPOT_POWER_MAX_W
+    assert (
+        max(pulse["duty"] for pulse in pulses) / 65535 * DEFAULT_LIMITS.full_power_uw * 1e-6 <= 5e-3 < SPOT_POWER_MAX_W
+    )
 
 
 def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):

@@ -16,7 +16,7 @@ from optodrive.core.units import m_to_um, um_to_m
 
 if TYPE_CHECKING:
     from optodrive.lab.calibration.field_fit import FieldFit
-    from optodrive.lab.commissioning.measurement_loop import Measured, Progress
+    from optodrive.lab.commissioning.measurement_loop import MeasurementProgress, MeasurementResult
 
 ManualOption = Annotated[bool, typer.Option("--nudge", help="No sensor: a person moves the spot onto each mark.")]
 TargetErrorOption = Annotated[float, typer.Option("--goal-um", help="Stop when the field is surely this good, rms.")]
@@ -73,12 +73,12 @@ def calibrate_on_board(config: str | None, out: Path, request: BoardCalibrationR
 
 def delete_session(out: Path) -> None:
     """All is written: the next calibration begins anew."""
-    from optodrive.lab.commissioning.session_file import session_path
+    from optodrive.lab.commissioning.session_file import session_path_for
 
-    session_path(out).unlink(missing_ok=True)
+    session_path_for(out).unlink(missing_ok=True)
 
 
-def measure_on_board(config: str | None, out: Path, request: BoardCalibrationRequest) -> "Measured":
+def measure_on_board(config: str | None, out: Path, request: BoardCalibrationRequest) -> "MeasurementResult":
     """Arm, measure, fit; the board ends dark and disarmed in any case.
 
     Every spot is kept in a session beside out, which goes when what came of it is written.
@@ -86,62 +86,62 @@ def measure_on_board(config: str | None, out: Path, request: BoardCalibrationReq
     from optodrive.cli.board_access import open_board
     from optodrive.core.clock import MonotonicClock
     from optodrive.lab.calibration.field_prior import FieldPrior
-    from optodrive.lab.commissioning.exclusive_board import check_power
-    from optodrive.lab.commissioning.measurement_loop import Measuring, fitted
-    from optodrive.lab.commissioning.session_file import SessionFile
-    from optodrive.lab.commissioning.spot_locator import NudgeLook, SensorLook
-    from optodrive.lab.commissioning.worker_process import Aside
+    from optodrive.lab.commissioning.exclusive_board import check_spot_power
+    from optodrive.lab.commissioning.measurement_loop import MeasurementLoop, fit_and_warm_up
+    from optodrive.lab.commissioning.session_file import CalibrationSession
+    from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
+    from optodrive.lab.commissioning.worker_process import WorkerProcess
 
     if not out.absolute().parent.is_dir():
         raise InputError("--out", str(out), "a file in a folder that exists")
     power_w, target_rms_m = request.spot_power_mw * 1e-3, um_to_m(request.target_rms_um)
     # The bench is left first: the board is told to abort before anything is waited for.
-    with Aside() as worker, open_board(config) as (board, spot_reader):
-        check_power(board.config, power_w)
-        session = SessionFile.beside(out, board.config)
+    with WorkerProcess() as worker, open_board(config) as (board, spot_reader):
+        check_spot_power(board.config, power_w)
+        session = CalibrationSession.load_or_create(out, board.config)
         if not request.manual and spot_reader is None:
             raise InputError("sensor.port", None, "a spot sensor in the configuration; without one, --nudge", "no_port")
         if session.rows:
             _print_status(
                 f"optodrive: going on with {len(session.rows)} spots of {session.path}; delete it to begin anew"
             )
-        worker.begin(fitted, session.spots, FieldPrior.from_config(board.config))
+        worker.submit(fit_and_warm_up, session.spots, FieldPrior.from_config(board.config))
         worker.result()  # loaded before the board is held
         board.connect()
         if request.manual or spot_reader is None:
-            locator: NudgeLook | SensorLook = NudgeLook(board, power_w, _read_stdin_lines(), _print_status)
+            locator: ManualLocator | SensorLocator = ManualLocator(board, power_w, _read_stdin_lines(), _print_status)
         else:
             spot_reader.open()
-            locator = SensorLook(board, spot_reader, power_w, request.readings)
+            locator = SensorLocator(board, spot_reader, power_w, request.readings)
         _print_status("optodrive: arming, the board's indicator is lit for two seconds first")
         board.arm()
         with _report_progress(request) as on_progress:
-            measured = Measuring(
+            measured = MeasurementLoop(
                 board, locator, session, worker, MonotonicClock(), target_rms_m, request.spots_max
             ).run(on_progress)
         board.disarm()
     return measured
 
 
-def build_stats(measured: "Measured", request: BoardCalibrationRequest, spots_file: Path) -> dict[str, object]:
+def build_stats(measured: "MeasurementResult", request: BoardCalibrationRequest, spots_file: Path) -> dict[str, object]:
     """What the loop itself has to say, for --json."""
     return {
         "looked": "nudge" if request.manual else "sensor",
         "readings": 1 if request.manual else request.readings,
-        "predicted_rms_um": round(m_to_um(measured.predicted_m), 3),
-        "sure_rms_um": round(m_to_um(measured.sure_m), 3),
+        "predicted_rms_um": round(m_to_um(measured.predicted_error_m), 3),
+        "sure_rms_um": round(m_to_um(measured.error_bound_m), 3),
         "goal_um": request.target_rms_um,
-        "goal_reached": measured.goal_reached,
+        "goal_reached": measured.target_reached,
         "spots_file": str(spots_file),
     }
 
 
-def format_stats(measured: "Measured", request: BoardCalibrationRequest, spots_file: Path) -> tuple[str, ...]:
+def format_stats(measured: "MeasurementResult", request: BoardCalibrationRequest, spots_file: Path) -> tuple[str, ...]:
     """The same in words."""
-    spots, upper_bound_um = len(measured.fit.spots), m_to_um(measured.sure_m)
-    reached = "reached" if measured.goal_reached else f"not reached with {spots} spots"
+    spots, upper_bound_um = len(measured.fit.spots), m_to_um(measured.error_bound_m)
+    reached = "reached" if measured.target_reached else f"not reached with {spots} spots"
     return (
-        f"predicted        {m_to_um(measured.predicted_m):.1f} µm rms over the display, nine times in ten at most "
+        f"predicted        {m_to_um(measured.predicted_error_m):.1f} µm rms over the display, nine times in ten at most "
         f"{upper_bound_um:.1f} µm",
         f"goal             {request.target_rms_um:g} µm: {reached}",
         f"spots kept       {spots_file}",
@@ -166,7 +166,7 @@ def _read_stdin_lines() -> "SimpleQueue[str | None]":
 
 
 @contextmanager
-def _report_progress(request: BoardCalibrationRequest) -> "Iterator[Callable[[Progress], None]]":
+def _report_progress(request: BoardCalibrationRequest) -> "Iterator[Callable[[MeasurementProgress], None]]":
     """A bar on stderr with the error so far; a line a spot where that is no terminal, or a person is asked there."""
     if request.manual or not sys.stderr.isatty():
         yield lambda progress: _print_status(
@@ -185,6 +185,6 @@ def _report_progress(request: BoardCalibrationRequest) -> "Iterator[Callable[[Pr
         )
 
 
-def _format_progress(progress: "Progress", request: BoardCalibrationRequest) -> str:
+def _format_progress(progress: "MeasurementProgress", request: BoardCalibrationRequest) -> str:
     outliers = f", {progress.outliers} taken for false" if progress.outliers else ""
-    return f"error {m_to_um(progress.sure_m):.1f} µm rms at most, goal {request.target_rms_um:g}{outliers}"
+    return f"error {m_to_um(progress.error_bound_m):.1f} µm rms at most, goal {request.target_rms_um:g}{outliers}"

@@ -33,10 +33,10 @@ from optodrive.link.transport.base import Transport
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 from optodrive.planning.pipeline import DisplayModel
 
-TURN_S = 0.002
+LOOP_STEP_S = 0.002
 SWITCH_INTERVAL_S = 2e-4
 """As the engine's: another thread that computes must not keep the lease waiting."""
-BEYOND_M = 4e-3
+FIELD_MARGIN_M = 4e-3
 """Beams are sent so far beyond the outermost pixels: uncorrected they miss by less."""
 SPOT_POWER_MAX_W = 0.05
 """Most power of a spot: 2 % of what draws a pixel, and steadily on one absorber a few kelvin."""
@@ -44,28 +44,28 @@ SPOT_SHARE_MAX = 0.05
 """And no more than this share of the laser's power."""
 SPOT_WIDTH_S = 0.02
 START_LEAD_S = 0.03
-SETTLED = 15.0
+SETTLING_TIME_CONSTANTS = 15.0
 """A move has so many of the servo's time constants to die out."""
 ARM_TIMEOUT_S = 6.0
 POINT_TIMEOUT_S = 3.0
-FAULT_NAMED_S = 0.5
+FAULT_NAME_TIMEOUT_S = 0.5
 
 
-class HeldBoard:
+class ExclusiveBoard:
     """A board and its session. Methods raise LinkError, BoardFaultError, NotReadyError for what ends the task."""
 
     def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
         self._display, self._clock = display, clock
         config = display.config
         code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
-        self.requirements = BoardRequirements.from_config(config, ceil(BEYOND_M / code_m))
+        self.requirements = BoardRequirements.from_config(config, ceil(FIELD_MARGIN_M / code_m))
         self._limits = self.requirements.build_limits()
         self.session = BoardSession(transport, clock, self.requirements)
         self._state = display.build_cold_state()[1]
-        self._zero_s: float | None = None
-        self._pixel = weakest_pixel(display)
-        self._settle_s, self._width_s = settle_s(config), spot_width_s(config)
-        self._in_use = self._armed = False
+        self._timeline_zero_s: float | None = None
+        self._accounted_pixel = find_weakest_pixel(display)
+        self._settling_s, self._width_s = max_settling_s(config), spot_width_s(config)
+        self._arm_requested = self._armed = False
 
     def __enter__(self) -> Self:
         return self
@@ -84,34 +84,34 @@ class HeldBoard:
         """Open the link and shake hands; kernels are loaded first, for whoever compiles renews no lease."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         request_realtime_scheduling()
-        limit(self._plan(0.0, 0.0, self._dark_w), self._state, self._display.budget)
+        limit(self._plan(0.0, 0.0, self._zero_duty_power_w), self._state, self._display.budget)
         gc.collect()
         gc.freeze()
         self.session.connect()
         while self.session.board.temperature_c is None:  # until a STATUS tells of faults and inputs
-            self.session.step(TURN_S, renew_lease=False)
+            self.session.step(LOOP_STEP_S, renew_lease=False)
 
     def close(self) -> None:
         """Abort, and close the link for good."""
-        self._in_use = self._armed = False
+        self._arm_requested = self._armed = False
         self.session.close()
 
     def step(self) -> None:
         """Keep the lease and listen, for a moment; raises where the board ended the task by itself."""
-        self.session.step(TURN_S, renew_lease=True)
+        self.session.step(LOOP_STEP_S, renew_lease=True)
         board, refusal = self.session.board, self.session.pop_refusal()
-        if board.state == "FAULT" and self._in_use:
-            raise self._fault()
+        if board.state == "FAULT" and self._arm_requested:
+            raise self._build_fault_error()
         if refusal is not None:
             raise NotReadyError(f"the board refuses: {refusal}")
         if self._armed and board.state in ("DISARMED", "ARMING"):
             raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_event_reason}")
 
-    def _fault(self) -> BoardFaultError:
+    def _build_fault_error(self) -> BoardFaultError:
         """The fault by its name, which a STATUS tells soon after an ACK told of FAULT."""
-        until_s = self._clock.now_s() + FAULT_NAMED_S
+        until_s = self._clock.now_s() + FAULT_NAME_TIMEOUT_S
         while not self.session.board.fault and self._clock.now_s() < until_s:
-            self.session.step(TURN_S, renew_lease=False)
+            self.session.step(LOOP_STEP_S, renew_lease=False)
         fault = self.session.board.fault
         return BoardFaultError(f"the board went to FAULT {fault}: {get_fault_hint(fault)}")
 
@@ -123,23 +123,23 @@ class HeldBoard:
 
     def arm(self) -> float:
         """Arm; how long it took from the order to ARMED, s: the board lights its indicator for two seconds first."""
-        began_s = self._clock.now_s()
+        start_s = self._clock.now_s()
         self.session.arm()
-        self._in_use = True
+        self._arm_requested = True
         while self.session.board.state != "ARMED":
             self.step()
-            if self._clock.now_s() - began_s > ARM_TIMEOUT_S:
+            if self._clock.now_s() - start_s > ARM_TIMEOUT_S:
                 raise NotReadyError(f"the board did not arm within {ARM_TIMEOUT_S:g} s: {self.session.board.state}")
         self._armed = True
-        return self._clock.now_s() - began_s
+        return self._clock.now_s() - start_s
 
     def disarm(self) -> None:
         """To DISARMED, a fault acknowledged, and hear that it is; NotReadyError where the board refuses."""
-        self._in_use = self._armed = False
+        self._arm_requested = self._armed = False
         self.session.disarm()
         until_s = self._clock.now_s() + ARM_TIMEOUT_S
         while self.session.board.state != "DISARMED":
-            self.session.step(TURN_S, renew_lease=False)
+            self.session.step(LOOP_STEP_S, renew_lease=False)
             refusal = self.session.pop_refusal()
             if refusal is not None:
                 raise NotReadyError(f"the board refuses to disarm: {refusal}")
@@ -148,37 +148,37 @@ class HeldBoard:
 
     # --- points -------------------------------------------------------------------------------------------------
 
-    def go(self, x_code: int, y_code: int) -> None:
+    def move_to(self, x_code: int, y_code: int) -> None:
         """Send the mirrors somewhere in the dark, and wait until they have settled."""
-        self._show(x_code, y_code, self._dark_w, lit=False)
+        self._execute_point(x_code, y_code, self._zero_duty_power_w, gate_on=False)
 
-    def light(self, x_code: int, y_code: int, power_w: float) -> None:
+    def fire_spot(self, x_code: int, y_code: int, power_w: float) -> None:
         """One short pulse at a place, mirrors settled; done when the board has reported it in full."""
-        check_power(self.config, power_w)
-        self._show(x_code, y_code, power_w, lit=True)
+        check_spot_power(self.config, power_w)
+        self._execute_point(x_code, y_code, power_w, gate_on=True)
 
     @property
-    def _dark_w(self) -> float:
+    def _zero_duty_power_w(self) -> float:
         """Rounds to a duty of nothing: the board gets a dark point, while the limiter counts the mirrors' move."""
         return 0.5 * self.config.laser.max_power_w / DUTY_MAX
 
     def _plan(self, x_rad: float, y_rad: float, power_w: float) -> PulsePlan:
         """One pulse. Nobody knows yet which pixel it meets: all count on one, the one that bears least."""
         columns = {
-            "start_s": self._settle_s,
+            "start_s": self._settling_s,
             "width_s": self._width_s,
             "x_rad": x_rad,
             "y_rad": y_rad,
             "power_w": power_w,
-            "pixel": self._pixel,
-            "settle_s": self._settle_s,
+            "pixel": self._accounted_pixel,
+            "settle_s": self._settling_s,
             "target_m": np.nan,
-            "nominal_s": self._settle_s,
+            "nominal_s": self._settling_s,
             "source": 0,
         }
         return PulsePlan(**{item.name: np.array([columns[item.name]]) for item in fields(PulsePlan)})
 
-    def _show(self, x_code: int, y_code: int, power_w: float, lit: bool) -> None:
+    def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:
         self.check_range(x_code, y_code)
         if not self._armed:
             raise NotReadyError(f"the board is not armed: {self.session.board.state}")
@@ -187,11 +187,11 @@ class HeldBoard:
         scale = self.session.scale
         x_rad, y_rad = scale.to_angles_rad(np.array([x_code, y_code]))
         plan = self._plan(x_rad, y_rad, power_w)
-        limited, before, after, start_s = self._passed(plan)
+        limited, before, after, start_s = self._limit_when_feasible(plan)
         points = quantise(limited, scale)
-        self._prove(points, limited, before, lit)
-        self._state, self._zero_s = after, start_s
-        self._zero_s += self._run(points, limited, start_s, lit)
+        self._verify_encoded(points, limited, before, gate_on)
+        self._state, self._timeline_zero_s = after, start_s
+        self._timeline_zero_s += self._stream(points, limited, start_s, gate_on)
 
     def check_range(self, x_code: int, y_code: int) -> None:
         """InputError for codes beyond the display and a little more."""
@@ -199,18 +199,22 @@ class HeldBoard:
         for axis, code in (("x", x_code), ("y", y_code)):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
             if not low <= code <= high:
-                raise InputError(f"{axis}_code", code, f"{low} to {high}, the display and {BEYOND_M * 1e3:g} mm more")
+                raise InputError(
+                    f"{axis}_code", code, f"{low} to {high}, the display and {FIELD_MARGIN_M * 1e3:g} mm more"
+                )
 
-    def within(self, codes: FloatArray) -> FloatArray:
+    def clip_codes(self, codes: FloatArray) -> FloatArray:
         """Codes [k, 2], those too far out drawn in as far as the board goes."""
         limits = self._limits
         return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
 
-    def _passed(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
+    def _limit_when_feasible(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
         """The plan as the limiter lets it pass, the state before and after, and when it begins; waits where it must."""
         while True:
             start_s = self.session.board_s() + START_LEAD_S
-            before = shift_state(self._state, (start_s if self._zero_s is None else self._zero_s) - start_s)
+            before = shift_state(
+                self._state, (start_s if self._timeline_zero_s is None else self._timeline_zero_s) - start_s
+            )
             try:
                 limited, after = limit(plan, before, self._display.budget, "refuse")
             except OverBudgetError as error:
@@ -220,14 +224,14 @@ class HeldBoard:
                 continue
             return limited, before, after, start_s
 
-    def _prove(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, lit: bool) -> None:
+    def _verify_encoded(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, gate_on: bool) -> None:
         """Decode the very bytes that will leave, and hold them against the budget."""
         decoded = decode(points.encode_payload(), self.session.scale)
-        if len(decoded.index) != int(lit):
-            raise LocalProtocolError(f"{len(decoded.index)} lit points where {int(lit)} is meant")
+        if len(decoded.index) != int(gate_on):
+            raise LocalProtocolError(f"{len(decoded.index)} lit points where {int(gate_on)} is meant")
         verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
 
-    def _run(self, points: WirePoints, plan: LimitedPlan, start_s: float, lit: bool) -> float:
+    def _stream(self, points: WirePoints, plan: LimitedPlan, start_s: float, gate_on: bool) -> float:
         """Stream points and hear them through; by how much they came late, s."""
         job = self.session.begin(points, start_s)
         until_s = self._clock.now_s() + POINT_TIMEOUT_S
@@ -235,25 +239,27 @@ class HeldBoard:
             self.step()
             if self._clock.now_s() > until_s:
                 raise LinkError(f"{self.session.port}: a point was not reported within {POINT_TIMEOUT_S:g} s")
-        done = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
-        if lit and not np.allclose(done.width_s, plan.width_s):
-            raise BoardFaultError(f"the board lit a spot for {done.width_s.sum():g} s, asked for {plan.width_s[0]:g} s")
-        ended_s = float(done.start_s[-1] + done.width_s[-1])
+        executed = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
+        if gate_on and not np.allclose(executed.width_s, plan.width_s):
+            raise BoardFaultError(
+                f"the board lit a spot for {executed.width_s.sum():g} s, asked for {plan.width_s[0]:g} s"
+            )
+        ended_s = float(executed.start_s[-1] + executed.width_s[-1])
         return max(0.0, ended_s - float(plan.start_s[0] + plan.width_s[0]))
 
 
-def weakest_pixel(display: DisplayModel) -> int:
+def find_weakest_pixel(display: DisplayModel) -> int:
     """The pixel whose absorber steady light warms most."""
     heat = display.budget.heat
     return int(np.argmax(heat.epsilon * heat.r_k_per_w))
 
 
-def settle_s(config: Config) -> float:
+def max_settling_s(config: Config) -> float:
     """Dark time in which any move dies out, s, whole milliseconds."""
     scanner = config.scanner
     ramp_s = 2.0 * scanner.range_rad / scanner.slew_rad_per_s
     constant_s = 1.0 / (2.0 * pi * scanner.bandwidth_hz * scanner.damping)
-    return ceil(1e3 * (scanner.delay_s + ramp_s + SETTLED * constant_s)) * 1e-3
+    return ceil(1e3 * (scanner.delay_s + ramp_s + SETTLING_TIME_CONSTANTS * constant_s)) * 1e-3
 
 
 def spot_width_s(config: Config) -> float:
@@ -263,13 +269,13 @@ def spot_width_s(config: Config) -> float:
     return round(periods / pwm_hz * 1e6) * 1e-6
 
 
-def power_max_w(config: Config) -> float:
+def max_spot_power_w(config: Config) -> float:
     """Most power of a spot, W."""
     return min(SPOT_POWER_MAX_W, SPOT_SHARE_MAX * config.laser.max_power_w)
 
 
-def check_power(config: Config, power_w: float, option: str = "--spot") -> None:
+def check_spot_power(config: Config, power_w: float, option: str = "--spot") -> None:
     """InputError, naming the option, for a power that no spot may have."""
-    most_w = power_max_w(config)
-    if not 0.0 < power_w <= most_w:
-        raise InputError(option, f"{power_w * 1e3:g} mW", f"more than 0 and at most {most_w * 1e3:g} mW")
+    max_w = max_spot_power_w(config)
+    if not 0.0 < power_w <= max_w:
+        raise InputError(option, f"{power_w * 1e3:g} mW", f"more than 0 and at most {max_w * 1e3:g} mW")

@@ -12,45 +12,45 @@ import numpy as np
 
 from optodrive.core.errors import RefusedError
 from optodrive.device.config import build_pixel_layout
-from optodrive.lab.commissioning.exclusive_board import HeldBoard
-from optodrive.lab.commissioning.spot_reader import Eyes
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+from optodrive.lab.commissioning.spot_reader import SpotReader
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 from optodrive.link.session.fault_hints import get_fault_hint
 
 INDICATOR_S = 2.0
-READINGS = 3
+READINGS_PER_SPOT = 3
 """Of each spot: one reflection among them does not count."""
-CLOCKS_AGREE = 1e-3
+CLOCK_TOLERANCE = 1e-3
 """Host and board count seconds alike within this share."""
-TRAVEL_LEAST_M = 3e-3
-SAFE_WORDS = {"interlock": ("open", "closed"), "key": ("off", "on"), "estop": ("released", "pressed")}
+TRAVEL_MIN_M = 3e-3
+INPUT_LABELS = {"interlock": ("open", "closed"), "key": ("off", "on"), "estop": ("released", "pressed")}
 """Words for an input that is 0 and 1."""
-SAFE = {"interlock": "closed", "key": "on", "estop": "released"}
-STANDS = 0.1
+SAFE_LABELS = {"interlock": "closed", "key": "on", "estop": "released"}
+STUCK_SHARE = 0.1
 """A mirror that goes less than this share of its way does not move."""
-OUTPUT_SHARE, SPOT_SHARE = 0.05, 0.1
+OUTPUT_TOLERANCE, SPOT_TOLERANCE = 0.05, 0.1
 """Position outputs and spots may be off by such a share of the way: what the calibration is there for."""
-ZERO_RAD = 2e-3
+ZERO_TOLERANCE_RAD = 2e-3
 """Position outputs may be off by so much in the middle."""
 AXES = "xy"
 
 
-class Place(NamedTuple):
+class HomingPosition(NamedTuple):
     """Where mirrors were sent, rad, and what was seen there: outputs, rad, and spot, m; None where nothing looks."""
 
-    sent_rad: tuple[float, float]
+    commanded_rad: tuple[float, float]
     output_rad: tuple[float, float] | None
     spot_m: tuple[float, float] | None
 
 
 @dataclass(frozen=True)
-class Done:
+class HomingResult:
     """A step that went well, in words and figures."""
 
     step: str
-    words: str
-    figures: dict[str, object] = field(default_factory=dict)
+    message: str
+    details: dict[str, object] = field(default_factory=dict)
 
 
 class Homing:
@@ -59,180 +59,206 @@ class Homing:
     eyes: None without a sensor; power_w: of spots, 0 in the dark; acknowledge: a fault that the board still shows
     """
 
-    def __init__(self, held: HeldBoard, eyes: Eyes | None, power_w: float, acknowledge: bool = False) -> None:
-        self._held, self._eyes, self._power_w, self._acknowledge = held, eyes, power_w, acknowledge
-        self._code_rad = held.config.scanner.rad_per_code
-        self._zero: Place | None = None
-        self._ends: dict[int, tuple[Place, Place]] = {}
+    def __init__(
+        self, board: ExclusiveBoard, spot_reader: SpotReader | None, power_w: float, acknowledge: bool = False
+    ) -> None:
+        self._board, self._spot_reader, self._power_w, self._acknowledge = board, spot_reader, power_w, acknowledge
+        self._code_rad = board.config.scanner.rad_per_code
+        self._zero: HomingPosition | None = None
+        self._ends: dict[int, tuple[HomingPosition, HomingPosition]] = {}
 
-    def run(self, tell: Callable[[Done], None]) -> None:
+    def run(self, on_step: Callable[[HomingResult], None]) -> None:
         """Do every step of the table in order, telling each; an OptodriveError names what stops it."""
         for name, step in STEPS:
-            tell(step(self, name))
+            on_step(step(self, name))
 
     # --- the steps ----------------------------------------------------------------------------------------------
 
-    def link(self, name: str) -> Done:
+    def check_link(self, name: str) -> HomingResult:
         """Board and sensor answer."""
-        self._held.connect()
-        if self._eyes is not None:
-            self._eyes.open()
-        board, sensor = self._held.session, "no sensor" if self._eyes is None else f"sensor at {self._eyes.port}"
-        uid = board.board.uid
-        return Done(name, f"board {uid} at {board.port}, {sensor}", {"board": board.port, "uid": uid})
+        self._board.connect()
+        if self._spot_reader is not None:
+            self._spot_reader.open()
+        session, sensor = (
+            self._board.session,
+            "no sensor" if self._spot_reader is None else f"sensor at {self._spot_reader.port}",
+        )
+        uid = session.board.uid
+        return HomingResult(name, f"board {uid} at {session.port}, {sensor}", {"board": session.port, "uid": uid})
 
-    def status(self, name: str) -> Done:
+    def check_status(self, name: str) -> HomingResult:
         """The board waits, without a fault."""
-        board = self._held.session.board
+        board = self._board.session.board
         if board.state == "FAULT" and self._acknowledge:
-            self._held.disarm()
+            self._board.disarm()
         if board.state != "DISARMED":
             fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
-            raise _refused(name, "board", f"{board.state}{fault}", "DISARMED; --acknowledge once the cause is gone")
-        return Done(name, f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c})
+            raise _build_refusal(
+                name, "board", f"{board.state}{fault}", "DISARMED; --acknowledge once the cause is gone"
+            )
+        return HomingResult(name, f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c})
 
-    def inputs(self, name: str) -> Done:
+    def check_inputs(self, name: str) -> HomingResult:
         """Interlock, key and emergency stop are safe."""
-        bits = self._held.session.board.inputs
-        found = {each: SAFE_WORDS[each][bits >> k & 1] for k, each in enumerate(INPUTS)}
-        for each, word in found.items():
-            if word != SAFE[each]:
-                raise _refused(name, each, word, SAFE[each])
-        return Done(name, ", ".join(f"{each} {word}" for each, word in found.items()), dict(found))
+        bits = self._board.session.board.inputs
+        labels = {each: INPUT_LABELS[each][bits >> k & 1] for k, each in enumerate(INPUTS)}
+        for each, label in labels.items():
+            if label != SAFE_LABELS[each]:
+                raise _build_refusal(name, each, label, SAFE_LABELS[each])
+        return HomingResult(name, ", ".join(f"{each} {word}" for each, word in labels.items()), dict(labels))
 
-    def indicator(self, name: str) -> Done:
+    def check_indicator(self, name: str) -> HomingResult:
         """The board arms, and warns for two seconds before it is ARMED."""
-        lit_s = self._held.arm()
-        if lit_s < INDICATOR_S * (1.0 - CLOCKS_AGREE):
-            raise _refused(name, "time from the order to ARMED", f"{lit_s:.2f} s", f"at least {INDICATOR_S:g} s")
-        return Done(name, f"lit for {lit_s:.2f} s, ARMED", {"lit_s": round(lit_s, 3)})
+        indicator_s = self._board.arm()
+        if indicator_s < INDICATOR_S * (1.0 - CLOCK_TOLERANCE):
+            raise _build_refusal(
+                name, "time from the order to ARMED", f"{indicator_s:.2f} s", f"at least {INDICATOR_S:g} s"
+            )
+        return HomingResult(name, f"lit for {indicator_s:.2f} s, ARMED", {"lit_s": round(indicator_s, 3)})
 
-    def zero(self, name: str) -> Done:
+    def move_to_zero(self, name: str) -> HomingResult:
         """Mirrors to their middle."""
-        self._zero = place = self._look(CENTRE_CODE, CENTRE_CODE)
-        if place.output_rad is not None:
+        self._zero = position = self._measure_at(CENTRE_CODE, CENTRE_CODE)
+        if position.output_rad is not None:
             for axis in range(2):
-                off_rad = place.output_rad[axis]
-                if abs(off_rad) > ZERO_RAD:
-                    expected = f"0 ± {ZERO_RAD:g} rad in the middle"
-                    raise _refused(name, f"position output of mirror {AXES[axis]}", f"{off_rad:.5f} rad", expected)
-        return Done(name, _seen(place), _figures(place))
+                output_rad = position.output_rad[axis]
+                if abs(output_rad) > ZERO_TOLERANCE_RAD:
+                    expected = f"0 ± {ZERO_TOLERANCE_RAD:g} rad in the middle"
+                    raise _build_refusal(
+                        name, f"position output of mirror {AXES[axis]}", f"{output_rad:.5f} rad", expected
+                    )
+        return HomingResult(name, _describe_position(position), _position_details(position))
 
-    def travel_x(self, name: str) -> Done:
+    def check_travel_x(self, name: str) -> HomingResult:
         """Mirror x to both ends of the display."""
-        return self._travel(name, 0)
+        return self._check_travel(name, 0)
 
-    def travel_y(self, name: str) -> Done:
+    def check_travel_y(self, name: str) -> HomingResult:
         """Mirror y to both ends of the display."""
-        return self._travel(name, 1)
+        return self._check_travel(name, 1)
 
-    def readback(self, name: str) -> Done:
+    def check_readback(self, name: str) -> HomingResult:
         """Position outputs follow: the right mirror, the right way, as far as sent."""
         if self._zero is None or self._zero.output_rad is None:
-            return Done(name, "no position outputs: not checked", {"checked": False})
+            return HomingResult(name, "no position outputs: not checked", {"checked": False})
         for axis, (high, low) in self._ends.items():
-            sent_rad = high.sent_rad[axis] - low.sent_rad[axis]
-            own_rad, other_rad = (_between(high.output_rad, low.output_rad, each) for each in (axis, 1 - axis))
-            within = f"{sent_rad:.5f} ± {OUTPUT_SHARE * sent_rad:.5f} rad"
+            commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
+            own_rad, other_rad = (_difference(high.output_rad, low.output_rad, each) for each in (axis, 1 - axis))
+            expected = f"{commanded_rad:.5f} ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
             what = f"position output of mirror {AXES[axis]}"
-            if abs(own_rad + sent_rad) <= OUTPUT_SHARE * sent_rad:
-                raise _refused(name, f"{what} over its way", f"{own_rad:.5f} rad, inverted", within)
-            if abs(own_rad - sent_rad) > OUTPUT_SHARE * sent_rad:
-                raise _refused(name, f"{what} over its way", f"{own_rad:.5f} rad", within)
-            if abs(other_rad) > OUTPUT_SHARE * sent_rad:
+            if abs(own_rad + commanded_rad) <= OUTPUT_TOLERANCE * commanded_rad:
+                raise _build_refusal(name, f"{what} over its way", f"{own_rad:.5f} rad, inverted", expected)
+            if abs(own_rad - commanded_rad) > OUTPUT_TOLERANCE * commanded_rad:
+                raise _build_refusal(name, f"{what} over its way", f"{own_rad:.5f} rad", expected)
+            if abs(other_rad) > OUTPUT_TOLERANCE * commanded_rad:
                 other = f"position output of mirror {AXES[1 - axis]} while {AXES[axis]} goes"
-                raise _refused(name, other, f"{other_rad:.5f} rad", f"0 ± {OUTPUT_SHARE * sent_rad:.5f} rad")
-        return Done(name, f"both mirrors follow within {OUTPUT_SHARE:.0%}", {"checked": True})
+                raise _build_refusal(
+                    name, other, f"{other_rad:.5f} rad", f"0 ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
+                )
+        return HomingResult(name, f"both mirrors follow within {OUTPUT_TOLERANCE:.0%}", {"checked": True})
 
-    def end(self, name: str) -> Done:
+    def return_to_zero(self, name: str) -> HomingResult:
         """Back to the middle in the dark, and disarmed."""
-        self._held.go(CENTRE_CODE, CENTRE_CODE)
-        self._held.disarm()
-        return Done(name, "mirrors in the middle, DISARMED", {"board": "DISARMED"})
+        self._board.move_to(CENTRE_CODE, CENTRE_CODE)
+        self._board.disarm()
+        return HomingResult(name, "mirrors in the middle, DISARMED", {"board": "DISARMED"})
 
     # --- what they share ----------------------------------------------------------------------------------------
 
-    def _look(self, x_code: int, y_code: int) -> Place:
-        self._held.go(x_code, y_code)
-        sent_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
-        if self._eyes is None:
+    def _measure_at(self, x_code: int, y_code: int) -> HomingPosition:
+        self._board.move_to(x_code, y_code)
+        commanded_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
+        if self._spot_reader is None:
             if self._power_w:
-                self._held.light(x_code, y_code, self._power_w)
-            return Place(sent_rad, None, None)
-        output_rad = self._eyes.mirrors_rad()
-        seen = self._eyes.spot(x_code, y_code, self._power_w, READINGS) if self._power_w else None
-        spot_m = None if seen is None else (seen.x_m, seen.y_m)
+                self._board.fire_spot(x_code, y_code, self._power_w)
+            return HomingPosition(commanded_rad, None, None)
+        output_rad = self._spot_reader.read_mirrors_rad()
+        reading = (
+            self._spot_reader.read_spot(x_code, y_code, self._power_w, READINGS_PER_SPOT) if self._power_w else None
+        )
+        spot_m = None if reading is None else (reading.x_m, reading.y_m)
         if self._power_w and spot_m is None:
-            sent = f"with the mirrors at {sent_rad[0]:.4f}, {sent_rad[1]:.4f} rad"
-            raise _refused(
-                "spot", f"sensor at {self._eyes.port} {sent}", "no spot", "a spot: is it covered, or too dim?"
+            context = f"with the mirrors at {commanded_rad[0]:.4f}, {commanded_rad[1]:.4f} rad"
+            raise _build_refusal(
+                "spot", f"sensor at {self._spot_reader.port} {context}", "no spot", "a spot: is it covered, or too dim?"
             )
-        return Place(sent_rad, output_rad, spot_m)
+        return HomingPosition(commanded_rad, output_rad, spot_m)
 
-    def _travel(self, name: str, axis: int) -> Done:
-        high, low = (self._look(*self._end(axis, sign)) for sign in (1, -1))
+    def _check_travel(self, name: str, axis: int) -> HomingResult:
+        high, low = (self._measure_at(*self._end_codes(axis, sign)) for sign in (1, -1))
         self._ends[axis] = high, low
-        sent_rad = high.sent_rad[axis] - low.sent_rad[axis]
+        commanded_rad = high.commanded_rad[axis] - low.commanded_rad[axis]
         if high.output_rad is not None:
-            self._check_stands(name, axis, _between(high.output_rad, low.output_rad, axis), sent_rad, "rad")
+            self._check_moved(name, axis, _difference(high.output_rad, low.output_rad, axis), commanded_rad, "rad")
         if high.spot_m is not None:
-            sent_m = 2.0 * self._held.config.scanner.focal_length_m * sent_rad
-            own_m, other_m = (_between(high.spot_m, low.spot_m, each) for each in (axis, 1 - axis))
-            self._check_stands(name, axis, own_m, sent_m, "m")
-            within, what = f"{sent_m:.4f} ± {SPOT_SHARE * sent_m:.4f} m", f"spot while mirror {AXES[axis]} goes its way"
-            if abs(own_m - sent_m) > SPOT_SHARE * sent_m or abs(other_m) > SPOT_SHARE * sent_m:
-                went = f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}"
-                raise _refused(name, what, went, f"{within} along {AXES[axis]}: axes mirrored, swapped, another lens?")
-        words = f"±{sent_rad / 2:.4f} rad, {_how_seen(high)}"
-        return Done(name, words, {"plus": _figures(high), "minus": _figures(low)})
+            commanded_m = 2.0 * self._board.config.scanner.focal_length_m * commanded_rad
+            own_m, other_m = (_difference(high.spot_m, low.spot_m, each) for each in (axis, 1 - axis))
+            self._check_moved(name, axis, own_m, commanded_m, "m")
+            expected, what = (
+                f"{commanded_m:.4f} ± {SPOT_TOLERANCE * commanded_m:.4f} m",
+                f"spot while mirror {AXES[axis]} goes its way",
+            )
+            if abs(own_m - commanded_m) > SPOT_TOLERANCE * commanded_m or abs(other_m) > SPOT_TOLERANCE * commanded_m:
+                measured = f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}"
+                raise _build_refusal(
+                    name, what, measured, f"{expected} along {AXES[axis]}: axes mirrored, swapped, another lens?"
+                )
+        message = f"±{commanded_rad / 2:.4f} rad, {_describe_evidence(high)}"
+        return HomingResult(name, message, {"plus": _position_details(high), "minus": _position_details(low)})
 
-    def _end(self, axis: int, sign: int) -> tuple[int, int]:
-        layout = build_pixel_layout(self._held.config.display)
-        reach_m = max(float(np.abs((layout.x_m, layout.y_m)[axis]).max()), TRAVEL_LEAST_M)
-        way = round(reach_m / (2.0 * self._held.config.scanner.focal_length_m * self._code_rad))
+    def _end_codes(self, axis: int, sign: int) -> tuple[int, int]:
+        layout = build_pixel_layout(self._board.config.display)
+        half_travel_m = max(float(np.abs((layout.x_m, layout.y_m)[axis]).max()), TRAVEL_MIN_M)
+        code_count = round(half_travel_m / (2.0 * self._board.config.scanner.focal_length_m * self._code_rad))
         codes = [CENTRE_CODE, CENTRE_CODE]
-        codes[axis] += sign * way
+        codes[axis] += sign * code_count
         return codes[0], codes[1]
 
-    def _check_stands(self, name: str, axis: int, moved: float, sent: float, unit: str) -> None:
-        if abs(moved) < STANDS * sent:
-            what = f"mirror {AXES[axis]}, sent {sent:.4f} {unit} from end to end,"
-            raise _refused(name, what, f"does not move: {moved:.4f} {unit}", f"{sent:.4f} {unit}")
+    def _check_moved(self, name: str, axis: int, moved: float, commanded: float, unit: str) -> None:
+        if abs(moved) < STUCK_SHARE * commanded:
+            what = f"mirror {AXES[axis]}, sent {commanded:.4f} {unit} from end to end,"
+            raise _build_refusal(name, what, f"does not move: {moved:.4f} {unit}", f"{commanded:.4f} {unit}")
 
 
-def _refused(step: str, what: str, value: str, expected: str) -> RefusedError:
+def _build_refusal(step: str, what: str, value: str, expected: str) -> RefusedError:
     return RefusedError(f"home: {step}: {what}: got {value}, expected {expected}")
 
 
-def _between(high: tuple[float, float] | None, low: tuple[float, float] | None, axis: int) -> float:
+def _difference(high: tuple[float, float] | None, low: tuple[float, float] | None, axis: int) -> float:
     return 0.0 if high is None or low is None else high[axis] - low[axis]
 
 
-def _how_seen(place: Place) -> str:
-    seen = [word for word, there in (("position outputs", place.output_rad), ("spot", place.spot_m)) if there]
-    return f"seen by {' and '.join(seen)}" if seen else "executed; nothing here sees the mirrors"
+def _describe_evidence(position: HomingPosition) -> str:
+    instruments = [
+        word for word, reading in (("position outputs", position.output_rad), ("spot", position.spot_m)) if reading
+    ]
+    return f"seen by {' and '.join(instruments)}" if instruments else "executed; nothing here sees the mirrors"
 
 
-def _seen(place: Place) -> str:
-    words = [] if place.output_rad is None else [f"outputs {place.output_rad[0]:.5f}, {place.output_rad[1]:.5f} rad"]
-    if place.spot_m is not None:
-        words.append(f"spot {place.spot_m[0] * 1e3:.3f}, {place.spot_m[1] * 1e3:.3f} mm")
-    return "; ".join(words) or "executed; nothing here sees the mirrors"
+def _describe_position(position: HomingPosition) -> str:
+    parts = (
+        []
+        if position.output_rad is None
+        else [f"outputs {position.output_rad[0]:.5f}, {position.output_rad[1]:.5f} rad"]
+    )
+    if position.spot_m is not None:
+        parts.append(f"spot {position.spot_m[0] * 1e3:.3f}, {position.spot_m[1] * 1e3:.3f} mm")
+    return "; ".join(parts) or "executed; nothing here sees the mirrors"
 
 
-def _figures(place: Place) -> dict[str, object]:
-    return {"sent_rad": place.sent_rad, "output_rad": place.output_rad, "spot_m": place.spot_m}
+def _position_details(position: HomingPosition) -> dict[str, object]:
+    return {"sent_rad": position.commanded_rad, "output_rad": position.output_rad, "spot_m": position.spot_m}
 
 
-STEPS: tuple[tuple[str, Callable[[Homing, str], Done]], ...] = (
-    ("link", Homing.link),
-    ("status", Homing.status),
-    ("inputs", Homing.inputs),
-    ("indicator", Homing.indicator),
-    ("zero", Homing.zero),
-    ("travel x", Homing.travel_x),
-    ("travel y", Homing.travel_y),
-    ("readback", Homing.readback),
-    ("zero again", Homing.end),
+STEPS: tuple[tuple[str, Callable[[Homing, str], HomingResult]], ...] = (
+    ("link", Homing.check_link),
+    ("status", Homing.check_status),
+    ("inputs", Homing.check_inputs),
+    ("indicator", Homing.check_indicator),
+    ("zero", Homing.move_to_zero),
+    ("travel x", Homing.check_travel_x),
+    ("travel y", Homing.check_travel_y),
+    ("readback", Homing.check_readback),
+    ("zero again", Homing.return_to_zero),
 )
 """In order; each begins in what the one before it left."""

@@ -11,70 +11,72 @@ from optodrive.core.units import um_to_m
 from optodrive.device.config import build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.lab.commissioning.exclusive_board import HeldBoard
-from optodrive.lab.commissioning.predicted_error import display_codes
-from optodrive.lab.commissioning.session_file import Row
-from optodrive.lab.commissioning.spot_reader import Eyes
+from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
+from optodrive.lab.commissioning.predicted_error import build_code_grid
+from optodrive.lab.commissioning.session_file import SpotRow
+from optodrive.lab.commissioning.spot_reader import SpotReader
 
-SIDE = 11
+GRID_SIDE = 11
 """Places a side that a sensor may be asked about."""
-BEYOND_PIXELS_M = 1.5e-3
+GRID_MARGIN_M = 1.5e-3
 BLINK_S = 0.1
 """Darkness between two flashes for a person's eye."""
 NUDGE_MAX_UM = 5000.0
 HELP = "'dx dy' in µm moves the spot, an empty line says that it lies on the mark, 's' skips this pixel"
 
 
-class SensorLook:
+class SensorLocator:
     """A sensor looks, a few times at each place."""
 
-    def __init__(self, held: HeldBoard, eyes: Eyes, power_w: float, readings: int) -> None:
-        self._eyes, self._power_w, self._readings = eyes, power_w, readings
-        self._codes = np.rint(held.within(display_codes(held.config, BEYOND_PIXELS_M, SIDE)))
-        self.name = f"sensor at {eyes.port}"
-        self.unseen = f"{self.name} sees no spot, expected one: is it covered, or {power_w * 1e3:g} mW too dim?"
+    def __init__(self, board: ExclusiveBoard, spot_reader: SpotReader, power_w: float, readings: int) -> None:
+        self._spot_reader, self._power_w, self._readings = spot_reader, power_w, readings
+        self._codes = np.rint(board.clip_codes(build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)))
+        self.name = f"sensor at {spot_reader.port}"
+        self.not_found_message = (
+            f"{self.name} sees no spot, expected one: is it covered, or {power_w * 1e3:g} mW too dim?"
+        )
 
-    def candidates(self, fit: FieldFit) -> FloatArray:
+    def candidate_codes(self, fit: FieldFit) -> FloatArray:
         """A grid over the display and a little more."""
         return self._codes
 
-    def start(self) -> list[int]:
+    def initial_places(self) -> list[int]:
         """Corners, edges and the middle."""
-        ends = (0, SIDE // 2, SIDE - 1)
-        return [row * SIDE + column for row in ends for column in ends]
+        ends = (0, GRID_SIDE // 2, GRID_SIDE - 1)
+        return [row * GRID_SIDE + column for row in ends for column in ends]
 
-    def places(self, spots: MeasuredSpots) -> IntArray:
+    def match_places(self, spots: MeasuredSpots) -> IntArray:
         """By the codes they were sent to."""
-        return _same(self._codes, np.column_stack([spots.x_code, spots.y_code]))
+        return _match_rows(self._codes, np.column_stack([spots.x_code, spots.y_code]))
 
-    def measure(self, place: int, x_code: int, y_code: int) -> Row | None:
+    def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
         """Light it, and take the mean of what is seen."""
-        seen = self._eyes.spot(x_code, y_code, self._power_w, self._readings)
-        return None if seen is None else Row(x_code, y_code, seen.x_m, seen.y_m)
+        reading = self._spot_reader.read_spot(x_code, y_code, self._power_w, self._readings)
+        return None if reading is None else SpotRow(x_code, y_code, reading.x_m, reading.y_m)
 
 
-class NudgeLook:
+class ManualLocator:
     """A person looks: the spot is to be moved onto the middle of a pixel, whose place is known.
 
     lines: what the person types, None at its end; say: words for the person.
     """
 
     name = "spots moved by hand"
-    unseen = "skipped, expected a spot moved onto its mark"
+    not_found_message = "skipped, expected a spot moved onto its mark"
 
     def __init__(
-        self, held: HeldBoard, power_w: float, lines: "SimpleQueue[str | None]", say: Callable[[str], None]
+        self, board: ExclusiveBoard, power_w: float, input_lines: "SimpleQueue[str | None]", show: Callable[[str], None]
     ) -> None:
-        self._held, self._power_w, self._lines, self._say = held, power_w, lines, say
-        self._layout = build_pixel_layout(held.config.display)
-        scanner = held.config.scanner
+        self._board, self._power_w, self._input_lines, self._show = board, power_w, input_lines, show
+        self._layout = build_pixel_layout(board.config.display)
+        scanner = board.config.scanner
         self._code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
 
-    def candidates(self, fit: FieldFit) -> FloatArray:
+    def candidate_codes(self, fit: FieldFit) -> FloatArray:
         """The middle of every pixel, where the field so far leads the beam to it; no farther than the board goes."""
-        return self._held.within(np.column_stack(fit.field.codes(self._layout.x_m, self._layout.y_m)))
+        return self._board.clip_codes(np.column_stack(fit.field.codes(self._layout.x_m, self._layout.y_m)))
 
-    def start(self) -> list[int]:
+    def initial_places(self) -> list[int]:
         """Pixels nearest to the corners, edges and middle of the lattice."""
         x_m, y_m = self._layout.x_m, self._layout.y_m
         places = [
@@ -84,55 +86,58 @@ class NudgeLook:
         ]
         return list(dict.fromkeys(places))
 
-    def places(self, spots: MeasuredSpots) -> IntArray:
+    def match_places(self, spots: MeasuredSpots) -> IntArray:
         """By the pixels they lie on."""
-        return _same(np.column_stack([self._layout.x_m, self._layout.y_m]), np.column_stack([spots.x_m, spots.y_m]))
+        return _match_rows(
+            np.column_stack([self._layout.x_m, self._layout.y_m]), np.column_stack([spots.x_m, spots.y_m])
+        )
 
-    def measure(self, place: int, x_code: int, y_code: int) -> Row | None:
+    def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
         """Flash the spot until the person says that it lies on the mark."""
         x_m, y_m = float(self._layout.x_m[place]), float(self._layout.y_m[place])
-        self._say(f"pixel {place}, {x_m * 1e3:+.2f} {y_m * 1e3:+.2f} mm: {HELP}")
+        self._show(f"pixel {place}, {x_m * 1e3:+.2f} {y_m * 1e3:+.2f} mm: {HELP}")
         while True:
-            line = self._line(x_code, y_code)
+            line = self._read_line(x_code, y_code)
             if not line:
-                return Row(x_code, y_code, x_m, y_m)
+                return SpotRow(x_code, y_code, x_m, y_m)
             if line == "s":
                 return None
-            moved = _nudge_um(line)
-            if moved is None:
-                self._say(f"got {line!r}, expected {HELP}; no more than {NUDGE_MAX_UM:g} µm at a time")
+            nudge_um = _parse_nudge_um(line)
+            if nudge_um is None:
+                self._show(f"got {line!r}, expected {HELP}; no more than {NUDGE_MAX_UM:g} µm at a time")
                 continue
-            x_to, y_to = (
-                code + round(um_to_m(way) / self._code_m) for code, way in zip((x_code, y_code), moved, strict=True)
+            new_x_code, new_y_code = (
+                code + round(um_to_m(offset_um) / self._code_m)
+                for code, offset_um in zip((x_code, y_code), nudge_um, strict=True)
             )
             try:
-                self._held.check_range(x_to, y_to)
+                self._board.check_range(new_x_code, new_y_code)
             except InputError as error:
-                self._say(str(error))
+                self._show(str(error))
                 continue
-            x_code, y_code = x_to, y_to
+            x_code, y_code = new_x_code, new_y_code
 
-    def _line(self, x_code: int, y_code: int) -> str:
+    def _read_line(self, x_code: int, y_code: int) -> str:
         """What the person types, the spot flashing meanwhile."""
         while True:
             try:
-                line = self._lines.get_nowait()
+                line = self._input_lines.get_nowait()
             except Empty:
-                self._held.light(x_code, y_code, self._power_w)
-                self._held.wait(BLINK_S)
+                self._board.fire_spot(x_code, y_code, self._power_w)
+                self._board.wait(BLINK_S)
                 continue
             if line is None:
                 raise RefusedError("calibrate: nobody answers any more (end of input); what was measured is kept")
             return line.strip()
 
 
-def _same(known: FloatArray, given: FloatArray) -> IntArray:
+def _match_rows(known: FloatArray, given: FloatArray) -> IntArray:
     """Row of known [k, 2] that each row of given [n, 2] repeats, -1 where none does."""
-    same = np.all(np.isclose(given[:, None], known[None], rtol=0.0, atol=1e-9), axis=2)
-    return np.where(same.any(axis=1), same.argmax(axis=1), -1)
+    equal = np.all(np.isclose(given[:, None], known[None], rtol=0.0, atol=1e-9), axis=2)
+    return np.where(equal.any(axis=1), equal.argmax(axis=1), -1)
 
 
-def _nudge_um(line: str) -> tuple[float, float] | None:
+def _parse_nudge_um(line: str) -> tuple[float, float] | None:
     try:
         dx_um, dy_um = (float(each) for each in line.split())
     except ValueError:

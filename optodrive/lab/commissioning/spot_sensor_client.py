@@ -10,7 +10,7 @@ from optodrive.link.transport.base import Transport
 LINE_MAX = 64
 
 
-class Sighting(NamedTuple):
+class SpotReading(NamedTuple):
     """Where a spot was seen on the display, and one sigma of either number."""
 
     x_m: float
@@ -18,12 +18,12 @@ class Sighting(NamedTuple):
     sigma_m: float
 
 
-class SpotSensor:
+class SpotSensorClient:
     """A sensor on a transport of its own. Methods raise LinkError when the link fails or what is heard is no answer."""
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
-        self._heard = b""
+        self._buffer = b""
 
     @property
     def port(self) -> str:
@@ -38,22 +38,22 @@ class SpotSensor:
         """Close its port."""
         self._transport.release()
 
-    def ask(self, request: str) -> None:
+    def send_request(self, request: str) -> None:
         """Say a line; what lay there unheard belongs to no question and is dropped."""
         self._read()
-        self._heard = b""
+        self._buffer = b""
         try:
             self._transport.write(request.encode("ascii") + b"\n")
         except LinkError as error:
             raise LinkError(f"sensor: {error}") from None
 
-    def answer(self) -> str | None:
+    def poll_answer(self) -> str | None:
         """The line that came, None as long as there is none."""
-        self._heard += self._read()
-        line, end, _ = self._heard.partition(b"\n")
+        self._buffer += self._read()
+        line, end, _ = self._buffer.partition(b"\n")
         if not end:
-            if len(self._heard) > LINE_MAX:
-                raise self._no_answer(self._heard.decode("ascii", "replace"), "a line")
+            if len(self._buffer) > LINE_MAX:
+                raise self._build_answer_error(self._buffer.decode("ascii", "replace"), "a line")
             return None
         return line.decode("ascii", "replace").strip()
 
@@ -63,20 +63,20 @@ class SpotSensor:
         except LinkError as error:
             raise LinkError(f"sensor: {error}") from None
 
-    def sighting(self, line: str) -> Sighting | None:
+    def parse_spot(self, line: str) -> SpotReading | None:
         """The answer to `spot`; None where it saw nothing."""
-        numbers = self._numbers(line, "spot", 3)
+        numbers = self._parse_numbers(line, "spot", 3)
         if numbers is None:
             return None
         x_m, y_m, sigma_m = (um_to_m(number) for number in numbers)
-        return Sighting(x_m, y_m, sigma_m)
+        return SpotReading(x_m, y_m, sigma_m)
 
-    def mirrors_rad(self, line: str) -> tuple[float, float] | None:
+    def parse_mirrors_rad(self, line: str) -> tuple[float, float] | None:
         """The answer to `mirrors`; None where the driver has no position outputs."""
-        numbers = self._numbers(line, "mirrors", 2)
+        numbers = self._parse_numbers(line, "mirrors", 2)
         return None if numbers is None else (numbers[0], numbers[1])
 
-    def _numbers(self, line: str, request: str, count: int) -> list[float] | None:
+    def _parse_numbers(self, line: str, request: str, count: int) -> list[float] | None:
         word, *rest = line.split() or [""]
         if word == request and rest == ["none"]:
             return None
@@ -85,10 +85,10 @@ class SpotSensor:
         except ValueError:
             numbers = []
         if word != request or len(numbers) != count or not all(map(isfinite, numbers)):
-            raise self._no_answer(line, f"'{request}' and {count} numbers, or '{request} none'")
+            raise self._build_answer_error(line, f"'{request}' and {count} numbers, or '{request} none'")
         return numbers
 
-    def _no_answer(self, heard: str, expected: str) -> LinkError:
+    def _build_answer_error(self, received: str, expected: str) -> LinkError:
         return LinkError(
-            f"sensor at {self.port}: heard {heard[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
+            f"sensor at {self.port}: heard {received[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
         )

@@ -15,15 +15,15 @@ from optodrive.core.errors import InputError, OptodriveError, RefusedError
 NICE = 5
 
 
-class Aside:
+class WorkerProcess:
     """Does one thing at a time; ends with whoever started it, however that ends."""
 
     def __init__(self) -> None:
         context = mp.get_context("spawn")  # a fork would keep the board's port open after its holder has gone
-        self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(theirs,), name="aside", daemon=True)
+        self._pipe, child_end = context.Pipe()
+        self._process = context.Process(target=_serve, args=(child_end,), name="aside", daemon=True)
         self._process.start()
-        theirs.close()
+        child_end.close()
 
     def __enter__(self) -> Self:
         return self
@@ -35,28 +35,28 @@ class Aside:
         self._process.terminate()
         self._process.join()
 
-    def begin(self, function: Callable[..., Any], *arguments: object) -> None:
+    def submit(self, function: Callable[..., Any], *arguments: object) -> None:
         """Hand over a function of a module, and what it takes."""
         try:
             self._pipe.send((function, arguments))
         except OSError:
-            raise self._gone() from None
+            raise self._build_exit_error() from None
 
-    def ready(self) -> bool:
+    def is_ready(self) -> bool:
         """Whether it is done."""
         return self._pipe.poll()
 
     def result(self) -> Any:
         """What came of it; waits for it. RefusedError where its input was wrong, OptodriveError where it failed."""
         try:
-            came = self._pipe.recv()
+            outcome = self._pipe.recv()
         except (EOFError, OSError):
-            raise self._gone() from None
-        if isinstance(came, OptodriveError):
-            raise came
-        return came
+            raise self._build_exit_error() from None
+        if isinstance(outcome, OptodriveError):
+            raise outcome
+        return outcome
 
-    def _gone(self) -> OptodriveError:
+    def _build_exit_error(self) -> OptodriveError:
         return OptodriveError("the process that fits has ended: out of memory, or ended from outside?")
 
 
@@ -71,9 +71,9 @@ def _serve(pipe: Connection) -> None:
         except (EOFError, OSError):
             return
         try:
-            came = function(*arguments)
+            outcome = function(*arguments)
         except InputError as error:
-            came = RefusedError(str(error))
+            outcome = RefusedError(str(error))
         except Exception as error:
-            came = OptodriveError(f"{function.__name__}: {type(error).__name__}: {error}")
-        pipe.send(came)
+            outcome = OptodriveError(f"{function.__name__}: {type(error).__name__}: {error}")
+        pipe.send(outcome)

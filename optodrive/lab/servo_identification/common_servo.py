@@ -9,21 +9,21 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.identify import Identified
+from optodrive.lab.servo_identification.identify import IdentifiedServo
 
 DAMPING_MIN, DAMPING_MAX = 0.3, 0.9
 """What a configuration may state."""
 FREQUENCY_MIN_HZ = 100.0
-ROOM_SHARES = (1.0, 0.75, 0.5)
+TOLERANCE_SHARES = (1.0, 0.75, 0.5)
 """The gate keeps up to so much of its tolerance for former moves."""
-MOVES = 8
-SLOWER = 0.995
-EVEN = 1.001
+MOVE_SIZE_COUNT = 8
+FREQUENCY_STEP = 0.995
+SETTLING_SLACK = 1.001
 """So much sooner is as late."""
 
 
 @dataclass(frozen=True)
-class Common:
+class CommonServo:
     """servo: for both; galvo_share: by how much the galvo cap must be lowered, as the quicker mirror accelerates more.
 
     later: of x and y, by what share the servo's mean settle time is longer than the mirror's own
@@ -31,39 +31,43 @@ class Common:
 
     servo: Servo
     galvo_share: float
-    later: tuple[float, float]
+    settling_excess: tuple[float, float]
 
 
-def common_servo(mirrors: tuple[Identified, Identified], config: Config) -> Common:
+def find_common_servo(mirrors: tuple[IdentifiedServo, IdentifiedServo], config: Config) -> CommonServo:
     """For moves from a pitch to the whole display, at the gate's tolerances, with each mirror's 95 % interval."""
     moves = [
         (step_rad, share * tolerance_rad, axis)
         for axis, tolerance_rad in enumerate(config.tolerance_rad)
-        for step_rad in moves_rad(config, axis)
-        for share in ROOM_SHARES
+        for step_rad in move_sizes_rad(config, axis)
+        for share in TOLERANCE_SHARES
     ]
-    needed_s = np.array([mirrors[axis].settled_s(step, tolerance)[2] for step, tolerance, axis in moves])
-    candidates = [_late_enough(mirror.servo, mirrors, moves, needed_s) for mirror in mirrors]
-    servo = min(candidates, key=lambda each: float(_times_s(each, moves).mean()))
+    required_s = np.array([mirrors[axis].settling_s(step, tolerance)[2] for step, tolerance, axis in moves])
+    candidates = [_slow_to_required(mirror.servo, mirrors, moves, required_s) for mirror in mirrors]
+    servo = min(candidates, key=lambda each: float(_settling_times_s(each, moves).mean()))
     steps_rad = [step for step, _, _ in moves]
-    ratio = max(_energy(each.servo, step) / _energy(servo, step) for each in mirrors for step in steps_rad)
-    return Common(servo, min(1.0, 1.0 / sqrt(ratio)), _later(mirrors, servo, moves))
+    ratio = max(
+        _acceleration_energy(each.servo, step) / _acceleration_energy(servo, step)
+        for each in mirrors
+        for step in steps_rad
+    )
+    return CommonServo(servo, min(1.0, 1.0 / sqrt(ratio)), _settling_excess(mirrors, servo, moves))
 
 
-def moves_rad(config: Config, axis: int) -> list[float]:
+def move_sizes_rad(config: Config, axis: int) -> list[float]:
     """Moves along one axis from a pitch to the whole display, rad."""
     display = config.display
     pitch_rad = display.pitch_m / (2.0 * config.scanner.focal_length_m)
     farthest = max(1, (display.columns, display.rows)[axis] - 1)
-    pitches: list[float] = np.unique(np.geomspace(1, farthest, MOVES).round()).tolist()
-    return [pitch_rad * way for way in pitches]
+    pitches: list[float] = np.unique(np.geomspace(1, farthest, MOVE_SIZE_COUNT).round()).tolist()
+    return [pitch_rad * pitch_count for pitch_count in pitches]
 
 
-def _late_enough(
+def _slow_to_required(
     start: Servo,
-    mirrors: tuple[Identified, Identified],
+    mirrors: tuple[IdentifiedServo, IdentifiedServo],
     moves: list[tuple[float, float, int]],
-    needed_s: FloatArray,
+    required_s: FloatArray,
 ) -> Servo:
     """A servo like this one, with the longer delay and the lower slew, as slow as both mirrors need."""
     damping = min(max(start.damping, DAMPING_MIN), DAMPING_MAX)
@@ -71,29 +75,36 @@ def _late_enough(
     frequency = start.frequency
     while True:
         servo = Servo(frequency, damping, delay_s, slew)
-        if frequency * SLOWER < FREQUENCY_MIN_HZ or np.all(_times_s(servo, moves) * EVEN >= needed_s):
+        if frequency * FREQUENCY_STEP < FREQUENCY_MIN_HZ or np.all(
+            _settling_times_s(servo, moves) * SETTLING_SLACK >= required_s
+        ):
             return servo
-        frequency *= SLOWER
+        frequency *= FREQUENCY_STEP
 
 
-def _times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> FloatArray:
+def _settling_times_s(servo: Servo, moves: list[tuple[float, float, int]]) -> FloatArray:
     return np.array([settling_s(servo, step, tolerance) for step, tolerance, _ in moves])
 
 
-def _later(
-    mirrors: tuple[Identified, Identified], servo: Servo, moves: list[tuple[float, float, int]]
+def _settling_excess(
+    mirrors: tuple[IdentifiedServo, IdentifiedServo], servo: Servo, moves: list[tuple[float, float, int]]
 ) -> tuple[float, float]:
     shares = []
     for axis in range(2):
-        own = [move for move in moves if move[2] == axis]
-        shares.append(float(_times_s(servo, own).mean() / _times_s(mirrors[axis].servo, own).mean()) - 1.0)
+        axis_moves = [move for move in moves if move[2] == axis]
+        shares.append(
+            float(
+                _settling_times_s(servo, axis_moves).mean() / _settling_times_s(mirrors[axis].servo, axis_moves).mean()
+            )
+            - 1.0
+        )
     return shares[0], shares[1]
 
 
-def _energy(servo: Servo, move_rad: float) -> float:
+def _acceleration_energy(servo: Servo, move_rad: float) -> float:
     """Integral of the squared acceleration of a move, rad²/s³, as the limiter counts it."""
     omega, damping = 2.0 * pi * servo.frequency, servo.damping
     root = sqrt(1.0 - damping**2)
-    turned = min(omega * root * move_rad / servo.slew, pi)
-    alike = exp(-turned * damping / root) * (cos(turned) + damping / root * sin(turned))
-    return servo.slew**2 * omega / (2.0 * damping) * (1.0 - alike)
+    phase = min(omega * root * move_rad / servo.slew, pi)
+    overlap = exp(-phase * damping / root) * (cos(phase) + damping / root * sin(phase))
+    return servo.slew**2 * omega / (2.0 * damping) * (1.0 - overlap)

@@ -11,25 +11,25 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.device.gate_timing import settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.step_response import angles_rad
-from optodrive.lab.servo_identification.step_trace import AXES, Piece, Trace
+from optodrive.lab.servo_identification.step_response import step_response_rad
+from optodrive.lab.servo_identification.step_trace import AXES, StepTrace, TraceSegment
 
-NAMES = ("frequency", "damping", "delay", "slowness")
+PARAMETER_NAMES = ("frequency", "damping", "delay", "slowness")
 """What is fitted: the logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
-LOW = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
-HIGH = np.array([np.log(3e4), 0.999, 0.01, 1.0])
+LOWER_BOUNDS = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
+UPPER_BOUNDS = np.array([np.log(3e4), 0.999, 0.01, 1.0])
 SCALE = np.array([0.1, 0.1, 1e-5, 1e-3])
-THIN = 3000
+START_SAMPLES_MAX = 3000
 """Samples that starts are tried on."""
-ALL = 100_000
-STARTS = 4
-SLEW_SEEN = 5.0
+FIT_SAMPLES_MAX = 100_000
+STARTS_REFINED = 4
+SLEW_SIGMAS_MIN = 5.0
 """1 / slew must lie so many sigma above 0, else the steps were too small to show it."""
-COARSE = 0.4
+SAMPLE_SPACING_MAX = 0.4
 """Samples a period of the servo at least, as its inverse."""
-UNSURE = 0.1
-DRAWS = 60
-SURE = 0.95
+FREQUENCY_UNCERTAINTY_MAX = 0.1
+SERVO_SAMPLES = 60
+CONFIDENCE = 0.95
 
 FREQUENCIES_HZ = np.geomspace(150.0, 8000.0, 16)
 DAMPINGS = (0.35, 0.6, 0.9)
@@ -38,20 +38,20 @@ DELAY_SHARES = (0.0, 0.3, 0.6, 0.9)
 
 
 @dataclass(frozen=True, eq=False)
-class Identified:
+class IdentifiedServo:
     """A mirror's servo. sigma: of frequency (relative), damping, delay (s), 1/slew (s/rad); covariance likewise [4, 4].
 
     gain, offset_rad: of the measured angle; misfit: rms of what is left, in units of the noise
     slew_seen: else servo.slew is assumed
     """
 
-    trace: Trace
+    trace: StepTrace
     servo: Servo
     covariance: FloatArray
     gain: float
     offset_rad: float
     misfit: float
-    slew_seen: bool
+    slew_identified: bool
 
     def __post_init__(self) -> None:
         freeze_arrays(self)
@@ -64,64 +64,66 @@ class Identified:
     @property
     def sigma(self) -> FloatArray:
         """One sigma of each of NAMES, [4]."""
-        found: FloatArray = np.sqrt(np.diag(self.covariance))
-        return found
+        sigma: FloatArray = np.sqrt(np.diag(self.covariance))
+        return sigma
 
-    def drawn(self) -> list[Servo]:
+    def sample_servos(self) -> list[Servo]:
         """Servos that the trace does not tell from this one, DRAWS of them."""
         random = np.random.default_rng(0)
-        drawn = random.multivariate_normal(_packed(self.servo), self.covariance, DRAWS, method="eigh")
-        return [_servo(each) for each in np.clip(drawn, LOW, HIGH)]
+        packed = random.multivariate_normal(_pack(self.servo), self.covariance, SERVO_SAMPLES, method="eigh")
+        return [_unpack(each) for each in np.clip(packed, LOWER_BOUNDS, UPPER_BOUNDS)]
 
-    def settled_s(self, step_rad: float, tolerance_rad: float) -> tuple[float, float, float]:
+    def settling_s(self, step_rad: float, tolerance_rad: float) -> tuple[float, float, float]:
         """Settle time, as the gate counts it, and its 95 % interval, s."""
-        times_s = [settling_s(servo, step_rad, tolerance_rad) for servo in self.drawn()]
+        times_s = [settling_s(servo, step_rad, tolerance_rad) for servo in self.sample_servos()]
         best_s = settling_s(self.servo, step_rad, tolerance_rad)
-        low, high = np.quantile(times_s, [0.5 - SURE / 2, 0.5 + SURE / 2]).tolist()
+        low, high = np.quantile(times_s, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2]).tolist()
         return best_s, min(low, best_s), max(high, best_s)
 
 
-def identify(where: str, trace: Trace, assumed_slew_rad_per_s: float) -> Identified:
+def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> IdentifiedServo:
     """Fit a servo to a trace; where the slew does not show, the assumed one is kept. InputError names `where`."""
-    thin, whole = _thinned(trace, THIN), _thinned(trace, ALL)
+    start_trace, fit_trace = _decimate(trace, START_SAMPLES_MAX), _decimate(trace, FIT_SAMPLES_MAX)
     free = np.full(4, True)
-    starts = sorted(_starts(trace), key=lambda start: float((_left(thin, start)[0] ** 2).sum()))[:STARTS]
-    rough = min((_fitted(thin, start, free) for start in starts), key=lambda found: found[1])[0]
-    best, _, covariance = _fitted(whole, rough, free)
-    seen = bool(best[3] > SLEW_SEEN * np.sqrt(covariance[3, 3]))
-    if not seen and abs(1.0 / assumed_slew_rad_per_s - best[3]) < 3.0 * np.sqrt(covariance[3, 3]):
+    starts = sorted(_generate_starts(trace), key=lambda start: float((_residual(start_trace, start)[0] ** 2).sum()))[
+        :STARTS_REFINED
+    ]
+    initial = min((_fit(start_trace, start, free) for start in starts), key=lambda found: found[1])[0]
+    best, _, covariance = _fit(fit_trace, initial, free)
+    slew_identified = bool(best[3] > SLEW_SIGMAS_MIN * np.sqrt(covariance[3, 3]))
+    if not slew_identified and abs(1.0 / assumed_slew_rad_per_s - best[3]) < 3.0 * np.sqrt(covariance[3, 3]):
         free[3] = False
         best[3] = 1.0 / assumed_slew_rad_per_s
-        best, _, covariance = _fitted(whole, best, free)
-    left, gain, offset_rad = _left(whole, best)
-    misfit = float(np.sqrt((left**2).mean()))
-    found = Identified(trace, _servo(best), covariance, gain, offset_rad, misfit, seen)
-    _check(f"{where}: mirror_{AXES[trace.axis]}_rad", found)
+        best, _, covariance = _fit(fit_trace, best, free)
+    residual, gain, offset_rad = _residual(fit_trace, best)
+    misfit = float(np.sqrt((residual**2).mean()))
+    found = IdentifiedServo(trace, _unpack(best), covariance, gain, offset_rad, misfit, slew_identified)
+    _check_identifiable(f"{where}: mirror_{AXES[trace.axis]}_rad", found)
     return found
 
 
-def _check(where: str, found: Identified) -> None:
+def _check_identifiable(where: str, found: IdentifiedServo) -> None:
     spacing_s, servo = found.trace.spacing_s, found.servo
-    if servo.frequency * spacing_s > COARSE or 2.0 * found.sigma[0] > UNSURE:
+    if servo.frequency * spacing_s > SAMPLE_SPACING_MAX or 2.0 * found.sigma[0] > FREQUENCY_UNCERTAINTY_MAX:
         sampled = f"{1e6 * spacing_s:.3g} µs a sample, {servo.frequency:.3g} Hz ± {2 * found.sigma[0]:.1%}"
         expected = "finer sampling or more steps: the sampling is too coarse, or the noise too high, for this servo"
         raise InputError(where, sampled, expected)
 
 
-def _servo(packed: FloatArray) -> Servo:
+def _unpack(packed: FloatArray) -> Servo:
     return Servo(float(np.exp(packed[0])), float(packed[1]), float(packed[2]), float(1.0 / packed[3]))
 
 
-def _packed(servo: Servo) -> FloatArray:
+def _pack(servo: Servo) -> FloatArray:
     return np.array([np.log(servo.frequency), servo.damping, servo.delay, 1.0 / servo.slew])
 
 
-def _left(trace: Trace, packed: FloatArray) -> tuple[FloatArray, float, float]:
+def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, float]:
     """What a servo leaves of the angles, in units of their noise, with the gain and offset that leave least."""
-    servo = _servo(packed)
-    model = np.concatenate([angles_rad(servo, piece.steps, piece.t_s) for piece in trace.pieces])
-    value = np.concatenate([piece.value_rad for piece in trace.pieces])
-    noise_rad = np.concatenate([np.full(len(piece.t_s), piece.noise_rad) for piece in trace.pieces])
+    servo = _unpack(packed)
+    model = np.concatenate([step_response_rad(servo, piece.steps, piece.t_s) for piece in trace.segments])
+    value = np.concatenate([piece.value_rad for piece in trace.segments])
+    noise_rad = np.concatenate([np.full(len(piece.t_s), piece.noise_rad) for piece in trace.segments])
     weight = noise_rad**-2.0 / (noise_rad**-2.0).sum()
     model_mean, mean = float(weight @ model), float(weight @ value)
     around = model - model_mean
@@ -129,52 +131,53 @@ def _left(trace: Trace, packed: FloatArray) -> tuple[FloatArray, float, float]:
     return (value - mean - gain * around) / noise_rad, gain, mean - gain * model_mean
 
 
-def _fitted(trace: Trace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
+def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
     """The best servo near a start, the sum of squares it leaves, and the covariance, 0 for what is not free."""
 
-    def whole(part: FloatArray) -> FloatArray:
+    def expand(part: FloatArray) -> FloatArray:
         packed = start.copy()
         packed[free] = part * SCALE[free]
         return packed
 
-    left: Callable[[FloatArray], FloatArray] = lambda part: _left(trace, whole(part))[0]  # noqa: E731
-    low, high = LOW[free] / SCALE[free], HIGH[free] / SCALE[free]
-    at = np.clip(start[free] / SCALE[free], low + 1e-9, high - 1e-9)
-    found = least_squares(left, at, bounds=(low, high), jac="3-point", x_scale="jac", max_nfev=80)
-    spare = max(1, len(found.fun) - len(at) - 2)
-    variance = 2.0 * found.cost / spare
+    residual: Callable[[FloatArray], FloatArray] = lambda part: _residual(trace, expand(part))[0]  # noqa: E731
+    low, high = LOWER_BOUNDS[free] / SCALE[free], UPPER_BOUNDS[free] / SCALE[free]
+    initial = np.clip(start[free] / SCALE[free], low + 1e-9, high - 1e-9)
+    solution = least_squares(residual, initial, bounds=(low, high), jac="3-point", x_scale="jac", max_nfev=80)
+    degrees_of_freedom = max(1, len(solution.fun) - len(initial) - 2)
+    variance = 2.0 * solution.cost / degrees_of_freedom
     covariance = np.zeros((4, 4))
-    inverse = np.linalg.pinv(found.jac.T @ found.jac) * variance
+    inverse = np.linalg.pinv(solution.jac.T @ solution.jac) * variance
     fitted = np.flatnonzero(free)
     covariance[np.ix_(fitted, fitted)] = inverse * np.outer(SCALE[free], SCALE[free])
-    return whole(found.x), float(found.cost), covariance
+    return expand(solution.x), float(solution.cost), covariance
 
 
-def _starts(trace: Trace) -> Iterator[FloatArray]:
+def _generate_starts(trace: StepTrace) -> Iterator[FloatArray]:
     rise_s = _rise_s(trace)
     for frequency, damping, slew, share in product(FREQUENCIES_HZ, DAMPINGS, SLEWS, DELAY_SHARES):
-        yield _packed(Servo(frequency, damping, min(share * rise_s, 0.009), slew))
+        yield _pack(Servo(frequency, damping, min(share * rise_s, 0.009), slew))
 
 
-def _rise_s(trace: Trace) -> float:
+def _rise_s(trace: StepTrace) -> float:
     """The shortest time after which a mirror has gone a tenth of its step, s: its delay is less."""
     shortest_s = []
-    for piece in trace.pieces:
+    for piece in trace.segments:
         steps = piece.steps
         for row in range(1, len(steps.at_s)):
-            way = steps.command_rad[row] - steps.command_rad[row - 1]
+            step_rad = steps.command_rad[row] - steps.command_rad[row - 1]
             begin, end = np.searchsorted(piece.t_s, [steps.at_s[row], steps.at_s[row] + 0.01])
-            gone = (piece.value_rad[begin:end] - steps.command_rad[row - 1]) / way
-            there = np.flatnonzero(gone > 0.1)
-            if len(there):
-                shortest_s.append(piece.t_s[begin + there[0]] - steps.at_s[row])
+            progress = (piece.value_rad[begin:end] - steps.command_rad[row - 1]) / step_rad
+            reached = np.flatnonzero(progress > 0.1)
+            if len(reached):
+                shortest_s.append(piece.t_s[begin + reached[0]] - steps.at_s[row])
     return float(np.median(shortest_s)) if shortest_s else 1e-4
 
 
-def _thinned(trace: Trace, most: int) -> Trace:
+def _decimate(trace: StepTrace, max_samples: int) -> StepTrace:
     """Samples chosen evenly, about so many at the most."""
-    every = -(-sum(len(piece.t_s) for piece in trace.pieces) // most)
+    stride = -(-sum(len(piece.t_s) for piece in trace.segments) // max_samples)
     pieces = tuple(
-        Piece(each.steps, each.t_s[::every], each.value_rad[::every], each.noise_rad) for each in trace.pieces
+        TraceSegment(each.steps, each.t_s[::stride], each.value_rad[::stride], each.noise_rad)
+        for each in trace.segments
     )
-    return replace(trace, pieces=pieces)
+    return replace(trace, segments=pieces)

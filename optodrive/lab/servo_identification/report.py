@@ -10,35 +10,38 @@ from optodrive.core.files import atomic_write
 from optodrive.device.config import MIRRORS_FORMAT, MIRRORS_VERSION, Config
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
-from optodrive.lab.servo_identification.common_servo import Common
-from optodrive.lab.servo_identification.identify import Identified
+from optodrive.lab.servo_identification.common_servo import CommonServo
+from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.lab.servo_identification.step_trace import AXES
 
-SIGMAS = 1.96
+INTERVAL_SIGMAS = 1.96
 """A 95 % interval to either side."""
-SHARE = 0.02
+STEP_TOLERANCE = 0.02
 """Of a step, the usual tolerance of a settle time."""
-ALIKE = 0.05
+RELATIVE_TOLERANCE = 0.05
 """Steps whose sizes differ by less are shown as one."""
 SIZES_MAX = 6
-BANDWIDTH_GOOD, DELAY_GOOD_S, SETTLE_GOOD = 0.03, 1e-5, 0.05
-MISFIT = 1.5
+BANDWIDTH_TOLERANCE, DELAY_TOLERANCE_S, SETTLING_TOLERANCE = 0.03, 1e-5, 0.05
+MISFIT_MAX = 1.5
 """A residual so many times the noise is not noise alone."""
-OVERDAMPED = 0.99
+CRITICAL_DAMPING = 0.99
 
 
-def figures(mirrors: tuple[Identified, Identified], common: Common, config: Config) -> dict[str, Any]:
+def build_report(
+    mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo, config: Config
+) -> dict[str, Any]:
     """Figures for people and programs, SI; intervals are of 95 %."""
     return {
-        "scanner": fragment(common.servo),
+        "scanner": scanner_table(common.servo),
         "galvo": {"share": common.galvo_share},
-        "later": dict(zip(AXES, common.later, strict=True)),
-        "axes": {AXES[mirror.trace.axis]: _axis(mirror, config) for mirror in mirrors},
-        "remarks": [remark for mirror in mirrors for remark in _remarks(mirror, config)] + _lost(mirrors, common),
+        "later": dict(zip(AXES, common.settling_excess, strict=True)),
+        "axes": {AXES[mirror.trace.axis]: _axis_report(mirror, config) for mirror in mirrors},
+        "remarks": [remark for mirror in mirrors for remark in _axis_remarks(mirror, config)]
+        + _common_servo_remarks(mirrors, common),
     }
 
 
-def fragment(servo: Servo) -> dict[str, float]:
+def scanner_table(servo: Servo) -> dict[str, float]:
     """A servo by the keys of a configuration's scanner."""
     return {
         "bandwidth_hz": servo.frequency,
@@ -48,13 +51,13 @@ def fragment(servo: Servo) -> dict[str, float]:
     }
 
 
-def lines(told: dict[str, Any]) -> list[str]:
+def format_report_lines(report: dict[str, Any]) -> list[str]:
     """The figures in plain words."""
-    said = []
-    for name, axis in told["axes"].items():
+    lines = []
+    for name, axis in report["axes"].items():
         low, high = axis["bandwidth_interval_hz"]
         slew = f"{axis['slew_rad_per_s']:.4g} rad/s" if axis["slew_seen"] else "not seen"
-        said += [
+        lines += [
             f"mirror {name}         bandwidth {axis['bandwidth_hz']:.1f} Hz ({low:.1f} to {high:.1f}), damping "
             f"{axis['damping']:.3f} ± {axis['damping_half']:.3f}, delay {1e6 * axis['delay_s']:.1f} ± "
             f"{1e6 * axis['delay_half_s']:.1f} µs, slew {slew}",
@@ -63,133 +66,145 @@ def lines(told: dict[str, Any]) -> list[str]:
             f"gain {axis['gain']:.4f}; {axis['steps']} steps",
         ]
         for row in axis["settle"]:
-            said.append(f"  step {1e3 * row['step_rad']:8.3f} mrad  " + _settles(row))
-    scanner = told["scanner"]
-    said.append("[scanner]        " + ", ".join(f"{key} = {value:.5g}" for key, value in scanner.items()))
-    return said + [f"note             {remark}" for remark in told["remarks"]]
+            lines.append(f"  step {1e3 * row['step_rad']:8.3f} mrad  " + _describe_settling(row))
+    scanner = report["scanner"]
+    lines.append("[scanner]        " + ", ".join(f"{key} = {value:.5g}" for key, value in scanner.items()))
+    return lines + [f"note             {remark}" for remark in report["remarks"]]
 
 
-def write_mirrors(path: Path, told: dict[str, Any], source: str) -> None:
+def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
     """Write mirrors.toml, whole or not at all. source: what it was measured from, in words."""
-    plain = "".join(letter for letter in source if letter.isprintable() and letter not in '"\\')
-    text = [f'format = "{MIRRORS_FORMAT}"', f"version = {MIRRORS_VERSION}", "", "[about]", f'source = "{plain}"', ""]
-    text += ["[scanner] # for both mirrors, in place of the configuration's", *_pairs(told["scanner"])]
-    text += ["", "[galvo] # what the quicker mirror leaves of the galvo cap", *_pairs(told["galvo"])]
-    for name, axis in told["axes"].items():
-        text += ["", f"[axes.{name}] # as measured, for people", *_pairs(axis)]
+    printable = "".join(letter for letter in source if letter.isprintable() and letter not in '"\\')
+    text = [
+        f'format = "{MIRRORS_FORMAT}"',
+        f"version = {MIRRORS_VERSION}",
+        "",
+        "[about]",
+        f'source = "{printable}"',
+        "",
+    ]
+    text += ["[scanner] # for both mirrors, in place of the configuration's", *_format_pairs(report["scanner"])]
+    text += ["", "[galvo] # what the quicker mirror leaves of the galvo cap", *_format_pairs(report["galvo"])]
+    for name, axis in report["axes"].items():
+        text += ["", f"[axes.{name}] # as measured, for people", *_format_pairs(axis)]
     with atomic_write(path) as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
 
 
-def _pairs(table: dict[str, Any]) -> list[str]:
+def _format_pairs(table: dict[str, Any]) -> list[str]:
     numbers = {key: value for key, value in table.items() if isinstance(value, int | float)}
     return [
         f"{key} = {str(value).lower() if isinstance(value, bool) else repr(value)}" for key, value in numbers.items()
     ]
 
 
-def _axis(mirror: Identified, config: Config) -> dict[str, Any]:
-    servo, half = mirror.servo, SIGMAS * mirror.sigma
+def _axis_report(mirror: IdentifiedServo, config: Config) -> dict[str, Any]:
+    servo, half_widths = mirror.servo, INTERVAL_SIGMAS * mirror.sigma
     slew_interval = [
-        1.0 / (1.0 / servo.slew + sign * half[3]) for sign in (1, -1) if 1.0 / servo.slew + sign * half[3] > 0
+        1.0 / (1.0 / servo.slew + sign * half_widths[3])
+        for sign in (1, -1)
+        if 1.0 / servo.slew + sign * half_widths[3] > 0
     ]
     return {
-        **fragment(servo),
-        "bandwidth_interval_hz": [servo.frequency * float(np.exp(sign * half[0])) for sign in (-1, 1)],
-        "damping_half": float(half[1]),
-        "delay_half_s": float(half[2]),
-        "slew_seen": mirror.slew_seen,
-        "slew_interval_rad_per_s": slew_interval if mirror.slew_seen else None,
+        **scanner_table(servo),
+        "bandwidth_interval_hz": [servo.frequency * float(np.exp(sign * half_widths[0])) for sign in (-1, 1)],
+        "damping_half": float(half_widths[1]),
+        "delay_half_s": float(half_widths[2]),
+        "slew_seen": mirror.slew_identified,
+        "slew_interval_rad_per_s": slew_interval if mirror.slew_identified else None,
         "gain": mirror.gain,
         "offset_rad": mirror.offset_rad,
         "residual_rad": mirror.residual_rad,
         "noise_rad": mirror.trace.noise_rad,
         "steps": len(mirror.trace.steps_rad),
-        "settle": [_settle(mirror, step_rad, config) for step_rad in _sizes_rad(mirror.trace.steps_rad)],
+        "settle": [_settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)],
     }
 
 
-def _sizes_rad(steps_rad: "np.ndarray[Any, np.dtype[np.float64]]") -> list[float]:
+def _distinct_sizes_rad(steps_rad: "np.ndarray[Any, np.dtype[np.float64]]") -> list[float]:
     """Sizes that differ; where there are many, some from the smallest to the largest."""
     sizes: list[float] = []
     for step_rad in np.sort(steps_rad).tolist():
-        if not sizes or step_rad > (1.0 + ALIKE) * sizes[-1]:
+        if not sizes or step_rad > (1.0 + RELATIVE_TOLERANCE) * sizes[-1]:
             sizes.append(step_rad)
-    chosen = np.unique(np.linspace(0, len(sizes) - 1, SIZES_MAX).round().astype(int))
-    return [sizes[at] for at in chosen]
+    rows = np.unique(np.linspace(0, len(sizes) - 1, SIZES_MAX).round().astype(int))
+    return [sizes[at] for at in rows]
 
 
-def _settle(mirror: Identified, step_rad: float, config: Config) -> dict[str, Any]:
-    stated = build_servo(config.scanner)
+def _settling_row(mirror: IdentifiedServo, step_rad: float, config: Config) -> dict[str, Any]:
+    configured = build_servo(config.scanner)
     row: dict[str, Any] = {"step_rad": step_rad}
-    for name, tolerance_rad in (("gate", config.tolerance_rad[mirror.trace.axis]), ("share", SHARE * step_rad)):
-        best_s, low_s, high_s = mirror.settled_s(step_rad, tolerance_rad)
+    for name, tolerance_rad in (
+        ("gate", config.tolerance_rad[mirror.trace.axis]),
+        ("share", STEP_TOLERANCE * step_rad),
+    ):
+        best_s, low_s, high_s = mirror.settling_s(step_rad, tolerance_rad)
         row[name] = {
             "tolerance_rad": tolerance_rad,
             "measured_s": best_s,
             "interval_s": [low_s, high_s],
-            "configured_s": settling_s(stated, step_rad, tolerance_rad),
+            "configured_s": settling_s(configured, step_rad, tolerance_rad),
         }
     return row
 
 
-def _settles(row: dict[str, Any]) -> str:
-    said = []
-    for name, words in (("gate", "gate's tolerance"), ("share", f"{SHARE:.0%} of it")):
+def _describe_settling(row: dict[str, Any]) -> str:
+    parts = []
+    for name, words in (("gate", "gate's tolerance"), ("share", f"{STEP_TOLERANCE:.0%} of it")):
         each = row[name]
         low, high = (1e3 * value for value in each["interval_s"])
-        off = each["configured_s"] / each["measured_s"] - 1.0
-        said.append(
+        excess = each["configured_s"] / each["measured_s"] - 1.0
+        parts.append(
             f"to {words} in {1e3 * each['measured_s']:.3f} ms ({low:.3f} to {high:.3f}; configured "
-            f"{1e3 * each['configured_s']:.3f}, {off:+.1%})"
+            f"{1e3 * each['configured_s']:.3f}, {excess:+.1%})"
         )
-    return ", ".join(said)
+    return ", ".join(parts)
 
 
-def _remarks(mirror: Identified, config: Config) -> list[str]:
-    name, half, servo = AXES[mirror.trace.axis], SIGMAS * mirror.sigma, mirror.servo
-    said = []
-    if not mirror.slew_seen:
-        kept = config.scanner.slew_rad_per_s
-        said.append(
-            f"{name}: the slew cannot be told, no step was large enough to show it; the configuration's {kept:g} rad/s "
+def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
+    name, half_widths, servo = AXES[mirror.trace.axis], INTERVAL_SIGMAS * mirror.sigma, mirror.servo
+    remarks = []
+    if not mirror.slew_identified:
+        configured = config.scanner.slew_rad_per_s
+        remarks.append(
+            f"{name}: the slew cannot be told, no step was large enough to show it; the configuration's {configured:g} rad/s "
             "is kept. Settle times of larger moves rest on it"
         )
-    if half[0] > BANDWIDTH_GOOD or half[2] > DELAY_GOOD_S:
-        said.append(
-            f"{name}: not sure enough: bandwidth ± {half[0]:.1%}, delay ± {1e6 * half[2]:.1f} µs; "
+    if half_widths[0] > BANDWIDTH_TOLERANCE or half_widths[2] > DELAY_TOLERANCE_S:
+        remarks.append(
+            f"{name}: not sure enough: bandwidth ± {half_widths[0]:.1%}, delay ± {1e6 * half_widths[2]:.1f} µs; "
             "measure more steps, or sample faster"
         )
-    if mirror.misfit > MISFIT:
-        said.append(
+    if mirror.misfit > MISFIT_MAX:
+        remarks.append(
             f"{name}: what is left is {mirror.misfit:.1f} times the noise: "
             "the mirror does more than a servo of the second order with a delay and a slew limit"
         )
-    if servo.damping + half[1] > OVERDAMPED:
-        said.append(
+    if servo.damping + half_widths[1] > CRITICAL_DAMPING:
+        remarks.append(
             f"{name}: damped critically or more, as nearly as can be told; a configuration is underdamped always"
         )
-    for row in (_settle(mirror, step_rad, config) for step_rad in _sizes_rad(mirror.trace.steps_rad)):
+    for row in (_settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)):
         low_s, high_s = row["share"]["interval_s"]
-        if high_s - low_s > 2.0 * SETTLE_GOOD * row["share"]["measured_s"]:
-            said.append(
-                f"{name}: a step of {1e3 * row['step_rad']:.3g} mrad is within {SHARE:.0%} after {1e3 * low_s:.3f} to "
+        if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
+            remarks.append(
+                f"{name}: a step of {1e3 * row['step_rad']:.3g} mrad is within {STEP_TOLERANCE:.0%} after {1e3 * low_s:.3f} to "
                 f"{1e3 * high_s:.3f} ms: an overshoot just touches it, or too few steps"
             )
-    return said
+    return remarks
 
 
-def _lost(mirrors: tuple[Identified, Identified], common: Common) -> list[str]:
-    said = []
+def _common_servo_remarks(mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo) -> list[str]:
+    remarks = []
     x, y = (asdict(mirror.servo) for mirror in mirrors)
-    apart = max(abs(x[key] - y[key]) / max(x[key], y[key], 1e-12) for key in ("frequency", "damping", "slew"))
-    if apart > BANDWIDTH_GOOD or max(common.later) > SETTLE_GOOD:
-        said.append(
+    difference = max(abs(x[key] - y[key]) / max(x[key], y[key], 1e-12) for key in ("frequency", "damping", "slew"))
+    if difference > BANDWIDTH_TOLERANCE or max(common.settling_excess) > SETTLING_TOLERANCE:
+        remarks.append(
             "one servo stands for both mirrors and settles no sooner than either: at the gate it takes "
-            f"{common.later[0]:.1%} longer than x needs and {common.later[1]:.1%} longer than y"
+            f"{common.settling_excess[0]:.1%} longer than x needs and {common.settling_excess[1]:.1%} longer than y"
         )
-    if common.galvo_share < 1.0 - ALIKE:
-        said.append(
+    if common.galvo_share < 1.0 - RELATIVE_TOLERANCE:
+        remarks.append(
             f"the quicker mirror accelerates more than that servo: the galvo cap is taken × {common.galvo_share:.3f}"
         )
-    return said
+    return remarks

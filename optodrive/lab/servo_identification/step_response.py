@@ -29,45 +29,45 @@ class Steps:
         return sizes
 
 
-def angles_rad(servo: Servo, steps: Steps, t_s: FloatArray) -> FloatArray:
+def step_response_rad(servo: Servo, steps: Steps, t_s: FloatArray) -> FloatArray:
     """Angle at t_s, rad; at rest at the first command before. The servo's damping lies below 1."""
     pole = pole_per_s(servo)
-    left_over = -2.0 * servo.damping / (2.0 * np.pi * servo.frequency)
-    bends = _bends(servo, steps)
-    swings = np.empty(len(bends), dtype=np.complex128)
-    angle, speed = bends[0][1], 0.0
-    for row, (at_s, target, slope) in enumerate(bends):
-        error, rate = angle - target - left_over * slope, speed - slope
+    ramp_lag_s = -2.0 * servo.damping / (2.0 * np.pi * servo.frequency)
+    breakpoints = _find_breakpoints(servo, steps)
+    modes = np.empty(len(breakpoints), dtype=np.complex128)
+    angle, speed = breakpoints[0][1], 0.0
+    for row, (at_s, target, slope) in enumerate(breakpoints):
+        error, rate = angle - target - ramp_lag_s * slope, speed - slope
         # e = 2 Re(A), e' = 2 Re(λ A)
-        swings[row] = swing = 0.5 * complex(error, (pole.real * error - rate) / pole.imag)
-        if row + 1 < len(bends):
-            later_s = bends[row + 1][0] - at_s
-            swung = 2.0 * swing * np.exp(pole * later_s)
-            angle = target + slope * (later_s + left_over) + swung.real
-            speed = slope + (pole * swung).real
-    begin_s, target, slope = np.array(bends).T
+        modes[row] = mode = 0.5 * complex(error, (pole.real * error - rate) / pole.imag)
+        if row + 1 < len(breakpoints):
+            later_s = breakpoints[row + 1][0] - at_s
+            transient = 2.0 * mode * np.exp(pole * later_s)
+            angle = target + slope * (later_s + ramp_lag_s) + transient.real
+            speed = slope + (pole * transient).real
+    begin_s, target, slope = np.array(breakpoints).T
     row_of = np.clip(np.searchsorted(begin_s, t_s, side="right") - 1, 0, None)
     since_s = np.maximum(t_s - begin_s[row_of], 0.0)
-    swung = 2.0 * (swings[row_of] * np.exp(pole * since_s)).real
-    found: FloatArray = target[row_of] + slope[row_of] * (since_s + left_over) + swung
-    return found
+    transient = 2.0 * (modes[row_of] * np.exp(pole * since_s)).real
+    response: FloatArray = target[row_of] + slope[row_of] * (since_s + ramp_lag_s) + transient
+    return response
 
 
-def _bends(servo: Servo, steps: Steps) -> list[tuple[float, float, float]]:
+def _find_breakpoints(servo: Servo, steps: Steps) -> list[tuple[float, float, float]]:
     """Where the target's line bends: time, target there and its slope from there on."""
     at_s, command = (steps.at_s + servo.delay).tolist(), steps.command_rad.tolist()
     target = command[0]
-    bends = [(at_s[0], target, 0.0)]
+    breakpoints = [(at_s[0], target, 0.0)]
     for row in range(1, len(at_s)):
-        way, end_s = command[row] - target, at_s[row + 1] if row + 1 < len(at_s) else np.inf
-        if way == 0.0:
-            bends.append((at_s[row], target, 0.0))
+        step_rad, end_s = command[row] - target, at_s[row + 1] if row + 1 < len(at_s) else np.inf
+        if step_rad == 0.0:
+            breakpoints.append((at_s[row], target, 0.0))
             continue
-        slope, there_s = (servo.slew if way > 0.0 else -servo.slew), at_s[row] + abs(way) / servo.slew
-        bends.append((at_s[row], target, slope))
-        if there_s < end_s:
+        slope, reached_s = (servo.slew if step_rad > 0.0 else -servo.slew), at_s[row] + abs(step_rad) / servo.slew
+        breakpoints.append((at_s[row], target, slope))
+        if reached_s < end_s:
             target = command[row]
-            bends.append((there_s, target, 0.0))
+            breakpoints.append((reached_s, target, 0.0))
         else:
             target += slope * (end_s - at_s[row])
-    return bends
+    return breakpoints

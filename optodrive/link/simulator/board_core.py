@@ -14,8 +14,8 @@ from optodrive.core.errors import RemoteProtocolError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import WINDOW, BoardLink
 from optodrive.link.protocol.framing import Frame, encode_frame
-from optodrive.link.simulator.board_limits import BoardSettings, tightened
-from optodrive.link.simulator.guards import Guards
+from optodrive.link.simulator.board_limits import BoardSettings, tighten
+from optodrive.link.simulator.guards import EmissionGuards
 
 INDICATOR_US = 2_000_000
 ARMING_TIMEOUT_US = 10_000_000
@@ -27,18 +27,18 @@ INDEX_MAX = 0xFFFF_FFFF
 TICK_HZ = 1_000_000
 FIRMWARE = 0x0001_0000
 CAPABILITY_KEY_EDGE = 1
-LEASED = ("ARMING", "ARMED", "RUNNING", "HOLD")
+LEASED_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 SAFE_INPUTS = {"interlock": True, "key": True, "estop": False}
 INPUT_FAULTS = {"interlock": "INTERLOCK", "key": "KEY", "estop": "ESTOP"}
 
-Sink = Callable[[dict[str, Any]], None]
-Steer = Callable[[int, int, int], None]
+LogSink = Callable[[dict[str, Any]], None]
+MirrorSink = Callable[[int, int, int], None]
 """Told where the mirrors are sent, x and y in codes, and when, µs."""
-Record = tuple[int, int, int, int]
+ExecutionRecord = tuple[int, int, int, int]
 """Number of the point, tick of gate on, gate-on time, duty."""
 
 
-class Point(NamedTuple):
+class QueuedPoint(NamedTuple):
     """One queued point; number: its index over the session."""
 
     number: int
@@ -50,7 +50,7 @@ class Point(NamedTuple):
 
 
 @dataclass
-class Job:
+class BoardJob:
     """The job between START and its end."""
 
     number: int
@@ -65,13 +65,13 @@ class BoardCore:
     def __init__(
         self,
         settings: BoardSettings | None = None,
-        sink: Sink | None = None,
+        sink: LogSink | None = None,
         seed: int | None = None,
-        steer: Steer | None = None,
+        mirror_sink: MirrorSink | None = None,
     ) -> None:
         self._settings = settings or BoardSettings()
-        self._sink: Sink = sink or (lambda event: None)
-        self._steer: Steer = steer or (lambda x, y, at_us: None)
+        self._sink: LogSink = sink or (lambda event: None)
+        self._mirror_sink: MirrorSink = mirror_sink or (lambda x, y, at_us: None)
         self._random = random.Random(seed)
         self._now_us = 0
         self.inputs = dict(SAFE_INPUTS)
@@ -85,28 +85,28 @@ class BoardCore:
         self._link = BoardLink()
         self._out: list[bytes] = []
         self._limits = self._settings.limits
-        self._guards = Guards(self._settings.cell_codes)
-        self._queue: deque[Point] = deque()
+        self._guards = EmissionGuards(self._settings.cell_codes)
+        self._queue: deque[QueuedPoint] = deque()
         self._position = (32768, 32768)
-        self._steer(*self._position, self._now_us)
+        self._mirror_sink(*self._position, self._now_us)
         self._settled_us = self._now_us
-        self._job: Job | None = None
-        self._current: Point | None = None
-        self._lit_us = self._due_us = 0
+        self._job: BoardJob | None = None
+        self._current_point: QueuedPoint | None = None
+        self._gate_on_us = self._due_us = 0
         self._next_index = self._done_index = 0
-        self._records: deque[Record] = deque(maxlen=RING_RECORDS)
-        self._unreported: list[Record] = []
+        self._records: deque[ExecutionRecord] = deque(maxlen=RING_RECORDS)
+        self._unreported: list[ExecutionRecord] = []
         self._lease_until_us = 0
-        self._nonce: int | None = None
-        self._armed_by: int | None = None
+        self._board_nonce: int | None = None
+        self._arming_host_nonce: int | None = None
         self._arming_since_us = 0
         self._confirmed = False
         self._hold_since_us = 0
-        self._underruns: deque[int] = deque()
+        self._underrun_times_us: deque[int] = deque()
         self._underruns_total = 0
-        self._laser_on = 0
+        self._laser_on_duty_us = 0
         self._key_turned = False
-        self._version_fits = False
+        self._is_version_supported = False
         self._ack_due = False
         self._set_state("DISARMED", "boot")
 
@@ -124,23 +124,23 @@ class BoardCore:
             if due_us is None or due_us > now_us:
                 break
             self._now_us = max(self._now_us, due_us)
-            self._do_due()
+            self._run_due_event()
         self._now_us = max(self._now_us, now_us)
         self._report_executed()
 
-    def _do_due(self) -> None:
+    def _run_due_event(self) -> None:
         now_us = self._now_us
-        if _reached(self._lease_due_us(), now_us):
-            self._fail("LINK")
-        elif _reached(self._arming_due_us(), now_us):
-            self._arming_over()
-        elif _reached(self._hold_due_us(), now_us):
+        if is_due(self._lease_due_us(), now_us):
+            self._enter_fault("LINK")
+        elif is_due(self._arming_due_us(), now_us):
+            self._finish_arming()
+        elif is_due(self._hold_due_us(), now_us):
             self._disarm("hold too long")
         else:
-            self._point_over()
+            self._advance_point()
 
     def _lease_due_us(self) -> int | None:
-        return self._lease_until_us if self.state in LEASED else None
+        return self._lease_until_us if self.state in LEASED_STATES else None
 
     def _arming_due_us(self) -> int | None:
         if self.state != "ARMING":
@@ -151,67 +151,74 @@ class BoardCore:
         if self.state == "HOLD":
             return self._hold_since_us + HOLD_MAX_US
         job = self._job
-        if self.state == "RUNNING" and self._current is None and job is not None and not self._enough_queued(job):
+        if (
+            self.state == "RUNNING"
+            and self._current_point is None
+            and job is not None
+            and not self._has_enough_points(job)
+        ):
             return job.start_us + HOLD_MAX_US
         return None
 
     def _point_due_us(self) -> int | None:
         if self.state != "RUNNING":
             return None
-        if self._current is not None:
+        if self._current_point is not None:
             return self._due_us
-        return self._may_begin_us()
+        return self._next_start_us()
 
     # --- points -------------------------------------------------------------------------------------------------
 
-    def _may_begin_us(self) -> int | None:
+    def _next_start_us(self) -> int | None:
         """When the next point may begin: the job's start with enough queued, else not before more data."""
         job = self._job
-        if job is None or not self._enough_queued(job):
+        if job is None or not self._has_enough_points(job):
             return None
         return max(job.start_us, self._now_us)
 
-    def _enough_queued(self, job: Job) -> bool:
-        all_here = job.end_index is not None and self._next_index >= job.end_index
-        return bool(self._queue) and (all_here or len(self._queue) >= job.watermark)
+    def _has_enough_points(self, job: BoardJob) -> bool:
+        is_complete = job.end_index is not None and self._next_index >= job.end_index
+        return bool(self._queue) and (is_complete or len(self._queue) >= job.watermark)
 
-    def _point_over(self) -> None:
+    def _advance_point(self) -> None:
         """A phase of the current point ended, or the first point of a job, or after a hold, begins."""
-        point = self._current
+        point = self._current_point
         if point is None:
             self._begin_point(self._queue.popleft())
         elif not self.gate and point.on_us:
-            self._light(point)
+            self._begin_pulse(point)
         else:
             self._finish_point(point)
 
-    def _begin_point(self, point: Point) -> None:
+    def _begin_point(self, point: QueuedPoint) -> None:
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
         if move:
             settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000)
             # A move that was broken off may have left the mirrors anywhere on its way: its own time counts too.
             self._settled_us = max(self._settled_us, self._now_us) + settle_us
         self._position = point.x, point.y
-        self._steer(point.x, point.y, self._now_us)
-        self._current = point
+        self._mirror_sink(point.x, point.y, self._now_us)
+        self._current_point = point
         self._due_us = max(self._now_us + point.dark_us, self._settled_us)
 
-    def _light(self, point: Point) -> None:
-        fault = self._guards.refuses(self._limits, point.x, point.y, self._now_us, point.on_us, point.duty)
+    def _begin_pulse(self, point: QueuedPoint) -> None:
+        fault = self._guards.check_pulse(self._limits, point.x, point.y, self._now_us, point.on_us, point.duty)
         if fault:
-            self._fail(fault)
+            self._enter_fault(fault)
             return
-        self._guards.fire(self._limits, point.x, point.y, self._now_us, point.on_us, point.duty)
-        self._lit_us = self._now_us
+        self._guards.record_pulse(self._limits, point.x, point.y, self._now_us, point.on_us, point.duty)
+        self._gate_on_us = self._now_us
         self._due_us = self._now_us + point.on_us
         self._set_gate(True, f"point {point.number}")
 
-    def _finish_point(self, point: Point) -> None:
-        lit = self.gate
-        if lit:
+    def _finish_point(self, point: QueuedPoint) -> None:
+        gate_was_on = self.gate
+        if gate_was_on:
             self._set_gate(False, f"point {point.number} done")
-        self._record(point, self._lit_us if lit else self._now_us, point.on_us if lit else 0)
-        self._current = None
+        self._record_execution(
+            point, self._gate_on_us if gate_was_on else self._now_us, point.on_us if gate_was_on else 0
+        )
+        self._current_point = None
         job = self._job
         if job is not None and job.end_index is not None and self._done_index >= job.end_index:
             self._job = None
@@ -219,11 +226,11 @@ class BoardCore:
         elif self._queue:
             self._begin_point(self._queue.popleft())
         else:
-            self._underrun()
+            self._on_underrun()
 
-    def _record(self, point: Point, on_at_us: int, on_us: int) -> None:
+    def _record_execution(self, point: QueuedPoint, on_at_us: int, on_us: int) -> None:
         self._done_index = point.number + 1
-        self._laser_on += on_us * point.duty
+        self._laser_on_duty_us += on_us * point.duty
         record = point.number, on_at_us - self._epoch_us, on_us, point.duty if on_us else 0
         self._records.append(record)
         self._unreported.append(record)
@@ -238,19 +245,19 @@ class BoardCore:
                 off_us=on_at_us + on_us,
             )
 
-    def _underrun(self) -> None:
+    def _on_underrun(self) -> None:
         self._underruns_total += 1
-        self._underruns.append(self._now_us)
-        while self._underruns[0] < self._now_us - UNDERRUN_WINDOW_US:
-            self._underruns.popleft()
-        if len(self._underruns) >= UNDERRUNS_MAX:
-            self._fail("UNDERRUN")
+        self._underrun_times_us.append(self._now_us)
+        while self._underrun_times_us[0] < self._now_us - UNDERRUN_WINDOW_US:
+            self._underrun_times_us.popleft()
+        if len(self._underrun_times_us) >= UNDERRUNS_MAX:
+            self._enter_fault("UNDERRUN")
             return
         self._hold_since_us = self._now_us
         self._set_state("HOLD", "queue empty")
 
-    def _refill(self) -> None:
-        if self.state == "HOLD" and self._job is not None and self._enough_queued(self._job):
+    def _resume_if_refilled(self) -> None:
+        if self.state == "HOLD" and self._job is not None and self._has_enough_points(self._job):
             self._set_state("RUNNING", "refilled")
 
     # --- states -------------------------------------------------------------------------------------------------
@@ -262,20 +269,22 @@ class BoardCore:
 
     def _set_state(self, state: str, reason: str) -> None:
         if state != "RUNNING":
-            self._go_dark(reason)
-        before, self.state = self.state, state
-        self._log("state", state=state, before=before, reason=reason)
+            self._close_gate(reason)
+        previous, self.state = self.state, state
+        self._log("state", state=state, before=previous, reason=reason)
         self._send(
-            m.Event(m.STATES.index(state), m.FAULTS.index(self.fault), m.EVENT_REASONS.index(reason), self._tick())
+            m.Event(
+                m.STATES.index(state), m.FAULTS.index(self.fault), m.EVENT_REASONS.index(reason), self._current_tick()
+            )
         )
 
-    def _go_dark(self, reason: str) -> None:
+    def _close_gate(self, reason: str) -> None:
         """Gate off; what a cut-short pulse really did is recorded."""
-        point, lit = self._current, self.gate
+        point, gate_was_on = self._current_point, self.gate
         self._set_gate(False, reason)
-        if point is not None and lit:
-            self._record(point, self._lit_us, self._now_us - self._lit_us)
-        self._current = None
+        if point is not None and gate_was_on:
+            self._record_execution(point, self._gate_on_us, self._now_us - self._gate_on_us)
+        self._current_point = None
 
     def _drop_queue(self) -> None:
         self._queue.clear()
@@ -284,21 +293,21 @@ class BoardCore:
 
     def _disarm(self, reason: str) -> None:
         self._confirmed = False
-        self._nonce = None
+        self._board_nonce = None
         if self.state not in ("DISARMED", "FAULT"):
             self._set_state("DISARMED", reason)
         self._drop_queue()
 
-    def _fail(self, fault: str) -> None:
+    def _enter_fault(self, fault: str) -> None:
         if self.state != "FAULT":
             self.fault = fault
             self._log("fault", fault=fault)
             self._set_state("FAULT", "fault")
         self._confirmed = False
-        self._nonce = None
+        self._board_nonce = None
         self._drop_queue()
 
-    def _arming_over(self) -> None:
+    def _finish_arming(self) -> None:
         if self._confirmed:
             self._set_state("ARMED", "armed")
         else:
@@ -314,9 +323,9 @@ class BoardCore:
         self.inputs[name] = value
         self._log("input", input=name, value=value)
         if value != SAFE_INPUTS[name]:
-            self._fail(INPUT_FAULTS[name])
+            self._enter_fault(INPUT_FAULTS[name])
 
-    def link_lost(self, now_us: int) -> None:
+    def on_link_lost(self, now_us: int) -> None:
         """The host's end of the link closed (DTR dropped, BREAK): as an ABORT."""
         self.advance(now_us)
         self._disarm("link lost")
@@ -325,7 +334,7 @@ class BoardCore:
         """Power lost and back: everything is forgotten, the clock starts again."""
         self.advance(now_us)
         self._set_gate(False, "reset")
-        self._current = None
+        self._current_point = None
         self._power_up(cause)
 
     # --- bytes --------------------------------------------------------------------------------------------------
@@ -339,11 +348,11 @@ class BoardCore:
     def receive(self, data: bytes, now_us: int) -> None:
         """Take bytes that arrived at now_us."""
         self.advance(now_us)
-        bad = self._bad_frames()
+        bad = self._count_bad_frames()
         for frame in self._link.decoder.feed(data):
-            self._take(frame)
-        if self._bad_frames() != bad:
-            self._log("rx_error", bad_frames=self._bad_frames())
+            self._handle_frame(frame)
+        if self._count_bad_frames() != bad:
+            self._log("rx_error", bad_frames=self._count_bad_frames())
         if self._ack_due:
             self._ack_due = False
             free = self._settings.queue_points - len(self._queue)
@@ -351,11 +360,11 @@ class BoardCore:
             self._send(m.Ack(self._link.expected_seq, free, self._done_index, state))
         self.advance(now_us)
 
-    def _bad_frames(self) -> int:
+    def _count_bad_frames(self) -> int:
         counters = self._link.decoder.counters
         return counters.crc_errors + counters.format_errors
 
-    def _take(self, frame: Frame) -> None:
+    def _handle_frame(self, frame: Frame) -> None:
         try:
             message = m.parse_message(frame.type, frame.body)
         except RemoteProtocolError:
@@ -364,18 +373,18 @@ class BoardCore:
         if isinstance(message, m.Abort):
             self._disarm("abort")
         elif isinstance(message, m.Hello):
-            self._greet(message)
+            self._on_hello(message)
         elif frame.session != self._link.session or not self._link.session or not isinstance(message, m.HOST_MESSAGES):
             self._link.seq_errors += 1
         elif message.SEQUENCED:
-            self._take_in_order(frame.seq, message)
+            self._handle_sequenced(frame.seq, message)
         else:
-            self._obey_now(message)
+            self._handle_unsequenced(message)
 
-    def _take_in_order(self, seq: int, message: m.Message) -> None:
-        awaited, answer = self._link.accept(seq)
-        if awaited:
-            refusal = self._obey(message)
+    def _handle_sequenced(self, seq: int, message: m.Message) -> None:
+        is_expected, answer = self._link.accept(seq)
+        if is_expected:
+            refusal = self._dispatch_sequenced(message)
             if refusal == "NO_ROOM":
                 answer = m.NAK_REASONS.index(refusal)
             else:
@@ -386,34 +395,34 @@ class BoardCore:
         else:
             self._send(m.Nak(self._link.expected_seq, answer))
 
-    def _obey_now(self, message: m.Message) -> None:
-        if isinstance(message, m.Lease) and self.state in LEASED:
+    def _handle_unsequenced(self, message: m.Message) -> None:
+        if isinstance(message, m.Lease) and self.state in LEASED_STATES:
             until_us = self._now_us + 1000 * min(message.ms, self._limits.lease_ms)
             self._lease_until_us = max(self._lease_until_us, until_us)
         elif isinstance(message, m.Clock):
-            self._send(m.ClockReply(message.host_t, self._tick()))
+            self._send(m.ClockReply(message.host_t, self._current_tick()))
         elif isinstance(message, m.Get):
-            self._send(self._status())
+            self._send(self._build_status())
         elif isinstance(message, m.GetExecuted):
-            wanted = [record for record in self._records if record[0] >= message.first_index]
-            self._send_records(_one_report(wanted))
+            records = [record for record in self._records if record[0] >= message.first_index]
+            self._send_records(select_one_report(records))
 
-    def _obey(self, message: m.Message) -> str:
+    def _dispatch_sequenced(self, message: m.Message) -> str:
         """Carry a sequenced message out; the NAK reason where it is refused."""
-        table: dict[type[m.Message], Callable[[Any], str]] = {
-            m.Limits: self._limit,
-            m.Data: self._data,
-            m.Start: self._start,
-            m.End: self._end,
-            m.ArmReq: self._arm,
-            m.ArmConfirm: self._confirm,
+        handlers: dict[type[m.Message], Callable[[Any], str]] = {
+            m.Limits: self._on_limits,
+            m.Data: self._on_data,
+            m.Start: self._on_start,
+            m.End: self._on_end,
+            m.ArmReq: self._on_arm_req,
+            m.ArmConfirm: self._on_arm_confirm,
             m.Disarm: self._on_disarm,
-            m.ClearFault: self._clear,
-            m.Flush: self._flush,
+            m.ClearFault: self._on_clear_fault,
+            m.Flush: self._on_flush,
         }
-        return table[type(message)](message)
+        return handlers[type(message)](message)
 
-    def _greet(self, hello: m.Hello) -> None:
+    def _on_hello(self, hello: m.Hello) -> None:
         self._disarm("hello")
         session = self._random.randrange(1, 1 << 16)
         while session == self._link.session:
@@ -425,7 +434,7 @@ class BoardCore:
         self._unreported.clear()
         self._out.clear()
         self._ack_due = False
-        self._version_fits = hello.major == m.MAJOR
+        self._is_version_supported = hello.major == m.MAJOR
         self._send(
             m.HelloReply(
                 major=m.MAJOR,
@@ -444,38 +453,39 @@ class BoardCore:
             )
         )
 
-    def _limit(self, message: m.Limits) -> str:
+    def _on_limits(self, message: m.Limits) -> str:
         if self.state not in ("DISARMED", "FAULT"):
             return "STATE"
-        self._limits = tightened(self._limits, message)
+        self._limits = tighten(self._limits, message)
         return ""
 
-    def _data(self, message: m.Data) -> str:
+    def _on_data(self, message: m.Data) -> str:
         if self.state not in ("ARMED", "RUNNING", "HOLD"):
             return "STATE"
         idle = self._job is None and not self._queue
         if message.first_index < self._next_index or (message.first_index > self._next_index and not idle):
             return "INDEX"
         points = [
-            Point(message.first_index + k, *values) for k, values in enumerate(m.POINT.iter_unpack(message.points))
+            QueuedPoint(message.first_index + k, *values)
+            for k, values in enumerate(m.POINT.iter_unpack(message.points))
         ]
         if message.first_index + len(points) > INDEX_MAX:
             return "INDEX"
         if len(self._queue) + len(points) > self._settings.queue_points:
             return "NO_ROOM"
         for point in points:
-            fault = self._static_fault(point)
+            fault = self._check_point(point)
             if fault:
-                self._fail(fault)
+                self._enter_fault(fault)
                 return "STATE"
         if idle:
             self._done_index = message.first_index
         self._queue.extend(points)
         self._next_index = message.first_index + len(points)
-        self._refill()
+        self._resume_if_refilled()
         return ""
 
-    def _static_fault(self, point: Point) -> str:
+    def _check_point(self, point: QueuedPoint) -> str:
         limits = self._limits
         if not (limits.x_min <= point.x <= limits.x_max and limits.y_min <= point.y <= limits.y_max):
             return "RANGE"
@@ -485,17 +495,17 @@ class BoardCore:
             return "DUTY"
         return ""
 
-    def _start(self, message: m.Start) -> str:
+    def _on_start(self, message: m.Start) -> str:
         if self.state != "ARMED":
             return "STATE"
         if message.first_index != (self._queue[0].number if self._queue else self._next_index):
             return "INDEX"
         start_us = max(self._epoch_us + message.start_tick, self._now_us)
-        self._job = Job(message.job, start_us, message.watermark)
+        self._job = BoardJob(message.job, start_us, message.watermark)
         self._set_state("RUNNING", "start")
         return ""
 
-    def _end(self, message: m.End) -> str:
+    def _on_end(self, message: m.End) -> str:
         job = self._job
         if job is None or job.number != message.job:
             return "STATE"
@@ -505,32 +515,32 @@ class BoardCore:
         if self._done_index >= message.end_index:
             self._job = None
             self._set_state("ARMED", "job done")
-        self._refill()
+        self._resume_if_refilled()
         return ""
 
-    def _arm(self, message: m.ArmReq) -> str:
+    def _on_arm_req(self, message: m.ArmReq) -> str:
         if self.state != "DISARMED":
             return "STATE"
-        if not self._version_fits:
+        if not self._is_version_supported:
             return "VERSION"
         if self.inputs != SAFE_INPUTS:
             return "INPUT"
         if self._settings.key_edge and not self._key_turned:
             return "KEY_EDGE"
-        self._nonce = self._random.getrandbits(32)
-        self._armed_by = message.host_nonce
+        self._board_nonce = self._random.getrandbits(32)
+        self._arming_host_nonce = message.host_nonce
         self._arming_since_us = self._now_us
         self._confirmed = False
         self._lease_until_us = self._now_us + 1000 * self._limits.lease_ms
         self._set_state("ARMING", "arm requested")
-        self._send(m.ArmChallenge(message.host_nonce, self._nonce))
+        self._send(m.ArmChallenge(message.host_nonce, self._board_nonce))
         return ""
 
-    def _confirm(self, message: m.ArmConfirm) -> str:
-        nonce, self._nonce = self._nonce, None
+    def _on_arm_confirm(self, message: m.ArmConfirm) -> str:
+        nonce, self._board_nonce = self._board_nonce, None
         if self.state != "ARMING" or self._confirmed:
             return "STATE"
-        if nonce is None or message.board_nonce != nonce or message.host_nonce != self._armed_by:
+        if nonce is None or message.board_nonce != nonce or message.host_nonce != self._arming_host_nonce:
             self._disarm("disarm")
             return "NONCE"
         self._confirmed = True
@@ -541,17 +551,17 @@ class BoardCore:
         self._disarm("disarm")
         return ""
 
-    def _clear(self, message: m.ClearFault) -> str:
+    def _on_clear_fault(self, message: m.ClearFault) -> str:
         if self.state != "FAULT":
             return "STATE"
         if self.inputs != SAFE_INPUTS:
             return "INPUT"
         self.fault = ""
-        self._underruns.clear()
+        self._underrun_times_us.clear()
         self._set_state("DISARMED", "fault cleared")
         return ""
 
-    def _flush(self, message: m.Flush) -> str:
+    def _on_flush(self, message: m.Flush) -> str:
         if self.state not in ("ARMED", "RUNNING", "HOLD"):
             return "STATE"
         if self.state != "ARMED":
@@ -559,35 +569,35 @@ class BoardCore:
         self._drop_queue()
         return ""
 
-    def _status(self) -> m.Status:
+    def _build_status(self) -> m.Status:
         counters = self._link.decoder.counters
         bits = sum(1 << k for k, name in enumerate(m.INPUTS) if self.inputs[name])
         return m.Status(
             state=m.STATES.index(self.state),
             fault=m.FAULTS.index(self.fault),
             inputs=bits,
-            tick=self._tick(),
+            tick=self._current_tick(),
             done_index=self._done_index,
             queued=len(self._queue),
             crc_errors=counters.crc_errors & 0xFFFF,
             format_errors=counters.format_errors & 0xFFFF,
             seq_errors=self._link.seq_errors & 0xFFFF,
             underruns=self._underruns_total & 0xFFFF,
-            laser_on_us=self._laser_on // 65535,
+            laser_on_us=self._laser_on_duty_us // 65535,
             temperature_dc=250,
         )
 
     def _report_executed(self) -> None:
         while self._unreported:
-            report = _one_report(self._unreported)
+            report = select_one_report(self._unreported)
             self._send_records(report)
             del self._unreported[: len(report)]
 
-    def _send_records(self, records: list[Record]) -> None:
+    def _send_records(self, records: list[ExecutionRecord]) -> None:
         if records:
             self._send(m.Executed(records[0][0], tuple(record[1:] for record in records)))
 
-    def _tick(self) -> int:
+    def _current_tick(self) -> int:
         return self._now_us - self._epoch_us
 
     def _send(self, message: m.Message) -> None:
@@ -598,7 +608,7 @@ class BoardCore:
         self._sink({"t_us": self._now_us, "event": event, **more})
 
 
-def _one_report(records: list[Record]) -> list[Record]:
+def select_one_report(records: list[ExecutionRecord]) -> list[ExecutionRecord]:
     """As many from the first on as one EXECUTED can tell: numbers without a gap, offsets that fit 32 bits."""
     count = 0
     for number, on_tick, _, _ in records[: m.RECORDS_MAX]:
@@ -608,5 +618,5 @@ def _one_report(records: list[Record]) -> list[Record]:
     return records[:count]
 
 
-def _reached(due_us: int | None, now_us: int) -> bool:
+def is_due(due_us: int | None, now_us: int) -> bool:
     return due_us is not None and due_us <= now_us

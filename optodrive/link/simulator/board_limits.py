@@ -8,7 +8,7 @@ from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
 from optodrive.link.protocol.messages import POINTS_MAX, Limits
 
-OWN = Limits(
+DEFAULT_LIMITS = Limits(
     max_on_us=50_000,
     max_duty=65535,
     mean_duty=65535,
@@ -25,24 +25,26 @@ OWN = Limits(
     lease_ms=100,
 )
 FIELD_MAX = {"H": 0xFFFF, "I": 0xFFFF_FFFF}
-RANGES = {item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)}
-RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
-LOOSENED_BY_MORE = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
-LOOSENED_BY_LESS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
+SETTING_RANGES = {
+    item.name: (0, FIELD_MAX[code]) for item, code in zip(fields(Limits), Limits.LAYOUT.format[1:], strict=True)
+}
+SETTING_RANGES |= {"cell_codes": (1, 0xFFFF), "queue_points": (POINTS_MAX, 0xFFFF)}
+UPPER_LIMITS = ("max_on_us", "max_duty", "mean_duty", "spot_uj", "spot_leak_uw", "x_max", "y_max", "lease_ms")
+LOWER_LIMITS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
 
-def tightened(own: Limits, asked: Limits) -> Limits:
+def tighten(current: Limits, requested: Limits) -> Limits:
     """The tighter of both, field by field; the board's power is its own."""
-    tighter = {name: min(getattr(own, name), getattr(asked, name)) for name in LOOSENED_BY_MORE}
-    tighter |= {name: max(getattr(own, name), getattr(asked, name)) for name in LOOSENED_BY_LESS}
-    return replace(own, **tighter)
+    tighter = {name: min(getattr(current, name), getattr(requested, name)) for name in UPPER_LIMITS}
+    tighter |= {name: max(getattr(current, name), getattr(requested, name)) for name in LOWER_LIMITS}
+    return replace(current, **tighter)
 
 
 @dataclass(frozen=True)
 class BoardSettings:
     """What a simulated board is: limits, identity, the grid of cells that its spot guards watch."""
 
-    limits: Limits = OWN
+    limits: Limits = DEFAULT_LIMITS
     uid: str = "73696d756c61746564303031"
     cell_codes: int = 1300
     queue_points: int = 4096
@@ -52,16 +54,16 @@ class BoardSettings:
 def load_settings(path: Path) -> BoardSettings:
     """Settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge."""
     table = read_toml(path)
-    known = [*RANGES, "uid", "key_edge"]
+    known = [*SETTING_RANGES, "uid", "key_edge"]
     for name, value in table.items():
         if name not in known:
             raise InputError(f"{path}", name, f"a known key, {suggest_nearest(name, known)}")
-        _check(f"{path}: {name}", name, value)
-    limits = replace(OWN, **{name: value for name, value in table.items() if hasattr(OWN, name)})
-    return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(OWN, name)})
+        _check_setting(f"{path}: {name}", name, value)
+    limits = replace(DEFAULT_LIMITS, **{name: value for name, value in table.items() if hasattr(DEFAULT_LIMITS, name)})
+    return BoardSettings(limits, **{name: value for name, value in table.items() if not hasattr(DEFAULT_LIMITS, name)})
 
 
-def _check(where: str, name: str, value: object) -> None:
+def _check_setting(where: str, name: str, value: object) -> None:
     if name == "uid":
         if not isinstance(value, str) or not fullmatch("[0-9a-fA-F]{24}", value):
             raise InputError(where, value, "24 hexadecimal digits")
@@ -69,6 +71,6 @@ def _check(where: str, name: str, value: object) -> None:
         if not isinstance(value, bool):
             raise InputError(where, value, "true or false")
     else:
-        low, high = RANGES[name]
+        low, high = SETTING_RANGES[name]
         if type(value) is not int or not low <= value <= high:
             raise InputError(where, value, f"a whole number from {low} to {high}")

@@ -23,47 +23,47 @@ from optodrive.core.errors import InputError
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings
 from optodrive.link.simulator.faulty_link import FaultyLink
-from optodrive.link.simulator.pseudo_terminal import check_link, open_pty
-from optodrive.link.simulator.script import SENSOR_ACTIONS, Step, load_script
-from optodrive.link.simulator.sensor_options import add_sensor_options, bench_of
+from optodrive.link.simulator.pseudo_terminal import check_link_path, open_pty
+from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep, load_script
+from optodrive.link.simulator.sensor_options import add_sensor_options, build_optics
 
 if TYPE_CHECKING:
-    from optodrive.link.simulator.bench import Bench
+    from optodrive.link.simulator.bench import SimulatedOptics
 
-TURN_MAX_S = 0.005
-LATE_US = 2_000
+LOOP_WAIT_MAX_S = 0.005
+LATE_LOOP_US = 2_000
 """A turn that begins so long after its time was kept from the processor."""
-BITS_A_BYTE = 10
+BITS_PER_BYTE = 10
 BAUD_MIN = 300
 BURST_BYTES = 64
 READ_MAX = 4096
 
 
-class Pace:
+class LineRate:
     """Lets bytes pass at a serial line's rate."""
 
     def __init__(self, baud: int) -> None:
-        self._bytes_per_s = baud / BITS_A_BYTE
+        self._bytes_per_s = baud / BITS_PER_BYTE
         self._tokens = float(BURST_BYTES)
-        self._at_s = 0.0
+        self._updated_s = 0.0
 
-    def allowed(self, now_s: float) -> int:
+    def available_bytes(self, now_s: float) -> int:
         """How many bytes may pass now."""
         # A late turn may catch up on what the line would have carried meanwhile, up to a whole read.
-        self._tokens = min(READ_MAX, self._tokens + (now_s - self._at_s) * self._bytes_per_s)
-        self._at_s = now_s
+        self._tokens = min(READ_MAX, self._tokens + (now_s - self._updated_s) * self._bytes_per_s)
+        self._updated_s = now_s
         return int(self._tokens)
 
-    def passed(self, count: int) -> None:
+    def consume(self, count: int) -> None:
         """Count bytes that passed."""
         self._tokens -= count
 
-    def idle(self) -> None:
+    def cap_credit(self) -> None:
         """Nothing waits to pass: a line saves nothing up."""
         self._tokens = min(self._tokens, BURST_BYTES)
 
 
-class Core(Protocol):
+class BoardBackend(Protocol):
     """What stands behind the pty: the simulated board, or a real core elsewhere. Times in µs since the start."""
 
     def advance(self, now_us: int) -> None:
@@ -75,7 +75,7 @@ class Core(Protocol):
     def bytes_to_send(self) -> bytes:
         """Bytes for the host since the last call."""
 
-    def link_lost(self, now_us: int) -> None:
+    def on_link_lost(self, now_us: int) -> None:
         """The host's end closed."""
 
     def set_input(self, name: str, value: bool, now_us: int) -> None:
@@ -88,10 +88,10 @@ class Core(Protocol):
         """When it must be looked at next, None for whenever."""
 
 
-MakeCore = Callable[[BoardSettings, Callable[[dict[str, Any]], None]], Core]
-Actions = Mapping[str, Callable[[Any], None]]
+BackendFactory = Callable[[BoardSettings, Callable[[dict[str, Any]], None]], BoardBackend]
+ScriptActions = Mapping[str, Callable[[Any], None]]
 """What a script may do to this core and to no other, by name."""
-NO_ACTIONS: Actions = {}
+NO_ACTIONS: ScriptActions = {}
 
 
 class PtyBoard:
@@ -102,42 +102,42 @@ class PtyBoard:
         link: Path,
         log: BinaryIO | None,
         settings: BoardSettings,
-        script: list[Step],
+        script: list[ScriptStep],
         baud: int,
-        exit_closed_s: float | None,
-        make_core: MakeCore = BoardCore,
-        actions: Actions = NO_ACTIONS,
-        bench: "Bench | None" = None,
+        exit_when_closed_s: float | None,
+        build_core: BackendFactory = BoardCore,
+        actions: ScriptActions = NO_ACTIONS,
+        optics: "SimulatedOptics | None" = None,
     ) -> None:
         self.failure = ""
         self._actions = actions
-        self._bench = bench
+        self._optics = optics
         self._link_path = link
         self._log_file = log
-        self._script = [step for step in script if not step.from_light]
-        self._since_light = [step for step in script if step.from_light]
-        self._exit_closed_s = exit_closed_s
+        self._script = [step for step in script if not step.from_first_pulse]
+        self._steps_from_first_pulse = [step for step in script if step.from_first_pulse]
+        self._exit_when_closed_s = exit_when_closed_s
         self._started_s = time.monotonic()
         self._running = True
-        self._core = make_core(settings, self._log)
+        self._core = build_core(settings, self._log)
         self._faults = FaultyLink()
-        self._in_pace, self._out_pace = Pace(baud), Pace(baud)
-        self._out = b""
-        self._open = False
+        self._input_rate, self._output_rate = LineRate(baud), LineRate(baud)
+        self._output = b""
+        self._is_open = False
         self._was_open = False
         self._closed_since_s = 0.0
         self._master = -1
         self._due_us = 0
-        self._make_pty()
+        self._open_pty()
 
-    def _make_pty(self) -> None:
+    def _open_pty(self) -> None:
         self._master = open_pty(self._link_path)
 
     def _log(self, event: dict[str, Any]) -> None:
-        if self._bench is not None:
-            self._bench.note(event)
-        if self._since_light and event["event"] == "gate":
-            self._time_from_light(event["t_us"] * 1e-6)
+        if self._optics is not None:
+            self._optics.on_log_event(event)
+        if self._steps_from_first_pulse and event["event"] == "gate":
+            self._schedule_from_first_pulse(event["t_us"] * 1e-6)
         if self._log_file is None:
             return
         try:
@@ -158,117 +158,122 @@ class PtyBoard:
         """Serve until stopped, then go dark."""
         try:
             while self._running:
-                self._turn()
+                self._run_once()
         finally:
-            self._core.link_lost(self._now_us())
+            self._core.on_link_lost(self._now_us())
             self._link_path.unlink(missing_ok=True)
-            if self._bench is not None:
-                self._bench.close()
+            if self._optics is not None:
+                self._optics.close()
 
     def _now_us(self) -> int:
         return int(self._now_s() * 1e6)
 
-    def _turn(self) -> None:
-        if self._open and self._now_us() - self._due_us > LATE_US:
+    def _run_once(self) -> None:
+        if self._is_open and self._now_us() - self._due_us > LATE_LOOP_US:
             # This process ran late, not the board that it stands for: what lies there came bit by bit meanwhile.
             self._read(self._due_us)
-        self._follow_script()
+        self._run_due_steps()
         self._core.advance(self._now_us())
-        self._watch_port()
-        if self._open:
+        self._update_port_state()
+        if self._is_open:
             self._read(self._now_us())
             self._core.advance(self._now_us())
             self._write()
         else:
             self._core.bytes_to_send()
-            self._out = b""
-        if self._bench is not None:
-            self._bench.serve(self._now_us())
+            self._output = b""
+        if self._optics is not None:
+            self._optics.answer_requests(self._now_us())
         self._wait()
 
     def _wait(self) -> None:
         now_us, due_us = self._now_us(), self._core.next_event_us()
-        wait_s = TURN_MAX_S if due_us is None else min(TURN_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
+        wait_s = LOOP_WAIT_MAX_S if due_us is None else min(LOOP_WAIT_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
         if self._script:
             wait_s = min(wait_s, max(0.0, self._script[0].at_s - self._now_s()))
         self._due_us = now_us + round(wait_s * 1e6)
-        if not self._open:
+        if not self._is_open:
             time.sleep(max(wait_s, 0.001))
-        elif self._in_pace.allowed(self._now_s()) < 1:
+        elif self._input_rate.available_bytes(self._now_s()) < 1:
             time.sleep(0.0005)
         else:
-            select.select([self._master], [self._master] if self._out else [], [], wait_s)
+            select.select([self._master], [self._master] if self._output else [], [], wait_s)
 
-    def _watch_port(self) -> None:
+    def _update_port_state(self) -> None:
         poller = select.poll()
         poller.register(self._master, select.POLLIN)
         hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
-        if self._open and hung_up:
-            self._last_words()
-            self._port_closed(self._now_us())
-        elif not self._open and not hung_up:
+        if self._is_open and hung_up:
+            self._drain_input()
+            self._on_port_closed(self._now_us())
+        elif not self._is_open and not hung_up:
             self._log({"t_us": self._now_us(), "event": "port", "open": True})
             self._was_open = True
-        self._open = not hung_up
+        self._is_open = not hung_up
         closed_for_s = self._now_s() - self._closed_since_s
-        if self._exit_closed_s is not None and self._was_open and not self._open and closed_for_s > self._exit_closed_s:
+        if (
+            self._exit_when_closed_s is not None
+            and self._was_open
+            and not self._is_open
+            and closed_for_s > self._exit_when_closed_s
+        ):
             self._running = False
 
-    def _port_closed(self, now_us: int) -> None:
+    def _on_port_closed(self, now_us: int) -> None:
         self._log({"t_us": now_us, "event": "port", "open": False})
-        self._core.link_lost(now_us)
+        self._core.on_link_lost(now_us)
         self._closed_since_s = self._now_s()
-        self._open = False
+        self._is_open = False
 
     def _read(self, since_us: int) -> None:
         """Take what lies there as if it had come evenly from since_us until now."""
-        allowed = self._in_pace.allowed(self._now_s())
+        allowed = self._input_rate.available_bytes(self._now_s())
         if allowed < 1:
             return
         try:
             data = os.read(self._master, allowed)
         except (BlockingIOError, OSError):
-            self._in_pace.idle()
+            self._input_rate.cap_credit()
             return  # nothing there, or the host has just closed: the next look at the port tells
-        self._in_pace.passed(len(data))
+        self._input_rate.consume(len(data))
         if len(data) < allowed:
-            self._in_pace.idle()
-        data, late_us = self._faults.carry(data), self._now_us() - since_us
-        pieces = max(1, late_us // LATE_US)
-        for k in range(pieces):
-            piece = data[len(data) * k // pieces : len(data) * (k + 1) // pieces]
-            self._core.receive(piece, since_us + late_us * (k + 1) // pieces)
+            self._input_rate.cap_credit()
+        data, late_us = self._faults.transmit(data), self._now_us() - since_us
+        part_count = max(1, late_us // LATE_LOOP_US)
+        for k in range(part_count):
+            part = data[len(data) * k // part_count : len(data) * (k + 1) // part_count]
+            self._core.receive(part, since_us + late_us * (k + 1) // part_count)
 
-    def _last_words(self) -> None:
+    def _drain_input(self) -> None:
         """Take what a host wrote before it closed, so that no later host finds it in the line."""
         with suppress(OSError):  # empty, or the other end's EIO
             while data := os.read(self._master, READ_MAX):
-                self._core.receive(self._faults.carry(data), self._now_us())
+                self._core.receive(self._faults.transmit(data), self._now_us())
 
     def _write(self) -> None:
-        self._out += self._faults.carry(self._core.bytes_to_send())
-        allowed = min(self._out_pace.allowed(self._now_s()), len(self._out))
-        if not self._out:
-            self._out_pace.idle()
+        self._output += self._faults.transmit(self._core.bytes_to_send())
+        allowed = min(self._output_rate.available_bytes(self._now_s()), len(self._output))
+        if not self._output:
+            self._output_rate.cap_credit()
         if allowed < 1:
             return
         try:
-            written = os.write(self._master, self._out[:allowed])
+            written = os.write(self._master, self._output[:allowed])
         except (BlockingIOError, OSError):
             return
-        self._out_pace.passed(written)
-        self._out = self._out[written:]
+        self._output_rate.consume(written)
+        self._output = self._output[written:]
 
-    def _time_from_light(self, light_s: float) -> None:
-        self._script += [replace(step, at_s=light_s + step.at_s) for step in self._since_light]
+    def _schedule_from_first_pulse(self, first_pulse_s: float) -> None:
+        self._script += [replace(step, at_s=first_pulse_s + step.at_s) for step in self._steps_from_first_pulse]
         self._script.sort(key=lambda step: step.at_s)
-        self._since_light = []
+        self._steps_from_first_pulse = []
 
-    def _follow_script(self) -> None:
+    def _run_due_steps(self) -> None:
         while self._script and self._script[0].at_s <= self._now_s():
-            self._do(self._script.pop(0))
+            self._run_step(self._script.pop(0))
 
-    def _do(self, step: Step) -> None:
+    def _run_step(self, step: ScriptStep) -> None:
         now_us = min(self._now_us(), int(step.at_s * 1e6))  # it happened when the script says, not when we looked
         if step.kind == "set":
             self._core.set_input(step.name, step.value, now_us)
@@ -277,25 +282,27 @@ class PtyBoard:
         elif step.name == "repair":
             self._faults.repair()
         elif step.name == "close":
-            self._port_closed(now_us)
+            self._on_port_closed(now_us)
             os.close(self._master)
-            self._make_pty()
+            self._open_pty()
         elif step.name in self._actions:
             self._actions[step.name](self._core)
         elif step.name in SENSOR_ACTIONS:
-            if self._bench is not None:
-                self._bench.break_down(step.name, now_us)
+            if self._optics is not None:
+                self._optics.inject_fault(step.name, now_us)
         else:
-            self._faults.break_down(step.name, step.rate)
+            self._faults.inject_fault(step.name, step.rate)
 
 
 def _check_options(options: argparse.Namespace) -> None:
-    check_link("--pty", options.pty)
+    check_link_path("--pty", options.pty)
     if options.baud < BAUD_MIN:
         raise InputError("--baud", options.baud, f"at least {BAUD_MIN}")
 
 
-def main(arguments: list[str] | None = None, make_core: MakeCore = BoardCore, actions: Actions = NO_ACTIONS) -> int:
+def main(
+    arguments: list[str] | None = None, build_core: BackendFactory = BoardCore, actions: ScriptActions = NO_ACTIONS
+) -> int:
     """Run a board until SIGTERM or SIGINT."""
     parser = argparse.ArgumentParser(
         prog="optodrive.link.simulator.board_process", description="A simulated board on a pty."
@@ -314,18 +321,18 @@ def main(arguments: list[str] | None = None, make_core: MakeCore = BoardCore, ac
         settings = load_settings(options.limits) if options.limits else BoardSettings()
         script = load_script(options.script, actions) if options.script else []
         log = options.log.open("ab", buffering=0) if options.log else None
-        bench = bench_of(options, settings)
+        optics = build_optics(options, settings)
     except InputError as error:
         print(f"optodrive.link.simulator.board_process: {error}", file=sys.stderr)
         return error.exit_status
     except OSError as error:
         print(f"optodrive.link.simulator.board_process: --log {options.log}: {error.strerror}", file=sys.stderr)
         return 2
-    simulated = make_core is BoardCore
+    simulated = build_core is BoardCore
     if simulated:
-        make_core = partial(BoardCore, seed=options.seed, steer=bench.mirrors.go if bench else None)
+        build_core = partial(BoardCore, seed=options.seed, mirror_sink=optics.mirrors.move_to if optics else None)
     board = PtyBoard(
-        options.pty, log, settings, script, options.baud, options.exit_when_closed, make_core, actions, bench
+        options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics
     )
     if simulated:
         request_realtime_scheduling()  # a real board waits for none; before an emulator's, it would starve what it serves

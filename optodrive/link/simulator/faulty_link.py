@@ -12,29 +12,30 @@ class FaultyLink:
         self.flip_rate = 0.0
         self.hung = False
 
-    def break_down(self, how: str, rate: float = 0.0) -> None:
+    def inject_fault(self, kind: str, rate: float = 0.0) -> None:
         """`drop_bytes` or `flip_bits` at a rate, or `hang`: nothing passes."""
-        if how == "hang":
+        if kind == "hang":
             self.hung = True
-        elif how == "drop_bytes":
+        elif kind == "drop_bytes":
             self.drop_rate = rate
-        elif how == "flip_bits":
+        elif kind == "flip_bits":
             self.flip_rate = rate
         else:
-            raise ValueError(how)
+            raise ValueError(kind)
 
     def repair(self) -> None:
         """All well again."""
         self.drop_rate = self.flip_rate = 0.0
         self.hung = False
 
-    def carry(self, data: bytes) -> bytes:
+    def transmit(self, data: bytes) -> bytes:
         """What arrives of data."""
         if self.hung:
             return b""
         if not self.drop_rate and not self.flip_rate:
             return data
-        kept = (byte for byte in data if self._random.random() >= self.drop_rate)
+        received = (byte for byte in data if self._random.random() >= self.drop_rate)
         return bytes(
-            byte ^ (1 << self._random.randrange(8)) if self._random.random() < self.flip_rate else byte for byte in kept
+            byte ^ (1 << self._random.randrange(8)) if self._random.random() < self.flip_rate else byte
+            for byte in received
         )

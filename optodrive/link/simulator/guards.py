@@ -11,17 +11,17 @@ Cell = tuple[int, int, int]
 """Which of the four grids, column, row."""
 
 
-class Guards:
+class EmissionGuards:
     """The accounts of one board; times in µs."""
 
     def __init__(self, cell_codes: int) -> None:
         self._cell_codes = cell_codes
-        self._on: dict[Cell, tuple[int, int]] = {}
+        self._on_time: dict[Cell, tuple[int, int]] = {}
         self._bucket: dict[Cell, tuple[int, int]] = {}
-        self._recent: deque[tuple[int, int, int]] = deque()
-        self._recent_sum = 0
+        self._recent_pulses: deque[tuple[int, int, int]] = deque()
+        self._recent_duty_us = 0
 
-    def cells(self, x: int, y: int) -> list[Cell]:
+    def find_cells(self, x: int, y: int) -> list[Cell]:
         """The cells of a position, one in each of four grids half a cell apart.
 
         Two positions less than half a cell apart share a cell in at least one grid, so no border hides one from the
@@ -34,30 +34,30 @@ class Guards:
             for grid, (shift_x, shift_y) in enumerate(((half, half), (0, half), (half, 0), (0, 0)))
         ]
 
-    def refuses(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> str:
+    def check_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> str:
         """The fault that this pulse would be, '' where it may fire."""
-        cells = self.cells(x, y)
+        cells = self.find_cells(x, y)
         if max(self.on_time_us(limits, cell, start_us) for cell in cells) + on_us > limits.max_on_us:
             return "ON_TIME"
-        if self.mean_account(start_us, on_us, duty) > WINDOW_US * limits.mean_duty:
+        if self.max_window_duty_us(start_us, on_us, duty) > WINDOW_US * limits.mean_duty:
             return "MEAN_POWER"
         level_uj = max(self.bucket_uj(limits, cell, start_us) for cell in cells)
         if level_uj + energy_uj(limits, on_us, duty) > limits.spot_uj:
             return "SPOT"
         return ""
 
-    def fire(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> None:
+    def record_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> None:
         """Count a pulse."""
         energy = energy_uj(limits, on_us, duty)
-        for cell in self.cells(x, y):
-            self._on[cell] = self.on_time_us(limits, cell, start_us) + on_us, start_us + on_us
+        for cell in self.find_cells(x, y):
+            self._on_time[cell] = self.on_time_us(limits, cell, start_us) + on_us, start_us + on_us
             self._bucket[cell] = self.bucket_uj(limits, cell, start_us) + energy, start_us
-        self._recent.append((start_us, on_us, duty))
-        self._recent_sum += on_us * duty
+        self._recent_pulses.append((start_us, on_us, duty))
+        self._recent_duty_us += on_us * duty
 
     def on_time_us(self, limits: Limits, cell: Cell, at_us: int) -> int:
         """Light a cell had without a rest up to at_us."""
-        on_us, ended_us = self._on.get(cell, (0, -WINDOW_US))
+        on_us, ended_us = self._on_time.get(cell, (0, -WINDOW_US))
         return 0 if at_us - ended_us >= limits.rest_us else on_us
 
     def bucket_uj(self, limits: Limits, cell: Cell, at_us: int) -> int:
@@ -65,27 +65,31 @@ class Guards:
         level_uj, since_us = self._bucket.get(cell, (0, 0))
         return max(0, level_uj - (at_us - since_us) * limits.spot_leak_uw // 1_000_000)
 
-    def mean_account(self, start_us: int, on_us: int, duty: int) -> int:
+    def max_window_duty_us(self, start_us: int, on_us: int, duty: int) -> int:
         """Most gate-on time × duty that any second would hold with this pulse, µs × duty code."""
-        while self._recent and sum(self._recent[0][:2]) <= start_us - WINDOW_US:
-            _, gone_us, gone_duty = self._recent.popleft()
-            self._recent_sum -= gone_us * gone_duty
+        while self._recent_pulses and sum(self._recent_pulses[0][:2]) <= start_us - WINDOW_US:
+            _, old_on_us, old_duty = self._recent_pulses.popleft()
+            self._recent_duty_us -= old_on_us * old_duty
         # The sum of a second grows until the pulse ends, or a brighter old pulse begins to leave the second.
-        ends = [start_us + on_us]
-        for begun_us, _, _ in self._recent:
-            if begun_us + WINDOW_US >= start_us + on_us:
+        window_ends_us = [start_us + on_us]
+        for old_start_us, _, _ in self._recent_pulses:
+            if old_start_us + WINDOW_US >= start_us + on_us:
                 break
-            if begun_us + WINDOW_US > start_us:
-                ends.append(begun_us + WINDOW_US)
-        return max(self._second_before(end_us) + (end_us - start_us) * duty for end_us in ends)
+            if old_start_us + WINDOW_US > start_us:
+                window_ends_us.append(old_start_us + WINDOW_US)
+        return max(self._window_duty_us(end_us) + (end_us - start_us) * duty for end_us in window_ends_us)
 
-    def _second_before(self, end_us: int) -> int:
-        begin_us, left = end_us - WINDOW_US, 0
-        for start_us, on_us, duty in self._recent:  # oldest first: only the front of the line has left the second
+    def _window_duty_us(self, end_us: int) -> int:
+        begin_us, expired_duty_us = end_us - WINDOW_US, 0
+        for (
+            start_us,
+            on_us,
+            duty,
+        ) in self._recent_pulses:  # oldest first: only the front of the line has left the second
             if start_us >= begin_us:
                 break
-            left += min(on_us, begin_us - start_us) * duty
-        return self._recent_sum - left
+            expired_duty_us += min(on_us, begin_us - start_us) * duty
+        return self._recent_duty_us - expired_duty_us
 
 
 def energy_uj(limits: Limits, on_us: int, duty: int) -> int:

@@ -3,7 +3,7 @@
 from optodrive.core.clock import ManualClock
 from optodrive.link.simulator.board_core import BoardCore
 
-PASSAGE_S = 1e-4
+EXCHANGE_MIN_S = 1e-4
 """What an exchange takes at least, so that time always moves."""
 
 
@@ -21,7 +21,7 @@ class MemoryLink:
 
     def close(self) -> None:
         """The board hears that the host has gone."""
-        self._core.link_lost(self._now_us())
+        self._core.on_link_lost(self._now_us())
 
     def release(self) -> None:
         """Nothing was started."""
@@ -36,11 +36,11 @@ class MemoryLink:
 
     def read(self, timeout_s: float) -> bytes:
         """What the board has sent; time passes until it has, at most timeout_s."""
-        self._clock.sleep(PASSAGE_S)
+        self._clock.sleep(EXCHANGE_MIN_S)
         self._core.advance(self._now_us())
         data = self._core.bytes_to_send()
-        if not data and timeout_s > PASSAGE_S:
-            self._clock.sleep(timeout_s - PASSAGE_S)
+        if not data and timeout_s > EXCHANGE_MIN_S:
+            self._clock.sleep(timeout_s - EXCHANGE_MIN_S)
             self._core.advance(self._now_us())
             data = self._core.bytes_to_send()
         return data

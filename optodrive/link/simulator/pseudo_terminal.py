@@ -7,7 +7,7 @@ from pathlib import Path
 from optodrive.core.errors import InputError
 
 
-def check_link(option: str, link: Path) -> None:
+def check_link_path(option: str, link: Path) -> None:
     """InputError, naming the option, where a link cannot be put."""
     if not link.parent.is_dir():
         raise InputError(option, str(link), "a name in a folder that exists")

@@ -30,7 +30,7 @@ ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSO
 
 
 @dataclass(frozen=True)
-class Step:
+class ScriptStep:
     """One thing that happens. kind: "set" or "do"; name: the input or the action.
 
     from_light: at_s counts from the first light, else from the start
@@ -41,10 +41,10 @@ class Step:
     name: str
     value: bool = False
     rate: float = 0.0
-    from_light: bool = False
+    from_first_pulse: bool = False
 
 
-def load_script(path: Path, more: Collection[str] = ()) -> list[Step]:
+def load_script(path: Path, extra_actions: Collection[str] = ()) -> list[ScriptStep]:
     """The steps of a script file in order of time; InputError for what it cannot mean. more: actions beside ACTIONS."""
     table = read_toml(path)
     entries = table.pop("step", [])
@@ -52,32 +52,32 @@ def load_script(path: Path, more: Collection[str] = ()) -> list[Step]:
         raise InputError(f"{path}", name, "nothing but [[step]]")
     if not isinstance(entries, list):
         raise InputError(f"{path}: step", entries, "[[step]], with two brackets")
-    steps = [_step(f"{path}: step {k}", entry, (*ACTIONS, *more)) for k, entry in enumerate(entries)]
+    steps = [_parse_step(f"{path}: step {k}", entry, (*ACTIONS, *extra_actions)) for k, entry in enumerate(entries)]
     return sorted(steps, key=lambda step: step.at_s)
 
 
-def _step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> Step:
+def _parse_step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> ScriptStep:
     kind = "set" if "set" in entry else "do"
     known = INPUTS if kind == "set" else actions
     name = entry.get(kind)
     if not isinstance(name, str) or name not in known:
         raise InputError(f"{where}: {kind}", name, f"a known one, {suggest_nearest(str(name), list(known))}")
-    at_s = _number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
-    rate = _number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
+    at_s = _parse_number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
+    rate = _parse_number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
     value = entry.get("value", False)
     if not isinstance(value, bool):
         raise InputError(f"{where}: value", value, "true or false")
-    since = entry.get("from", "start")
-    if since not in ("start", "light"):
-        raise InputError(f"{where}: from", since, "start or light")
+    origin = entry.get("from", "start")
+    if origin not in ("start", "light"):
+        raise InputError(f"{where}: from", origin, "start or light")
     allowed = ["at_s", "from", *(("set", "value") if kind == "set" else ("do", "rate"))]
     for key in entry:
         if key not in allowed:
             raise InputError(where, key, f"a known key, {suggest_nearest(key, allowed)}")
-    return Step(at_s, kind, name, value, rate, since == "light")
+    return ScriptStep(at_s, kind, name, value, rate, origin == "light")
 
 
-def _number(where: str, value: object, expected: str, most: float) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= most:
+def _parse_number(where: str, value: object, expected: str, max_value: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= max_value:
         raise InputError(where, value, expected)
     return float(value)

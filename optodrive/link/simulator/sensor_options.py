@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from optodrive.core.errors import InputError
 from optodrive.link.simulator.board_limits import BoardSettings
-from optodrive.link.simulator.pseudo_terminal import check_link
+from optodrive.link.simulator.pseudo_terminal import check_link_path
 
 if TYPE_CHECKING:
-    from optodrive.link.simulator.bench import Bench
+    from optodrive.link.simulator.bench import SimulatedOptics
 
 DEMO_GEOMETRY = 437
 NOISE_MAX_UM = 1e4
@@ -26,11 +26,11 @@ def add_sensor_options(parser: argparse.ArgumentParser) -> None:
     sensor.add_argument("--no-readback", action="store_true", help="a galvo driver without position outputs")
 
 
-def bench_of(options: argparse.Namespace, settings: BoardSettings) -> "Bench | None":
+def build_optics(options: argparse.Namespace, settings: BoardSettings) -> "SimulatedOptics | None":
     """What the options ask for, None without --sensor; InputError for what they cannot mean."""
     if options.sensor is None:
         return None
-    check_link("--sensor", options.sensor)
+    check_link_path("--sensor", options.sensor)
     if not 0.0 <= options.false_share <= 1.0:
         raise InputError("--false-share", options.false_share, "a share, 0 to 1")
     if not 0.0 <= options.sensor_noise_um <= NOISE_MAX_UM:
@@ -40,9 +40,9 @@ def bench_of(options: argparse.Namespace, settings: BoardSettings) -> "Bench | N
     # Optics and servos are computed with what takes half a second to import; a board without a sensor needs none of it.
     from optodrive.core.units import um_to_m
     from optodrive.device.config import load_config
-    from optodrive.link.simulator.bench import Bench
+    from optodrive.link.simulator.bench import SimulatedOptics
 
-    return Bench(
+    return SimulatedOptics(
         options.sensor,
         load_config(options.config),
         settings,

@@ -7,18 +7,18 @@ import numpy as np
 
 from optodrive.core.units import m_to_um
 from optodrive.device.config import Config, build_pixel_layout
-from optodrive.link.simulator.galvos import Mirrors
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.galvos import SimulatedGalvos
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
-HOLD_US = 500_000
+PULSE_MEMORY_US = 500_000
 """Light longer ago than this is forgotten."""
-LEAST_J = 10e-6
+SPOT_ENERGY_MIN_J = 10e-6
 """Less light than this is no spot."""
-MARGIN_M = 6e-3
+FIELD_MARGIN_M = 6e-3
 """The sensor sees so far beyond the outermost pixels."""
 
 
-class Glimpse(NamedTuple):
+class DetectedPulse(NamedTuple):
     """Light that fell on the sensor until at_us."""
 
     at_us: int
@@ -27,7 +27,7 @@ class Glimpse(NamedTuple):
     energy_j: float
 
 
-class SpotSensor:
+class SimulatedSpotSensor:
     """Sees pulses by the truth's geometry, with noise, and now and then something else: a reflection anywhere.
 
     blind: it is covered; outputs: whether the galvo driver's position outputs are wired to it.
@@ -36,48 +36,51 @@ class SpotSensor:
     def __init__(
         self,
         config: Config,
-        truth: Truth,
-        mirrors: Mirrors,
+        geometry: GroundTruthGeometry,
+        galvos: SimulatedGalvos,
         noise_m: float,
-        false_share: float,
-        outputs: bool,
+        outlier_share: float,
+        has_position_outputs: bool,
         seed: int | np.random.SeedSequence,
     ) -> None:
         layout = build_pixel_layout(config.display)
-        self._half_m = float(np.abs(layout.x_m).max()) + MARGIN_M, float(np.abs(layout.y_m).max()) + MARGIN_M
-        self._truth, self._mirrors = truth, mirrors
-        self._noise_m, self._false_share, self._outputs = noise_m, false_share, outputs
+        self._half_field_m = (
+            float(np.abs(layout.x_m).max()) + FIELD_MARGIN_M,
+            float(np.abs(layout.y_m).max()) + FIELD_MARGIN_M,
+        )
+        self._geometry, self._galvos = geometry, galvos
+        self._noise_m, self._outlier_share, self._has_position_outputs = noise_m, outlier_share, has_position_outputs
         self._random = np.random.default_rng(seed)
-        self._seen: deque[Glimpse] = deque(maxlen=1000)
+        self._pulses: deque[DetectedPulse] = deque(maxlen=1000)
         self.blind = False
 
-    def saw(self, start_us: int, end_us: int, energy_j: float) -> None:
+    def record_pulse(self, start_us: int, end_us: int, energy_j: float) -> None:
         """A pulse ended; it landed where the mirrors stood in its middle."""
-        x_m, y_m = self._truth.position_m(*self._mirrors.codes((start_us + end_us) // 2))
-        if abs(float(x_m)) <= self._half_m[0] and abs(float(y_m)) <= self._half_m[1] and not self.blind:
-            self._seen.append(Glimpse(end_us, float(x_m), float(y_m), energy_j))
+        x_m, y_m = self._geometry.position_m(*self._galvos.codes((start_us + end_us) // 2))
+        if abs(float(x_m)) <= self._half_field_m[0] and abs(float(y_m)) <= self._half_field_m[1] and not self.blind:
+            self._pulses.append(DetectedPulse(end_us, float(x_m), float(y_m), energy_j))
 
     def answer(self, request: str, now_us: int) -> str:
         """The line that answers a line."""
         if request == "spot":
-            return self._spot(now_us)
+            return self._answer_spot(now_us)
         if request == "mirrors":
-            if not self._outputs:
+            if not self._has_position_outputs:
                 return "mirrors none"
-            x_rad, y_rad = self._mirrors.output_rad(now_us)
+            x_rad, y_rad = self._galvos.position_output_rad(now_us)
             return f"mirrors {x_rad:.7f} {y_rad:.7f}"
         return "error unknown request"
 
-    def _spot(self, now_us: int) -> str:
+    def _answer_spot(self, now_us: int) -> str:
         """The middle of all light since the last answer; what was told is forgotten."""
-        seen = [glimpse for glimpse in self._seen if glimpse.at_us >= now_us - HOLD_US]
-        self._seen.clear()
-        energy_j = sum(glimpse.energy_j for glimpse in seen)
-        if energy_j < LEAST_J:
+        pulses = [pulse for pulse in self._pulses if pulse.at_us >= now_us - PULSE_MEMORY_US]
+        self._pulses.clear()
+        energy_j = sum(glimpse.energy_j for glimpse in pulses)
+        if energy_j < SPOT_ENERGY_MIN_J:
             return "spot none"
-        x_m = sum(glimpse.x_m * glimpse.energy_j for glimpse in seen) / energy_j
-        y_m = sum(glimpse.y_m * glimpse.energy_j for glimpse in seen) / energy_j
-        if self._random.random() < self._false_share:
-            x_m, y_m = (self._random.uniform(-half_m, half_m) for half_m in self._half_m)
+        x_m = sum(glimpse.x_m * glimpse.energy_j for glimpse in pulses) / energy_j
+        y_m = sum(glimpse.y_m * glimpse.energy_j for glimpse in pulses) / energy_j
+        if self._random.random() < self._outlier_share:
+            x_m, y_m = (self._random.uniform(-half_m, half_m) for half_m in self._half_field_m)
         x_um, y_um = m_to_um(np.array([x_m, y_m]) + self._noise_m * self._random.standard_normal(2))
         return f"spot {x_um:.2f} {y_um:.2f} {m_to_um(self._noise_m):.2f}"

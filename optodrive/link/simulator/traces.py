@@ -6,26 +6,28 @@ from optodrive.core.types.measurements import PixelTrace
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.physics.thermal_state import ThermalState
 
-AFTERGLOW_S = 0.2
+TRACE_TAIL_S = 0.2
 """A trace goes on this long after the last pulse."""
-BEFORE_S = 0.02
+TRACE_LEAD_S = 0.02
 """A trace of a pixel's own pulses begins so long before the first of them."""
 
 
-def trace(at_rest: ThermalState, executed: ExecutedPulses, looked_at: list[int], dt_s: float) -> PixelTrace:
+def compute_traces(cold_state: ThermalState, executed: ExecutedPulses, pixels: list[int], dt_s: float) -> PixelTrace:
     """Traces from rest, sampled every dt_s from the plan's zero to a while after the last pulse."""
     end_s = float(executed.start_s[-1] + executed.width_s[-1]) if len(executed) else 0.0
-    t_s = np.arange(0.0, end_s + AFTERGLOW_S, dt_s)
+    t_s = np.arange(0.0, end_s + TRACE_TAIL_S, dt_s)
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
-    return at_rest.simulate_traces(pulses, looked_at, t_s)
+    return cold_state.simulate_traces(pulses, pixels, t_s)
 
 
-def trace_near(at_rest: ThermalState, executed: ExecutedPulses, pixel: int, dt_s: float, after_s: float) -> PixelTrace:
+def compute_pixel_trace(
+    cold_state: ThermalState, executed: ExecutedPulses, pixel: int, dt_s: float, after_s: float
+) -> PixelTrace:
     """One pixel from rest, from a little before its own first pulse to after_s beyond the last, every dt_s."""
-    own = executed.pixel == pixel
-    if not own.any():
-        return at_rest.simulate_traces(np.zeros((0, 4)), [pixel], np.arange(0.0, after_s, dt_s))
-    first_s = max(0.0, float(executed.start_s[own][0]) - BEFORE_S)
-    last_s = float((executed.start_s + executed.width_s)[own][-1]) + after_s
+    is_pixel = executed.pixel == pixel
+    if not is_pixel.any():
+        return cold_state.simulate_traces(np.zeros((0, 4)), [pixel], np.arange(0.0, after_s, dt_s))
+    first_s = max(0.0, float(executed.start_s[is_pixel][0]) - TRACE_LEAD_S)
+    last_s = float((executed.start_s + executed.width_s)[is_pixel][-1]) + after_s
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
-    return at_rest.simulate_traces(pulses, [pixel], np.arange(first_s, last_s, dt_s))
+    return cold_state.simulate_traces(pulses, [pixel], np.arange(first_s, last_s, dt_s))

@@ -14,15 +14,15 @@ from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import HALF_RANGE_CODES, Config, build_pixel_layout
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
-LEAST_REACH_M = 0.01
+HALF_FIELD_MIN_M = 0.01
 """Half of the field on which deviations are drawn where a display has hardly any size."""
-WAVES = 3
-MISS_M = (0.5e-3, 3.0e-3)
+WAVE_COUNT = 3
+MAX_ERROR_RANGE_M = (0.5e-3, 3.0e-3)
 """A geometry is drawn again until the farthest miss of an uncorrected beam on the display lies between these."""
 
 
 @dataclass(frozen=True, eq=False)
-class Truth:
+class GroundTruthGeometry:
     """One geometry. Pairs and arrays [2] are x and y.
 
     nominal_rad_per_code, range_rad: the converter's; gain, offset_rad, cross, cubic: command to standing mirror angle,
@@ -34,16 +34,16 @@ class Truth:
 
     nominal_rad_per_code: float
     range_rad: float
-    mirrors_apart_m: float
+    mirror_spacing_m: float
     gain: FloatArray
     offset_rad: FloatArray
     cross: FloatArray
     cubic: FloatArray
-    lens_m: FloatArray
+    lens_coefficients_m: FloatArray
     focal_length_m: float
-    lens_at_m: float
-    board_at_m: FloatArray
-    board_axes: FloatArray
+    lens_position_m: float
+    display_origin_m: FloatArray
+    display_axes: FloatArray
     wave_rad: FloatArray
     wave_phase: FloatArray
     wave_m: FloatArray
@@ -52,7 +52,7 @@ class Truth:
         freeze_arrays(self)
 
     @classmethod
-    def drawn(cls, seed: int, config: Config) -> Self:
+    def sample(cls, seed: int, config: Config) -> Self:
         """A geometry within a workshop's tolerances of what the configuration says; the same for the same seed."""
         random = np.random.default_rng(seed)
         layout = build_pixel_layout(config.display)
@@ -60,116 +60,122 @@ class Truth:
         step_rad = config.scanner.rad_per_code
         codes = CENTRE_CODE + np.array([layout.x_m, layout.y_m]) / (twice_f_m * step_rad)
         for _ in range(1000):
-            truth = cls._once(random, config)
-            x_m, y_m = truth.position_m(codes[0], codes[1])
-            farthest_m = float(np.hypot(x_m - layout.x_m, y_m - layout.y_m).max())
-            if MISS_M[0] <= farthest_m <= MISS_M[1]:
-                return truth
-        raise AssertionError(f"no geometry of seed {seed} misses by {MISS_M} m")
+            geometry = cls._sample_once(random, config)
+            x_m, y_m = geometry.position_m(codes[0], codes[1])
+            max_error_m = float(np.hypot(x_m - layout.x_m, y_m - layout.y_m).max())
+            if MAX_ERROR_RANGE_M[0] <= max_error_m <= MAX_ERROR_RANGE_M[1]:
+                return geometry
+        raise AssertionError(f"no geometry of seed {seed} misses by {MAX_ERROR_RANGE_M} m")
 
     @classmethod
-    def _once(cls, random: np.random.Generator, config: Config) -> Self:
+    def _sample_once(cls, random: np.random.Generator, config: Config) -> Self:
         layout, scanner = build_pixel_layout(config.display), config.scanner
-        reach_m = max(LEAST_REACH_M, float(np.abs([layout.x_m, layout.y_m]).max()))
-        edge_rad = np.hypot(reach_m, reach_m) / scanner.focal_length_m
+        half_field_m = max(HALF_FIELD_MIN_M, float(np.abs([layout.x_m, layout.y_m]).max()))
+        edge_rad = np.hypot(half_field_m, half_field_m) / scanner.focal_length_m
         focal_m = scanner.focal_length_m * (1.0 + random.uniform(-0.005, 0.005))
-        bends = random.uniform(-1.0, 1.0, 2) * [3e-3, 1e-3] / edge_rad ** np.array([2, 4])
-        turn, tilt_x, tilt_y = np.radians(random.uniform(-1.0, 1.0, 3))
-        turned_by = _turn(2, turn) @ _turn(0, tilt_x) @ _turn(1, tilt_y)
-        angle = random.uniform(0.0, 2.0 * np.pi, (2, WAVES))
+        distortion = random.uniform(-1.0, 1.0, 2) * [3e-3, 1e-3] / edge_rad ** np.array([2, 4])
+        rotation, tilt_x, tilt_y = np.radians(random.uniform(-1.0, 1.0, 3))
+        orientation = _rotation_matrix(2, rotation) @ _rotation_matrix(0, tilt_x) @ _rotation_matrix(1, tilt_y)
+        angle = random.uniform(0.0, 2.0 * np.pi, (2, WAVE_COUNT))
         # One to two lengths of the field a wave.
-        waves_a_field = random.uniform(0.5, 1.0, (2, WAVES))
-        half_rad = reach_m / (2.0 * scanner.focal_length_m)
-        weights = random.uniform(0.3, 1.0, (2, WAVES))
+        waves_per_field = random.uniform(0.5, 1.0, (2, WAVE_COUNT))
+        half_rad = half_field_m / (2.0 * scanner.focal_length_m)
+        weights = random.uniform(0.3, 1.0, (2, WAVE_COUNT))
         peak_m = random.uniform(20e-6, 40e-6, (2, 1))
         return cls(
             nominal_rad_per_code=scanner.rad_per_code,
             range_rad=scanner.range_rad,
-            mirrors_apart_m=random.uniform(8e-3, 20e-3),
+            mirror_spacing_m=random.uniform(8e-3, 20e-3),
             gain=1.0 + random.uniform(-0.01, 0.01, 2),
             offset_rad=random.uniform(-1e-3, 1e-3, 2),
             cross=random.uniform(-5e-3, 5e-3, 2),
             cubic=random.uniform(-2e-3, 2e-3, 2),
-            lens_m=focal_m * np.array([1.0, *bends]),
+            lens_coefficients_m=focal_m * np.array([1.0, *distortion]),
             focal_length_m=focal_m,
-            lens_at_m=random.uniform(0.03, 0.06),
-            board_at_m=random.uniform(-1e-3, 1e-3, 2),
-            board_axes=turned_by.T,
-            wave_rad=(np.pi / half_rad * waves_a_field)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
-            wave_phase=random.uniform(0.0, 2.0 * np.pi, (2, WAVES)),
+            lens_position_m=random.uniform(0.03, 0.06),
+            display_origin_m=random.uniform(-1e-3, 1e-3, 2),
+            display_axes=orientation.T,
+            wave_rad=(np.pi / half_rad * waves_per_field)[..., None]
+            * np.stack([np.cos(angle), np.sin(angle)], axis=-1),
+            wave_phase=random.uniform(0.0, 2.0 * np.pi, (2, WAVE_COUNT)),
             wave_m=peak_m * weights / weights.sum(axis=1, keepdims=True),
         )
 
-    def mirror_rad(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def mirror_angles_rad(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Mechanical angles at which the mirrors stand for codes, whole or not; any shape."""
-        asked = np.array(np.broadcast_arrays(x_code, y_code), dtype=np.float64) - CENTRE_CODE
-        asked_rad = asked * self.nominal_rad_per_code
+        codes = np.array(np.broadcast_arrays(x_code, y_code), dtype=np.float64) - CENTRE_CODE
+        command_rad = codes * self.nominal_rad_per_code
         gain, offset_rad, cross, cubic = (
-            own.reshape(2, *[1] * (asked.ndim - 1)) for own in (self.gain, self.offset_rad, self.cross, self.cubic)
+            coefficient.reshape(2, *[1] * (codes.ndim - 1))
+            for coefficient in (self.gain, self.offset_rad, self.cross, self.cubic)
         )
-        bent = gain * asked_rad * (1.0 + cubic * (asked_rad / self.range_rad) ** 2)
-        x_rad, y_rad = bent + cross * asked_rad[::-1] + offset_rad
+        scaled_rad = gain * command_rad * (1.0 + cubic * (command_rad / self.range_rad) ** 2)
+        x_rad, y_rad = scaled_rad + cross * command_rad[::-1] + offset_rad
         return x_rad, y_rad
 
-    def lands_m(self, x_rad: ArrayLike, y_rad: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def landing_point_m(self, x_rad: ArrayLike, y_rad: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Where on the board, in its own axes, the beam lands while the mirrors stand at these angles; any shape."""
-        turned = np.array(np.broadcast_arrays(x_rad, y_rad), dtype=np.float64)
-        start, way = self._after_mirrors(*turned)
-        at_lens = start + way * ((self.lens_at_m - start[2]) / way[2])
-        bend_rad = np.arctan2(np.hypot(way[0], way[1]), way[2])
-        f1, f3, f5 = self.lens_m
-        radius_m = bend_rad * (f1 + f3 * bend_rad**2 + f5 * bend_rad**4)
-        across = np.maximum(np.hypot(way[0], way[1]), np.finfo(np.float64).tiny)
+        mirror_rad = np.array(np.broadcast_arrays(x_rad, y_rad), dtype=np.float64)
+        start, direction = self._trace_mirrors(*mirror_rad)
+        at_lens = start + direction * ((self.lens_position_m - start[2]) / direction[2])
+        field_angle_rad = np.arctan2(np.hypot(direction[0], direction[1]), direction[2])
+        f1, f3, f5 = self.lens_coefficients_m
+        radius_m = field_angle_rad * (f1 + f3 * field_angle_rad**2 + f5 * field_angle_rad**4)
+        transverse = np.maximum(np.hypot(direction[0], direction[1]), np.finfo(np.float64).tiny)
         in_focus = np.stack(
-            [radius_m * way[0] / across, radius_m * way[1] / across, np.full(across.shape, self._focus)]
+            [
+                radius_m * direction[0] / transverse,
+                radius_m * direction[1] / transverse,
+                np.full(transverse.shape, self._focal_plane_m),
+            ]
         )
-        origin = np.array([*self.board_at_m, self._focus]).reshape(3, *[1] * (turned.ndim - 1))
-        normal = self.board_axes[2]
-        through = in_focus - at_lens
-        share = np.tensordot(normal, origin - at_lens, 1) / np.tensordot(normal, through, 1)
-        x_m, y_m = np.tensordot(self.board_axes[:2], at_lens + share * through - origin, 1)
-        dx_m, dy_m = self._deviation_m(turned)
+        origin = np.array([*self.display_origin_m, self._focal_plane_m]).reshape(3, *[1] * (mirror_rad.ndim - 1))
+        normal = self.display_axes[2]
+        lens_to_focus = in_focus - at_lens
+        fraction = np.tensordot(normal, origin - at_lens, 1) / np.tensordot(normal, lens_to_focus, 1)
+        x_m, y_m = np.tensordot(self.display_axes[:2], at_lens + fraction * lens_to_focus - origin, 1)
+        dx_m, dy_m = self._deviation_m(mirror_rad)
         return x_m + dx_m, y_m + dy_m
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Where on the board the beam lands for codes, whole or not; any shape, float64."""
-        return self.lands_m(*self.mirror_rad(x_code, y_code))
+        return self.landing_point_m(*self.mirror_angles_rad(x_code, y_code))
 
     @property
-    def _focus(self) -> float:
-        return self.lens_at_m + self.focal_length_m
+    def _focal_plane_m(self) -> float:
+        return self.lens_position_m + self.focal_length_m
 
-    def _after_mirrors(self, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _trace_mirrors(self, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
         """A point [3, ...] on mirror y and the direction [3, ...] in which the beam leaves it."""
         zero = np.zeros_like(x_rad)
         x_angle, y_angle = 0.25 * np.pi + x_rad, 0.25 * np.pi - y_rad
         x_normal = np.stack([-np.cos(x_angle), -np.sin(x_angle), zero])
         y_normal = np.stack([zero, np.cos(y_angle), np.sin(y_angle)])
-        into = np.stack([zero + 1.0, zero, zero])
-        between = _reflected(into, x_normal)
-        first = np.stack([zero, zero + self.mirrors_apart_m, zero])
-        length = -(first * y_normal).sum(axis=0) / (between * y_normal).sum(axis=0)
-        return first + between * length, _reflected(between, y_normal)
+        incident = np.stack([zero + 1.0, zero, zero])
+        intermediate = _reflect(incident, x_normal)
+        first = np.stack([zero, zero + self.mirror_spacing_m, zero])
+        length = -(first * y_normal).sum(axis=0) / (intermediate * y_normal).sum(axis=0)
+        return first + intermediate * length, _reflect(intermediate, y_normal)
 
-    def _deviation_m(self, turned_rad: FloatArray) -> FloatArray:
+    def _deviation_m(self, mirror_rad: FloatArray) -> FloatArray:
         """What no part explains, [2, ...]."""
-        phase = np.tensordot(self.wave_rad, turned_rad, 1)
-        shape = (2, WAVES, *[1] * (turned_rad.ndim - 1))
+        phase = np.tensordot(self.wave_rad, mirror_rad, 1)
+        shape = (2, WAVE_COUNT, *[1] * (mirror_rad.ndim - 1))
         waves = self.wave_m.reshape(shape) * np.cos(phase + self.wave_phase.reshape(shape))
         deviation_m: FloatArray = waves.sum(axis=1)
         return deviation_m
 
 
-def _reflected(way: FloatArray, normal: FloatArray) -> FloatArray:
+def _reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
     """Directions after a plane mirror, both [3, ...]; normals of length one."""
-    mirrored: FloatArray = way - 2.0 * (way * normal).sum(axis=0) * normal
+    mirrored: FloatArray = direction - 2.0 * (direction * normal).sum(axis=0) * normal
     return mirrored
 
 
-def _turn(axis: int, angle_rad: float) -> FloatArray:
+def _rotation_matrix(axis: int, angle_rad: float) -> FloatArray:
     """Rotation about an axis, [3, 3]."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
-    turn = np.eye(3)
-    turn[first, first] = turn[second, second] = np.cos(angle_rad)
-    turn[first, second], turn[second, first] = -np.sin(angle_rad), np.sin(angle_rad)
-    return turn
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = np.cos(angle_rad)
+    matrix[first, second], matrix[second, first] = -np.sin(angle_rad), np.sin(angle_rad)
+    return matrix

@@ -17,7 +17,7 @@ START_LEAD_S = 0.05
 
 
 def execute(
-    display: DisplayModel, prepared: PlannedSequence, progress: Callable[[float], None] | None = None
+    display: DisplayModel, prepared: PlannedSequence, on_progress: Callable[[float], None] | None = None
 ) -> ExecutedPulses:
     """Arm a fresh simulated board, stream the plan, give what the board says it did."""
     clock = ManualClock(1.0)
@@ -32,8 +32,8 @@ def execute(
     job = session.begin(points, session.board_s() + START_LEAD_S)
     while len(points) and not job.is_finished:
         _step(session)
-        if progress is not None:
-            progress(job.executed_count / len(prepared.plan))
+        if on_progress is not None:
+            on_progress(job.executed_count / len(prepared.plan))
     session.close()
     return job.build_executed(prepared.plan, scale.full_power_w, scale.tick_s)
 

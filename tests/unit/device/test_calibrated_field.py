@@ -8,9 +8,9 @@ from optodrive.core.errors import InputError
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_writer import write_field
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
-FIT = fit_field(measure_spots(Truth.drawn(0, CONFIG), grid_codes(9), np.random.default_rng(0))[0], PRIOR)
+FIT = fit_field(measure_spots(GroundTruthGeometry.sample(0, CONFIG), grid_codes(9), np.random.default_rng(0))[0], PRIOR)
 FIELD = FIT.field
 CODE = st.floats(0.0, 65535.0)
 
@@ -43,7 +43,7 @@ def test_far_places_are_never_taken_for_others():
     """Polynomials fold over: what comes back without being lost leads where it should."""
     far_m = np.random.default_rng(3).uniform(-1.0, 1.0, (2, 4000))
     for seed in range(6):
-        spots, _ = measure_spots(Truth.drawn(seed, CONFIG), grid_codes(5), np.random.default_rng(0))
+        spots, _ = measure_spots(GroundTruthGeometry.sample(seed, CONFIG), grid_codes(5), np.random.default_rng(0))
         field = fit_field(spots, PRIOR).field
         for beyond, most_codes in ((False, 0.1), (True, 10.0)):
             codes = np.array(field.codes(*far_m, extrapolate=beyond))

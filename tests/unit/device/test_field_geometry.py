@@ -8,9 +8,9 @@ from optodrive.device.field_geometry import (
     build_board_axes,
     compute_parameter_derivatives,
 )
-from optodrive.link.simulator.true_geometry import Truth, _turn
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry, _rotation_matrix
 
-TRUTH = Truth.drawn(5, CONFIG)
+TRUTH = GroundTruthGeometry.sample(5, CONFIG)
 SAME = FieldGeometry(
     gain_x=TRUTH.gain[0],
     gain_y=TRUTH.gain[1],
@@ -20,13 +20,13 @@ SAME = FieldGeometry(
     cross_y=TRUTH.cross[1],
     cubic_x_per_rad2=TRUTH.cubic[0] / TRUTH.range_rad**2,
     cubic_y_per_rad2=TRUTH.cubic[1] / TRUTH.range_rad**2,
-    mirror_distance_m=TRUTH.mirrors_apart_m,
-    lens_distance_m=TRUTH.lens_at_m,
-    focal_length_m=TRUTH.lens_m[0],
-    distortion3_per_rad2=TRUTH.lens_m[1] / TRUTH.lens_m[0],
-    distortion5_per_rad4=TRUTH.lens_m[2] / TRUTH.lens_m[0],
-    shift_x_m=TRUTH.board_at_m[0],
-    shift_y_m=TRUTH.board_at_m[1],
+    mirror_distance_m=TRUTH.mirror_spacing_m,
+    lens_distance_m=TRUTH.lens_position_m,
+    focal_length_m=TRUTH.lens_coefficients_m[0],
+    distortion3_per_rad2=TRUTH.lens_coefficients_m[1] / TRUTH.lens_coefficients_m[0],
+    distortion5_per_rad4=TRUTH.lens_coefficients_m[2] / TRUTH.lens_coefficients_m[0],
+    shift_x_m=TRUTH.display_origin_m[0],
+    shift_y_m=TRUTH.display_origin_m[1],
     turn_rad=0.01,
     tilt_x_rad=-0.012,
     tilt_y_rad=0.008,
@@ -34,10 +34,12 @@ SAME = FieldGeometry(
 
 
 def test_closed_forms_agree_with_rays_traced_by_other_code():
-    axes = (_turn(2, SAME.turn_rad) @ _turn(0, SAME.tilt_x_rad) @ _turn(1, SAME.tilt_y_rad)).T
+    axes = (
+        _rotation_matrix(2, SAME.turn_rad) @ _rotation_matrix(0, SAME.tilt_x_rad) @ _rotation_matrix(1, SAME.tilt_y_rad)
+    ).T
     assert np.allclose(build_board_axes(SAME), axes, atol=1e-15)
     table = {name: getattr(TRUTH, name) for name in TRUTH.__dataclass_fields__}
-    traced = Truth(**(table | {"board_axes": axes, "wave_m": np.zeros_like(TRUTH.wave_m)}))
+    traced = GroundTruthGeometry(**(table | {"board_axes": axes, "wave_m": np.zeros_like(TRUTH.wave_m)}))
     x_code, y_code = np.random.default_rng(0).uniform(2000, 63000, (2, 500))
     scale = PRIOR.rad_per_code
     closed = beam_position_m(SAME, (x_code - 32768) * scale, (y_code - 32768) * scale)

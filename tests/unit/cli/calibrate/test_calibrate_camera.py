@@ -13,10 +13,10 @@ from optodrive.cli.main import run
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.spots import MeasuredSpots, read_spots
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 from rendered import GRID, PIXEL_M, describe, grid_light, marks_px, save, spot_light, taken
 
-TRUTH = Truth.drawn(4, CONFIG)
+TRUTH = GroundTruthGeometry.sample(4, CONFIG)
 CODES = grid_codes(5)
 PLACES = np.column_stack(TRUTH.position_m(*CODES.T))
 OUTLIER = 7

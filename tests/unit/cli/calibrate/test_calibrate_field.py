@@ -15,9 +15,9 @@ from optodrive.lab.calibration.correction_grid import (
     read_correction_grid,
 )
 from optodrive.lab.calibration.spots import MeasuredSpots, write_spots
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
-TRUTH = Truth.drawn(4, CONFIG)
+TRUTH = GroundTruthGeometry.sample(4, CONFIG)
 SPOTS, IS_OUTLIER = measure_spots(TRUTH, grid_codes(17), np.random.default_rng(2))
 
 

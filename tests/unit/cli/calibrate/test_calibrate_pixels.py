@@ -11,7 +11,7 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.device.config import load_config
-from optodrive.link.simulator.true_pixels import PixelTruth
+from optodrive.link.simulator.true_pixels import GroundTruthPixels
 from pixel_lab import calibrate_map, map_errors, measured_um, record_sweep, run_json
 
 TARGET_UM = 80.0
@@ -28,8 +28,8 @@ NOISE = 1.0
     ],
 )
 def test_heights_as_asked_once_the_pixels_are_known(capsys, tmp_path, display, seed):
-    truth = PixelTruth.drawn(seed, load_config(display))
-    lives = np.setdiff1d(np.arange(len(truth.lift)), truth.dead)
+    truth = GroundTruthPixels.sample(seed, load_config(display))
+    lives = np.setdiff1d(np.arange(len(truth.displacement_gain)), truth.dead)
     before_um, plain = measured_um(capsys, tmp_path, display, seed, TARGET_UM)
     assert np.abs(before_um[lives] / TARGET_UM - 1.0).max() > 0.15
     assert plain["summary"]["dead"]["count"] == 0
@@ -74,7 +74,7 @@ def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):
     (middle,) = record_sweep(capsys, tmp_path, "display-16", 11, aims=("middle",))
     assert run(["calibrate", "--config", "display-16", "--pixels", str(middle)]) == 0
     told = capsys.readouterr().out
-    dead = PixelTruth.drawn(11, load_config("display-16")).dead.tolist()
+    dead = GroundTruthPixels.sample(11, load_config("display-16")).dead.tolist()
     assert f"dead             1: {dead[0]}\n" in told
     assert "offset x" in told
     assert "aims on both sides" in told

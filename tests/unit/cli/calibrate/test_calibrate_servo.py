@@ -6,15 +6,15 @@ import tomllib
 import numpy as np
 import pytest
 
-from hidden_servo import SIZES_RAD, Hidden, recording
+from hidden_servo import SIZES_RAD, HiddenServo, recording
 from optodrive.cli.main import run
 from optodrive.device.config import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.lab.recording import write_recording
-from optodrive.lab.servo_identification.common_servo import moves_rad
+from optodrive.lab.servo_identification.common_servo import move_sizes_rad
 
-SERVOS = Hidden(1100.0, 0.62, 5e-5, 80.0), Hidden(1250.0, 0.55, 3e-5, 95.0)
+SERVOS = HiddenServo(1100.0, 0.62, 5e-5, 80.0), HiddenServo(1250.0, 0.55, 3e-5, 95.0)
 CAP = "galvo_acceleration_rms_max_rad_per_s2"
 
 
@@ -64,7 +64,7 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
 def test_the_one_servo_settles_no_sooner_than_either_mirror(folder):
     config = load_config(write_config(folder))
     for axis, hidden in enumerate(SERVOS):
-        for move_rad in moves_rad(config, axis):
+        for move_rad in move_sizes_rad(config, axis):
             tolerance_rad = config.tolerance_rad[axis]
             common_s = settling_s(build_servo(config.scanner), move_rad, tolerance_rad)
             assert common_s > 0.995 * hidden.settled_s(move_rad, tolerance_rad)

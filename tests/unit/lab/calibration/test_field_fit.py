@@ -9,7 +9,7 @@ from hidden_field import CONFIG, NOISE_M, PRIOR, field_errors_m, grid_codes, mea
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.next_spot import select_next_spot
 from optodrive.lab.calibration.spots import MeasuredSpots
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 GEOMETRIES = range(10)
 
@@ -19,7 +19,7 @@ def fit_geometries(side, outlier_fraction=0.02):
     """For each geometry: misses in metres [2, k], the sigma stated there [k], the fit, which spots were false."""
     out = []
     for seed in GEOMETRIES:
-        truth = Truth.drawn(seed, CONFIG)
+        truth = GroundTruthGeometry.sample(seed, CONFIG)
         spots, is_outlier = measure_spots(
             truth, grid_codes(side), np.random.default_rng([seed, side]), outlier_fraction
         )
@@ -76,7 +76,7 @@ def test_with_a_fifth_of_289_false_the_field_is_still_as_good():
 
 def test_without_rejection_false_detections_would_spoil_it():
     """The mutant: every spot believed."""
-    truth = Truth.drawn(0, CONFIG)
+    truth = GroundTruthGeometry.sample(0, CONFIG)
     spots, false = measure_spots(truth, grid_codes(17), np.random.default_rng(3))
     assert false.any()
     believed = fit_field(spots, PRIOR, noise_m=10e-3)
@@ -85,7 +85,7 @@ def test_without_rejection_false_detections_would_spoil_it():
 
 def test_noise_is_found_out():
     for noise_m in (3e-6, 10e-6, 30e-6):
-        truth = Truth.drawn(1, CONFIG)
+        truth = GroundTruthGeometry.sample(1, CONFIG)
         spots, _ = measure_spots(truth, grid_codes(17), np.random.default_rng(5), noise_m=noise_m)
         assert fit_field(spots, PRIOR).noise_m == pytest.approx(noise_m, rel=0.5)
 
@@ -93,7 +93,7 @@ def test_noise_is_found_out():
 @pytest.mark.slow
 def test_spots_anywhere_do_as_well_where_there_are_many():
     for seed in GEOMETRIES:
-        truth, random = Truth.drawn(seed, CONFIG), np.random.default_rng([seed, 1])
+        truth, random = GroundTruthGeometry.sample(seed, CONFIG), np.random.default_rng([seed, 1])
         spots, _ = measure_spots(truth, random_codes(random, 289), random)
         assert axis_rms_m(field_errors_m(truth, fit_field(spots, PRIOR).field)[0]) <= 5e-6
 
@@ -113,7 +113,7 @@ def test_outside_what_it_was_made_for_nothing_is_claimed():
 
 def test_the_next_spot_is_where_it_helps_most():
     """Against trying each, by what a measurement adds to the inverse of the covariance."""
-    truth, random = Truth.drawn(2, CONFIG), np.random.default_rng(8)
+    truth, random = GroundTruthGeometry.sample(2, CONFIG), np.random.default_rng(8)
     fit = fit_field(measure_spots(truth, grid_codes(3)[:6], random, 0.0)[0], PRIOR, NOISE_M)
     candidates = grid_codes(5)
     looked_at = fit.jacobian_m(*PRIOR.display_extent.build_grid(9)).reshape(-1, len(fit.parameter_sigma))
@@ -130,7 +130,7 @@ def test_the_next_spot_is_where_it_helps_most():
 @pytest.mark.slow
 def test_spots_as_proposed_reach_10_um_with_25():
     for seed in (0, 1, 2):
-        truth, random = Truth.drawn(seed, CONFIG), np.random.default_rng([seed, 2])
+        truth, random = GroundTruthGeometry.sample(seed, CONFIG), np.random.default_rng([seed, 2])
         table, candidates = np.zeros((0, 4)), grid_codes(13)
         for _ in range(25):
             proposed = select_next_spot(fit_field(MeasuredSpots.from_table(table), PRIOR), candidates)

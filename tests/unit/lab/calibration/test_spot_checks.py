@@ -6,11 +6,11 @@ from optodrive.core.errors import InputError
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
 from optodrive.lab.calibration.spots import MeasuredSpots, read_spots, write_spots
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 RANDOM = np.random.default_rng(4)
 MANY, NINE, SIX = (
-    measure_spots(Truth.drawn(seed, CONFIG), codes, RANDOM, share)[0].to_table()
+    measure_spots(GroundTruthGeometry.sample(seed, CONFIG), codes, RANDOM, share)[0].to_table()
     for seed, codes, share in ((0, grid_codes(17), 0.2), (1, grid_codes(3), 0.0), (2, random_codes(RANDOM, 6), 0.0))
 )
 

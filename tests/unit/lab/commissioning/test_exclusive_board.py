@@ -5,10 +5,16 @@ import pytest
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError, InputError, NotReadyError, RefusedError
-from optodrive.lab.commissioning.exclusive_board import HeldBoard, power_max_w, settle_s, spot_width_s, weakest_pixel
+from optodrive.lab.commissioning.exclusive_board import (
+    ExclusiveBoard,
+    find_weakest_pixel,
+    max_settling_s,
+    max_spot_power_w,
+    spot_width_s,
+)
 from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.galvos import CENTRE_CODE, Mirrors
+from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
 from optodrive.link.simulator.memory_link import MemoryLink
 from optodrive.planning.pipeline import DisplayModel
 
@@ -18,9 +24,9 @@ CENTRE = (CENTRE_CODE, CENTRE_CODE)
 class Rig:
     def __init__(self, display):
         self.log, self.clock = [], ManualClock(3.0)
-        self.mirrors = Mirrors(display.config, 0)
-        self.core = BoardCore(None, self.log.append, seed=4, steer=self.mirrors.go)
-        self.held = HeldBoard(display, MemoryLink(self.core, self.clock), self.clock)
+        self.mirrors = SimulatedGalvos(display.config, 0)
+        self.core = BoardCore(None, self.log.append, seed=4, mirror_sink=self.mirrors.move_to)
+        self.held = ExclusiveBoard(display, MemoryLink(self.core, self.clock), self.clock)
 
     def of(self, kind):
         return [event for event in self.log if event["event"] == kind]
@@ -56,7 +62,7 @@ def test_a_spot_is_one_pulse_with_mirrors_at_rest(rig):
 def test_going_somewhere_is_dark(rig):
     with rig.armed() as held:
         for sign in (1, -1, 1):
-            held.go(CENTRE_CODE + sign * 15_000, CENTRE_CODE)
+            held.move_to(CENTRE_CODE + sign * 15_000, CENTRE_CODE)
             assert rig.mirrors.codes(held_us(rig))[0] == pytest.approx(CENTRE_CODE + sign * 15_000, abs=0.1)
     assert not rig.of("pulse")
     assert not rig.of("gate")
@@ -85,7 +91,7 @@ def test_what_the_limiter_refuses_never_reaches_the_board(display):
     """20 ms of 50 mW are 1 mJ; the cap here is half of that."""
     rig = Rig(limited(display, pulse_energy_max_j=0.5e-3))
     with rig.armed() as held, pytest.raises(RefusedError, match="pulse energy cap"):
-        held.light(*CENTRE, 0.05)
+        held.fire_spot(*CENTRE, 0.05)
     assert not rig.of("pulse")
     assert not rig.of("gate")
     assert rig.core.state == "DISARMED"
@@ -97,7 +103,7 @@ def test_spots_anywhere_count_on_one_pixel(display):
     places = [(CENTRE_CODE + 3000 * column, CENTRE_CODE + 3000 * row) for row in (-4, 0, 4) for column in (-4, 0, 4)]
     with rig.armed() as held:
         for place in places:
-            held.light(*place, 0.05)
+            held.fire_spot(*place, 0.05)
     pulses = rig.of("pulse")
     assert len(pulses) == len(places)
     energy_j = 0.05 * 0.02
@@ -107,12 +113,12 @@ def test_spots_anywhere_count_on_one_pixel(display):
 
 def test_spots_at_their_most_hardly_warm_anything(any_display):
     heat, config = any_display.budget.heat, any_display.config
-    pixel = weakest_pixel(any_display)
+    pixel = find_weakest_pixel(any_display)
     for other in range(len(any_display.pixels)):
         assert heat.epsilon[other] * heat.r_k_per_w[other] <= heat.epsilon[pixel] * heat.r_k_per_w[pixel]
-    steady_k = float(heat.epsilon[pixel] * heat.r_k_per_w[pixel]) * power_max_w(config)
+    steady_k = float(heat.epsilon[pixel] * heat.r_k_per_w[pixel]) * max_spot_power_w(config)
     assert steady_k < 0.05 * any_display.budget.caps.absorber_k
-    assert power_max_w(config) <= 0.05 * config.laser.max_power_w
+    assert max_spot_power_w(config) <= 0.05 * config.laser.max_power_w
 
 
 def test_widths_and_waits_are_whole_and_long_enough(any_display):
@@ -120,7 +126,7 @@ def test_widths_and_waits_are_whole_and_long_enough(any_display):
     periods = spot_width_s(config) * config.laser.pwm_hz
     assert periods == pytest.approx(round(periods))
     assert spot_width_s(config) <= config.limits.pulse_width_max_s
-    assert settle_s(config) * 1e6 >= any_display.scan_head.settling.lead_us
+    assert max_settling_s(config) * 1e6 >= any_display.scan_head.settling.lead_us
 
 
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])

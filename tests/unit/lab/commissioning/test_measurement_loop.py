@@ -7,10 +7,10 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
-from optodrive.lab.commissioning.session_file import Row, SessionFile, save, session_path
-from optodrive.lab.commissioning.spot_reader import agreed
-from optodrive.lab.commissioning.spot_sensor_client import Sighting
-from optodrive.lab.commissioning.worker_process import Aside
+from optodrive.lab.commissioning.session_file import CalibrationSession, SpotRow, save_text, session_path_for
+from optodrive.lab.commissioning.spot_reader import robust_mean
+from optodrive.lab.commissioning.spot_sensor_client import SpotReading
+from optodrive.lab.commissioning.worker_process import WorkerProcess
 
 CONFIG = DISPLAYS["display-437"].config
 
@@ -20,21 +20,21 @@ def refuse(where):
 
 
 def test_one_reflection_among_three_changes_nothing():
-    true = [Sighting(1e-3, 2e-3, 1e-5), Sighting(1.01e-3, 2.01e-3, 1e-5)]
-    seen = agreed([true[0], Sighting(-0.03, 0.01, 1e-5), true[1]])
+    true = [SpotReading(1e-3, 2e-3, 1e-5), SpotReading(1.01e-3, 2.01e-3, 1e-5)]
+    seen = robust_mean([true[0], SpotReading(-0.03, 0.01, 1e-5), true[1]])
     assert seen.x_m == pytest.approx(1.005e-3)
     assert seen.y_m == pytest.approx(2.005e-3)
     assert seen.sigma_m == pytest.approx(1e-5 / 2**0.5)
-    assert agreed(true[:1]) == true[0]
+    assert robust_mean(true[:1]) == true[0]
 
 
 def test_a_session_goes_on(tmp_path):
     out = tmp_path / "field.toml"
-    session = SessionFile.beside(out, CONFIG)
+    session = CalibrationSession.load_or_create(out, CONFIG)
     assert len(session.spots) == 0
-    session.rows.append(Row(1.0, 2.0, 3e-3, 4e-3))
-    save(session.path, session.text())
-    again = SessionFile.beside(out, CONFIG)
+    session.rows.append(SpotRow(1.0, 2.0, 3e-3, 4e-3))
+    save_text(session.path, session.to_json())
+    again = CalibrationSession.load_or_create(out, CONFIG)
     assert again.rows == session.rows
     assert again.spots.to_table().tolist() == [[1.0, 2.0, 3e-3, 4e-3]]
 
@@ -50,21 +50,21 @@ def test_a_session_goes_on(tmp_path):
 )
 def test_a_session_of_something_else_is_refused(tmp_path, change, says):
     out = tmp_path / "field.toml"
-    about = json.loads(SessionFile.beside(out, CONFIG).text())
-    session_path(out).write_text(json.dumps(about | change))
+    about = json.loads(CalibrationSession.load_or_create(out, CONFIG).to_json())
+    session_path_for(out).write_text(json.dumps(about | change))
     with pytest.raises(InputError, match=r"field\.toml\.session\.json") as caught:
-        SessionFile.beside(out, CONFIG)
+        CalibrationSession.load_or_create(out, CONFIG)
     assert says in str(caught.value)
 
 
 def test_work_aside_comes_back_or_says_why():
-    with Aside() as aside:
-        aside.begin(str.upper, "spot")
+    with WorkerProcess() as aside:
+        aside.submit(str.upper, "spot")
         assert aside.result() == "SPOT"
-        aside.begin(refuse, "a file")
+        aside.submit(refuse, "a file")
         with pytest.raises(RefusedError, match="a file: got 1, expected 2"):
             aside.result()
-        aside.begin(Path.read_text, Path("/nowhere at all"))
+        aside.submit(Path.read_text, Path("/nowhere at all"))
         with pytest.raises(OptodriveError, match="read_text: FileNotFoundError"):
             aside.result()
         aside._process.terminate()

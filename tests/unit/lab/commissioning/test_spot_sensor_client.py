@@ -3,7 +3,7 @@
 import pytest
 
 from optodrive.core.errors import LinkError
-from optodrive.lab.commissioning.spot_sensor_client import LINE_MAX, SpotSensor
+from optodrive.lab.commissioning.spot_sensor_client import LINE_MAX, SpotSensorClient
 
 
 class Wire:
@@ -23,21 +23,21 @@ class Wire:
 
 def test_a_line_comes_in_pieces_and_what_lay_there_is_dropped():
     wire = Wire(b"spot 1 2 3\nspo", b"", b"spot 4", b" 5 6\n")
-    sensor = SpotSensor(wire)
-    sensor.ask("spot")
+    sensor = SpotSensorClient(wire)
+    sensor.send_request("spot")
     assert wire.written == b"spot\n"
-    assert sensor.answer() is None
-    assert sensor.answer() is None
-    line = sensor.answer()
+    assert sensor.poll_answer() is None
+    assert sensor.poll_answer() is None
+    line = sensor.poll_answer()
     assert line == "spot 4 5 6"
-    assert sensor.sighting(line) == pytest.approx((4e-6, 5e-6, 6e-6))
+    assert sensor.parse_spot(line) == pytest.approx((4e-6, 5e-6, 6e-6))
 
 
 def test_none_is_an_answer():
-    sensor = SpotSensor(Wire())
-    assert sensor.sighting("spot none") is None
-    assert sensor.mirrors_rad("mirrors none") is None
-    assert sensor.mirrors_rad("mirrors -0.1 0.2") == (-0.1, 0.2)
+    sensor = SpotSensorClient(Wire())
+    assert sensor.parse_spot("spot none") is None
+    assert sensor.parse_mirrors_rad("mirrors none") is None
+    assert sensor.parse_mirrors_rad("mirrors -0.1 0.2") == (-0.1, 0.2)
 
 
 @pytest.mark.parametrize(
@@ -45,13 +45,13 @@ def test_none_is_an_answer():
 )
 def test_what_is_no_answer_is_named(line):
     with pytest.raises(LinkError, match=r"a wire: heard .*expected 'spot' and 3 numbers"):
-        SpotSensor(Wire()).sighting(line)
+        SpotSensorClient(Wire()).parse_spot(line)
 
 
 def test_a_flood_without_a_line_ends():
-    sensor = SpotSensor(Wire(b"", *[b"x" * 50] * 3))
-    sensor.ask("spot")
-    assert sensor.answer() is None
+    sensor = SpotSensorClient(Wire(b"", *[b"x" * 50] * 3))
+    sensor.send_request("spot")
+    assert sensor.poll_answer() is None
     with pytest.raises(LinkError, match="expected a line") as caught:
-        sensor.answer()
+        sensor.poll_answer()
     assert len(str(caught.value)) < 2 * LINE_MAX + 100

@@ -7,17 +7,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hidden_servo import SIZES_RAD, Hidden, commands, recording
+from hidden_servo import SIZES_RAD, HiddenServo, commands, recording
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.device.config import load_config
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.step_response import Steps, angles_rad
-from optodrive.lab.servo_identification.step_trace import trace_of
+from optodrive.lab.servo_identification.step_response import Steps, step_response_rad
+from optodrive.lab.servo_identification.step_trace import extract_trace
 
 CONFIG = load_config()
-ONE, OTHER = Hidden(900.0, 0.6, 4e-5, 90.0), Hidden(1400.0, 0.45, 2e-5, 120.0)
+ONE, OTHER = HiddenServo(900.0, 0.6, 4e-5, 90.0), HiddenServo(1400.0, 0.45, 2e-5, 120.0)
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +26,7 @@ def measured():
 
 
 def found(measurement, axis):
-    return identify("r.h5", trace_of("r.h5", measurement, axis), CONFIG.scanner.slew_rad_per_s)
+    return identify("r.h5", extract_trace("r.h5", measurement, axis), CONFIG.scanner.slew_rad_per_s)
 
 
 def altered(measurement, change):
@@ -40,28 +40,28 @@ def test_the_closed_form_is_what_integration_gives_also_where_steps_overlap(hz, 
     at_s = np.cumsum(random.uniform(1e-4, 4e-3, 8))
     command_rad = random.uniform(-0.1, 0.1, 8)
     t_s = np.linspace(0.0, at_s[-1] + 5e-3, 300)
-    told = angles_rad(Servo(hz, damping, delay_s, slew), Steps(at_s, command_rad), t_s)
-    assert told == pytest.approx(Hidden(hz, damping, delay_s, slew).follow(at_s, command_rad, t_s), abs=1e-7)
+    told = step_response_rad(Servo(hz, damping, delay_s, slew), Steps(at_s, command_rad), t_s)
+    assert told == pytest.approx(HiddenServo(hz, damping, delay_s, slew).follow(at_s, command_rad, t_s), abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", [900, *(pytest.param(k, marks=pytest.mark.slow) for k in range(901, 912))])
 def test_hidden_servos_are_found_on_both_axes(seed):
     random = np.random.default_rng(seed)
-    servos = Hidden.drawn(random), Hidden.drawn(random)
+    servos = HiddenServo.sample(random), HiddenServo.sample(random)
     rate_hz, noise = (float(np.exp(random.uniform(*np.log(ends)))) for ends in ((1e4, 1e5), (1e-3, 1e-2)))
     measurement = recording(servos, random, rate_hz, noise)
     for axis, servo in enumerate(servos):
         told = found(measurement, axis)
         assert told.servo.delay == pytest.approx(servo.delay_s, abs=1e-5)
         assert told.servo.frequency == pytest.approx(servo.hz, rel=0.03)
-        assert told.slew_seen
+        assert told.slew_identified
         assert told.servo.slew == pytest.approx(servo.slew, rel=0.03)
         assert 0.7 < told.misfit < 1.4
         for step_rad in SIZES_RAD:
             for tolerance_rad in (CONFIG.tolerance_rad[axis], 0.02 * step_rad):
                 # Where an overshoot just touches the tolerance the time jumps: a hair wider or narrower is as true.
                 ends_s = [servo.settled_s(step_rad, near * tolerance_rad) for near in (0.98, 1.0, 1.02)]
-                told_s = told.settled_s(step_rad, tolerance_rad)[0]
+                told_s = told.settling_s(step_rad, tolerance_rad)[0]
                 assert 0.95 * min(ends_s) < told_s < 1.05 * max(ends_s)
 
 
@@ -77,8 +77,8 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say():
 
 def test_without_a_large_step_the_slew_is_kept_as_configured_and_the_rest_is_found():
     random = np.random.default_rng(4)
-    told = found(recording((Hidden(1500.0, 0.7, 3e-5, 100.0), OTHER), random, 1e5, 0.01, (2e-4,)), 0)
-    assert not told.slew_seen
+    told = found(recording((HiddenServo(1500.0, 0.7, 3e-5, 100.0), OTHER), random, 1e5, 0.01, (2e-4,)), 0)
+    assert not told.slew_identified
     assert told.servo.slew == pytest.approx(CONFIG.scanner.slew_rad_per_s)
     assert told.servo.delay == pytest.approx(3e-5, abs=1e-5)
 
@@ -133,7 +133,7 @@ def test_what_is_wrong_with_a_mirror_is_named(measured, change, words):
 
 
 def test_sampling_too_coarse_is_named():
-    coarse = recording((Hidden(2500.0, 0.6, 4e-5, 200.0), OTHER), np.random.default_rng(5), 1.5e3)
+    coarse = recording((HiddenServo(2500.0, 0.6, 4e-5, 200.0), OTHER), np.random.default_rng(5), 1.5e3)
     with pytest.raises(InputError, match="the sampling is too coarse"):
         found(coarse, 0)
 

@@ -5,23 +5,23 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hidden_servo import Hidden, recording
+from hidden_servo import HiddenServo, recording
 from optodrive.core.types.measurements import Measurement, Signal
 from optodrive.device.config import load_config
-from optodrive.lab.servo_identification.common_servo import DAMPING_MAX, common_servo
+from optodrive.lab.servo_identification.common_servo import DAMPING_MAX, find_common_servo
 from optodrive.lab.servo_identification.identify import identify
-from optodrive.lab.servo_identification.report import figures, lines
-from optodrive.lab.servo_identification.step_trace import trace_of
+from optodrive.lab.servo_identification.report import build_report, format_report_lines
+from optodrive.lab.servo_identification.step_trace import extract_trace
 
 CONFIG = load_config()
-SLOW, QUICK = Hidden(700.0, 0.99, 6e-5, 90.0), Hidden(1500.0, 0.6, 2e-5, 90.0)
+SLOW, QUICK = HiddenServo(700.0, 0.99, 6e-5, 90.0), HiddenServo(1500.0, 0.6, 2e-5, 90.0)
 
 
 def told(measurement):
     slew = CONFIG.scanner.slew_rad_per_s
-    mirrors = tuple(identify("r.h5", trace_of("r.h5", measurement, axis), slew) for axis in range(2))
-    common = common_servo(mirrors, CONFIG)
-    return figures(mirrors, common, CONFIG), common
+    mirrors = tuple(identify("r.h5", extract_trace("r.h5", measurement, axis), slew) for axis in range(2))
+    common = find_common_servo(mirrors, CONFIG)
+    return build_report(mirrors, common, CONFIG), common
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +34,14 @@ def test_a_mirror_damped_critically_is_said_and_planned_slower_by_what_may_be_st
     assert any(remark.startswith("x: damped critically") for remark in found["remarks"])
     assert common.servo.damping <= DAMPING_MAX
     assert common.servo.frequency < SLOW.hz
-    assert common.later[1] > common.later[0] >= -0.005
+    assert common.settling_excess[1] > common.settling_excess[0] >= -0.005
 
 
 @pytest.mark.slow
 def test_the_quicker_mirrors_acceleration_lowers_the_galvo_cap(unlike):
     found, common = told(unlike)
     assert common.galvo_share < 0.8
-    assert any("the galvo cap is taken ×" in line for line in lines(found))
+    assert any("the galvo cap is taken ×" in line for line in format_report_lines(found))
 
 
 def test_a_mirror_that_does_more_than_a_servo_is_said(unlike):
@@ -61,4 +61,4 @@ def test_small_steps_say_that_the_slew_cannot_be_told():
     found, common = told(small)
     assert sum("the slew cannot be told" in remark for remark in found["remarks"]) == 2
     assert common.servo.slew == pytest.approx(CONFIG.scanner.slew_rad_per_s)
-    assert any("slew not seen" in line for line in lines(found))
+    assert any("slew not seen" in line for line in format_report_lines(found))

@@ -6,7 +6,7 @@ import pytest
 from displays import DISPLAYS
 from optodrive.device.config import Config
 from optodrive.link.session.board_requirements import BoardRequirements
-from optodrive.link.simulator.board_limits import OWN, tightened
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 
 
 def board_us(limits, codes):
@@ -30,7 +30,7 @@ def moves_between(display, rng, count=400):
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
 def test_the_board_settles_no_longer_than_planned_and_nearly_as_long(name):
     display = DISPLAYS[name]
-    limits = tightened(OWN, BoardRequirements.from_config(display.config).build_limits())
+    limits = tighten(DEFAULT_LIMITS, BoardRequirements.from_config(display.config).build_limits())
     codes, planned_us = moves_between(display, np.random.default_rng(1))
     assert np.all(board_us(limits, codes) <= planned_us)
     pitch = (
@@ -54,5 +54,5 @@ def test_a_single_pixel_beside_the_middle_is_planned_with_the_way_to_it():
 def test_the_simulated_board_is_quick_enough_for_every_shipped_display():
     for display in DISPLAYS.values():
         asked = BoardRequirements.from_config(display.config).build_limits()
-        assert OWN.settle_us <= asked.settle_us
-        assert OWN.settle_ns_per_code <= asked.settle_ns_per_code
+        assert DEFAULT_LIMITS.settle_us <= asked.settle_us
+        assert DEFAULT_LIMITS.settle_ns_per_code <= asked.settle_ns_per_code

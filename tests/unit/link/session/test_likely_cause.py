@@ -34,9 +34,9 @@ class Damaged(Rig):
     def __init__(self):
         super().__init__()
         self.faults = FaultyLink(seed=1)
-        self.link.write = lambda data: self.core.receive(self.faults.carry(data), round(self.clock.now_s() * 1e6))
+        self.link.write = lambda data: self.core.receive(self.faults.transmit(data), round(self.clock.now_s() * 1e6))
         read = super(type(self.link), self.link).read
-        self.link.read = lambda timeout_s: self.faults.carry(read(timeout_s))
+        self.link.read = lambda timeout_s: self.faults.transmit(read(timeout_s))
 
 
 def cause(rig):
@@ -126,7 +126,7 @@ def test_a_link_that_comes_back_to_the_same_board_does_not_blame_a_restart():
 def test_damage_of_what_the_board_sends_is_told_at_once():
     rig = Damaged().connect()
     rig.link.write = lambda data: super(type(rig.link), rig.link).write(data)
-    rig.faults.break_down("flip_bits", 0.3)
+    rig.faults.inject_fault("flip_bits", 0.3)
     told = lost(rig)
     assert "bytes arrive damaged" in told
     assert "cable" in told
@@ -134,7 +134,7 @@ def test_damage_of_what_the_board_sends_is_told_at_once():
 
 def test_damage_of_what_the_board_hears_is_told_when_it_answers_again():
     rig = Damaged().connect()
-    rig.faults.break_down("flip_bits", 0.3)
+    rig.faults.inject_fault("flip_bits", 0.3)
     assert "cannot read what reaches it" in lost(rig)
     rig.faults.repair()
     rig.connect()
@@ -143,7 +143,7 @@ def test_damage_of_what_the_board_hears_is_told_when_it_answers_again():
 
 def test_a_board_that_hears_only_damage_lets_the_lease_lapse():
     rig = Damaged().connect().arm()
-    rig.faults.break_down("flip_bits", 0.04)
+    rig.faults.inject_fault("flip_bits", 0.04)
     rig.until(lambda: rig.session.board.state == "FAULT")
     assert rig.session.board.fault == "LINK"
     assert "bytes arrive damaged" in cause(rig)

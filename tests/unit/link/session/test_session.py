@@ -20,7 +20,7 @@ from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
 from optodrive.link.session.fault_hints import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.session import CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S, BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 from optodrive.link.simulator.memory_link import MemoryLink
 
 CONFIG = DISPLAYS["display-16"].config
@@ -118,7 +118,7 @@ def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     assert session.is_acknowledged
     assert session.board.state == "DISARMED"
     assert session.board.uid == BoardSettings().uid
-    assert rig.core._limits.spot_uj == session._requirements.build_limits().spot_uj < OWN.spot_uj
+    assert rig.core._limits.spot_uj == session._requirements.build_limits().spot_uj < DEFAULT_LIMITS.spot_uj
     assert session.board_s() == pytest.approx(rig.clock.now_s(), abs=0.003)
     assert session.collect_link_stats()["round_trip_ms"] > 0
 
@@ -155,14 +155,18 @@ def changed(section, **values):
     ("settings", "config", "says"),
     [
         (BoardSettings(uid="00" * 12), changed("board", uid="11" * 12), "board.uid: got '0000"),
-        (BoardSettings(replace(OWN, settle_us=228)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
-        (BoardSettings(replace(OWN, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
-        (BoardSettings(replace(OWN, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
-        (BoardSettings(replace(OWN, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),
-        (BoardSettings(replace(OWN, spot_uj=100_000)), CONFIG, "limits.pulse_energy_max_j: got 0.125"),
-        (BoardSettings(replace(OWN, spot_leak_uw=1_000_000)), CONFIG, "limits.pixel_mean_power_max_w: got 1.3"),
-        (BoardSettings(replace(OWN, x_min=31_000)), CONFIG, "display x"),
-        (BoardSettings(replace(OWN, y_max=33_000)), CONFIG, "display y"),
+        (BoardSettings(replace(DEFAULT_LIMITS, settle_us=228)), CONFIG, "scanner.bandwidth_hz: got 1700.0"),
+        (BoardSettings(replace(DEFAULT_LIMITS, settle_ns_per_code=500)), CONFIG, "scanner.slew_rad_per_s: got 100.0"),
+        (BoardSettings(replace(DEFAULT_LIMITS, max_on_us=49_999)), CONFIG, "limits.pulse_width_max_s: got 0.05"),
+        (BoardSettings(replace(DEFAULT_LIMITS, full_power_uw=2_000_000)), CONFIG, "laser.max_power_w: got 2.45"),
+        (BoardSettings(replace(DEFAULT_LIMITS, spot_uj=100_000)), CONFIG, "limits.pulse_energy_max_j: got 0.125"),
+        (
+            BoardSettings(replace(DEFAULT_LIMITS, spot_leak_uw=1_000_000)),
+            CONFIG,
+            "limits.pixel_mean_power_max_w: got 1.3",
+        ),
+        (BoardSettings(replace(DEFAULT_LIMITS, x_min=31_000)), CONFIG, "display x"),
+        (BoardSettings(replace(DEFAULT_LIMITS, y_max=33_000)), CONFIG, "display y"),
     ],
 )
 def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config, says):
@@ -177,7 +181,7 @@ def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config
 def test_another_protocol_or_clock_is_refused(field, value):
     requirements = BoardRequirements.from_config(CONFIG)
     fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
-    fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=OWN)
+    fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=DEFAULT_LIMITS)
     requirements.check_board(m.HelloReply(**fits))
     with pytest.raises(InputError, match=f"{value}"):
         requirements.check_board(m.HelloReply(**{**fits, field: value}))
@@ -197,7 +201,7 @@ def test_limits_hold_also_where_the_session_found_a_fault(rig):
     rig.session.disarm()
     rig.until(lambda: rig.session.board.state == "DISARMED")
     rig.arm()
-    assert rig.core._limits.spot_uj < OWN.spot_uj
+    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj
 
 
 # --- arming and playing ---------------------------------------------------------------------------------------------
@@ -318,7 +322,7 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
     rig.session.disconnect()
     rig.connect()
     assert rig.session.board.state == "DISARMED"
-    assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
+    assert rig.session.board_s() == pytest.approx(rig.core._current_tick() * 1e-6, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", [m.HelloReply.TYPE, m.ClockReply.TYPE])
@@ -329,7 +333,7 @@ def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
     rig.link.keep_back = lambda frame: frame.type == kind
     with pytest.raises(LinkError):
         rig.connect()
-    assert rig.session.board_s() == pytest.approx(rig.core._tick() * 1e-6, abs=0.01)
+    assert rig.session.board_s() == pytest.approx(rig.core._current_tick() * 1e-6, abs=0.01)
     rig.link.keep_back = lambda frame: False
     before_s = rig.session.board_s()
     rig.connect()
@@ -389,7 +393,7 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
     rig.run(0.5)
     assert len(rig.pulses()) <= lit + 1
-    assert rig.core._limits.spot_uj < OWN.spot_uj, "the new session tightens again"
+    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens again"
     rig.arm()
     asked = plan(50)
     job = rig.play(asked)
@@ -417,7 +421,7 @@ def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_
     assert len(hellos) == 2
     told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
     assert told == [m.Limits.TYPE, m.ArmReq.TYPE]
-    assert rig.core._limits.spot_uj < OWN.spot_uj
+    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj
 
 
 def test_flush_in_mid_job_stays_armed_for_the_next(rig):

@@ -5,7 +5,7 @@ from dataclasses import replace
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.board_limits import OWN, BoardSettings
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 CENTRE = 32768
 LEASE_STEP_US = 20_000
@@ -16,7 +16,7 @@ class Bench:
 
     def __init__(self, limits=None, **settings):
         self.log = []
-        own = replace(OWN, **(limits or {}))
+        own = replace(DEFAULT_LIMITS, **(limits or {}))
         self.core = BoardCore(BoardSettings(limits=own, **settings), self.log.append, seed=1)
         self.now_us = 0
         self.session = 0
@@ -121,7 +121,7 @@ class Bench:
         """All that junk on the line must leave as it is."""
         core = self.core
         job, lease = core._job, core._lease_until_us
-        return core.state, core.gate, list(core._queue), job, core._current, core._next_index, lease
+        return core.state, core.gate, list(core._queue), job, core._current_point, core._next_index, lease
 
     def bad_frames(self):
         """Frames counted as no frames: CRC, form."""

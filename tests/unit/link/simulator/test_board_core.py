@@ -11,8 +11,8 @@ from board_bench import CENTRE, Bench, here, naks
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.simulator import board_core as core_module
-from optodrive.link.simulator.board_limits import OWN
-from optodrive.link.simulator.guards import DUTY_FULL, WINDOW_US, Guards, energy_uj
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.guards import DUTY_FULL, WINDOW_US, EmissionGuards, energy_uj
 
 
 @pytest.fixture
@@ -108,7 +108,7 @@ def test_orders_in_the_wrong_state_are_refused_and_change_nothing():
         assert naks(b.say(order)) == ["STATE"]
         assert b.state == "DISARMED"
     b.arm()
-    for order in (OWN, m.ArmReq(1), m.ArmConfirm(1, 2), m.ClearFault(), m.End(1, 0)):
+    for order in (DEFAULT_LIMITS, m.ArmReq(1), m.ArmConfirm(1, 2), m.ClearFault(), m.End(1, 0)):
         assert naks(b.say(order)) == ["STATE"]
         assert b.state == "ARMED"
 
@@ -368,12 +368,12 @@ def test_points_dropped_settle_nothing_on_the_next_job(bench):
 
 
 def test_hello_ends_everything_and_restores_the_board_s_own_limits(bench):
-    bench.say(m.Disarm(), replace(OWN, lease_ms=50, max_on_us=10_000))
+    bench.say(m.Disarm(), replace(DEFAULT_LIMITS, lease_ms=50, max_on_us=10_000))
     bench.arm()
     bench.play(*dim(5))
     bench.wait(5000)
     reply = bench.hello(nonce=7)
-    assert (reply.host_nonce, reply.limits, bench.state) == (7, OWN, "DISARMED")
+    assert (reply.host_nonce, reply.limits, bench.state) == (7, DEFAULT_LIMITS, "DISARMED")
     assert walk(bench)[-1] == ("DISARMED", "hello")
     status = bench.status()
     assert (status.queued, status.done_index) == (0, 0)
@@ -409,7 +409,7 @@ def test_limits_sent_in_a_fault_hold_after_it(bench):
     bench.core.set_input("estop", True, bench.now_us)
     bench.core.set_input("estop", False, bench.now_us)
     bench.hello()
-    assert naks(bench.say(replace(OWN, max_on_us=10_000), m.ClearFault())) == []
+    assert naks(bench.say(replace(DEFAULT_LIMITS, max_on_us=10_000), m.ClearFault())) == []
     bench.arm()
     bench.say(bench.data(here(10_001)))
     assert bench.fault == "ON_TIME"
@@ -503,11 +503,11 @@ def in_second_before(end_us, pulses):
 def test_mean_account_is_the_fullest_second_of_all():
     rng = random.Random(4)
     for _ in range(20):
-        guards, pulses, at_us = Guards(1300), [], 0
+        guards, pulses, at_us = EmissionGuards(1300), [], 0
         for _ in range(60):
             at_us += rng.randrange(0, 60_000)
             on_us, duty = rng.randrange(1, 50_000), rng.choice([100, 20_000, DUTY_FULL])
-            account, before = guards.mean_account(at_us, on_us, duty), in_second_before(at_us, pulses)
+            account, before = guards.max_window_duty_us(at_us, on_us, duty), in_second_before(at_us, pulses)
             pulses = [*pulses, (at_us, on_us, duty)]
             kinks = [t + WINDOW_US for t, _, _ in pulses] + [t + on + WINDOW_US for t, on, _ in pulses]
             ends = [at_us + on_us, *rng.choices(range(at_us + 1, at_us + on_us + 1), k=5)]
@@ -515,11 +515,11 @@ def test_mean_account_is_the_fullest_second_of_all():
             fullest = max(in_second_before(end_us, pulses) for end_us in ends)
             assert account in [in_second_before(end_us, pulses) for end_us in ends]
             assert fullest <= max(account, before)
-            guards.fire(OWN, 0, 0, at_us, on_us, duty)
+            guards.record_pulse(DEFAULT_LIMITS, 0, 0, at_us, on_us, duty)
             at_us += on_us
 
 
 def test_energy_is_rounded_up_and_full_duty_is_full_power():
-    assert energy_uj(OWN, 50_000, DUTY_FULL) == 122_500
-    assert energy_uj(OWN, 1, 1) == 1
-    assert energy_uj(OWN, 0, DUTY_FULL) == 0
+    assert energy_uj(DEFAULT_LIMITS, 50_000, DUTY_FULL) == 122_500
+    assert energy_uj(DEFAULT_LIMITS, 1, 1) == 1
+    assert energy_uj(DEFAULT_LIMITS, 0, DUTY_FULL) == 0

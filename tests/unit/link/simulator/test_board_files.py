@@ -3,9 +3,9 @@
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.link.simulator.board_limits import OWN, RANGES, BoardSettings, load_settings, tightened
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, SETTING_RANGES, BoardSettings, load_settings, tighten
 from optodrive.link.simulator.faulty_link import FaultyLink
-from optodrive.link.simulator.script import ACTIONS, Step, load_script
+from optodrive.link.simulator.script import ACTIONS, ScriptStep, load_script
 
 
 @pytest.fixture
@@ -22,7 +22,11 @@ def test_limits_file_replaces_what_it_names(file):
     settings = load_settings(
         file('max_on_us = 20000\nlease_ms = 50\nuid = "00112233445566778899AABB"\nkey_edge = true')
     )
-    assert (settings.limits.max_on_us, settings.limits.lease_ms, settings.limits.max_duty) == (20000, 50, OWN.max_duty)
+    assert (settings.limits.max_on_us, settings.limits.lease_ms, settings.limits.max_duty) == (
+        20000,
+        50,
+        DEFAULT_LIMITS.max_duty,
+    )
     assert (settings.uid, settings.key_edge) == ("00112233445566778899AABB", True)
     assert load_settings(file("")) == BoardSettings()
 
@@ -50,20 +54,22 @@ def test_limits_file_that_cannot_be_meant(file, text, says):
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", [name for name in RANGES if hasattr(OWN, name)])
+@pytest.mark.parametrize("name", [name for name in SETTING_RANGES if hasattr(DEFAULT_LIMITS, name)])
 def test_every_limit_takes_the_ends_of_its_field(file, name):
-    for value in RANGES[name]:
+    for value in SETTING_RANGES[name]:
         limits = load_settings(file(f"{name} = {value}")).limits
         assert limits.parse(limits.encode_body()) == limits
         assert getattr(limits, name) == value
 
 
 def test_tightened_is_the_same_whoever_is_first():
-    other = type(OWN)(*(value + (-1) ** k if value else 1 for k, value in enumerate(vars(OWN).values())))
-    once = tightened(OWN, other)
-    assert tightened(once, other) == once
-    assert tightened(once, OWN) == once
-    assert once.full_power_uw == OWN.full_power_uw
+    other = type(DEFAULT_LIMITS)(
+        *(value + (-1) ** k if value else 1 for k, value in enumerate(vars(DEFAULT_LIMITS).values()))
+    )
+    once = tighten(DEFAULT_LIMITS, other)
+    assert tighten(once, other) == once
+    assert tighten(once, DEFAULT_LIMITS) == once
+    assert once.full_power_uw == DEFAULT_LIMITS.full_power_uw
 
 
 def test_script_is_sorted_and_has_defaults(file):
@@ -74,9 +80,9 @@ def test_script_is_sorted_and_has_defaults(file):
         )
     )
     assert steps == [
-        Step(1.5, "set", "key", value=False, rate=0.01),
-        Step(2.0, "do", "flip_bits", rate=0.5),
-        Step(3.0, "do", "hang", rate=0.01, from_light=True),
+        ScriptStep(1.5, "set", "key", value=False, rate=0.01),
+        ScriptStep(2.0, "do", "flip_bits", rate=0.5),
+        ScriptStep(3.0, "do", "hang", rate=0.01, from_first_pulse=True),
     ]
     assert load_script(file("")) == []
 
@@ -109,24 +115,24 @@ def test_script_that_cannot_be_meant(file, text, says):
 
 def test_link_breaks_down_and_is_repaired():
     link, data = FaultyLink(seed=1), bytes(range(256)) * 40
-    assert link.carry(data) == data
-    link.break_down("flip_bits", 0.01)
-    flipped = link.carry(data)
+    assert link.transmit(data) == data
+    link.inject_fault("flip_bits", 0.01)
+    flipped = link.transmit(data)
     wrong = [a ^ b for a, b in zip(data, flipped, strict=True) if a != b]
     assert 60 < len(wrong) < 150
     assert all(bits.bit_count() == 1 for bits in wrong)
     link.repair()
-    link.break_down("drop_bytes", 0.01)
-    assert 60 < len(data) - len(link.carry(data)) < 150
-    link.break_down("hang")
-    assert link.carry(data) == b""
+    link.inject_fault("drop_bytes", 0.01)
+    assert 60 < len(data) - len(link.transmit(data)) < 150
+    link.inject_fault("hang")
+    assert link.transmit(data) == b""
     link.repair()
-    assert link.carry(data) == data
+    assert link.transmit(data) == data
     with pytest.raises(ValueError, match="explode"):
-        link.break_down("explode")
+        link.inject_fault("explode")
 
 
 def test_every_way_to_break_down_can_be_scripted():
     link = FaultyLink()
     for how in ACTIONS[:3]:
-        link.break_down(how, 0.1)
+        link.inject_fault(how, 0.1)

@@ -14,7 +14,7 @@ from optodrive.link.protocol.connection import BoardLink
 from optodrive.link.protocol.framing import CRC, HEADER, Frame, FrameDecoder, cobs_decode, encode_frame
 from optodrive.link.simulator import board_core as core_module
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.simulator.guards import Guards
+from optodrive.link.simulator.guards import EmissionGuards
 
 REFUSED = tomllib.loads((Path(__file__).parents[4] / "firmware_protocol" / "refused.toml").read_text())["case"]
 OTHER_CELL = CENTRE + 2000
@@ -50,7 +50,7 @@ def check_b1(make):
 
 
 def b1_states_do_not_darken(patch):
-    patch.setattr(BoardCore, "_go_dark", lambda self, reason: setattr(self, "_current", None))
+    patch.setattr(BoardCore, "_close_gate", lambda self, reason: setattr(self, "_current_point", None))
 
 
 # --- B2: queue empty: gate off within 100 µs ------------------------------------------------------------------------
@@ -122,18 +122,20 @@ def b3_no_lease(patch):
 
 
 def b3_any_session_renews(patch):
-    take = BoardCore._take
-    patch.setattr(BoardCore, "_take", lambda self, frame: take(self, frame._replace(session=self._link.session)))
+    take = BoardCore._handle_frame
+    patch.setattr(
+        BoardCore, "_handle_frame", lambda self, frame: take(self, frame._replace(session=self._link.session))
+    )
 
 
 def b3_anything_renews(patch):
-    obey = BoardCore._obey_now
+    obey = BoardCore._handle_unsequenced
 
     def renew(self, message):
         self._lease_until_us = self._now_us + 100_000
         obey(self, message)
 
-    patch.setattr(BoardCore, "_obey_now", renew)
+    patch.setattr(BoardCore, "_handle_unsequenced", renew)
 
 
 def b3_host_says_how_long(patch):
@@ -141,7 +143,7 @@ def b3_host_says_how_long(patch):
         if isinstance(message, m.Lease):
             self._lease_until_us = self._now_us + 1000 * message.ms
 
-    patch.setattr(BoardCore, "_obey_now", obey)
+    patch.setattr(BoardCore, "_handle_unsequenced", obey)
 
 
 # --- B4: gate on at most max_on a point, and a cell, however many points it is split over ---------------------------
@@ -179,21 +181,21 @@ def check_b4(make):
 
 
 def b4_no_look_at_points(patch):
-    static = BoardCore._static_fault
-    patch.setattr(BoardCore, "_static_fault", lambda self, point: static(self, point._replace(on_us=0)))
+    static = BoardCore._check_point
+    patch.setattr(BoardCore, "_check_point", lambda self, point: static(self, point._replace(on_us=0)))
 
 
 def b4_no_account_of_cells(patch):
-    patch.setattr(Guards, "on_time_us", lambda self, limits, cell, at_us: 0)
+    patch.setattr(EmissionGuards, "on_time_us", lambda self, limits, cell, at_us: 0)
 
 
 def b4_by_position_and_not_by_cell(patch):
-    patch.setattr(Guards, "cells", lambda self, x, y: [(0, x, y)])
+    patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: [(0, x, y)])
 
 
 def b4_one_grid_whose_borders_hide(patch):
-    cells = Guards.cells
-    patch.setattr(Guards, "cells", lambda self, x, y: cells(self, x, y)[:1])
+    cells = EmissionGuards.find_cells
+    patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1])
 
 
 # --- B5: duty at most max_duty; mean power over any second at most mean_duty ----------------------------------------
@@ -224,12 +226,12 @@ def check_b5(make):
 
 
 def b5_no_duty(patch):
-    static = BoardCore._static_fault
-    patch.setattr(BoardCore, "_static_fault", lambda self, point: static(self, point._replace(duty=0)))
+    static = BoardCore._check_point
+    patch.setattr(BoardCore, "_check_point", lambda self, point: static(self, point._replace(duty=0)))
 
 
 def b5_no_mean(patch):
-    patch.setattr(Guards, "mean_account", lambda self, start_us, on_us, duty: 0)
+    patch.setattr(EmissionGuards, "max_window_duty_us", lambda self, start_us, on_us, duty: 0)
 
 
 # --- B6: energy of a cell, a bucket that leaks ----------------------------------------------------------------------
@@ -263,20 +265,20 @@ def check_b6(make):
 
 
 def b6_no_bucket(patch):
-    patch.setattr(Guards, "bucket_uj", lambda self, limits, cell, at_us: 0)
+    patch.setattr(EmissionGuards, "bucket_uj", lambda self, limits, cell, at_us: 0)
 
 
 def b6_bucket_never_leaks(patch):
-    patch.setattr(Guards, "bucket_uj", lambda self, limits, cell, at_us: self._bucket.get(cell, (0, 0))[0])
+    patch.setattr(EmissionGuards, "bucket_uj", lambda self, limits, cell, at_us: self._bucket.get(cell, (0, 0))[0])
 
 
 def b6_one_bucket_for_all(patch):
-    patch.setattr(Guards, "cells", lambda self, x, y: [(0, 0, 0)])
+    patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: [(0, 0, 0)])
 
 
 def b6_one_grid_whose_borders_hide(patch):
-    cells = Guards.cells
-    patch.setattr(Guards, "cells", lambda self, x, y: cells(self, x, y)[:1])
+    cells = EmissionGuards.find_cells
+    patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1])
 
 
 # --- B7: no gate until the host's settling and the board's own are over ---------------------------------------------
@@ -355,7 +357,7 @@ def check_b8(make):
 
 
 def b8_no_field(patch):
-    patch.setattr(BoardCore, "_static_fault", lambda self, point: "")
+    patch.setattr(BoardCore, "_check_point", lambda self, point: "")
 
 
 # --- B9: interlock, key and emergency stop: gate off within 1 ms, latched -------------------------------------------
@@ -396,7 +398,7 @@ def b9_not_latched(patch):
     def forgive(self, name, value, now_us):
         set_input(self, name, value, now_us)
         if self.inputs == core_module.SAFE_INPUTS and self.state == "FAULT":
-            self._clear(m.ClearFault())
+            self._on_clear_fault(m.ClearFault())
 
     patch.setattr(BoardCore, "set_input", forgive)
 
@@ -407,7 +409,7 @@ def b9_cleared_without_a_look(patch):
         self._set_state("DISARMED", "fault cleared")
         return ""
 
-    patch.setattr(BoardCore, "_clear", clear)
+    patch.setattr(BoardCore, "_on_clear_fault", clear)
 
 
 # --- B10: the host only tightens ------------------------------------------------------------------------------------
@@ -439,12 +441,12 @@ def check_b10(make):
 
 
 def b10_takes_what_it_is_told(patch):
-    patch.setattr(core_module, "tightened", lambda own, asked: asked)
+    patch.setattr(core_module, "tighten", lambda own, asked: asked)
 
 
 def b10_against_own_only(patch):
-    tightened = core_module.tightened
-    patch.setattr(core_module, "tightened", lambda own, asked: tightened(m.Limits(**OWN), asked))
+    tightened = core_module.tighten
+    patch.setattr(core_module, "tighten", lambda own, asked: tightened(m.Limits(**OWN), asked))
 
 
 # --- B11: arming needs a fresh nonce, and the key's edge where the board wants it -----------------------------------
@@ -503,7 +505,7 @@ def b11_any_nonce(patch):
         self._key_turned = False
         return ""
 
-    patch.setattr(BoardCore, "_confirm", confirm)
+    patch.setattr(BoardCore, "_on_arm_confirm", confirm)
 
 
 def b11_predictable(patch):
@@ -522,14 +524,14 @@ def b11_predictable(patch):
 
 
 def b11_key_may_stay(patch):
-    confirm = BoardCore._confirm
+    confirm = BoardCore._on_arm_confirm
 
     def keep(self, message):
         refusal = confirm(self, message)
         self._key_turned = True
         return refusal
 
-    patch.setattr(BoardCore, "_confirm", keep)
+    patch.setattr(BoardCore, "_on_arm_confirm", keep)
 
 
 # --- B12: each index at most once, in order -------------------------------------------------------------------------
@@ -568,8 +570,8 @@ def b12_duplicates_are_taken(patch):
 
 
 def b12_index_is_not_looked_at(patch):
-    data = BoardCore._data
-    patch.setattr(BoardCore, "_data", lambda self, message: data(self, m.Data(self._next_index, message.points)))
+    data = BoardCore._on_data
+    patch.setattr(BoardCore, "_on_data", lambda self, message: data(self, m.Data(self._next_index, message.points)))
 
 
 # --- B13: malformed frames change counters only ---------------------------------------------------------------------

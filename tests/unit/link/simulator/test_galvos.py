@@ -6,14 +6,14 @@ import pytest
 from displays import DISPLAYS
 from optodrive.device.gate_timing import build_servo
 from optodrive.device.servo import STEPS_PER_TIME_CONSTANT, simulate_servo
-from optodrive.link.simulator.galvos import CENTRE_CODE, Mirrors
+from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
 
 CONFIG = DISPLAYS["display-437"].config
 
 
 def test_a_move_follows_the_servo():
-    mirrors = Mirrors(CONFIG, seed=0)
-    mirrors.go(CENTRE_CODE + 12_000, CENTRE_CODE - 500, 1000)
+    mirrors = SimulatedGalvos(CONFIG, seed=0)
+    mirrors.move_to(CENTRE_CODE + 12_000, CENTRE_CODE - 500, 1000)
     # The integration moves the servo's target on by whole steps; the closed form does not.
     scanner = CONFIG.scanner
     step_rad = scanner.slew_rad_per_s * 2.0 / (STEPS_PER_TIME_CONSTANT * 2.0 * np.pi * scanner.bandwidth_hz)
@@ -27,20 +27,20 @@ def test_a_move_follows_the_servo():
 
 
 def test_many_moves_end_where_they_were_sent():
-    mirrors, random = Mirrors(CONFIG, seed=0), np.random.default_rng(3)
+    mirrors, random = SimulatedGalvos(CONFIG, seed=0), np.random.default_rng(3)
     for k in range(200):
         x, y = random.integers(0, 65536, 2).tolist()
-        mirrors.go(x, y, 20_000 * k)
+        mirrors.move_to(x, y, 20_000 * k)
         assert mirrors.codes(20_000 * (k + 1)) == pytest.approx((x, y), abs=0.02)
 
 
 def test_a_stuck_mirror_stands_and_outputs_tell_it():
-    mirrors = Mirrors(CONFIG, seed=0)
-    mirrors.go(CENTRE_CODE + 1000, CENTRE_CODE + 1000, 0)
+    mirrors = SimulatedGalvos(CONFIG, seed=0)
+    mirrors.move_to(CENTRE_CODE + 1000, CENTRE_CODE + 1000, 0)
     mirrors.stick(0, 50_000)
-    mirrors.go(CENTRE_CODE - 5000, CENTRE_CODE - 5000, 60_000)
+    mirrors.move_to(CENTRE_CODE - 5000, CENTRE_CODE - 5000, 60_000)
     assert mirrors.codes(100_000) == pytest.approx((CENTRE_CODE + 1000, CENTRE_CODE - 5000), abs=0.1)
-    mirrors.inverted = True
-    x_rad, y_rad = mirrors.output_rad(100_000)
+    mirrors.readback_inverted = True
+    x_rad, y_rad = mirrors.position_output_rad(100_000)
     assert x_rad == pytest.approx(-1000 * CONFIG.scanner.rad_per_code, abs=1e-4)
     assert y_rad == pytest.approx(5000 * CONFIG.scanner.rad_per_code, abs=1e-4)

@@ -4,24 +4,24 @@ import numpy as np
 import pytest
 
 from displays import DISPLAYS
-from optodrive.link.simulator.galvos import CENTRE_CODE, Mirrors
-from optodrive.link.simulator.spot_sensor import HOLD_US, MARGIN_M, SpotSensor
-from optodrive.link.simulator.true_geometry import Truth
+from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
+from optodrive.link.simulator.spot_sensor import FIELD_MARGIN_M, PULSE_MEMORY_US, SimulatedSpotSensor
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 CONFIG = DISPLAYS["display-437"].config
-TRUTH = Truth.drawn(5, CONFIG)
+TRUTH = GroundTruthGeometry.sample(5, CONFIG)
 CODES = (CENTRE_CODE + 9000, CENTRE_CODE - 4000)
 SETTLED_US = 100_000
 
 
 def looking(noise_m=10e-6, false_share=0.0, outputs=True):
-    mirrors = Mirrors(CONFIG, seed=1)
-    mirrors.go(*CODES, 0)
-    return SpotSensor(CONFIG, TRUTH, mirrors, noise_m, false_share, outputs, seed=2), mirrors
+    mirrors = SimulatedGalvos(CONFIG, seed=1)
+    mirrors.move_to(*CODES, 0)
+    return SimulatedSpotSensor(CONFIG, TRUTH, mirrors, noise_m, false_share, outputs, seed=2), mirrors
 
 
 def shine(sensor, at_us=SETTLED_US, energy_j=1e-4):
-    sensor.saw(at_us, at_us + 20_000, energy_j)
+    sensor.record_pulse(at_us, at_us + 20_000, energy_j)
     return sensor.answer("spot", at_us + 20_000)
 
 
@@ -45,16 +45,16 @@ def test_nothing_in_the_dark_and_nothing_twice():
     assert sensor.answer("spot", 0) == "spot none"
     assert shine(sensor) != "spot none"
     assert sensor.answer("spot", SETTLED_US + 20_001) == "spot none"
-    sensor.saw(SETTLED_US, SETTLED_US + 1000, 1e-4)
-    assert sensor.answer("spot", SETTLED_US + 1000 + HOLD_US + 1) == "spot none"
+    sensor.record_pulse(SETTLED_US, SETTLED_US + 1000, 1e-4)
+    assert sensor.answer("spot", SETTLED_US + 1000 + PULSE_MEMORY_US + 1) == "spot none"
 
 
 def test_too_little_light_a_cover_and_a_spot_outside_are_none():
     sensor, mirrors = looking()
     assert shine(sensor, energy_j=1e-6) == "spot none"
-    mirrors.go(65535, CENTRE_CODE, SETTLED_US)
+    mirrors.move_to(65535, CENTRE_CODE, SETTLED_US)
     assert shine(sensor, 2 * SETTLED_US) == "spot none"
-    mirrors.go(*CODES, 3 * SETTLED_US)
+    mirrors.move_to(*CODES, 3 * SETTLED_US)
     sensor.blind = True
     assert shine(sensor, 4 * SETTLED_US) == "spot none"
 
@@ -64,7 +64,7 @@ def test_false_detections_lie_anywhere_and_are_as_many_as_asked():
     lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k))[:2] for k in range(1000)])
     away = np.hypot(*(lines - 1e6 * np.array(TRUTH.position_m(*CODES))).T) > 100.0
     assert away.mean() == pytest.approx(0.2, abs=0.04)
-    half_um = 1e6 * (36e-3 + MARGIN_M)
+    half_um = 1e6 * (36e-3 + FIELD_MARGIN_M)
     assert np.abs(lines[away]).max() < half_um + 100.0
     assert np.abs(lines[away]).mean() == pytest.approx(half_um / 2, rel=0.15)
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from optodrive.device.config import build_pixel_layout, load_config
-from optodrive.link.simulator.true_geometry import CENTRE_CODE, Truth
+from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 CONFIG = load_config()
 LAYOUT = build_pixel_layout(CONFIG.display)
@@ -16,21 +16,21 @@ def test_an_uncorrected_beam_misses_by_half_a_millimetre_to_three(name):
     layout = build_pixel_layout(config.display)
     code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
     for seed in range(20):
-        x_m, y_m = Truth.drawn(seed, config).position_m(
+        x_m, y_m = GroundTruthGeometry.sample(seed, config).position_m(
             CENTRE_CODE + layout.x_m / code_m, CENTRE_CODE + layout.y_m / code_m
         )
         assert 0.5e-3 <= np.hypot(x_m - layout.x_m, y_m - layout.y_m).max() <= 3e-3
 
 
 def test_a_seed_is_a_geometry():
-    once, again, other = (Truth.drawn(seed, CONFIG).position_m(X_CODE, Y_CODE) for seed in (3, 3, 4))
+    once, again, other = (GroundTruthGeometry.sample(seed, CONFIG).position_m(X_CODE, Y_CODE) for seed in (3, 3, 4))
     assert np.array_equal(once, again)
     assert np.abs(np.subtract(once, other)).max() > 1e-4
 
 
 def test_positive_codes_lead_right_and_up_by_what_the_configuration_says():
     for seed in range(10):
-        truth = Truth.drawn(seed, CONFIG)
+        truth = GroundTruthGeometry.sample(seed, CONFIG)
         x_m, y_m = truth.position_m(
             CENTRE_CODE + np.array([-2000, 2000, 0, 0]), CENTRE_CODE + np.array([0, 0, -2000, 2000])
         )
@@ -39,7 +39,7 @@ def test_positive_codes_lead_right_and_up_by_what_the_configuration_says():
 
 
 def test_any_shape_and_rows_of_a_batch_are_what_they_are_alone():
-    truth = Truth.drawn(1, CONFIG)
+    truth = GroundTruthGeometry.sample(1, CONFIG)
     x_m, y_m = truth.position_m(X_CODE[:6].reshape(2, 3), Y_CODE[:6].reshape(2, 3))
     assert x_m.shape == y_m.shape == (2, 3)
     assert truth.position_m(X_CODE[4], Y_CODE[4]) == pytest.approx((x_m[1, 1], y_m[1, 1]), abs=1e-15)
@@ -47,6 +47,6 @@ def test_any_shape_and_rows_of_a_batch_are_what_they_are_alone():
 
 def test_what_no_part_explains_is_a_few_tens_of_micrometres():
     for seed in range(20):
-        truth = Truth.drawn(seed, CONFIG)
-        deviation_m = truth._deviation_m(np.array(truth.mirror_rad(X_CODE, Y_CODE)))
+        truth = GroundTruthGeometry.sample(seed, CONFIG)
+        deviation_m = truth._deviation_m(np.array(truth.mirror_angles_rad(X_CODE, Y_CODE)))
         assert 5e-6 < np.abs(deviation_m).max() <= 40e-6

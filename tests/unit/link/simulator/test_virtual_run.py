@@ -3,7 +3,7 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA, measure
-from optodrive.link.simulator.traces import trace
+from optodrive.link.simulator.traces import compute_traces
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.planning.pipeline import plan_sequence
 
@@ -37,7 +37,7 @@ def test_what_the_limiter_passes_is_no_fault_on_the_board(any_display, width_s, 
 def test_instruments_read_the_trace_with_their_stated_noise(display):
     prepared = plan_sequence(display, sequence(display, 3), *display.build_cold_state())
     executed = execute(display, prepared)
-    traced = trace(display.build_cold_heat(), executed, [0, 2], 1e-3)
+    traced = compute_traces(display.build_cold_heat(), executed, [0, 2], 1e-3)
     pulses = np.zeros((1, 4))
     exact = measure(traced, pulses, 293.15, 4e-4, 0.0, 0)
     assert [run.name for run in exact.runs] == ["pixel-0", "pixel-2"]
