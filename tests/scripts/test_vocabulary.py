@@ -1,0 +1,73 @@
+"""The vocabulary check finds retired words where they matter, and only there."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "scripts"))
+
+from vocabulary import c_names, load_retired, python_names, split_words, toml_names
+
+RETIRED = load_retired("| term | meaning | `standing_on`, `=Basis`, `tick()` |\n| other | text `kept` | |\n")
+
+
+def find(names):
+    return [RETIRED.find(name) for name in names if RETIRED.find(name)]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("link_up", ("link", "up")),
+        ("LinkUp", ("link", "up")),
+        ("LINK_UP2", ("link", "up", "2")),
+        ("PWMCode", ("pwm", "code")),
+    ],
+)
+def test_words_of_an_identifier(name, words):
+    assert split_words(name) == words
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "standing_on = 1",
+        "def f(standing_on): ...",
+        "class StandingOn: ...",
+        "self.now_standing_on = 1",
+        "f(standing_on=1)",
+        "{'standing_on': 1}",
+        "x['standing_on']",
+        "def tick(): ...",
+        "class Basis: ...",
+    ],
+)
+def test_a_retired_word_in_python_is_found(source):
+    assert find(python_names("x.py", source))
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "discrepancy_basis = 1",
+        "tick = 1",
+        "'standing_on the pixel'",
+        "# standing_on",
+        "outstanding_on = 1",
+        "def test_the_mirror_standing_on_a_pixel(): ...",
+        "kept = 1",
+    ],
+)
+def test_what_is_not_retired_is_not_found(source):
+    assert not find(python_names("x.py", source))
+
+
+def test_c_identifiers_without_comments_and_strings():
+    assert find(c_names("x.c", "int standing_on;"))
+    assert not find(c_names("x.c", '/* standing_on */ char *t = "standing_on"; // standing_on\n'))
+
+
+def test_toml_keys_at_every_depth():
+    assert find(toml_names("x.toml", "[a]\nb = [{standing_on = 1}]"))
+    assert not find(toml_names("x.toml", 'a = "standing_on"'))
