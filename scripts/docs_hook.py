@@ -1,5 +1,6 @@
 """What `mkdocs build` takes from beside docs/: the protocols, the REST reference from OpenAPI, all decisions."""
 
+import posixpath
 import re
 from pathlib import Path
 
@@ -22,18 +23,23 @@ def on_config(config):
 
 def on_files(files, config):
     """Pages that are no files of docs/."""
-    files.append(File.generated(config, "rest.md", content=build_rest_reference()))
+    files.append(File.generated(config, "reference/rest.md", content=build_rest_reference()))
     for name in PROTOCOL_PAGES:
-        files.append(File.generated(config, name, content=(ROOT / PROTOCOL_FOLDER / name).read_text(encoding="utf-8")))
+        files.append(
+            File.generated(
+                config, f"reference/{name}", content=(ROOT / PROTOCOL_FOLDER / name).read_text(encoding="utf-8")
+            )
+        )
     return files
 
 
 def on_page_markdown(markdown, page, config, files):
     """The protocols are pages here; what they link to beside docs/ is named, not linked."""
-    if page.file.src_uri in PROTOCOL_PAGES:
+    if page.file.src_uri.removeprefix("reference/") in PROTOCOL_PAGES:
         return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
+    folder = posixpath.relpath("reference", posixpath.dirname(page.file.src_uri) or ".")
     return re.sub(
         rf"\]\((?:\.\./)+{PROTOCOL_FOLDER}/({'|'.join(map(re.escape, PROTOCOL_PAGES))})(#[^)]*)?\)",
-        r"](\1\2)",
+        rf"]({folder}/\1\2)",
         markdown,
     )

@@ -11,7 +11,7 @@ HEAD = """# REST
 
 Generated from the daemon's OpenAPI, which it answers itself at `/openapi.json`. Every route but `/v1/health` needs
 `Authorization: Bearer TOKEN`; errors are problem documents (RFC 9457) with a stable `code`. The WebSocket is in
-[streaming](streaming.md), the client from Python in [client](client.md).
+[streaming](../how-to/stream-frames.md), the client from Python in [client](../how-to/use-the-python-client.md).
 """
 
 

@@ -1,4 +1,4 @@
-"""Writes docs/validation.md: the rows of `optodrive validate`, and what there is to say about them."""
+"""Writes docs/explanation/validation.md: the rows of `optodrive validate`, and what there is to say about them."""
 
 import argparse
 from pathlib import Path
@@ -162,5 +162,5 @@ def describe_fact(fact):
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, default=Path("docs/validation.md"))
+    parser.add_argument("--out", type=Path, default=Path("docs/explanation/validation.md"))
     parser.parse_args().out.write_text(build_page(), encoding="utf-8")

@@ -45,7 +45,9 @@ class _TerminatedError(OptodriveError):
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(help="Play on a Helios laser DAC; see docs/helios.md first.", no_args_is_help=True)
+    group = typer.Typer(
+        help="Play on a Helios laser DAC; see docs/how-to/use-a-helios-dac.md first.", no_args_is_help=True
+    )
     group.command("info")(info)
     group.command("play")(play)
     app.add_typer(group, name="helios")

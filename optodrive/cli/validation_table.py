@@ -158,4 +158,6 @@ def _print_table(rows: list[ValidationRow]) -> None:
     for row in rows:
         if row.remark:
             console.print(f"  {row.fact.id}: {row.remark}", highlight=False, soft_wrap=True)
-    console.print(f"No parameter set speaks to the other {len(NOT_MODELLED)} facts; docs/validation.md says why.")
+    console.print(
+        f"No parameter set speaks to the other {len(NOT_MODELLED)} facts; docs/explanation/validation.md says why."
+    )

@@ -1,4 +1,4 @@
-"""The driver from Python: `Display`, and `AsyncDisplay` for asyncio, over a running daemon (docs/client.md)."""
+"""The driver from Python: `Display`, and `AsyncDisplay` for asyncio, over a running daemon (docs/how-to/use-the-python-client.md)."""
 
 from optodrive.client.answers import FrameResult, Plan, State
 from optodrive.client.async_display import AsyncDisplay, AsyncStream

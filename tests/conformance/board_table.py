@@ -1,4 +1,4 @@
-"""The table of docs/board.md: for each guard what looks at it, counted from the suite. Run, it prints it."""
+"""The table of docs/reference/board-conformance.md: for each guard what looks at it, counted from the suite. Run, it prints it."""
 
 from collections import Counter
 

@@ -1,10 +1,10 @@
-"""docs/board.md says of the suite what the suite is."""
+"""docs/reference/board-conformance.md says of the suite what the suite is."""
 
 from board_table import table
 
 from optodrive.device.config import locate_shipped
 
-PAGE = locate_shipped().parent / "docs" / "board.md"
+PAGE = locate_shipped().parent / "docs" / "reference" / "board-conformance.md"
 
 
 def test_the_page_has_the_table_of_this_suite():

@@ -1,5 +1,5 @@
 /* The board's core on a Raspberry Pi Pico: the safety tick from the timer's interrupt, everything else from the loop.
-   docs/wiring.md has the circuit. Compiled, and never yet run on hardware. */
+   docs/how-to/wire-a-board.md has the circuit. Compiled, and never yet run on hardware. */
 
 #include "board.h"
 #include "chip.h"

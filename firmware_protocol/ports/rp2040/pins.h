@@ -1,4 +1,4 @@
-/* Which pin of the Pico does what; docs/wiring.md has the circuit around them. Numbers are GPIOs. */
+/* Which pin of the Pico does what; docs/how-to/wire-a-board.md has the circuit around them. Numbers are GPIOs. */
 
 #ifndef PINS_H
 #define PINS_H

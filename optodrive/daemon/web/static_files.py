@@ -1,4 +1,4 @@
-"""The page: its files, who may have them, and what a browser is told to allow (docs/page.md).
+"""The page: its files, who may have them, and what a browser is told to allow (docs/how-to/operate-the-page.md).
 
 A browser cannot send a bearer header for a page, so `/` and `/page/*` take the token from a cookie too, for GET alone;
 what the page asks of the daemon carries the header as everyone's calls do. Cookies know no ports: the port is in the

@@ -1,4 +1,4 @@
-"""What happens now, as server-sent events: state, display, pulses, budget, fault (docs/page.md).
+"""What happens now, as server-sent events: state, display, pulses, budget, fault (docs/how-to/operate-the-page.md).
 
 Readers pull: a look is made when one of them is due, in a thread of its own, and shared by all that ask at the time. A
 reader that is slow is handed the newest when it is ready for more; nothing waits for it.

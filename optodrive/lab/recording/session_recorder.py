@@ -3,7 +3,7 @@
 Written by a process of its own: the HDF5 library holds the interpreter while it waits for the disk, and a daemon that
 stands still for a tenth of a second loses its board's lease. The daemon's side is a thread that feeds a pipe.
 
-file: a recording (docs/recordings.md) whose runs have pulses as executed and no signals yet, and beside them
+file: a recording (docs/reference/recordings.md) whose runs have pulses as executed and no signals yet, and beside them
 /plans/ID. A run begins where the display had been dark for REST_S; a plan's attribute `run` names its own.
 """
 

@@ -1,7 +1,7 @@
 """A Helios laser DAC over pyusb: version, name, status, shutter, stop, frames.
 
 Its command that erases the firmware is not here, and never shall be. It has no interlock and no time-out for a silent
-host: see docs/helios.md for what that means.
+host: see docs/how-to/use-a-helios-dac.md for what that means.
 """
 
 from contextlib import suppress

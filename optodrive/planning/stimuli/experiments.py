@@ -1,4 +1,4 @@
-"""The paper's six perceptual experiments (Text S5) as pulse trains; docs/patterns.md says what the paper leaves open.
+"""The paper's six perceptual experiments (Text S5) as pulse trains; docs/how-to/show-stimuli.md says what the paper leaves open.
 
 A direction is as seen from above: right is +x, up is +y. `centre` None is the display's middle pixel. `where` names the
 caller in errors: every function raises InputError where the display has no pixel at a place that the stimulus needs.

@@ -25,14 +25,14 @@ def test_the_calibrated_set_is_what_the_fit_gives(tmp_path):
 
 def test_the_validation_page_is_current(tmp_path):
     made("validation_doc.py", tmp_path / "page.md")
-    page = ROOT / "docs" / "validation.md"
+    page = ROOT / "docs" / "explanation" / "validation.md"
     if (tmp_path / "page.md").read_text(encoding="utf-8") != page.read_text(encoding="utf-8"):
-        pytest.fail("docs/validation.md is not current: run scripts/validation-doc")
+        pytest.fail("docs/explanation/validation.md is not current: run scripts/validation-doc")
 
 
 def test_every_row_of_the_page_has_the_columns_of_its_heading():
     columns = None
-    for line in (ROOT / "docs" / "validation.md").read_text(encoding="utf-8").splitlines():
+    for line in (ROOT / "docs" / "explanation" / "validation.md").read_text(encoding="utf-8").splitlines():
         if not line.startswith("| "):
             columns = None
             continue

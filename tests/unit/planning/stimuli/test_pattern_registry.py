@@ -184,7 +184,7 @@ def test_a_frame_every_display_can_draw_in_its_time():
             assert frame.duration_s >= len(frame.target_m) * 2.8e-3
 
 
-DOC = (Path(__file__).parents[4] / "docs" / "patterns.md").read_text(encoding="utf-8")
+DOC = (Path(__file__).parents[4] / "docs" / "how-to" / "show-stimuli.md").read_text(encoding="utf-8")
 
 
 def test_the_documented_example_is_read():
