@@ -142,7 +142,7 @@ class ReportChecker:
 
     def check_plan(self, job, count):
         """A plan that is finished, with so many pulses."""
-        done = job.executed(SimpleNamespace(pixel=np.arange(count)), self._scale.full_power_w, self._scale.tick_s)
+        done = job.build_executed(SimpleNamespace(pixel=np.arange(count)), self._scale.full_power_w, self._scale.tick_s)
         on_us, width_us = done.on_tick, done.width_ticks
         ends_us = np.concatenate([[self._last_us], (on_us + width_us)[:-1]])
         wrong = (on_us < ends_us) | (width_us != WIDTH_US + done.index % WIDTHS)
@@ -169,7 +169,7 @@ class SoakRun:
             last, kept = self._jobs[-1]
             if last.end_index - last.next_to_send > PLAN_PULSES // 2:
                 return
-            job = self._session.follow(build_points(self._submitted, count), kept, float("inf"))
+            job = self._session.splice(build_points(self._submitted, count), kept, float("inf"))
             if job is None:
                 raise RuntimeError("a plan came too late to follow the one before it")
         self._jobs.append((job, count))
@@ -181,7 +181,7 @@ class SoakRun:
         while self._submitted < self._total or self._jobs:
             if self._submitted < self._total:
                 self._submit_next()
-            self._session.step(STEP_S, lease=True)
+            self._session.step(STEP_S, renew_lease=True)
             while self._jobs and self._jobs[0][0].finished:
                 self.reports.check_plan(*self._jobs.pop(0))
             if self._session.board.state in ("DISARMED", "FAULT"):
@@ -197,7 +197,7 @@ def connect_and_arm(session):
     session.connect()
     session.arm()
     while session.board.state != "ARMED":
-        session.step(STEP_S, lease=True)
+        session.step(STEP_S, renew_lease=True)
 
 
 def run_soak(total):

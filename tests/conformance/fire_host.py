@@ -52,7 +52,7 @@ class FireHost:
         while not condition():
             if self.clock.now_s() > give_up_s:
                 return False
-            self.session.step(STEP_S, lease=True)
+            self.session.step(STEP_S, renew_lease=True)
         return True
 
     def armed(self, patience_s=4.0):
@@ -63,7 +63,7 @@ class FireHost:
         if self.session.board.state != "DISARMED":
             return False
         self.session.arm()
-        return self.until(lambda: self.session.ready, patience_s)
+        return self.until(lambda: self.session.is_ready, patience_s)
 
     def begin(self, count, dark_us=200, ahead_s=0.25):
         """Stream points, from a little later on."""
@@ -76,7 +76,7 @@ class FireHost:
             session.connect()
             if self.armed():
                 job = self.begin(count)
-                self.until(lambda: job.finished or session.board.state in ("DISARMED", "FAULT"), patience_s)
+                self.until(lambda: job.is_finished or session.board.state in ("DISARMED", "FAULT"), patience_s)
         except LinkError:
             session.disconnect()
         else:

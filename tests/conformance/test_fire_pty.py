@@ -70,7 +70,7 @@ def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(make_
     assert rig.armed()
     rig.up.loss = rig.down.loss = 0.05
     job = rig.begin(1000, dark_us=2400)
-    assert rig.until(lambda: job.finished, 15.0), rig.session.board
+    assert rig.until(lambda: job.is_finished, 15.0), rig.session.board
     print(f"{rig.faults} faults")
     assert "HOLD" not in states(rig)
     assert "FAULT" not in states(rig)
@@ -82,7 +82,7 @@ def in_mid_job(rig):
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(3000, dark_us=900, ahead_s=1.0)
-    assert rig.until(lambda: job.executed_rows > 300, 10.0)
+    assert rig.until(lambda: job.executed_count > 300, 10.0)
     return job
 
 
@@ -90,7 +90,7 @@ def test_a_host_that_stalls_for_a_quarter_second_harms_nothing(make_rig):
     rig = make_rig(8)
     job = in_mid_job(rig)
     time.sleep(0.25)  # the stall itself
-    assert rig.until(lambda: job.finished, 15.0)
+    assert rig.until(lambda: job.is_finished, 15.0)
     assert "HOLD" not in states(rig)
     assert "FAULT" not in states(rig)
     assert rig.finish() == 3000
@@ -103,7 +103,7 @@ def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
     assert states(rig)[-1] == "FAULT"
     assert [entry["fault"] for entry in rig.board.of("fault")] == ["LINK"]
     assert not rig.board.lit()
-    assert not rig.until(lambda: job.finished, 0.5)
+    assert not rig.until(lambda: job.is_finished, 0.5)
     assert states(rig)[-1] == "FAULT"
     assert rig.finish() < 3000
 

@@ -81,13 +81,13 @@ class Owner(RuleBasedStateMachine):
         if self.is_in("DISARMED"):
             self.allowed = self.times("armed") + 1
             self.session.arm()
-            self.pass_time(lambda: self.session.ready, wait_s)
+            self.pass_time(lambda: self.session.is_ready, wait_s)
 
     @rule(count=st.integers(1, 1500), ahead_s=st.sampled_from([0.05, 0.25, 1.0]), wait_s=st.sampled_from([0.0, 0.1, 1]))
     def stream(self, count, ahead_s, wait_s):
-        if not (self.connected() and self.session.ready):
+        if not (self.connected() and self.session.is_ready):
             self.arm(2.5)
-        if self.connected() and self.session.ready:
+        if self.connected() and self.session.is_ready:
             self.rig.begin(count, ahead_s=ahead_s)
             self.jobs += 1
             self.pass_time(lambda: False, wait_s)

@@ -82,7 +82,7 @@ def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(seed)
     assert rig.armed()
     rig.up.loss = rig.down.loss = 0.05
     job = rig.begin(2000, dark_us=2400)
-    assert rig.until(lambda: job.finished, 20.0), rig.session.board
+    assert rig.until(lambda: job.is_finished, 20.0), rig.session.board
     assert [entry["state"] for entry in rig.log if entry["event"] == "state"][-2:] == ["RUNNING", "ARMED"]
     rig.session.close()
     assert rig.check() == 2000
@@ -97,7 +97,7 @@ def played_in_s(loss, seed):
     assert rig.armed()
     rig.up.loss = rig.down.loss = loss
     job = rig.begin(2000)
-    assert rig.until(lambda: job.finished, 20.0)
+    assert rig.until(lambda: job.is_finished, 20.0)
     pulses = [entry for entry in rig.log if entry["event"] == "pulse"]
     rig.session.close()
     assert rig.check() == 2000
@@ -159,7 +159,7 @@ def dark_after_abort_at_s(baud, executed):
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(4000, dark_us=4500, ahead_s=inf)  # as slow as pulses are: the line is full until all are there
-    assert rig.until(lambda: job.executed_rows > executed and rig.core.gate, 10.0)
+    assert rig.until(lambda: job.executed_count > executed and rig.core.gate, 10.0)
     assert not job.is_fully_sent
     aborted_s = rig.clock.now_s()
     rig.session.abort()
@@ -194,7 +194,7 @@ def stalled(for_s, ahead_s):
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(2000, dark_us=900, ahead_s=ahead_s)
-    assert rig.until(lambda: job.executed_rows > 500, 5.0)
+    assert rig.until(lambda: job.executed_count > 500, 5.0)
     rig.clock.sleep(for_s)
     rig.core.advance(round(rig.clock.now_s() * 1e6))
     return rig, job
@@ -203,7 +203,7 @@ def stalled(for_s, ahead_s):
 def test_a_stall_of_a_quarter_second_harms_nothing():
     rig, job = stalled(0.25, ahead_s=0.5)
     assert rig.core.state == "RUNNING"
-    assert rig.until(lambda: job.finished, 10.0)
+    assert rig.until(lambda: job.is_finished, 10.0)
     assert "HOLD" not in [entry["state"] for entry in rig.log if entry["event"] == "state"]
     rig.session.close()
     assert rig.check() == 2000
@@ -213,7 +213,7 @@ def test_a_stall_longer_than_the_queue_is_a_dark_hold_from_which_it_goes_on():
     rig, job = stalled(0.4, ahead_s=0.25)
     assert rig.core.state == "HOLD"
     assert not rig.core.gate
-    assert rig.until(lambda: job.finished, 10.0)
+    assert rig.until(lambda: job.is_finished, 10.0)
     rig.session.close()
     assert rig.check() == 2000
 
@@ -222,6 +222,6 @@ def test_a_stall_longer_than_the_lease_is_a_dark_fault_and_nothing_goes_on_by_it
     rig, job = stalled(0.7, ahead_s=inf)
     assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
     assert not rig.core.gate
-    assert not rig.until(lambda: job.finished or rig.core.state != "FAULT", 3.0)
+    assert not rig.until(lambda: job.is_finished or rig.core.state != "FAULT", 3.0)
     rig.session.close()
     assert 500 < rig.check() < 2000

@@ -44,7 +44,9 @@ def test_a_budget_comes_back_on_the_time_line_that_begins_now(memory):
     back = memory.load(DAY_S + 100.0, cold_state(16))
     for item in fields(BudgetState):
         before, after = np.asarray(getattr(budget, item.name)), np.asarray(getattr(back, item.name))
-        moved = 100.0 if item.name.endswith("_at_s") or item.name in ("at_s", "dark_since_s", "recent_start_s") else 0.0
+        moved = (
+            100.0 if item.name.endswith("_at_s") or item.name in ("at_s", "last_pulse_end_s", "recent_start_s") else 0.0
+        )
         assert after == pytest.approx(before - moved, abs=1e-6)
 
 

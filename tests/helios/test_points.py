@@ -113,7 +113,7 @@ def test_a_plan_right_at_the_mirrors_cap_is_proven():
 def test_without_what_whole_points_add_to_the_moves_that_plan_is_refused():
     """The mutant: planned as if mirrors left when planned, the proof finds them above their cap."""
     display = display_of()
-    exact = display.budget._replace(mirrors=display.budget.galvo._replace(early_s=0.0))
+    exact = display.budget._replace(galvo=display.budget.galvo._replace(interval_shrink_s=0.0))
     with pytest.raises(LocalProtocolError, match="galvo_acceleration"):
         proven_of(replace(display, budget=exact), FrameSequence(trains=AT_THE_CAP))
 

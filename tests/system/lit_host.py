@@ -55,7 +55,7 @@ def until(session, condition, patience_s=PATIENCE_S):
     while not condition():
         if time.monotonic() > give_up_s:
             sys.exit(f"{session.board} after {patience_s} s")
-        session.step(0.002, lease=True)
+        session.step(0.002, renew_lease=True)
 
 
 def train():

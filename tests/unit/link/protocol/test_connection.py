@@ -246,7 +246,7 @@ def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_beg
     assert host.receive_bytes(wire(m.Ack(0, 0, 0, 0)), 0.0) == []
     host.receive_bytes(wire(hello_reply(3, 222), session=222), 0.0)
     assert host.receive_bytes(wire(event), 0.0) == []
-    host.hello(4)  # greeted anew without an abort: nothing of before counts
+    host.send_hello(4)  # greeted anew without an abort: nothing of before counts
     assert host.receive_bytes(wire(event, session=222), 0.0) == []
 
 
@@ -254,9 +254,9 @@ def test_what_is_queued_for_the_next_session_waits_through_repeated_hellos(host)
     host.abort()
     host.send_hello(3)
     host.send(data(0))
-    host.hello(4)
+    host.send_hello(4)
     host.receive_bytes(wire(hello_reply(4, 222), session=222), 0.0)
-    host.send(m.Flush(), first=True)
+    host.send(m.Flush(), at_front=True)
     host.bytes_to_send(0.0, PLENTY)
     assert host.outstanding == 2
 

@@ -17,14 +17,14 @@ def board_us(limits, codes):
 def moves_between(display, rng, count=400):
     """Codes and planned times of calm moves between pixels, straight and diagonal, and of the first from the middle."""
     scale, moves = BoardRequirements.from_config(display.config).scale, display.scan_head.settling
-    x_rad, y_rad = display.machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
+    x_rad, y_rad = display.scan_head.field.angles_rad(display.layout.x_m, display.layout.y_m)
     pairs = rng.integers(len(display.layout), size=(count, 2))
     pairs = np.concatenate([pairs, [[k, min(k + 1, len(x_rad) - 1)] for k in range(len(x_rad))]])
     codes = [np.abs(np.diff(scale.to_codes(angle_rad)[pairs], axis=1)[:, 0]) for angle_rad in (x_rad, y_rad)]
     steps = zip(x_rad[pairs], y_rad[pairs], strict=True)
-    planned = [moves.time_us(x[1] - x[0], y[1] - y[0], moves.long_dwell_us) for x, y in steps]
+    planned = [moves.settling_us(x[1] - x[0], y[1] - y[0], moves.long_dwell_us) for x, y in steps]
     first = np.maximum(np.abs(scale.to_codes(x_rad) - 32768), np.abs(scale.to_codes(y_rad) - 32768))
-    return np.append(np.maximum(*codes), first), np.append(planned, np.full(len(x_rad), moves.lead_us))
+    return np.append(np.maximum(*codes), first), np.append(planned, np.full(len(x_rad), moves.lead_in_us))
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))

@@ -250,7 +250,7 @@ def test_one_job_after_another(rig):
         asked = plan(n)
         job = rig.play(asked)
         rig.until(lambda job=job: job.is_finished)
-        assert job.executed(asked, 2.45, 1e-6).complete
+        assert job.build_executed(asked, 2.45, 1e-6).complete
     assert len(rig.pulses()) == 38
 
 
@@ -263,7 +263,7 @@ def test_lost_reports_are_asked_for_again(rig):
     rig.until(lambda: job.is_finished)
     assert len(lost) == 30
     assert job.build_executed(asked, 2.45, 1e-6).complete
-    assert job.executed(asked, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
+    assert job.build_executed(asked, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
     assert m.GetExecuted.TYPE in {frame.type for frame in rig.link.sent}
 
 
@@ -286,7 +286,7 @@ def test_the_lease_is_renewed_by_step_alone(rig):
     rig.run(3.0)
     assert rig.session.board.state == "ARMED"
     rig.clock.sleep(0.2)  # the loop stands still, and nothing else renews
-    rig.session.step(STEP_S, lease=True)
+    rig.session.step(STEP_S, renew_lease=True)
     assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
 
 
@@ -387,7 +387,7 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     rig.run(0.3)
     lit = len(rig.pulses())
     rig.session.abort()
-    rig.session.step(STEP_S, lease=True)
+    rig.session.step(STEP_S, renew_lease=True)
     assert not rig.core.gate
     assert rig.core.state == "DISARMED"
     rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
@@ -397,8 +397,8 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     rig.arm()
     asked = plan(50)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
-    assert job.executed(asked, 2.45, 1e-6).complete
+    rig.until(lambda: job.is_finished)
+    assert job.build_executed(asked, 2.45, 1e-6).complete
 
 
 def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_limits_first(rig):
@@ -433,8 +433,8 @@ def test_flush_in_mid_job_stays_armed_for_the_next(rig):
     assert not cut.is_finished
     asked = plan(50)
     job = rig.play(asked)
-    rig.until(lambda: job.finished)
-    assert job.executed(asked, 2.45, 1e-6).complete
+    rig.until(lambda: job.is_finished)
+    assert job.build_executed(asked, 2.45, 1e-6).complete
 
 
 def test_a_board_that_gave_a_hold_up_can_be_armed_again(rig):
@@ -449,7 +449,7 @@ def test_a_board_that_gave_a_hold_up_can_be_armed_again(rig):
     asked = plan(50)
     job = rig.play(asked)
     rig.until(lambda: job.is_finished)
-    assert job.executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(asked, 2.45, 1e-6).complete
 
 
 def test_a_rejected_start_is_told(rig):

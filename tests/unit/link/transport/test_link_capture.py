@@ -108,15 +108,15 @@ def test_nothing_is_overwritten_and_other_files_are_refused_by_name(tmp_path):
 FULL = """
 import resource, signal, sys
 from pathlib import Path
-from optodrive.link.transport.link_capture import Entry, TapeWriter
+from optodrive.link.transport.link_capture import CaptureEntry, LinkCaptureWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
 said = []
-writer = TapeWriter(Path(sys.argv[1]), 0.0, said.append)
+writer = LinkCaptureWriter(Path(sys.argv[1]), 0.0, said.append)
 for k in range(200):
-    writer.note(Entry("to board", float(k), bytes(100)))
+    writer.record(CaptureEntry("to board", float(k), bytes(100)))
 writer.close()
-writer.note(Entry("to board", 1e3, b"afterwards"))
+writer.record(CaptureEntry("to board", 1e3, b"afterwards"))
 writer.close()
 assert not writer.recording
 assert len(said) == 1 and "stopped" in said[0] and "the session goes on" in said[0], said

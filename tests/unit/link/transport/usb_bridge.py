@@ -32,7 +32,7 @@ class UsbBridge(usb.backend.IBackend):
 
     def unplug(self):
         self.plugged = False
-        self.core.link_lost(self._now_us())
+        self.core.on_link_lost(self._now_us())
 
     # --- descriptors ---
 
