@@ -1,11 +1,10 @@
-"""What `mkdocs build` takes from beside docs/: the protocols, the REST reference from OpenAPI, all decisions."""
+"""What `mkdocs build` takes from beside docs/: the protocols and all decisions."""
 
 import posixpath
 import re
 from pathlib import Path
 
 from mkdocs.structure.files import File
-from rest_reference import build_rest_reference
 
 ROOT = Path(__file__).resolve().parent.parent
 PROTOCOL_FOLDER = "firmware_protocol"
@@ -23,7 +22,6 @@ def on_config(config):
 
 def on_files(files, config):
     """Pages that are no files of docs/."""
-    files.append(File.generated(config, "reference/rest.md", content=build_rest_reference()))
     for name in PROTOCOL_PAGES:
         files.append(
             File.generated(

@@ -1,0 +1,110 @@
+"""Write the reference pages that follow from the code: configuration, terms, REST."""
+
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import PydanticUndefined
+from rest_reference import build_rest_reference
+
+from optodrive.device.config import VERSION, Config
+from optodrive.physics.terms import discover_terms
+
+FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
+CONFIGURATION_HEAD = f"""# Configuration
+
+Generated from `optodrive/device/config.py` by `scripts/reference`. A configuration is one TOML file per display, format version
+{VERSION}; `optodrive config check` checks it whole, and `optodrive config show --json` prints it with every default and derived number. All
+quantities are in SI units, named by the suffix of the key.
+"""
+TERMS_HEAD = """# Terms
+
+Generated from `optodrive/physics/terms` by `scripts/reference`. A term is a physical effect beyond the nominal pixel. A parameter set
+may hold its parameters, `optodrive diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
+"""
+
+
+def sections(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """Yield every TOML table of a model with its path, depth first."""
+    yield path, model
+    for name, info in model.model_fields.items():
+        for kind in (info.annotation, *get_args(info.annotation)):
+            if isinstance(kind, type) and issubclass(kind, BaseModel):
+                yield from sections(kind, f"{path}.{name}".lstrip("."))
+
+
+def is_table(info: FieldInfo) -> bool:
+    """Return whether a field is a table of its own."""
+    kinds = (info.annotation, *get_args(info.annotation))
+    return any(isinstance(kind, type) and issubclass(kind, BaseModel) for kind in kinds)
+
+
+def format_type(schema: dict[str, Any]) -> str:
+    """Return a field's type and bounds as one phrase."""
+    if "anyOf" in schema:
+        return " or ".join(format_type(item) for item in schema["anyOf"] if item.get("type") != "null")
+    if "enum" in schema:
+        return ", ".join(f'`"{value}"`' for value in schema["enum"])
+    if "const" in schema:
+        return f'`"{schema["const"]}"`'
+    bounds = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
+    limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in bounds.items() if key in schema)
+    return " ".join(part for part in (schema.get("type", "value"), limits) if part)
+
+
+def format_default(info: FieldInfo) -> str:
+    """Return a field's default as TOML, or what its absence means."""
+    if info.default is PydanticUndefined:
+        return "required"
+    return "none" if info.default is None else f"`{info.default!r}`".replace("'", '"').replace("True", "true")
+
+
+def build_configuration_reference() -> str:
+    """Return Markdown with one section per TOML table and one row per key."""
+    parts = [CONFIGURATION_HEAD]
+    for path, model in sections(Config):
+        rows = [
+            f"| `{name}` | {format_type(model.model_json_schema()['properties'][name])} | {format_default(info)} |"
+            f" {' '.join((info.description or '').split())} |"
+            for name, info in model.model_fields.items()
+            if not is_table(info)
+        ]
+        summary = " ".join((model.__doc__ or "").split())
+        title = f"## `[{path}]`" if path else "## Top level"
+        parts.append("\n".join([title, "", summary, "", "| key | value | default | |", "|---|---|---|---|", *rows, ""]))
+    return "\n".join(parts)
+
+
+def build_terms_reference() -> str:
+    """Return Markdown with one section per term."""
+    parts = [TERMS_HEAD]
+    for key, term in sorted(discover_terms().items()):
+        rows = [
+            f"| `{item.name}` | {item.unit} | {item.default:g} | {item.low:g} to {item.high:g} | {item.source} |"
+            for item in term.parameters
+        ]
+        summary = " ".join((type(term).__doc__ or "").split())
+        head = ["| parameter | unit | start | range | source |", "|---|---|---|---|---|"]
+        parts.append("\n".join([f"## `{key}`", "", summary, "", *head, *rows, ""]))
+    return "\n".join(parts)
+
+
+PAGES = {
+    "configuration.md": build_configuration_reference,
+    "terms.md": build_terms_reference,
+    "rest.md": build_rest_reference,
+}
+
+
+def main() -> None:
+    """Write every page; an argument names another folder."""
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER
+    for name, build in PAGES.items():
+        (folder / name).write_text(build(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
