@@ -133,7 +133,7 @@ def describe(folder: Path, grid=GRID, views=("grid.png",), dark="dark.png", spot
     lines = ['format = "optodrive-pictures"', "version = 1"]
     lines += [f'dark = "{dark}"'] if dark else []
     lines += ["[grid]", *(f"{key} = {value!r}" for key, value in grid.items()), f"pictures = {list(views)!r}"]
-    lines += ["[origin]", f"marks_px = {np.round(marks).tolist()!r}", f"first_m = {list(FIRST_M)!r}"]
+    lines += ["[origin]", f"marks_px = {np.round(marks).tolist()!r}", f"first_corner_m = {list(FIRST_M)!r}"]
     lines += [f"turn_rad = {TURN_RAD}", "[spots]", spots]
     (folder / "pictures.toml").write_text("\n".join(lines) + "\n")
 

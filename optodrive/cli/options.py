@@ -116,12 +116,12 @@ def show_progress(label: str) -> Iterator[Callable[[float], None]]:
 def format_plan_summary(summary: dict[str, Any]) -> list[str]:
     """A plan's summary as a few lines of plain words."""
     lines = [
-        *_format_feasibility(summary["admission"]),
+        *_format_feasibility(summary["feasibility"]),
         f"pulses           {summary['pulses']}",
         f"duration         {summary['duration_s']:.4f} s",
         f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
         f"moves            {summary['moves_s']:.4f} s"
-        + (f", and {summary['mirrors_rest_s']:.1f} s of rest for the mirrors" if summary["mirrors_rest_s"] else ""),
+        + (f", and {summary['galvo_pause_s']:.1f} s of galvo pauses" if summary["galvo_pause_s"] else ""),
         f"energy           {summary['energy_j']:.4f} J incident",
         f"tallest          {summary['predicted_max_um']:.1f} µm predicted"
         + (f", {summary['tallest_asked_um']:.1f} µm asked for" if summary["tallest_asked_um"] else "")
@@ -144,8 +144,8 @@ def format_plan_summary(summary: dict[str, Any]) -> list[str]:
         lines.append(
             f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms"
         )
-    if summary["dead"]["sentence"]:
-        lines.append(f"dead             {summary['dead']['sentence']}")
+    if summary["dead"]["message"]:
+        lines.append(f"dead             {summary['dead']['message']}")
     if summary["skipped"]:
         lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
     return lines
@@ -153,13 +153,13 @@ def format_plan_summary(summary: dict[str, Any]) -> list[str]:
 
 def _format_feasibility(feasibility: dict[str, Any]) -> list[str]:
     if feasibility["fits"]:
-        return ["fits: yes" if feasibility["proof"] == "planned" else f"fits: yes, {feasibility['sentence']}"]
-    lines = [f"fits: no, {feasibility['sentence']}"]
+        return ["fits: yes" if feasibility["proof"] == "planned" else f"fits: yes, {feasibility['message']}"]
+    lines = [f"fits: no, {feasibility['message']}"]
     if feasibility["fit"] == "even":
-        lines.append(f"shown            all heights and powers × {feasibility['height']:g}")
-    for omitted in feasibility["left_out"][:OMITTED_LISTED_MAX]:
+        lines.append(f"shown            all heights and powers × {feasibility['height_factor']:g}")
+    for omitted in feasibility["omitted"][:OMITTED_LISTED_MAX]:
         lines.append(f"left out         {omitted['name']}: {_format_pixels(omitted['pixels'])}")
-    more = len(feasibility["left_out"]) - OMITTED_LISTED_MAX
+    more = len(feasibility["omitted"]) - OMITTED_LISTED_MAX
     if more > 0:
         lines.append(f"left out         and less of {more} more")
     return lines

@@ -91,7 +91,7 @@ def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
         print(f"{item['name']}: {item['summary']}")
         for parameter in item["parameters"]:
             choices = f" ({', '.join(str(choice) for choice in parameter['choices'])})" if parameter["choices"] else ""
-            print(f"    {parameter['name']}={parameter['default']}{choices}  {parameter['meaning']}")
+            print(f"    {parameter['name']}={parameter['default']}{choices}  {parameter['description']}")
 
 
 def _parse_parameters(pattern: str, values: list[str]) -> dict[str, str]:

@@ -79,7 +79,7 @@ class Plan:
     @classmethod
     def from_response(cls, answer: JsonObject, layout: PixelLayout) -> Self:
         """From an answer of /v1/plans or /v1/patterns."""
-        admission = answer["summary"]["admission"]
+        feasibility = answer["summary"]["feasibility"]
         return cls(
             plan_id=answer["plan"],
             name=answer["name"],
@@ -89,7 +89,7 @@ class Plan:
             sent=answer["sent"],
             executed=answer["executed"],
             dropped=answer["dropped"],
-            fits=None if admission is None else admission["fits"],
+            fits=None if feasibility is None else feasibility["fits"],
             duration_s=answer["summary"]["duration_s"],
             heights_um=_max_heights_um(answer, len(layout)),
             layout=layout,

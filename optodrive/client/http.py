@@ -239,7 +239,7 @@ def _build_typed_error(status: int, document: Mapping[str, Any]) -> OptodriveErr
         )
     error = ERROR_BY_CODE.get(code, RefusedError)(detail)
     if isinstance(error, RefusedError):
-        error.feasibility = document.get("admission")
+        error.feasibility = document.get("feasibility")
     return error
 
 

@@ -23,7 +23,7 @@ class ApiRequest(NamedTuple):
 def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
     """One frame, shown at once, as FRAMES.json has it."""
     frame: dict[str, Any] = {"show_at_s": 0.0, "duration_s": duration_s, "target_um": encode_json(heights_um)}
-    return {"frames": [frame | ({"together": True} if simultaneous else {})]}
+    return {"frames": [frame | ({"simultaneous": True} if simultaneous else {})]}
 
 
 def build_push_request(

@@ -17,7 +17,7 @@ PULSES_LISTED_MAX = 20_000
 """An answer lists pulses one by one up to this many."""
 
 
-def summarize_plan(planned: PlannedSequence, admission: FeasibilityReport | None = None) -> dict[str, Any]:
+def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | None = None) -> dict[str, Any]:
     """Whether all of it fits, what will be shown, when, how high, what was taken away and why; JSON-able."""
     plan = planned.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
@@ -25,14 +25,14 @@ def summarize_plan(planned: PlannedSequence, admission: FeasibilityReport | None
     simultaneous = {item.source: _simultaneous_to_json(item) for item in planned.simultaneous}
     tallest = int(np.argmax(planned.predicted_m)) if len(plan) else None
     return {
-        "admission": None if admission is None else admission.to_dict(),
+        "feasibility": None if feasibility is None else feasibility.to_dict(),
         "pulses": len(plan),
         "duration_s": planned.duration_s,
         "beam_on_s": beam_on_s,
         "beam_on_share": beam_on_s / planned.duration_s if len(plan) else 0.0,
         "moves_s": float(plan.settling_s.sum()),
         "lead_s": planned.lead_in_s,
-        "mirrors_rest_s": planned.galvo_pause_s,
+        "galvo_pause_s": planned.galvo_pause_s,
         "energy_j": float(plan.energy_j.sum()),
         "tallest_pixel": None if tallest is None else int(plan.pixel[tallest]),
         "predicted_max_um": 0.0 if tallest is None else m_to_um(float(planned.predicted_m[tallest])),
@@ -53,7 +53,7 @@ def summarize_plan(planned: PlannedSequence, admission: FeasibilityReport | None
         "dead": {
             "pixels": list(planned.dead_pixels),
             "count": len(planned.dead_pixels),
-            "sentence": describe_dead_pixels(planned.dead_pixels),
+            "message": describe_dead_pixels(planned.dead_pixels),
         },
         "skipped": [
             {
@@ -74,7 +74,7 @@ def summarize_plan(planned: PlannedSequence, admission: FeasibilityReport | None
                 "late_s": timing.late_s,
                 "pulses": timing.pulses,
                 "in_time": timing.on_time,
-                "together": simultaneous.get(timing.source),
+                "simultaneous": simultaneous.get(timing.source),
             }
             for timing in planned.frames
         ],

@@ -70,9 +70,7 @@ def _print_table(stats: dict[str, Any]) -> None:
     table = Table("", "median", "extremes", "one sigma", box=SIMPLE)
     gain = stats["gain"]
     if gain is not None:
-        extremes = (
-            f"{gain['least']:.3f} (pixel {gain['least_pixel']}) to {gain['most']:.3f} (pixel {gain['most_pixel']})"
-        )
+        extremes = f"{gain['min']:.3f} (pixel {gain['min_pixel']}) to {gain['max']:.3f} (pixel {gain['max_pixel']})"
         table.add_row("gain", f"{gain['median']:.3f}", extremes, f"{gain['sigma_median']:.4f}")
     for axis, offset in stats["offset_um"].items():
         if offset is None:

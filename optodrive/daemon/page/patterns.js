@@ -33,7 +33,7 @@ export class Library extends EventTarget {
     const unit = parameter.unit ? `, ${parameter.unit}` : "";
     const words = parameter.name.replace(/_(um|mm|s|hz)$/, "").replaceAll("_", " ");
     label.append(`${words}${unit}${parameter.required ? " (needed)" : ""}`, field);
-    label.title = parameter.meaning;
+    label.title = parameter.description;
     if (parameter.kind === "pixel") {
       field.addEventListener("focus", () => (field.placeholder = `${parameter.default ?? "middle"}; picked: ${this.picked()}`));
     }
@@ -68,9 +68,9 @@ function input(parameter) {
   field.type = { flag: "checkbox", text: "text", file: "file" }[parameter.kind] ?? "number";
   if (field.type === "number") {
     field.step = parameter.kind === "number" ? "any" : "1";
-    field.min = parameter.least ?? 0;
-    if (parameter.most !== null) {
-      field.max = parameter.most;
+    field.min = parameter.min ?? 0;
+    if (parameter.max !== null) {
+      field.max = parameter.max;
     }
     field.placeholder = parameter.default ?? (parameter.kind === "pixel" ? "middle" : "");
   }

@@ -84,9 +84,9 @@ export class Plans extends EventTarget {
   #show(answer) {
     const { summary } = answer;
     const lines = [];
-    const fits = summary.admission?.fits ?? summary.trimmed.pulses === 0;
-    const sentence = summary.admission?.sentence ?? (fits ? "all of it fits" : "not all of it fits");
-    lines.push([fits ? "good" : "warn", `${sentence[0].toUpperCase()}${sentence.slice(1)}.`]);
+    const fits = summary.feasibility?.fits ?? summary.trimmed.pulses === 0;
+    const message = summary.feasibility?.message ?? (fits ? "all of it fits" : "not all of it fits");
+    lines.push([fits ? "good" : "warn", `${message[0].toUpperCase()}${message.slice(1)}.`]);
     lines.push(["", `${summary.pulses} pulses in ${summary.duration_s.toFixed(2)} s, ${(summary.energy_j * 1e3).toFixed(0)} mJ of light.`]);
     lines.push(["", `Highest predicted: ${summary.predicted_max_um.toFixed(1)} µm of ${summary.asked_max_um.toFixed(1)} µm asked for.`]);
     if (summary.trimmed.pulses) {

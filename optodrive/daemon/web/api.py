@@ -219,7 +219,7 @@ def build_error_problem(error: OptodriveError) -> JsonObject:
         fits_after_s = error.earliest_s if error.earliest_s < inf else None
         extensions = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_later_s": fits_after_s}
     if isinstance(error, RefusedError) and error.feasibility is not None:
-        extensions["admission"] = error.feasibility
+        extensions["feasibility"] = error.feasibility
     return build_problem(status, error.code, type(error).__name__.removesuffix("Error"), str(error), **extensions)
 
 

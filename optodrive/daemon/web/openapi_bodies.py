@@ -42,7 +42,7 @@ _FRAME_SCHEMA = _object_schema(
     },
     {
         "id": {"type": "string", "minLength": 1, "maxLength": ID_MAX},
-        "together": {"type": "boolean"},
+        "simultaneous": {"type": "boolean"},
         "priority": _PRIORITY_SCHEMA,
     },
 )

@@ -63,8 +63,8 @@ def draw_residuals(fit: FieldFit) -> str:
         for row, (a, b, true) in enumerate(zip(x, y, is_inlier, strict=True))
         if not true
     ]
-    scale = f"<text x='{PICTURE_MARGIN}' y='{PICTURE_SIDE - 4}'>longest arrow {1e6 * longest_m:.1f} µm; × taken for false</text>"
-    return _wrap_svg("".join([*arrows, *crosses, scale]))
+    caption = f"longest arrow {1e6 * longest_m:.1f} µm; × outlier"
+    return _wrap_svg("".join([*arrows, *crosses, _draw_caption(caption)]))
 
 
 def draw_sigma_map(fit: FieldFit) -> str:
@@ -73,14 +73,18 @@ def draw_sigma_map(fit: FieldFit) -> str:
     size = (PICTURE_SIDE - 2 * PICTURE_MARGIN) / len(grid_um)
     low, high = float(grid_um.min()), float(grid_um.max())
     cells = [
-        f"<rect x='{PICTURE_MARGIN + column * size:.1f}' y='{PICTURE_MARGIN + row * size:.1f}' width='{size:.1f}' height='{size:.1f}' "
+        f"<rect x='{PICTURE_MARGIN + column * size:.1f}' y='{PICTURE_MARGIN + row * size:.1f}' "
+        f"width='{size:.1f}' height='{size:.1f}' "
         f"fill='hsl(210,70%,{92 - 62 * (value - low) / max(high - low, 1e-9):.0f}%)'>"
         f"<title>{value:.1f} µm</title></rect>"
         for row, line in enumerate(grid_um.tolist())
         for column, value in enumerate(line)
     ]
-    scale = f"<text x='{PICTURE_MARGIN}' y='{PICTURE_SIDE - 4}'>{low:.1f} (light) to {high:.1f} µm (dark)</text>"
-    return _wrap_svg("".join([*cells, scale]))
+    return _wrap_svg("".join([*cells, _draw_caption(f"{low:.1f} (light) to {high:.1f} µm (dark)")]))
+
+
+def _draw_caption(text: str) -> str:
+    return f"<text x='{PICTURE_MARGIN}' y='{PICTURE_SIDE - 4}'>{text}</text>"
 
 
 def _to_picture(fit: FieldFit, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -82,7 +82,8 @@ def _check_beam_moves(where: str, commanded_m: FloatArray, measured_m: FloatArra
         np.median(np.abs(places - np.median(places, axis=0)), axis=0) for places in (commanded_m, measured_m)
     )
     is_stationary = measured < MOTION_RATIO_MIN * commanded
-    motion = f"by {measured[0] * 1e3:.3g}, {measured[1] * 1e3:.3g} mm, asked {commanded[0] * 1e3:.3g}, {commanded[1] * 1e3:.3g}"
+    (x_mm, y_mm), (x_commanded_mm, y_commanded_mm) = measured * 1e3, commanded * 1e3
+    motion = f"by {x_mm:.3g}, {y_mm:.3g} mm, commanded {x_commanded_mm:.3g}, {y_commanded_mm:.3g}"
     if np.all(is_stationary | (commanded == 0.0)):
         raise InputError(f"{where}: x_m, y_m", motion, "a beam that moves: all spots were seen at one place")
     for axis, name in enumerate("xy"):

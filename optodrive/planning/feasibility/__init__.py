@@ -13,11 +13,11 @@ from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_seq
 __all__ = [
     "FeasibilityReport",
     "FitMode",
-    "Omission",
     "NearestFeasible",
+    "Omission",
     "SequenceReduction",
     "check_feasibility",
+    "omit_pixels",
     "scale_sequence",
     "stretch_sequence",
-    "omit_pixels",
 ]

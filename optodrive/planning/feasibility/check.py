@@ -99,7 +99,7 @@ def check_feasibility(
 def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:
     unreachable = None if query.fit == "as_is" else first_unreachable(query.display, query.sequence)
     if unreachable is not None:
-        return _plan_alternative(query, None, Violation("reach", unreachable[0], unreachable[1]), policy)
+        return _plan_alternative(query, None, Violation("unreachable", unreachable[0], unreachable[1]), policy)
     plan = query.plan()
     violation = find_first_violation(plan.plan, deadlines_s(query.sequence, plan.lead_in_s))
     if violation is None:

@@ -135,7 +135,7 @@ class OrderSearch:
         """What breaks the plan by these orders first; the planner's own where None."""
         unreachable = first_unreachable(self._display, sequence) if orders is None else None
         if unreachable is not None:
-            return Violation("reach", unreachable[0], unreachable[1])
+            return Violation("unreachable", unreachable[0], unreachable[1])
         if self.plans_tried >= self.plans_max:
             raise _PlanLimitError
         self.plans_tried += 1
@@ -146,7 +146,7 @@ class OrderSearch:
             )
         except InputError:  # as scaled or stretched, a train by height has no such cycle
             source, train = next((k, t) for k, t in enumerate(sequence.trains) if isinstance(t, HeightTrain))
-            return Violation("reach", len(sequence.frames) + source, train.pixel)
+            return Violation("unreachable", len(sequence.frames) + source, train.pixel)
 
     def _plan_until_violation(
         self, sequence: FrameSequence, orders: Orders | None, through_limiter: bool

@@ -45,7 +45,7 @@ class FeasibilityReport:
 
     proof: "planned" its plan fits, as the planner orders it; "searched" all orders were tried, or one was found that
     fits and is played; "bound" no order can fit; "not found" none was found, which proves nothing
-    reason: "deadline", the name of a cap, or "reach"; name, pixel: the frame or train that breaks it, and where first
+    reason: "deadline", the name of a cap, or "unreachable"; name, pixel: of the first violation
     beam_needed_s, beam_there_s: of that frame, from when it may be shown to its last pulse's end as planned and to its
     deadline; of a train's pulse, from its nominal time; of the whole where it fits; None for what is out of reach
     beam_least_s: what the frame takes in any order at the least, None where that is not known

@@ -20,7 +20,10 @@ SLOPE_INTERVAL_S = 1e-6
 
 @dataclass(frozen=True)
 class Violation:
-    """The first pulse that breaks a plan. reason: "deadline", the name of a cap, or "reach"; source: as in a plan."""
+    """The first pulse of a plan that violates a limit.
+
+    reason: "deadline", the name of a cap, or "unreachable"; source: as in a plan.
+    """
 
     reason: str
     source: int
@@ -51,7 +54,9 @@ def find_first_violation(plan: PulsePlan, deadline_s: FloatArray) -> Violation |
 
 def is_order_independent(violation: Violation, sequence: FrameSequence) -> bool:
     """Whether a breach is there whatever the order: out of reach, or a train that is late by itself."""
-    return violation.reason == "reach" or (violation.reason == "deadline" and violation.source >= len(sequence.frames))
+    return violation.reason == "unreachable" or (
+        violation.reason == "deadline" and violation.source >= len(sequence.frames)
+    )
 
 
 def beam_lower_bound_s(

@@ -29,19 +29,19 @@ def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[T
 
 def _parse_frame(entry: object, where: str, position: int, pixel_by_name: dict[str, int]) -> TactileFrame:
     required = ("show_at_s", "duration_s", "target_um")
-    table = require_object(entry, where, ("id", *required, "together", "priority"), required)
+    table = require_object(entry, where, ("id", *required, "simultaneous", "priority"), required)
     expected = "a time ≥ 0 in s (a frame in the past cannot be shown)"
     show_at_s = require_time(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _parse_frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
     target_m = parse_targets_m(table["target_um"], f"{where}.target_um", pixel_by_name)
-    simultaneous = _parse_simultaneous(table, f"{where}.together")
+    simultaneous = _parse_simultaneous(table, f"{where}.simultaneous")
     priority = require_priority(table.get("priority", 0), f"{where}.priority")
     return TactileFrame(frame_id, show_at_s, duration_s, target_m, simultaneous, priority)
 
 
 def _parse_simultaneous(table: Mapping[str, object], where: str) -> bool:
-    value = table.get("together", False)
+    value = table.get("simultaneous", False)
     if not isinstance(value, bool):
         raise InputError(where, value, "true or false", code="bad_json")
     return value

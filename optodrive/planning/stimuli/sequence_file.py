@@ -76,7 +76,7 @@ def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
 
 def _frame_to_json(frame: TactileFrame) -> dict[str, object]:
     driven = np.flatnonzero(frame.target_m)
-    simultaneous = {"together": True} if frame.simultaneous else {}
+    simultaneous = {"simultaneous": True} if frame.simultaneous else {}
     return (
         simultaneous
         | {

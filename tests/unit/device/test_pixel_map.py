@@ -148,13 +148,13 @@ def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
 
 
 def test_the_dead_are_left_out_and_named(display):
-    prepared, admission = check_feasibility(display, everywhere(60e-6), *display.build_cold_state())
-    figures = summarize_plan(prepared, admission)
-    assert admission.fits
+    prepared, feasibility = check_feasibility(display, everywhere(60e-6), *display.build_cold_state())
+    figures = summarize_plan(prepared, feasibility)
+    assert feasibility.fits
     assert figures["dead"] == {
         "pixels": [DEAD_PIXEL],
         "count": 1,
-        "sentence": f"pixel {DEAD_PIXEL} is dead: left out",
+        "message": f"pixel {DEAD_PIXEL} is dead: left out",
     }
     alone = np.zeros(COUNT)
     alone[DEAD_PIXEL] = 5e-3  # out of anyone's reach
@@ -167,7 +167,7 @@ def test_the_dead_are_left_out_and_named(display):
     fine, _ = check_feasibility(
         display, FrameSequence((TactileFrame("alive", 0.0, 1.0, alive),)), *display.build_cold_state()
     )
-    assert summarize_plan(fine)["dead"] == {"pixels": [], "count": 0, "sentence": None}
+    assert summarize_plan(fine)["dead"] == {"pixels": [], "count": 0, "message": None}
 
 
 @pytest.mark.parametrize(

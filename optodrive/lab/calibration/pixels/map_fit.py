@@ -71,14 +71,14 @@ def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
         if not len(measured)
         else {
             "median": float(np.median(gain)),
-            "least": float(gain.min()),
-            "least_pixel": int(measured[gain.argmin()]),
-            "most": float(gain.max()),
-            "most_pixel": int(measured[gain.argmax()]),
+            "min": float(gain.min()),
+            "min_pixel": int(measured[gain.argmin()]),
+            "max": float(gain.max()),
+            "max_pixel": int(measured[gain.argmax()]),
             "sigma_median": float(np.median(pixel_map.gain_sigma[measured])),
         },
         "offset_um": {axis: _compute_offset_stats(pixel_map, axis) for axis in "xy"},
-        "each": [
+        "per_pixel": [
             {
                 "pixel": pixel,
                 "state": str(pixel_map.state[pixel]),

@@ -67,7 +67,7 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
         capsys, "plan", f"{played}.json", "--pixels-map", f"{played}.pixels.toml", "--config", "display-437", "--json"
     )
     assert plan["trimmed"]["pulses"] == 0
-    assert plan["admission"]["fits"]
+    assert plan["feasibility"]["fits"]
 
 
 def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):

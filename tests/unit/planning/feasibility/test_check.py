@@ -67,7 +67,7 @@ def test_a_late_frame_is_named_with_what_it_needs_and_what_fits():
     assert nearest.time_factor == pytest.approx(admission.beam_required_s / 0.1, rel=0.02)
     for word in ("needs", "at the least", f"{nearest.pixels.kept} of 40 pixels", f"× {nearest.height_factor:g}"):
         assert word in admission.message
-    assert json.loads(json.dumps(admission.to_dict()))["nearest"]["rate"] == nearest.time_factor
+    assert json.loads(json.dumps(admission.to_dict()))["nearest"]["time_factor"] == nearest.time_factor
 
 
 def test_an_order_that_fits_is_found_and_played():
@@ -168,7 +168,7 @@ def test_out_of_reach_is_refused_as_it_is_and_mended_on_request():
     with pytest.raises(InputError, match="target_um of pixel 3"):
         check(build_frame([3], 5000))
     _, lower = check(build_frame([3, 4], [1000, 100]), fit="even")
-    assert lower.reason == "reach"
+    assert lower.reason == "unreachable"
     assert lower.height_factor == pytest.approx(0.5, abs=0.02)
     prepared, fewer = check(build_frame([3, 4], [1000, 100]), fit="priority")
     assert [(item.name, item.pixels) for item in fewer.omitted] == [("f", (3,))]
@@ -207,9 +207,9 @@ def test_nothing_is_tried_any_more_when_the_plans_are_spent(monkeypatch):
     tried = []
     true = order_search.OrderSearch.find_orders
     monkeypatch.setattr(
-        order_search.OrderSearch, "found", lambda self, sequence: tried.append(1) or true(self, sequence)
+        order_search.OrderSearch, "find_orders", lambda self, sequence: tried.append(1) or true(self, sequence)
     )
-    monkeypatch.setattr("optodrive.planning.feasibility.check.PULSES_ASKED_MAX", 0)
+    monkeypatch.setattr("optodrive.planning.feasibility.check.PULSES_REQUESTED_MAX", 0)
     frames = [build_frame(range(40), 60, 0.11 * k, 0.11, f"f{k}") for k in range(50)]
     _, admission = check(*frames, fit="priority")
     assert not admission.nearest.complete
@@ -233,15 +233,15 @@ def test_trains_whose_moves_add_up_do_not_fit_and_one_move_does():
 def test_progress_is_shown_while_orders_are_searched():
     told = []
     frames = [build_frame(range(4 * k, 4 * k + 4), 100, 0.05 * k, 0.05 if k < 1 else 0.0245, f"f{k}") for k in range(2)]
-    _, admission = check(*frames, trains=[PulseTrain(9, 0.0501, 0.02, 0.0004, 0.003, 0.3)], progress=told.append)
+    _, admission = check(*frames, trains=[PulseTrain(9, 0.0501, 0.02, 0.0004, 0.003, 0.3)], on_progress=told.append)
     assert admission.plans_tried > 20
     assert len(told) > admission.plans_tried
 
 
 def test_a_search_ends_at_its_bound_and_proves_nothing(monkeypatch):
     monkeypatch.setattr("optodrive.planning.feasibility.check.ORDERS_MAX", 5)
-    monkeypatch.setattr("optodrive.planning.feasibility.check.orders_count", lambda sequence: 1)
-    monkeypatch.setattr(order_search, "least_s", lambda *given: None)
+    monkeypatch.setattr("optodrive.planning.feasibility.check.count_orders", lambda sequence: 1)
+    monkeypatch.setattr(order_search, "beam_lower_bound_s", lambda *given: None)
     _, admission = check(build_frame(range(4), 100, duration_s=0.02))
     assert (admission.fits, admission.proof) == (False, "not found")
 

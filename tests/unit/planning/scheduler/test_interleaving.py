@@ -83,11 +83,11 @@ def test_slices_have_no_height_of_their_own_to_answer_for():
     assert np.isnan(result.plan.target_m[:4]).all()
     assert told["asked_max_um"] == pytest.approx(100.0)
     assert told["predicted_max_um"] == pytest.approx(100.0, rel=0.01)
-    assert told["frames"][0]["together"] == {
+    assert told["frames"][0]["simultaneous"] == {
         key: getattr(result.simultaneous[0], key)
         for key in ("rounds", "simultaneity", "simultaneity_unsplit", "extra_s")
     }
-    assert summarize_plan(prepared(frame(FOUR, together=False)))["frames"][0]["together"] is None
+    assert summarize_plan(prepared(frame(FOUR, together=False)))["frames"][0]["simultaneous"] is None
 
 
 def test_heat_that_is_there_counts_and_a_frame_after_another_is_split_too():
@@ -152,9 +152,9 @@ def test_a_short_rest_between_slices_is_no_rest():
 
 
 def test_together_is_read_written_and_checked():
-    entry = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}, "together": True}
-    once = parse_sequence({"frames": [entry, {**entry, "show_at_s": 1.0, "together": False}]}, DISPLAY.config, "f")
+    entry = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}, "simultaneous": True}
+    once = parse_sequence({"frames": [entry, {**entry, "show_at_s": 1.0, "simultaneous": False}]}, DISPLAY.config, "f")
     again = parse_sequence(sequence_to_json(once), DISPLAY.config, "f")
     assert [item.simultaneous for item in again.frames] == [item.simultaneous for item in once.frames] == [True, False]
-    with pytest.raises(InputError, match=r"frames\[0\].together: got 1, expected true or false"):
-        parse_sequence({"frames": [{**entry, "together": 1}]}, DISPLAY.config, "f")
+    with pytest.raises(InputError, match=r"frames\[0\].simultaneous: got 1, expected true or false"):
+        parse_sequence({"frames": [{**entry, "simultaneous": 1}]}, DISPLAY.config, "f")

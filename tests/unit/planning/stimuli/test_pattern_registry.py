@@ -57,7 +57,7 @@ def test_the_description_is_json():
     for item in described:
         assert item["summary"]
         for parameter in item["parameters"]:
-            assert parameter["meaning"]
+            assert parameter["description"]
             assert parameter["required"] == (parameter["default"] is None and parameter["name"] in ("text", "file"))
 
 

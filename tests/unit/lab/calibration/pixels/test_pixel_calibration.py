@@ -158,7 +158,7 @@ def test_figures_name_what_is_dead_and_what_was_not_measured():
     assert told["dead"] == [4, 9]
     assert told["not_measured"] == [15]
     assert told["measured"] == 13
-    assert (told["gain"]["least_pixel"], told["gain"]["most_pixel"]) == (0, 14)
+    assert (told["gain"]["min_pixel"], told["gain"]["max_pixel"]) == (0, 14)
     assert told["offset_um"]["x"]["median"] == pytest.approx(50, abs=10)
 
 

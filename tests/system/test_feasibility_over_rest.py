@@ -15,7 +15,7 @@ EASY = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}
 
 @pytest.fixture(scope="module")
 def armed(tmp_path_factory):
-    with running(tmp_path_factory.mktemp("admission")) as (_, daemon):
+    with running(tmp_path_factory.mktemp("feasibility")) as (_, daemon):
         daemon.arm()
         yield daemon
 
@@ -27,20 +27,20 @@ def run(*arguments):
 
 def test_what_fits_says_so(armed):
     answer = armed.call("POST", "/v1/plans", json=EASY, params={"dry_run": True})
-    admission = answer["summary"]["admission"]
-    assert (admission["fits"], admission["proof"], admission["plans"]) == (True, "planned", 0)
+    feasibility = answer["summary"]["feasibility"]
+    assert (feasibility["fits"], feasibility["proof"], feasibility["plans_tried"]) == (True, "planned", 0)
 
 
 def test_what_does_not_fit_names_who_breaks_it_before_anything_moves(armed):
     before = armed.state()["totals"]
-    admission = armed.call("POST", "/v1/plans", json=LATE, params={"dry_run": True})["summary"]["admission"]
-    assert (admission["fits"], admission["proof"], admission["name"]) == (False, "bound", "late")
-    assert admission["beam_needed_s"] > admission["beam_there_s"]
-    assert admission["nearest"]["pixels"]["kept"] < 40
+    feasibility = armed.call("POST", "/v1/plans", json=LATE, params={"dry_run": True})["summary"]["feasibility"]
+    assert (feasibility["fits"], feasibility["proof"], feasibility["name"]) == (False, "bound", "late")
+    assert feasibility["beam_required_s"] > feasibility["beam_available_s"]
+    assert feasibility["nearest"]["pixels"]["kept"] < 40
     refused = armed.call("POST", "/v1/plans", status=409, json=LATE, params={"policy": "refuse"})
     assert refused["code"] == "refused"
-    assert refused["admission"] == admission
-    assert refused["detail"] == admission["sentence"]
+    assert refused["feasibility"] == feasibility
+    assert refused["detail"] == feasibility["message"]
     assert armed.state()["totals"] == before
 
 
@@ -51,9 +51,9 @@ def test_best_effort_is_executed_in_time(armed, fit):
     assert answer["status"] == "done", answer["error"]
     figures = answer["summary"]
     assert figures["late"] == []
-    assert (figures["admission"]["height"] < 1.0) == (fit == "even")
-    left_out = [pixel for item in figures["admission"]["left_out"] for pixel in item["pixels"]]
-    assert answer["executed"] == 40 - len(left_out)
+    assert (figures["feasibility"]["height_factor"] < 1.0) == (fit == "even")
+    omitted = [pixel for item in figures["feasibility"]["omitted"] for pixel in item["pixels"]]
+    assert answer["executed"] == 40 - len(omitted)
     executed = answer["executed_pulses"]
     assert executed["start_s"][-1] + executed["width_s"][-1] <= figures["lead_s"] + 0.1 + 1e-4
 
@@ -61,7 +61,7 @@ def test_best_effort_is_executed_in_time(armed, fit):
 def test_a_pattern_takes_it_too(armed):
     params = {"fit": "even", "dry_run": True}
     answer = armed.call("POST", "/v1/patterns/dot", json={"step_s": 0.02}, params=params)
-    assert answer["summary"]["admission"]["fit"] == "even"
+    assert answer["summary"]["feasibility"]["fit"] == "even"
     armed.call("POST", "/v1/patterns/dot", status=422, json={}, params={"fit": "evenly"})
 
 
@@ -98,7 +98,7 @@ def test_the_command_line_says_it_in_one_line(armed, tmp_path):
     assert "nearest that fits: " in late
     figures = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
     assert figures["late"] == []
-    assert figures["admission"]["height"] < 1.0
+    assert figures["feasibility"]["height_factor"] < 1.0
     refused = run("plan", path, "--strict")
     assert refused.returncode == 1
     assert "nearest that fits: " in refused.stderr

@@ -284,7 +284,7 @@ def _only_the_planners_order(monkeypatch):
 
 def _bound_too_high(monkeypatch):
     true = order_search.beam_lower_bound_s
-    monkeypatch.setattr(order_search, "least_s", lambda *given: 1.05 * true(*given))
+    monkeypatch.setattr(order_search, "beam_lower_bound_s", lambda *given: 1.05 * true(*given))
 
 
 def _orders_passed_over(monkeypatch):
