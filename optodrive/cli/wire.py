@@ -48,12 +48,12 @@ def dump(file: CaptureArgument, json: JsonOption = False) -> None:
 
 
 def _build_document(line: "TranscriptEntry", capture: "LinkCapture") -> dict[str, Any]:
-    from optodrive.link.protocol.describe import describe, message_name
+    from optodrive.link.protocol.describe import describe
 
     document: dict[str, Any] = {"t_s": line.host_s - capture.host_s, "to": "board" if line.to_board else "host"}
     if line.message is None or line.frame is None:
         return {**document, "bad": line.error, "bytes": len(line.raw), "hex": line.raw.hex()}
-    document |= {"message": message_name(line.message), "session": line.frame.session}
+    document |= {"message": line.message.NAME, "session": line.frame.session}
     if line.message.SEQUENCED and line.to_board:
         document |= {"seq": line.frame.seq, "again": line.retransmitted}
     return {**document, "fields": describe(line.message)}

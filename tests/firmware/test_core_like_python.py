@@ -97,7 +97,7 @@ def messages(core, what, detail):
         "disarm": [m.Disarm()],
         "abort": [m.Abort()],
         "get": [m.Get()],
-        "clock": [m.Clock(77)],
+        "clock": [m.ClockRequest(77)],
         "executed": [m.GetExecuted(max(0, core._done_index - 40))],
         "limits": [detail],
     }[what]
@@ -151,7 +151,7 @@ def step(both, what, detail):
     elif what in ("again", "ahead"):
         both.raw(both.frame(m.Disarm(), ahead=-1 if what == "again" else 2))
     elif what == "damage":
-        for portion in damaged(both.frame(m.Get()) + both.frame(m.Clock(9)), *detail):
+        for portion in damaged(both.frame(m.Get()) + both.frame(m.ClockRequest(9)), *detail):
             both.raw(portion)
     else:
         both.raw(b"".join(both.frame(x, ahead) for ahead, x in enumerate(messages(core, what, detail))))

@@ -335,7 +335,7 @@ def test_bytes_come_no_faster_than_the_line_carries_them(tmp_path):
     try:
         wait_for(port.exists, "the port")
         host = Host(port).hello()
-        frame = encode_frame(Frame(m.Clock.TYPE, 0, host.session, m.Clock(0x01010101).encode_body()))
+        frame = encode_frame(Frame(m.ClockRequest.TYPE, 0, host.session, m.ClockRequest(0x01010101).encode_body()))
         count = -(-2000 // len(frame))
         time.sleep(0.5)  # an idle line saves nothing up
         began = time.monotonic()

@@ -99,7 +99,7 @@ def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_
     totals = last["totals"]
     assert totals["ignored_bytes"] == totals["bad_bytes"] == 0
     assert totals["host_silence_s"] > 0.09
-    assert 0 < totals["round_trip_least_s"] < 1
+    assert 0 < totals["round_trip_min_s"] < 1
 
 
 @pytest.fixture

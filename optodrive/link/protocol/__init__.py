@@ -1,1 +1,1 @@
-"""The board's protocol, sans-I/O: framing, messages, the connection, quantisation."""
+"""Board protocol, sans-I/O: framing, messages, connection and quantisation."""

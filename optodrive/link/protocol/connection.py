@@ -1,4 +1,4 @@
-"""The link, sans-I/O: go-back-N with an 8-bit sequence number, one end for the host and one for a board."""
+"""Both ends of the link, sans-I/O: go-back-N with an 8-bit sequence number."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -21,13 +21,15 @@ from optodrive.link.protocol.messages import (
 )
 
 WINDOW = 8
+"""Maximum number of unacknowledged sequenced frames."""
 SEQ_MODULUS = 256
 RTO_S = 0.025
+"""Default retransmission timeout."""
 
 
 @dataclass
 class LinkCounters:
-    """How the link fared."""
+    """Error counters of a link, as the host sees them."""
 
     crc_errors: int = 0
     format_errors: int = 0
@@ -36,7 +38,12 @@ class LinkCounters:
 
 
 class HostConnection:
-    """The host's end. Sequenced messages go through a window; the others go at once and may be lost."""
+    """Host end of the link.
+
+    Sequenced messages pass through the window and are retransmitted until acknowledged. Other messages are sent at once
+    and may be lost.
+    peer: the board's HELLO_REPLY, None before it arrives
+    """
 
     window = WINDOW
 
@@ -59,24 +66,27 @@ class HostConnection:
 
     @property
     def session(self) -> int:
-        """The session the board gave, 0 before it did."""
+        """Session number that the board assigned, 0 before its HELLO_REPLY."""
         return 0 if self.peer is None else self.peer.session
 
     @property
     def outstanding(self) -> int:
-        """Sequenced messages not yet acknowledged."""
+        """Number of sequenced messages not yet acknowledged."""
         return len(self._unacked) + len(self._queued)
 
     @property
     def counters(self) -> LinkCounters:
-        """How the link fared so far."""
+        """Error counters since the connection was created."""
         frame_counters = self._decoder.counters
         return LinkCounters(
             frame_counters.crc_errors, frame_counters.format_errors, self._retransmit_count, self._nak_count
         )
 
     def send_hello(self, nonce: int) -> None:
-        """Begin a new session; what was for the one before is forgotten, what was queued since waits for this one."""
+        """Begin a new session.
+
+        Messages of the previous session are dropped. Messages queued after its end wait for the new session.
+        """
         if self.peer is not None:
             self._reset()
         self.peer = None
@@ -84,9 +94,10 @@ class HostConnection:
         self._control.append(encode_frame(Frame(Hello.TYPE, 0, 0, Hello(MAJOR, MINOR, nonce).encode_body())))
 
     def abort(self) -> None:
-        """Put ABORT ahead of all and forget everything else; only a new hello goes on from here.
+        """Send ABORT before everything else and drop all other messages. A new session requires send_hello().
 
-        Until its answer the board's events of the session before are still given: they say what became of ABORT.
+        Until HELLO_REPLY arrives, receive_bytes() still returns EVENTs of the aborted session, because they report the
+        effect of ABORT.
         """
         self._aborted_session = self.session or self._aborted_session
         self._control = [encode_frame(Frame(Abort.TYPE, 0, self.session, b""))]
@@ -100,7 +111,7 @@ class HostConnection:
         self._retransmit_pending = self._retransmit_done = False
 
     def send(self, message: Message, at_front: bool = False) -> None:
-        """Queue a message. first: before all sequenced ones that wait."""
+        """Queue a message. at_front: put a sequenced message before all other queued ones."""
         if message.SEQUENCED and at_front:
             self._queued.appendleft(message)
         elif message.SEQUENCED:
@@ -109,11 +120,14 @@ class HostConnection:
             self._control.append(encode_frame(Frame(message.TYPE, 0, self.session, message.encode_body())))
 
     def bytes_to_send(self, now_s: float, max_in_flight_bytes: int) -> bytes:
-        """What may leave now, keeping at most flight_bytes of sequenced frames unacknowledged."""
+        """Return the bytes to transmit now.
+
+        At most max_in_flight_bytes of sequenced frames stay unacknowledged, but at least one frame.
+        """
         out, self._control = b"".join(self._control), []
         if self.peer is not None:
             out += self._collect_sequenced(now_s, max_in_flight_bytes)
-        # A frame whose end was lost would swallow the next one, an ABORT perhaps: a delimiter first ends it.
+        # A leading delimiter ends a truncated frame, which would otherwise swallow the next one, perhaps an ABORT.
         return b"\0" + out if out else b""
 
     def _collect_sequenced(self, now_s: float, max_in_flight_bytes: int) -> bytes:
@@ -139,7 +153,7 @@ class HostConnection:
         return out
 
     def receive_bytes(self, data: bytes, now_s: float) -> list[Message]:
-        """Take bytes; give the board's messages of this session. What is no frame, or no message, only counts."""
+        """Return the board's messages of this session in received bytes. Invalid frames only increase the counters."""
         messages = []
         for frame in self._decoder.feed(data):
             try:
@@ -148,7 +162,7 @@ class HostConnection:
                 self._decoder.counters.format_errors += 1
                 continue
             if not isinstance(message, BOARD_MESSAGES):
-                self._decoder.counters.format_errors += 1  # our own words: the line echoes
+                self._decoder.counters.format_errors += 1  # an echo of the host's own message
                 continue
             if isinstance(message, HelloReply):
                 if message.host_nonce != self._nonce or self.peer is not None:
@@ -168,17 +182,16 @@ class HostConnection:
             elif isinstance(message, Nak):
                 self._nak_count += 1
                 self._advance_window(message.next_seq, now_s)
+                # Every frame behind a gap is refused. Only the first NAK triggers a retransmission.
                 if message.reason == NAK_REASONS.index("SEQUENCE") and not self._retransmit_done:
-                    self._retransmit_pending = (
-                        True  # once: the other frames behind a gap are refused too, and say no more
-                    )
+                    self._retransmit_pending = True
             messages.append(message)
         return messages
 
     def _advance_window(self, next_seq: int, now_s: float) -> None:
         count = (next_seq - self._base_seq) % SEQ_MODULUS
         if count > len(self._unacked):
-            return  # an old acknowledgement, overtaken
+            return  # an outdated acknowledgement
         for _ in range(count):
             self._unacked.popleft()
         if count:
@@ -188,7 +201,7 @@ class HostConnection:
 
 
 class BoardLink:
-    """The board's end: frames in order go up once, gaps are refused, duplicates answered again."""
+    """Board end of the link: accepts frames in order, refuses gaps and repeats the answer to duplicates."""
 
     def __init__(self) -> None:
         self.decoder = FrameDecoder()
@@ -199,17 +212,20 @@ class BoardLink:
 
     @property
     def expected_seq(self) -> int:
-        """The sequence number awaited next."""
+        """Sequence number of the next frame to accept."""
         return self._expected_seq
 
     def begin_session(self, session: int) -> None:
-        """A new session."""
+        """Begin a session at sequence number 0."""
         self.session = session
         self._expected_seq = 0
         self._last_refusal = None
 
     def accept(self, seq: int) -> tuple[bool, int | None]:
-        """Whether a sequenced frame is the awaited one; if not, the NAK reason to answer with, None for an ACK."""
+        """Return whether a sequenced frame is the expected one, and the answer if it is not.
+
+        The answer is a NAK reason, or None for an ACK.
+        """
         ahead = (seq - self._expected_seq) % SEQ_MODULUS
         if ahead == 0:
             return True, None
@@ -219,6 +235,6 @@ class BoardLink:
         return False, NAK_REASONS.index("SEQUENCE")
 
     def mark_consumed(self, refusal: int | None) -> None:
-        """The awaited frame was taken; refusal: the NAK reason, None where it was carried out."""
+        """Advance past the expected frame. refusal: NAK reason, or None if the board carried out the message."""
         self._expected_seq = (self._expected_seq + 1) % SEQ_MODULUS
         self._last_refusal = refusal

@@ -1,4 +1,4 @@
-"""Messages in words and units, for people who read what passed on the wire."""
+"""Human-readable form of messages: names for enumerations, units for numbers."""
 
 from dataclasses import fields
 from typing import Any
@@ -11,19 +11,17 @@ DUTY_FIELDS = ("max_duty", "mean_duty")
 NONCE_FIELDS = ("host_nonce", "board_nonce", "host_t")
 
 
-def message_name(message: m.Message) -> str:
-    """The message's name as PROTOCOL.md writes it: HELLO_REPLY."""
-    name = type(message).__name__
-    return "".join(f"_{letter}" if letter.isupper() and at else letter for at, letter in enumerate(name)).upper()
-
-
 def describe_reset_cause(code: int) -> str:
-    """Why the board last started, in a word; the number where it has no meaning."""
+    """Return the cause of the board's last start as a word, or the number of an unknown cause."""
     return RESET_CAUSES[code] if code < len(RESET_CAUSES) else f"unknown cause {code}"
 
 
 def describe(message: m.Message) -> dict[str, Any]:
-    """Field by field: enumerations in words, units in the name, nonces in hex, points and records as columns."""
+    """Return the fields of a message by name.
+
+    Enumerations become words and nonces become hex strings. Units are part of the names. Points and records become
+    columns.
+    """
     if isinstance(message, m.Data):
         return {"first_index": message.first_index, **_describe_points(message)}
     if isinstance(message, m.Executed):

@@ -1,6 +1,6 @@
-"""Frames on the wire: COBS (Cheshire & Baker 1999) with a zero delimiter, CRC-32 (zlib's) at the end.
+"""Frames on the wire: COBS (Cheshire & Baker 1999) with a zero delimiter and zlib's CRC-32.
 
-raw frame: u8 type | u8 seq | u16 session | body | u32 crc over all before it, little-endian, at most RAW_MAX bytes
+raw frame: u8 type | u8 seq | u16 session | body | u32 CRC of all preceding bytes; little-endian, at most RAW_MAX bytes
 """
 
 import struct
@@ -16,11 +16,11 @@ HEADER = struct.Struct("<BBH")
 CRC = struct.Struct("<I")
 BODY_MAX = RAW_MAX - HEADER.size - CRC.size
 ENCODED_MAX = RAW_MAX + 1
-"""COBS adds one byte to fewer than 254; the delimiter is not counted."""
+"""COBS adds one byte to fewer than 254 bytes. The delimiter is not included."""
 
 
 class Frame(NamedTuple):
-    """One frame whose CRC is right."""
+    """Frame with a valid CRC."""
 
     type: int
     seq: int
@@ -30,21 +30,21 @@ class Frame(NamedTuple):
 
 @dataclass
 class FrameCounters:
-    """What arrived and was no frame."""
+    """Counters of invalid input: wrong CRC, and bytes that are no COBS frame of valid length."""
 
     crc_errors: int = 0
     format_errors: int = 0
 
 
 def cobs_encode(raw: bytes) -> bytes:
-    """COBS without the delimiter, for at most RAW_MAX bytes."""
+    """Return the COBS encoding, without delimiter, of at most RAW_MAX bytes."""
     if len(raw) > RAW_MAX:
         raise LocalProtocolError(f"a frame of {len(raw)} bytes is longer than {RAW_MAX}")
     return b"".join(bytes((len(run) + 1,)) + run for run in raw.split(b"\0"))
 
 
 def cobs_decode(encoded: bytes) -> bytes | None:
-    """The bytes that were encoded, or None where these are no COBS of at most RAW_MAX bytes."""
+    """Return the decoded bytes, or None if the input is not COBS or decodes to more than RAW_MAX bytes."""
     runs = []
     position = 0
     while position < len(encoded):
@@ -58,13 +58,13 @@ def cobs_decode(encoded: bytes) -> bytes | None:
 
 
 def encode_frame(frame: Frame) -> bytes:
-    """A frame as it goes over the wire, delimiter included."""
+    """Return the bytes of a frame on the wire, delimiter included."""
     raw = HEADER.pack(frame.type, frame.seq, frame.session) + frame.body
     return cobs_encode(raw + CRC.pack(crc32(raw))) + b"\0"
 
 
 class FrameDecoder:
-    """Bytes in any portions to frames; what is no frame only counts."""
+    """Incremental decoder from bytes to frames. Invalid input only increases the counters."""
 
     def __init__(self) -> None:
         self.counters = FrameCounters()
@@ -72,7 +72,7 @@ class FrameDecoder:
         self._overlong = False
 
     def feed(self, data: bytes) -> Iterator[Frame]:
-        """Take bytes, give the frames completed by them."""
+        """Yield the frames that `data` completes."""
         *complete, rest = (self._pending + data).split(b"\0")
         self._pending = rest
         for encoded in complete:

@@ -1,6 +1,7 @@
-"""The messages: one frozen dataclass each, fields in wire order. PROTOCOL.md says what they mean.
+"""Messages between host and board, one frozen dataclass each with its fields in wire order.
 
-firmware_protocol/messages.toml states the same once more, independently; a test holds the two together.
+PROTOCOL.md is the specification. firmware_protocol/messages.toml states the same fields independently, for code
+generators; a test compares the two.
 """
 
 import struct
@@ -30,7 +31,7 @@ FAULTS = (
 )
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
-"""Refusals after which the same frame is sent again; after the others it counts as taken and refused."""
+"""NAK reasons after which the host resends the same frame. Any other reason consumes the frame's sequence number."""
 EVENT_REASONS = (
     "",
     "boot",
@@ -53,40 +54,46 @@ EVENT_REASONS = (
 INPUTS = ("interlock", "key", "estop")
 
 POINT = struct.Struct("<HHHHH")
-"""x, y, dark_us, on_us, duty."""
+"""x, y (DAC codes), dark_us (gate off before the pulse), on_us (gate on), duty (1/65535)."""
 POINTS_MAX = 24
 RECORD = struct.Struct("<IHH")
-"""Offset of gate on from base_tick in ticks, gate-on ticks, duty."""
+"""Offset of gate on from base_tick, gate-on time (both ticks), duty (1/65535)."""
 RECORDS_MAX = 28
 
 
 class Message:
-    """A message; TYPE and LAYOUT are the class's, SEQUENCED says whether it goes through the go-back-N window.
+    """Base class of all messages.
 
-    ENUMS: fields that hold an index into names; an index beyond them is no message.
+    NAME: message name in PROTOCOL.md
+    TYPE: type byte in the frame header
+    LAYOUT: struct of the fixed-size part of the body
+    SEQUENCED: whether the message passes through the go-back-N window
+    ENUMS: names for each field that holds an index; a body whose index has no name is rejected
     """
 
+    NAME: ClassVar[str]
     TYPE: ClassVar[int]
     LAYOUT: ClassVar[struct.Struct]
     SEQUENCED: ClassVar[bool] = False
     ENUMS: ClassVar[dict[str, tuple[str, ...]]] = {}
 
     def encode_body(self) -> bytes:
-        """The body's bytes."""
+        """Return the body as bytes."""
         return self.LAYOUT.pack(*(getattr(self, item.name) for item in fields(self)))  # type: ignore[arg-type]
 
     @classmethod
     def parse(cls, body: bytes) -> Self:
-        """A message from its body; RemoteProtocolError where the length is wrong."""
+        """Parse a body. Raise RemoteProtocolError if its length is wrong."""
         if len(body) != cls.LAYOUT.size:
-            raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes of body, expected {cls.LAYOUT.size}")
+            raise RemoteProtocolError(f"{cls.NAME}: {len(body)} bytes of body, expected {cls.LAYOUT.size}")
         return cls(*cls.LAYOUT.unpack(body))
 
 
 @dataclass(frozen=True)
 class Hello(Message):
-    """Begin a session: whatever went on, ends."""
+    """Begin a new session. The board aborts the current one."""
 
+    NAME = "HELLO"
     TYPE, LAYOUT = 0x01, struct.Struct("<BBI")
     major: int
     minor: int
@@ -95,8 +102,9 @@ class Hello(Message):
 
 @dataclass(frozen=True)
 class Limits(Message):
-    """Limits, the board's own in HELLO_REPLY, or those a host asks it to tighten to."""
+    """Safety limits: the board's own in HELLO_REPLY, or the tighter ones that a host requests."""
 
+    NAME = "LIMITS"
     TYPE, LAYOUT, SEQUENCED = 0x02, struct.Struct("<HHHIIIHHHHHHHH"), True
     max_on_us: int
     max_duty: int
@@ -116,8 +124,9 @@ class Limits(Message):
 
 @dataclass(frozen=True)
 class HelloReply(Message):
-    """Who the board is and what it allows."""
+    """Identity, capabilities and limits of the board, in answer to HELLO."""
 
+    NAME = "HELLO_REPLY"
     TYPE = 0x81
     LAYOUT = struct.Struct("<BBIHI12sIIHHHB")
     major: int
@@ -135,32 +144,34 @@ class HelloReply(Message):
     limits: Limits
 
     def encode_body(self) -> bytes:
-        """The body's bytes."""
+        """Return the body as bytes."""
         values = [getattr(self, item.name) for item in fields(self)[:-1]]
         return self.LAYOUT.pack(*values) + self.limits.encode_body()
 
     @classmethod
     def parse(cls, body: bytes) -> Self:
-        """A message from its body."""
+        """Parse a body. Raise RemoteProtocolError if its length is wrong."""
         fixed_part, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
         if len(fixed_part) != cls.LAYOUT.size:
-            raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes of body")
+            raise RemoteProtocolError(f"{cls.NAME}: {len(body)} bytes of body")
         values: tuple[Any, ...] = (*cls.LAYOUT.unpack(fixed_part), Limits.parse(rest))
         return cls(*values)
 
 
 @dataclass(frozen=True)
-class Clock(Message):
-    """Ask what the board's clock reads."""
+class ClockRequest(Message):
+    """Request the board's clock."""
 
+    NAME = "CLOCK"
     TYPE, LAYOUT = 0x03, struct.Struct("<I")
     host_t: int
 
 
 @dataclass(frozen=True)
 class ClockReply(Message):
-    """The tick at which the question was taken in."""
+    """Board tick at which the board received CLOCK."""
 
+    NAME = "CLOCK_REPLY"
     TYPE, LAYOUT = 0x83, struct.Struct("<IQ")
     host_t: int
     tick: int
@@ -168,39 +179,46 @@ class ClockReply(Message):
 
 @dataclass(frozen=True)
 class Lease(Message):
-    """Permit to emit for another ms milliseconds."""
+    """Permit the board to emit for another `ms` milliseconds."""
 
+    NAME = "LEASE"
     TYPE, LAYOUT = 0x04, struct.Struct("<H")
     ms: int
 
 
 @dataclass(frozen=True)
 class Data(Message):
-    """Points to queue."""
+    """Append points to the board's queue."""
 
+    NAME = "DATA"
     TYPE, SEQUENCED = 0x10, True
     LAYOUT = struct.Struct("<I")
     first_index: int
     points: bytes
 
     def encode_body(self) -> bytes:
-        """The body's bytes."""
+        """Return the body as bytes."""
         return self.LAYOUT.pack(self.first_index) + self.points
 
     @classmethod
     def parse(cls, body: bytes) -> Self:
-        """A message from its body."""
+        """Parse a body. Raise RemoteProtocolError if its length is wrong."""
         points = body[cls.LAYOUT.size :]
         if not points or len(points) % POINT.size:
-            raise RemoteProtocolError(f"{cls.__name__}: {len(points)} bytes are no whole points")
+            raise RemoteProtocolError(f"{cls.NAME}: {len(points)} bytes are not a whole number of points")
         (first_index,) = cls.LAYOUT.unpack(body[: cls.LAYOUT.size])
         return cls(first_index, points)
 
 
 @dataclass(frozen=True)
 class Start(Message):
-    """Execute from first_index at start_tick, or at once where that is past, with watermark points queued."""
+    """Start a job at start_tick, or immediately if that tick has passed.
 
+    first_index: index of the job's first point
+    watermark: number of points that the board must have queued before it starts
+    """
+
+    NAME = "START"
     TYPE, LAYOUT, SEQUENCED = 0x11, struct.Struct("<IIQH"), True
     job: int
     first_index: int
@@ -210,8 +228,9 @@ class Start(Message):
 
 @dataclass(frozen=True)
 class End(Message):
-    """The job's last point is the one before end_index."""
+    """End a job: its last point is the one before end_index."""
 
+    NAME = "END"
     TYPE, LAYOUT, SEQUENCED = 0x12, struct.Struct("<II"), True
     job: int
     end_index: int
@@ -219,23 +238,26 @@ class End(Message):
 
 @dataclass(frozen=True)
 class Abort(Message):
-    """Gate off, queue dropped, DISARMED; in any session, at once."""
+    """Turn the gate off, drop the queue and go to DISARMED. The board accepts it in any session."""
 
+    NAME = "ABORT"
     TYPE, LAYOUT = 0x13, struct.Struct("<")
 
 
 @dataclass(frozen=True)
 class ArmReq(Message):
-    """Begin to arm."""
+    """Request arming. The board answers with ARM_CHALLENGE."""
 
+    NAME = "ARM_REQ"
     TYPE, LAYOUT, SEQUENCED = 0x14, struct.Struct("<I"), True
     host_nonce: int
 
 
 @dataclass(frozen=True)
 class ArmChallenge(Message):
-    """A nonce to be sent back once."""
+    """Nonce that the host must return once, in ARM_CONFIRM."""
 
+    NAME = "ARM_CHALLENGE"
     TYPE, LAYOUT = 0x94, struct.Struct("<II")
     host_nonce: int
     board_nonce: int
@@ -243,8 +265,9 @@ class ArmChallenge(Message):
 
 @dataclass(frozen=True)
 class ArmConfirm(Message):
-    """The nonces of the challenge."""
+    """Confirm arming with both nonces of the challenge."""
 
+    NAME = "ARM_CONFIRM"
     TYPE, LAYOUT, SEQUENCED = 0x15, struct.Struct("<II"), True
     host_nonce: int
     board_nonce: int
@@ -252,44 +275,50 @@ class ArmConfirm(Message):
 
 @dataclass(frozen=True)
 class Disarm(Message):
-    """Gate off, queue dropped, DISARMED."""
+    """Turn the gate off, drop the queue and go to DISARMED."""
 
+    NAME = "DISARM"
     TYPE, LAYOUT, SEQUENCED = 0x16, struct.Struct("<"), True
 
 
 @dataclass(frozen=True)
 class ClearFault(Message):
-    """Acknowledge a fault whose cause is gone; leads to DISARMED only."""
+    """Acknowledge a fault whose cause is gone. The board goes to DISARMED."""
 
+    NAME = "CLEAR_FAULT"
     TYPE, LAYOUT, SEQUENCED = 0x17, struct.Struct("<"), True
 
 
 @dataclass(frozen=True)
 class Get(Message):
-    """Ask for STATUS."""
+    """Request STATUS."""
 
+    NAME = "GET"
     TYPE, LAYOUT = 0x18, struct.Struct("<")
 
 
 @dataclass(frozen=True)
 class Flush(Message):
-    """Gate off, queue dropped, ARMED."""
+    """Turn the gate off, drop the queue and go to ARMED."""
 
+    NAME = "FLUSH"
     TYPE, LAYOUT, SEQUENCED = 0x19, struct.Struct("<"), True
 
 
 @dataclass(frozen=True)
 class GetExecuted(Message):
-    """Ask for the executed records from first_index again."""
+    """Request the executed records from first_index again."""
 
+    NAME = "GET_EXECUTED"
     TYPE, LAYOUT = 0x1A, struct.Struct("<I")
     first_index: int
 
 
 @dataclass(frozen=True)
 class Ack(Message):
-    """Everything before next_seq was taken."""
+    """Acknowledge every sequenced frame before next_seq."""
 
+    NAME = "ACK"
     TYPE, LAYOUT, ENUMS = 0x90, struct.Struct("<BHIB"), {"state": STATES}
     next_seq: int
     free_points: int
@@ -299,8 +328,9 @@ class Ack(Message):
 
 @dataclass(frozen=True)
 class Nak(Message):
-    """A frame was not taken, or taken and refused; next_seq as in ACK."""
+    """Refuse a sequenced frame. next_seq acknowledges as in ACK."""
 
+    NAME = "NAK"
     TYPE, LAYOUT, ENUMS = 0x91, struct.Struct("<BB"), {"reason": NAK_REASONS}
     next_seq: int
     reason: int
@@ -308,8 +338,9 @@ class Nak(Message):
 
 @dataclass(frozen=True)
 class Event(Message):
-    """The state changed."""
+    """Report a change of state."""
 
+    NAME = "EVENT"
     TYPE, LAYOUT = 0x92, struct.Struct("<BBBQ")
     ENUMS: ClassVar = {"state": STATES, "fault": FAULTS, "reason": EVENT_REASONS}
     state: int
@@ -320,8 +351,9 @@ class Event(Message):
 
 @dataclass(frozen=True)
 class Status(Message):
-    """How the board is."""
+    """Report state, inputs and counters of the board."""
 
+    NAME = "STATUS"
     TYPE, LAYOUT = 0x98, struct.Struct("<BBBQIHHHHHQh")
     ENUMS: ClassVar = {"state": STATES, "fault": FAULTS}
     state: int
@@ -340,29 +372,33 @@ class Status(Message):
 
 @dataclass(frozen=True)
 class Executed(Message):
-    """What was done to the points from first_index on: (tick of gate on, gate-on ticks, duty)."""
+    """Report executed points from first_index on.
 
+    records: (tick of gate on, gate-on time in ticks, duty) per point
+    """
+
+    NAME = "EXECUTED"
     TYPE = 0x99
     LAYOUT = struct.Struct("<IQ")
     first_index: int
     records: tuple[tuple[int, int, int], ...]
 
     def encode_body(self) -> bytes:
-        """The body's bytes; offsets count from the first record's tick."""
+        """Return the body as bytes. Offsets count from the first record's tick."""
         base = self.records[0][0]
         packed = (RECORD.pack(on_tick - base, on_ticks, duty) for on_tick, on_ticks, duty in self.records)
         return self.LAYOUT.pack(self.first_index, base) + b"".join(packed)
 
     @classmethod
     def parse(cls, body: bytes) -> Self:
-        """A message from its body."""
+        """Parse a body. Raise RemoteProtocolError if its length is wrong."""
         fixed_part, rest = body[: cls.LAYOUT.size], body[cls.LAYOUT.size :]
         if (
             len(fixed_part) != cls.LAYOUT.size
             or len(rest) % RECORD.size
             or not 1 <= len(rest) // RECORD.size <= RECORDS_MAX
         ):
-            raise RemoteProtocolError(f"{cls.__name__}: {len(body)} bytes are not 1 to {RECORDS_MAX} whole records")
+            raise RemoteProtocolError(f"{cls.NAME}: {len(body)} bytes are not 1 to {RECORDS_MAX} whole records")
         first_index, base = cls.LAYOUT.unpack(fixed_part)
         records = tuple((base + offset, on, duty) for offset, on, duty in RECORD.iter_unpack(rest))
         return cls(first_index, records)
@@ -371,7 +407,7 @@ class Executed(Message):
 HOST_MESSAGES: tuple[type[Message], ...] = (
     Hello,
     Limits,
-    Clock,
+    ClockRequest,
     Lease,
     Data,
     Start,
@@ -399,12 +435,12 @@ MESSAGES_BY_TYPE: dict[int, type[Message]] = {kind.TYPE: kind for kind in HOST_M
 
 
 def parse_message(type_id: int, body: bytes) -> Message:
-    """A message from a frame's type and body; RemoteProtocolError for unknown types, lengths and enumerations."""
+    """Parse a frame's type and body. Raise RemoteProtocolError if the type, the length or an enumeration is unknown."""
     message_class = MESSAGES_BY_TYPE.get(type_id)
     if message_class is None:
         raise RemoteProtocolError(f"unknown message type 0x{type_id:02x}")
     message = message_class.parse(body)
     for name, names in message_class.ENUMS.items():
         if getattr(message, name) >= len(names):
-            raise RemoteProtocolError(f"{message_class.__name__}: {name} {getattr(message, name)} has no meaning")
+            raise RemoteProtocolError(f"{message_class.NAME}: {name} {getattr(message, name)} has no meaning")
     return message

@@ -1,4 +1,4 @@
-"""Limited plans to points of codes and ticks, and the very bytes back to SI, for the proof before emission."""
+"""Quantisation of limited plans to wire points, and decoding of the wire bytes for verification before emission."""
 
 from dataclasses import dataclass
 
@@ -14,29 +14,33 @@ CENTRE_CODE, CODE_MAX = DAC.centre, DAC.code_max
 DUTY_MAX = 65535
 TICKS_MAX = 65535
 GATE_OFF_STEP_TICKS = 60_000
-"""A pause longer than a point can hold is cut into dark points of this length."""
+"""A pause longer than one point can hold is split into gate-off points of this length."""
 
 
 @dataclass(frozen=True)
 class WireScale:
-    """How SI becomes codes and ticks."""
+    """Scale factors between SI units and wire integers."""
 
     rad_per_code: float
     full_power_w: float
     tick_s: float
 
     def to_codes(self, angle_rad: FloatArray) -> IntArray:
-        """Mirror angle to DAC codes; LocalProtocolError beyond the DAC's range. Any shape."""
+        """Return the DAC codes of mirror angles, any shape. Raise LocalProtocolError beyond the DAC's range."""
         return DAC.to_codes(angle_rad, self.rad_per_code)
 
     def to_angles_rad(self, codes: IntArray) -> FloatArray:
-        """DAC codes to mirror angle, rad. Any shape."""
+        """Return the mirror angles of DAC codes, rad, any shape."""
         return DAC.to_angles_rad(codes, self.rad_per_code)
 
 
 @dataclass(frozen=True, eq=False)
 class WirePoints:
-    """Points of a plan: table uint16 [n, 5] of x, y, dark, on, duty; row [n] the plan's pulse, -1 for a dark point."""
+    """Points of a plan on the wire.
+
+    table: uint16 [n, 5] of x, y, gate-off ticks, gate-on ticks and duty
+    row: [n] row of the pulse in the plan, -1 for a point inserted into a long pause
+    """
 
     table: np.ndarray[tuple[int, ...], np.dtype[np.uint16]]
     row: IntArray
@@ -48,21 +52,21 @@ class WirePoints:
         return len(self.row)
 
     def encode_payload(self, first: int = 0, count: int | None = None) -> bytes:
-        """The bytes of points first to first + count, or to the last, as DATA carries them."""
+        """Return points first to first + count, or to the last, as the bytes in DATA."""
         return self.table[first : None if count is None else first + count].astype("<u2").tobytes()
 
     def compute_end_ticks(self) -> IntArray:
-        """When each point ends, ticks from the plan's zero, [n]."""
+        """Return the end of each point in ticks from the plan's zero, [n]."""
         return np.cumsum(self.table[:, 2:4].astype(np.int64).sum(axis=1))
 
     def count_before(self, row: int) -> int:
-        """How many points there are before the darkness that leads to the plan's pulse `row`."""
+        """Return the number of points before the pause that precedes the plan's pulse `row`."""
         return int(np.searchsorted(np.maximum.accumulate(self.row), row - 1)) + 1 if row else 0
 
 
 @dataclass(frozen=True, eq=False)
 class DecodedPulses:
-    """Pulses read back from bytes, times from the plan's zero; all [n]. index counts the points from the first."""
+    """Pulses decoded from wire bytes, all [n]. Times count from the plan's zero. index: position among the points."""
 
     index: IntArray
     start_s: FloatArray
@@ -73,10 +77,10 @@ class DecodedPulses:
 
 
 def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
-    """Points for a plan. Starts come from absolute times, so rounding never adds up; duty is rounded down.
+    """Quantise a plan to points. Raise LocalProtocolError if a pulse does not fit a point, or pulses overlap.
 
-    A pulse trimmed to nothing becomes a dark point of the same length, so that times stay; the mirrors do not go there
-    but on to the next pulse.
+    Starts are rounded from absolute times, so rounding errors do not accumulate. Duty is rounded down. A pulse trimmed
+    to zero power becomes a gate-off point of the same length; its mirror position is that of the next pulse.
     """
     start = np.rint(plan.start_s / scale.tick_s).astype(np.int64)
     width = np.rint(plan.width_s / scale.tick_s).astype(np.int64)
@@ -104,7 +108,10 @@ def quantise(plan: LimitedPlan, scale: WireScale) -> WirePoints:
 
 
 def _find_next_gate_on(duty: IntArray) -> IntArray:
-    """[n] the row itself where it is lit, else the next lit row, or the last; the first where none is lit."""
+    """Return for each row the first row from it on with duty > 0, [n].
+
+    Rows behind the last such row get that row. All rows get 0 if there is none.
+    """
     gate_on_rows = np.flatnonzero(duty)
     if not len(gate_on_rows):
         return np.zeros(len(duty), dtype=np.int64)
@@ -112,7 +119,7 @@ def _find_next_gate_on(duty: IntArray) -> IntArray:
 
 
 def decode(payload: bytes, scale: WireScale) -> DecodedPulses:
-    """Read points back from the bytes of DATA frames, joined in order; dark points only pass time."""
+    """Decode the concatenated payloads of DATA frames. Gate-off points only advance time."""
     table = np.frombuffer(payload, dtype="<u2").reshape(-1, 5).astype(np.int64)
     x, y, off, on, duty = table.T
     end = np.cumsum(off + on)

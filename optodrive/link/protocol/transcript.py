@@ -1,4 +1,7 @@
-"""What passed on a link, message by message, from its raw bytes; sans-I/O. Counts as the host and the board count."""
+"""Transcript of a link, message by message, from its raw bytes, sans-I/O.
+
+The error counts agree with those of the host and of the board.
+"""
 
 from dataclasses import dataclass, field
 from statistics import median
@@ -7,7 +10,6 @@ from typing import Any, NamedTuple
 from optodrive.core.errors import RemoteProtocolError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import SEQ_MODULUS
-from optodrive.link.protocol.describe import message_name
 from optodrive.link.protocol.framing import ENCODED_MAX, Frame, FrameDecoder
 
 PENDING_MAX = 4 * ENCODED_MAX
@@ -15,7 +17,12 @@ PENDING_CLOCKS_MAX = 256
 
 
 class TranscriptEntry(NamedTuple):
-    """One frame, or bytes that are none. message: None then, and bad says why; raw: as on the wire, no delimiter."""
+    """One frame, or a run of bytes that is no valid frame.
+
+    message, error: the parsed message and "", or None and the reason
+    raw: bytes on the wire without the delimiter
+    retransmitted: whether the host had sent the frame before
+    """
 
     host_s: float
     to_board: bool
@@ -28,7 +35,10 @@ class TranscriptEntry(NamedTuple):
 
 @dataclass
 class TranscriptTotals:
-    """Figures of a whole transcript. Silences are between bytes of the same direction while the link was open."""
+    """Statistics of a transcript.
+
+    board_silence_s, host_silence_s: longest time between bytes of one direction while the link was open
+    """
 
     frames_to_board: int = 0
     frames_from_board: int = 0
@@ -42,33 +52,33 @@ class TranscriptTotals:
     round_trips_s: list[float] = field(default_factory=list)
 
     def to_dict(self) -> dict[str, Any]:
-        """As a dict of numbers; round trip: of CLOCK and its reply, None where there was none."""
+        """Return the statistics by name. Round trips are those of CLOCK and CLOCK_REPLY, None without any."""
         trips_s = self.round_trips_s
         return {
             **{name: value for name, value in vars(self).items() if name != "round_trips_s"},
             "round_trip_median_s": median(trips_s) if trips_s else None,
-            "round_trip_least_s": min(trips_s, default=None),
-            "round_trip_most_s": max(trips_s, default=None),
+            "round_trip_min_s": min(trips_s, default=None),
+            "round_trip_max_s": max(trips_s, default=None),
         }
 
 
 class _FrameSplitter:
-    """One direction's bytes to frames, with what is none; a frame counts at the time of its delimiter."""
+    """Splits the bytes of one direction at the delimiters. A frame has the time of its delimiter."""
 
     def __init__(self) -> None:
         self._pending = b""
 
     def feed(self, data: bytes) -> list[bytes]:
         *encoded_frames, rest = (self._pending + data).split(b"\0")
-        if len(rest) > PENDING_MAX:  # no frame is so long: it is shown as it is, and memory stays bounded
+        if len(rest) > PENDING_MAX:  # longer than any frame; the bound limits memory
             encoded_frames.append(rest)
             rest = b""
         self._pending = rest
-        return [piece for piece in encoded_frames if piece]
+        return [encoded for encoded in encoded_frames if encoded]
 
 
 class Transcript:
-    """Takes bytes with their times and directions; gives lines, and keeps totals."""
+    """Incremental parser of both directions of a link. It keeps the totals."""
 
     def __init__(self) -> None:
         self.totals = TranscriptTotals()
@@ -78,15 +88,15 @@ class Transcript:
         self._clock_request_s: dict[int, float] = {}
 
     def reset_link(self) -> None:
-        """The link was opened or closed: half a frame is none, and what follows is no silence."""
+        """Discard partial frames and silence timers after the link was opened or closed."""
         self._splitters = {True: _FrameSplitter(), False: _FrameSplitter()}
         self._last_byte_s.clear()
         self._clock_request_s.clear()
 
     def feed(self, host_s: float, to_board: bool, data: bytes) -> list[TranscriptEntry]:
-        """Lines completed by these bytes."""
+        """Return the entries that `data` completes. to_board: direction."""
         self._record_silence(host_s, to_board)
-        return [self._parse_frame(host_s, to_board, piece) for piece in self._splitters[to_board].feed(data)]
+        return [self._parse_frame(host_s, to_board, encoded) for encoded in self._splitters[to_board].feed(data)]
 
     def _record_silence(self, host_s: float, to_board: bool) -> None:
         silence_s = host_s - self._last_byte_s.get(to_board, host_s)
@@ -109,7 +119,7 @@ class Transcript:
             return self._record_bad_frame(host_s, to_board, frame, str(error), encoded)
         if isinstance(message, m.BOARD_MESSAGES) == to_board:
             return self._record_bad_frame(
-                host_s, to_board, frame, f"{message_name(message)} in the wrong direction: an echo", encoded
+                host_s, to_board, frame, f"{message.NAME} in the wrong direction: an echo", encoded
             )
         if to_board:
             self.totals.frames_to_board += 1
@@ -130,12 +140,12 @@ class Transcript:
         return TranscriptEntry(host_s, to_board, frame, None, error_text, encoded)
 
     def _record_frame(self, host_s: float, frame: Frame, message: m.Message) -> bool:
-        """Whether the frame was sent before; counts what it tells."""
+        """Update the totals and return whether the frame is a retransmission."""
         if isinstance(message, m.Hello | m.Abort):
             self._next_seq = 0
         elif isinstance(message, m.Nak):
             self.totals.naks += 1
-        elif isinstance(message, m.Clock):
+        elif isinstance(message, m.ClockRequest):
             if len(self._clock_request_s) >= PENDING_CLOCKS_MAX:
                 self._clock_request_s.clear()
             self._clock_request_s[message.host_t] = host_s

@@ -102,8 +102,8 @@ def _diagnose_corruption(evidence: LinkEvidence) -> str | None:
     bad_frames = evidence.host_bad_frames + evidence.board_bad_frames
     if bad_frames:
         return (
-            f"bytes arrive damaged ({evidence.host_bad_frames} bad frames here, {evidence.board_bad_frames} at the board in the "
-            f"last seconds): {NOISE_REMEDY}, and compare board.baud"
+            f"bytes arrive damaged ({evidence.host_bad_frames} bad frames here, {evidence.board_bad_frames} at the board "
+            f"in the last seconds): {NOISE_REMEDY}, and compare board.baud"
         )
     if evidence.naks or evidence.retransmitted:
         return (

@@ -64,7 +64,7 @@ def clock_shift_s(entries: Iterable[CaptureEntry]) -> float:
             transcript.reset_link()
             continue
         for line in transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data):
-            if isinstance(line.message, m.Clock):
+            if isinstance(line.message, m.ClockRequest):
                 request_s[line.message.host_t] = line.host_s
             elif isinstance(line.message, m.ClockReply) and line.message.host_t in request_s:
                 board_s = line.message.tick * 1e-6

@@ -250,7 +250,7 @@ class BoardSession:
         if len(self._clock_requests_s) > 64:
             self._clock_requests_s.clear()
         self._clock_requests_s[stamp] = self._clock_sent_s
-        self._connection.send(m.Clock(host_t=stamp))
+        self._connection.send(m.ClockRequest(host_t=stamp))
 
     def _on_message(self, message: m.Message, now_s: float) -> None:
         handlers: dict[type[m.Message], Callable[[Any, float], None]] = {
@@ -409,4 +409,5 @@ class BoardSession:
 
     def _describe_errors(self) -> str:
         counts = self._count_errors()
-        return f"{counts.host_bad_frames} bad frames here, {counts.board_bad_frames} at the board, {counts.retransmitted} sent again"
+        bad = f"{counts.host_bad_frames} bad frames here, {counts.board_bad_frames} at the board"
+        return f"{bad}, {counts.retransmitted} sent again"

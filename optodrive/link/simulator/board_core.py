@@ -399,7 +399,7 @@ class BoardCore:
         if isinstance(message, m.Lease) and self.state in LEASED_STATES:
             until_us = self._now_us + 1000 * min(message.ms, self._limits.lease_ms)
             self._lease_until_us = max(self._lease_until_us, until_us)
-        elif isinstance(message, m.Clock):
+        elif isinstance(message, m.ClockRequest):
             self._send(m.ClockReply(message.host_t, self._current_tick()))
         elif isinstance(message, m.Get):
             self._send(self._build_status())

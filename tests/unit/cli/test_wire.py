@@ -15,7 +15,7 @@ def encode_message(message, seq=0):
 DATA = m.Data(0, m.POINT.pack(1, 2, 3, 4, 32768) * 20)
 ENTRIES = [
     CaptureEntry(OPENED, 10.0),
-    CaptureEntry(TO_BOARD, 10.1, b"\0" + encode_message(m.Clock(9)) + encode_message(DATA)),
+    CaptureEntry(TO_BOARD, 10.1, b"\0" + encode_message(m.ClockRequest(9)) + encode_message(DATA)),
     CaptureEntry(FROM_BOARD, 10.15, encode_message(m.ClockReply(9, 77))[:4]),
     CaptureEntry(FROM_BOARD, 10.2, encode_message(m.ClockReply(9, 77))[4:] + b"\x05no frame\0"),
     CaptureEntry(TO_BOARD, 10.3, encode_message(DATA)),

@@ -246,7 +246,7 @@ def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_beg
     assert host.receive_bytes(wire(m.Ack(0, 0, 0, 0)), 0.0) == []
     host.receive_bytes(wire(hello_reply(3, 222), session=222), 0.0)
     assert host.receive_bytes(wire(event), 0.0) == []
-    host.send_hello(4)  # greeted anew without an abort: nothing of before counts
+    host.send_hello(4)  # without an abort, no event of the old session is returned
     assert host.receive_bytes(wire(event, session=222), 0.0) == []
 
 

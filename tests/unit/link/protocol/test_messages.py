@@ -1,4 +1,4 @@
-"""The Python messages against messages.toml, the vectors and the refused frames: three statements of one wire."""
+"""Compare the Python messages with messages.toml, the test vectors and the frames to refuse."""
 
 import re
 import struct
@@ -29,15 +29,11 @@ VECTORS = {path.stem: tomllib.loads(path.read_text()) for path in sorted((CONTRA
 REFUSED = tomllib.loads((CONTRACT / "refused.toml").read_text())["case"]
 
 
-def python_name(name):
-    return "".join(word.title() for word in name.split("_"))
-
-
-KINDS = {name: getattr(m, python_name(name)) for name in STATED}
+KINDS = {message.NAME: message for message in m.MESSAGES_BY_TYPE.values()}
 
 
 def codes(entries):
-    """Format characters of fields, structs spelt out."""
+    """Return the struct format of fields, nested structs expanded."""
     return "".join(CODES.get(entry["type"]) or codes(STRUCTS[entry["type"]]) for entry in entries)
 
 
@@ -46,8 +42,8 @@ def names(entries):
 
 
 def test_every_message_is_stated_on_both_sides():
-    assert {entry["id"]: python_name(entry["name"]) for entry in TOML["message"]} == {
-        kind: message.__name__ for kind, message in m.MESSAGES_BY_TYPE.items()
+    assert {entry["id"]: entry["name"] for entry in TOML["message"]} == {
+        type_id: message.NAME for type_id, message in m.MESSAGES_BY_TYPE.items()
     }
     assert len(TOML["message"]) == len(STATED) == len(m.HOST_MESSAGES) + len(m.BOARD_MESSAGES)
 
@@ -88,9 +84,9 @@ def test_points_and_records_fill_a_frame():
     assert "<" + codes(data["fields"][:-1]) == m.Data.LAYOUT.format
     assert "<" + codes(STRUCTS["record"]) == m.RECORD.format
     assert "<" + codes(executed["fields"][:-1]) == m.Executed.LAYOUT.format
-    for stated, item, most in ((data, m.POINT, m.POINTS_MAX), (executed, m.RECORD, m.RECORDS_MAX)):
-        assert stated["repeat"] == {"min": 1, "max": most}
-        assert KINDS[stated["name"]].LAYOUT.size + most * item.size <= framing.BODY_MAX
+    for stated, item, count_max in ((data, m.POINT, m.POINTS_MAX), (executed, m.RECORD, m.RECORDS_MAX)):
+        assert stated["repeat"] == {"min": 1, "max": count_max}
+        assert KINDS[stated["name"]].LAYOUT.size + count_max * item.size <= framing.BODY_MAX
 
 
 def test_enumerations_and_framing():
@@ -108,7 +104,7 @@ def test_enumerations_and_framing():
 
 
 def offsets(entries):
-    """(offset, type, name) of each field, as PROTOCOL.md writes them; a struct has no type there."""
+    """Return (offset, type, name) of each field as in PROTOCOL.md, where a struct has no type."""
     at, placed = 0, []
     for entry in entries:
         placed.append((str(at), entry["type"].replace("bytes12", "u8[12]"), entry["name"]))
@@ -145,7 +141,7 @@ def test_the_page_s_numbers_say_the_same(name):
 
 
 def build(name, values):
-    """A Python message from a vector's fields."""
+    """Build a message from the fields of a test vector."""
     values = dict(values)
     if name == "LIMITS":
         return m.Limits(**values["limits"])
@@ -204,7 +200,7 @@ def test_every_other_length_of_body_is_refused(stem):
             shorter = m.parse_message(vector["type"], body[:length])
         except RemoteProtocolError:
             continue
-        assert vector["message"] in ("DATA", "EXECUTED")  # fewer points, but whole ones
+        assert vector["message"] in ("DATA", "EXECUTED")  # a whole number of points
         assert shorter.encode_body() == body[:length]
     with pytest.raises(RemoteProtocolError):
         m.parse_message(vector["type"], body + b"\x01")

@@ -1,4 +1,4 @@
-"""The firmware's header is what generate.py makes of messages.toml."""
+"""Check that the firmware header is the output of generate.py for messages.toml."""
 
 import runpy
 import tomllib

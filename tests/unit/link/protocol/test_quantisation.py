@@ -57,7 +57,7 @@ def test_times_come_back_to_1e_12():
 
 
 def test_rounding_of_starts_never_adds_up():
-    start = np.arange(2000) * 0.0030003  # 300 ns beside the tick, more and more
+    start = np.arange(2000) * 0.0030003  # 300 ns more off the tick at each pulse
     read = back(plan(*((s, 0.001, 0, 0, 1) for s in start)))
     assert np.abs(read.start_s - start).max() <= 0.5e-6 + 1e-12
 

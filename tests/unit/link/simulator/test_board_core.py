@@ -427,7 +427,7 @@ def test_a_reset_forgets_everything_and_starts_the_clock_again(bench):
     assert bench.say(m.Get()) == [], "the old session is gone"
     reply = bench.hello()
     assert reply.reset_cause == 2
-    (clock,) = bench.say(m.Clock(5))
+    (clock,) = bench.say(m.ClockRequest(5))
     assert clock == m.ClockReply(5, 100_000)
     assert bench.status().done_index == 0
     bench.arm()

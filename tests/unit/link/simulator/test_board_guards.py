@@ -101,7 +101,7 @@ def check_b3(make):
             b.frame(m.Lease(100))[:-3] + b"\0",
             encode_frame(Frame(m.Lease.TYPE | 0x80, 0, b.session, m.Lease(100).encode_body())),
             b.frame(m.Get()),
-            b.frame(m.Clock(1)),
+            b.frame(m.ClockRequest(1)),
         ]
         for _ in range(11):
             b.wait(10_000, lease=False)
