@@ -17,12 +17,12 @@ from optodrive.link.simulator.guards import EmissionGuards
 
 
 def b1_states_do_not_darken():
-    return BoardCore, "_go_dark", lambda self, reason: setattr(self, "_current_point", None)
+    return BoardCore, "_close_gate", lambda self, reason: setattr(self, "_current_point", None)
 
 
 def b1_start_tick_is_not_awaited():
     start = BoardCore._on_start
-    return BoardCore, "_start", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
+    return BoardCore, "_on_start", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
 
 
 def b2_lit_until_more_comes():
@@ -43,7 +43,7 @@ def b3_no_lease():
 
 def b3_any_session_renews():
     take = BoardCore._handle_frame
-    return BoardCore, "_take", lambda self, frame: take(self, frame._replace(session=self._link.session))
+    return BoardCore, "_handle_frame", lambda self, frame: take(self, frame._replace(session=self._link.session))
 
 
 def b3_anything_renews():
@@ -53,7 +53,7 @@ def b3_anything_renews():
         self._lease_until_us = self._now_us + 1000 * self._limits.lease_ms
         obey(self, message)
 
-    return BoardCore, "_obey_now", renew
+    return BoardCore, "_handle_unsequenced", renew
 
 
 def b3_host_says_how_long():
@@ -65,7 +65,7 @@ def b3_host_says_how_long():
         else:
             obey(self, message)
 
-    return BoardCore, "_obey_now", believe
+    return BoardCore, "_handle_unsequenced", believe
 
 
 def b3_a_short_lease_takes_time_back():
@@ -77,12 +77,12 @@ def b3_a_short_lease_takes_time_back():
         else:
             obey(self, message)
 
-    return BoardCore, "_obey_now", shorten
+    return BoardCore, "_handle_unsequenced", shorten
 
 
 def b4_points_are_not_looked_at():
     static = BoardCore._check_point
-    return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(on_us=0))
+    return BoardCore, "_check_point", lambda self, point: static(self, point._replace(on_us=0))
 
 
 def b4_no_account_of_cells():
@@ -90,32 +90,32 @@ def b4_no_account_of_cells():
 
 
 def b4_by_position_and_not_by_cell():
-    return EmissionGuards, "cells", lambda self, x, y: [(0, x, y)]
+    return EmissionGuards, "find_cells", lambda self, x, y: [(0, x, y)]
 
 
 def b4_one_grid_whose_borders_hide():
     cells = EmissionGuards.find_cells
-    return EmissionGuards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+    return EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1]
 
 
 def b4_light_elsewhere_is_rest():
     fire = EmissionGuards.record_pulse
 
     def forget(self, limits, x, y, start_us, on_us, duty):
-        mine = self.cells(x, y)
-        self._on = {cell: account for cell, account in self._on_time.items() if cell in mine}
+        mine = self.find_cells(x, y)
+        self._on_time = {cell: account for cell, account in self._on_time.items() if cell in mine}
         fire(self, limits, x, y, start_us, on_us, duty)
 
-    return EmissionGuards, "fire", forget
+    return EmissionGuards, "record_pulse", forget
 
 
 def b5_any_duty():
     static = BoardCore._check_point
-    return BoardCore, "_static_fault", lambda self, point: static(self, point._replace(duty=0))
+    return BoardCore, "_check_point", lambda self, point: static(self, point._replace(duty=0))
 
 
 def b5_no_mean():
-    return EmissionGuards, "mean_account", lambda self, start_us, on_us, duty: 0
+    return EmissionGuards, "max_window_duty_us", lambda self, start_us, on_us, duty: 0
 
 
 def b6_no_bucket():
@@ -127,19 +127,19 @@ def b6_bucket_never_leaks():
 
 
 def b6_one_bucket_for_all():
-    return EmissionGuards, "cells", lambda self, x, y: [(0, 0, 0)]
+    return EmissionGuards, "find_cells", lambda self, x, y: [(0, 0, 0)]
 
 
 def b6_one_grid_whose_borders_hide():
     cells = EmissionGuards.find_cells
-    return EmissionGuards, "cells", lambda self, x, y: cells(self, x, y)[:1]
+    return EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1]
 
 
 def _begin(due):
     def begin(self, point):
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
         settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000) if move else 0
-        self._position, self._current = (point.x, point.y), point
+        self._position, self._current_point = (point.x, point.y), point
         self._due_us = self._now_us + due(point.dark_us, settle_us)
 
     return BoardCore, "_begin_point", begin
@@ -158,12 +158,12 @@ def b7_forgets_a_move_that_was_broken_off():
 
 
 def b8_no_field():
-    return BoardCore, "_static_fault", lambda self, point: ""
+    return BoardCore, "_check_point", lambda self, point: ""
 
 
 def b8_lit_points_only():
     static = BoardCore._check_point
-    return BoardCore, "_static_fault", lambda self, point: static(self, point) if point.on_us else ""
+    return BoardCore, "_check_point", lambda self, point: static(self, point) if point.on_us else ""
 
 
 def b9_inputs_are_only_reported():
@@ -187,16 +187,16 @@ def b9_cleared_without_a_look():
         self._set_state("DISARMED", "fault cleared")
         return ""
 
-    return BoardCore, "_clear", clear
+    return BoardCore, "_on_clear_fault", clear
 
 
 def b10_takes_what_it_is_told():
-    return core_module, "tightened", lambda own, asked: asked
+    return core_module, "tighten", lambda own, asked: asked
 
 
 def b10_against_the_first_only():
     tightened = core_module.tighten
-    return core_module, "tightened", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
+    return core_module, "tighten", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
 
 
 def b11_any_echo():
@@ -204,7 +204,7 @@ def b11_any_echo():
         self._confirmed, self._key_turned = True, False
         return ""
 
-    return BoardCore, "_confirm", confirm
+    return BoardCore, "_on_arm_confirm", confirm
 
 
 def b11_predictable():
@@ -230,7 +230,7 @@ def b11_key_may_stay():
         self._key_turned = True
         return refusal
 
-    return BoardCore, "_confirm", keep
+    return BoardCore, "_on_arm_confirm", keep
 
 
 def b11_at_once():
@@ -247,7 +247,7 @@ def b12_duplicates_are_taken():
 
 def b12_number_is_not_looked_at():
     data = BoardCore._on_data
-    return BoardCore, "_data", lambda self, message: data(self, m.Data(self._next_index, message.points))
+    return BoardCore, "_on_data", lambda self, message: data(self, m.Data(self._next_index, message.points))
 
 
 def b13_no_crc():

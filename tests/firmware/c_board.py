@@ -202,7 +202,7 @@ class CBoard:
         """The gate's readback stays at `on`, or follows the gate again."""
         self._library.shim_stick(self._handle, stuck, on)
 
-    def link_lost(self, now_us):
+    def on_link_lost(self, now_us):
         self.advance(now_us)
         self._library.shim_link_lost(self._handle)
         self._drain()

@@ -124,7 +124,7 @@ def test_abort_and_a_lost_link_are_dark_at_once(make, what):
     if what == "abort":
         b.raw(b.frame(m.Abort(), session=0))
     else:
-        b.core.link_lost(b.now_us)
+        b.core.on_link_lost(b.now_us)
     assert dark_us(b) == b.now_us
     assert b.state == "DISARMED"
 

@@ -17,7 +17,7 @@ del test_energy_is_rounded_up_and_full_duty_is_full_power  # noqa: F821
 
 @pytest.fixture(autouse=True)
 def _c_core_on_every_bench(monkeypatch, library):
-    monkeypatch.setattr(python_board, "SimulatedOptics", partial(CBench, library))
+    monkeypatch.setattr(python_board, "Bench", partial(CBench, library))
 
 
 @pytest.fixture

@@ -113,7 +113,7 @@ def arm(both, limits=None):
         both.both(lambda board: board.set_input("key", False, both.now_us))
         both.both(lambda board: board.set_input("key", True, both.now_us))
     both.say(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
-    both.say(m.ArmConfirm(6, core._nonce or 0), m.Lease(60_000))
+    both.say(m.ArmConfirm(6, core._board_nonce or 0), m.Lease(60_000))
     for _ in range(30):
         both.wait(70_000)
         both.say(m.Lease(60_000))
@@ -141,7 +141,7 @@ def step(both, what, detail):
         value = not core.inputs[detail]
         both.both(lambda board: board.set_input(detail, value, both.now_us))
     elif what == "link lost":
-        both.both(lambda board: board.link_lost(both.now_us))
+        both.both(lambda board: board.on_link_lost(both.now_us))
     elif what == "reset":
         both.both(lambda board: board.reset(both.now_us))
     elif what == "anything":

@@ -172,7 +172,7 @@ def said(core, what, detail):
         messages = [m.Data(core._next_index, b"".join(m.POINT.pack(*point) for point in detail))]
         messages += [m.Start(1, first, 0, 1), m.End(1, end)] if what == "play" else []
     else:
-        confirm = m.ArmConfirm(core._arming_host_nonce or 0, core._nonce or 0)
+        confirm = m.ArmConfirm(core._arming_host_nonce or 0, core._board_nonce or 0)
         messages = {
             "start": [m.Start(1, first, 0, 1)],
             "end": [m.End(1, core._next_index)],

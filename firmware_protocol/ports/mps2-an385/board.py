@@ -128,7 +128,7 @@ class QemuCore:
         """Bytes for the host."""
         return self._read(self._host)
 
-    def link_lost(self, now_us: int) -> None:
+    def on_link_lost(self, now_us: int) -> None:
         """Tell the bench, and wait until the board is dark."""
         before = self._states
         self._bench.sendall(b"L")

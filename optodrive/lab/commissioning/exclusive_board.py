@@ -6,7 +6,6 @@ lease end it dark.
 
 import gc
 import sys
-from dataclasses import fields
 from math import ceil, inf, pi
 from types import TracebackType
 from typing import Self
@@ -164,19 +163,18 @@ class ExclusiveBoard:
 
     def _plan(self, x_rad: float, y_rad: float, power_w: float) -> PulsePlan:
         """One pulse. Nobody knows yet which pixel it meets: all count on one, the one that bears least."""
-        columns = {
-            "start_s": self._settling_s,
-            "width_s": self._width_s,
-            "x_rad": x_rad,
-            "y_rad": y_rad,
-            "power_w": power_w,
-            "pixel": self._accounted_pixel,
-            "settle_s": self._settling_s,
-            "target_m": np.nan,
-            "nominal_s": self._settling_s,
-            "source": 0,
-        }
-        return PulsePlan(**{item.name: np.array([columns[item.name]]) for item in fields(PulsePlan)})
+        return PulsePlan(
+            start_s=np.array([self._settling_s]),
+            width_s=np.array([self._width_s]),
+            x_rad=np.array([x_rad]),
+            y_rad=np.array([y_rad]),
+            power_w=np.array([power_w]),
+            pixel=np.array([self._accounted_pixel]),
+            settling_s=np.array([self._settling_s]),
+            target_m=np.array([np.nan]),
+            requested_start_s=np.array([self._settling_s]),
+            source=np.array([0]),
+        )
 
     def _execute_point(self, x_code: int, y_code: int, power_w: float, gate_on: bool) -> None:
         self.check_range(x_code, y_code)

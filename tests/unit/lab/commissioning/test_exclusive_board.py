@@ -126,7 +126,7 @@ def test_widths_and_waits_are_whole_and_long_enough(any_display):
     periods = spot_width_s(config) * config.laser.pwm_hz
     assert periods == pytest.approx(round(periods))
     assert spot_width_s(config) <= config.limits.pulse_width_max_s
-    assert max_settling_s(config) * 1e6 >= any_display.scan_head.settling.lead_us
+    assert max_settling_s(config) * 1e6 >= any_display.scan_head.settling.lead_in_us
 
 
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])

@@ -395,7 +395,7 @@ def test_a_fault_stays_latched_over_hello_and_link_loss_and_only_clear_ends_it(b
     bench.core.set_input("interlock", True, bench.now_us)
     assert bench.fault == "ON_TIME", "the first fault is kept"
     bench.hello()
-    bench.core.link_lost(bench.now_us)
+    bench.core.on_link_lost(bench.now_us)
     bench.say(m.Abort(), m.Disarm())
     status = bench.status()
     assert (m.STATES[status.state], m.FAULTS[status.fault]) == ("FAULT", "ON_TIME")
@@ -436,7 +436,7 @@ def test_a_reset_forgets_everything_and_starts_the_clock_again(bench):
 def test_link_loss_disarms(bench):
     bench.play(*dim(5))
     bench.wait(9500)
-    bench.core.link_lost(bench.now_us)
+    bench.core.on_link_lost(bench.now_us)
     assert walk(bench)[-1] == ("DISARMED", "link lost")
     assert not bench.core.gate
 

@@ -30,7 +30,7 @@ def check_b1(make):
         "abort": lambda b: b.say(m.Abort()),
         "hello": lambda b: b.hello(),
         "input": lambda b: b.core.set_input("interlock", False, b.now_us),
-        "link lost": lambda b: b.core.link_lost(b.now_us),
+        "link lost": lambda b: b.core.on_link_lost(b.now_us),
         "reset": lambda b: b.core.reset(b.now_us),
     }
     for name, end in ends.items():
@@ -323,7 +323,7 @@ def _begin(due):
     def begin(self, point):
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
         settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000) if move else 0
-        self._position, self._current = (point.x, point.y), point
+        self._position, self._current_point = (point.x, point.y), point
         self._due_us = self._now_us + due(point.dark_us, settle_us)
 
     return begin
@@ -520,7 +520,7 @@ def b11_predictable(patch):
         def getrandbits(self, bits):
             return 4
 
-    patch.setattr(core_module, "rng", SimpleNamespace(Random=Constant))
+    patch.setattr(core_module, "random", SimpleNamespace(Random=Constant))
 
 
 def b11_key_may_stay(patch):
