@@ -239,7 +239,7 @@ def b11_at_once():
 
 def b12_duplicates_are_taken():
     def accept(self, seq):
-        self._expected = seq
+        self._expected_seq = seq
         return True, None
 
     return BoardLink, "accept", accept
@@ -258,7 +258,7 @@ def b13_no_crc():
             return None
         return Frame(*HEADER.unpack(raw[: HEADER.size]), raw[HEADER.size : -CRC.size])
 
-    return FrameDecoder, "_frame", frame
+    return FrameDecoder, "_decode_frame", frame
 
 
 def b13_lengths_do_not_matter():

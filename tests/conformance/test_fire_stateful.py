@@ -104,7 +104,7 @@ class Owner(RuleBasedStateMachine):
         self.pass_time(lambda: False, 0.02)
 
     @precondition(lambda self: self.connected())
-    @rule(how=st.sampled_from(["drop", "close", "break_down"]))
+    @rule(how=st.sampled_from(["disconnect", "close", "break_down"]))
     def disconnect(self, how):
         if how == "break_down":
             self.rig.link.break_down()

@@ -63,7 +63,9 @@ class LikePython:
         """A frame with the number that is expected, or one ahead of it."""
         link = self.python._link
         seq = (link.expected_seq + ahead) % 256 if message.SEQUENCED else 0
-        return encode_frame(Frame(message.TYPE, seq, link.session if session is None else session, message.encode_body()))
+        return encode_frame(
+            Frame(message.TYPE, seq, link.session if session is None else session, message.encode_body())
+        )
 
     def say(self, *messages):
         for message in messages:

@@ -50,7 +50,7 @@ def limited(display, **caps):
 def test_a_spot_is_one_pulse_with_mirrors_at_rest(rig):
     with rig.armed() as held:
         codes = CENTRE_CODE + 15_000, CENTRE_CODE - 15_000
-        held.light(*codes, 5e-3)
+        held.fire_spot(*codes, 5e-3)
         (pulse,) = rig.of("pulse")
         assert (pulse["x"], pulse["y"]) == codes
         assert pulse["off_us"] - pulse["on_us"] == round(1e6 * spot_width_s(held.config)) == 20_000
@@ -75,14 +75,14 @@ def held_us(rig):
 @pytest.mark.parametrize("power_w", [0.0, -1e-3, 0.0501, 2.45, float("nan")])
 def test_no_spot_beyond_its_power(rig, power_w):
     with rig.armed() as held, pytest.raises(InputError, match="at most 50 mW"):
-        held.light(*CENTRE, power_w)
+        held.fire_spot(*CENTRE, power_w)
     assert not rig.of("pulse")
 
 
 @pytest.mark.parametrize("codes", [(CENTRE_CODE + 18_000, CENTRE_CODE), (CENTRE_CODE, 0), (-5, CENTRE_CODE)])
 def test_no_spot_far_outside_the_display(rig, codes):
     with rig.armed() as held, pytest.raises(InputError, match="the display and 4 mm more"):
-        held.light(*codes, 5e-3)
+        held.fire_spot(*codes, 5e-3)
     assert not rig.of("fault")
     assert rig.core.state == "DISARMED"
 
@@ -132,7 +132,7 @@ def test_widths_and_waits_are_whole_and_long_enough(any_display):
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])
 def test_an_input_that_opens_is_named_and_dark(rig, name, value):
     with rig.armed() as held:
-        held.light(*CENTRE, 5e-3)
+        held.fire_spot(*CENTRE, 5e-3)
         rig.core.set_input(name, value, held_us(rig))
         with pytest.raises(BoardFaultError, match=f"FAULT {name.upper()}"):
             held.wait(1.0)
@@ -155,7 +155,7 @@ def test_whoever_leaves_disarms(rig):
 def test_nothing_shines_unarmed(rig):
     rig.held.connect()
     with rig.held as held, pytest.raises(NotReadyError, match="not armed"):
-        held.light(*CENTRE, 5e-3)
+        held.fire_spot(*CENTRE, 5e-3)
     assert not rig.of("gate")
 
 
@@ -170,7 +170,7 @@ def test_late_points_count_as_late(rig):
     with rig.armed() as held:
         for _ in range(30):
             for sign in (1, -1):
-                held.light(CENTRE_CODE + sign * 15_000, CENTRE_CODE + sign * 15_000, 0.05)
+                held.fire_spot(CENTRE_CODE + sign * 15_000, CENTRE_CODE + sign * 15_000, 0.05)
     pulses = rig.of("pulse")
     assert len(pulses) == 60
     assert np.all(np.diff([pulse["on_us"] for pulse in pulses]) > 20_000)

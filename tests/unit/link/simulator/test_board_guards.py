@@ -563,7 +563,7 @@ def check_b12(make):
 
 def b12_duplicates_are_taken(patch):
     def accept(self, seq):
-        self._expected = seq
+        self._expected_seq = seq
         return True, None
 
     patch.setattr(BoardLink, "accept", accept)
