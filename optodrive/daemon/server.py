@@ -11,7 +11,7 @@ import uvicorn
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import LinkError
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.session_notes import start_session_recorder
+from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader
@@ -23,7 +23,7 @@ from optodrive.daemon.web.tokens import load_daemon_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
 from optodrive.link.transport.link_capture import LinkCaptureWriter
-from optodrive.link.transport.recorded import CapturingTransport
+from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.pipeline import DisplayModel
 

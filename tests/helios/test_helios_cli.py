@@ -157,9 +157,9 @@ def test_a_memory_that_cannot_be_kept_ends_it_before_the_light(desk, capsys, mon
 def test_no_helios_is_one_line(desk, capsys):
     desk.bench.emulated.unplugged_at_s = 0.0
     assert desk.play() == 2
-    assert capsys.readouterr().err == ("optodrive: board: got '1209:e500', expected a USB device that is plugged in\n")
+    assert capsys.readouterr().err == ("optodrive: board: got '1209:e500', expected a connected USB device\n")
 
 
 def test_a_daemon_on_a_helios_is_refused(desk, capsys):
     assert run(["serve", *desk.config()]) == 2
-    assert "a Helios cannot serve a daemon, see `optodrive helios play`" in capsys.readouterr().err
+    assert "the daemon cannot use a Helios, see `optodrive helios play`" in capsys.readouterr().err

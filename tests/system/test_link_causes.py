@@ -77,7 +77,7 @@ def test_flipped_bits_are_named(make_board, make_daemon):
 
 def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_daemon, tmp_path):
     tape = tmp_path / "tape"
-    daemon = make_daemon(board, options=("--record", str(tape)))
+    daemon = make_daemon(board, options=("--capture", str(tape)))
     plan = play(daemon)
     daemon.process.send_signal(signal.SIGSTOP)
     wait_for(lambda: board.of("fault"), "the lease to lapse")
@@ -131,7 +131,7 @@ def test_a_recorded_session_is_replayed_into_a_simulated_board_and_does_not_arm_
     seeded, make_daemon, tmp_path
 ):
     tape = tmp_path / "tape"
-    daemon = make_daemon(seeded(tmp_path / "first"), options=("--record", str(tape)))
+    daemon = make_daemon(seeded(tmp_path / "first"), options=("--capture", str(tape)))
     plan = play(daemon, 0.3)
     assert daemon.finished(plan)["status"] == "done"
     daemon.stop()
@@ -176,7 +176,7 @@ def test_the_doctor_leaves_a_running_daemon_alone_and_greets_a_free_board(board,
 def test_a_tape_is_never_overwritten(board, tmp_path):
     tape = tmp_path / "tape"
     tape.write_text("precious")
-    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--record", tape], capture_output=True, text=True)
+    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--capture", tape], capture_output=True, text=True)
     assert run.returncode == 2
-    assert run.stderr.splitlines()[-1].startswith("optodrive: --record")
+    assert run.stderr.splitlines()[-1].startswith("optodrive: --capture")
     assert tape.read_text() == "precious"

@@ -18,7 +18,7 @@ from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore, Status
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, apply_executed
 from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.job import PlanJob
+from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.physics.thermal_state import ThermalState

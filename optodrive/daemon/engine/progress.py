@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.link.session.job import PlanJob
+from optodrive.link.session.plan_job import PlanJob
 
 
 class PlanRun(NamedTuple):

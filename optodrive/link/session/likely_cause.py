@@ -38,7 +38,7 @@ class LinkEvidence:
 
 def diagnose_port(port: str, state: PortState) -> str | None:
     """A cause that the port alone tells; None where it is there and free."""
-    if state.status == "gone":
+    if state.status == "missing":
         others = (
             f"; {', '.join(state.other_ports)} there instead, perhaps the same board: " if state.other_ports else "; "
         )
@@ -48,7 +48,7 @@ def diagnose_port(port: str, state: PortState) -> str | None:
         )
     if state.status == "denied":
         return f"{port} may not be opened by this user: join its group (often dialout) and log in again"
-    if state.status == "held":
+    if state.status == "in_use":
         return f"{port} is held by {'; '.join(map(str, state.holders))}: end that program"
     return None
 

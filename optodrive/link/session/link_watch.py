@@ -85,7 +85,7 @@ class LinkWatch:
             self._record_stall(now_s)  # it may have stood still within this very turn, waiting for these bytes
             self._counts = counts
             self.cause = LinkCause(
-                diagnose_lease_expiry(self._collect_evidence(now_s, PortState("there"), silent=False)), now_s
+                diagnose_lease_expiry(self._collect_evidence(now_s, PortState("available"), silent=False)), now_s
             )
         self._fault = fault
 
@@ -94,14 +94,14 @@ class LinkWatch:
         self._last_received_s = last_received_s
         self._board_bad_frames = self._counts.board_bad_frames if silent else None
         state = read_port_state(self._port)
-        self._port_missing = state.status == "gone"
+        self._port_missing = state.status == "missing"
         self.cause = LinkCause(diagnose_link_loss(self._collect_evidence(now_s, state, silent)), now_s)
         return self.cause
 
     def on_reconnect_failed(self, now_s: float) -> None:
         """The link could not be opened again: the port may tell why."""
         state = read_port_state(self._port)
-        self._port_missing = self._port_missing or state.status == "gone"
+        self._port_missing = self._port_missing or state.status == "missing"
         message = diagnose_port(self._port, state)
         if message is not None and (self.cause is None or self.cause.message != message):
             self.cause = LinkCause(message, now_s)

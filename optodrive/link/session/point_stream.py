@@ -9,7 +9,7 @@ from math import inf
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session.job import PlanJob
+from optodrive.link.session.plan_job import PlanJob
 
 MISSING_REPORT_RETRY_S = 0.1
 WATERMARK_POINTS = 48

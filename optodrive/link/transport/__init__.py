@@ -1,1 +1,1 @@
-"""How bytes reach a board: serial ports, and whatever else the registry names."""
+"""Transports: byte streams to a board."""

@@ -1,7 +1,9 @@
-"""A link's bytes with their times, in a file: append-only, each entry whole or ignored.
+"""Link capture: an append-only file of a link's bytes with their times.
 
-file: MAGIC | u32 version | f64 host time | f64 seconds since 1970, both of the beginning
-entry: u8 kind | f64 host time, s | u32 length | bytes | u32 CRC-32 over all before it in the entry; little-endian
+file: MAGIC | u32 version | f64 host time | f64 Unix time, both at the start of the capture
+entry: u8 kind | f64 host time, s | u32 length | bytes | u32 CRC-32 of the preceding bytes of the entry; little-endian
+
+A reader ignores everything from the first incomplete entry on.
 """
 
 import struct
@@ -24,11 +26,11 @@ KINDS = ("to board", "from board", "opened", "closed")
 TO_BOARD, FROM_BOARD, OPENED, CLOSED = KINDS
 DATA_MAX = 1 << 20
 QUEUE_MAX = 8192
-"""Entries that may wait for the disk; bytes move in portions of a few hundred."""
+"""Maximum number of entries waiting for the disk. An entry holds a few hundred bytes."""
 
 
 class CaptureEntry(NamedTuple):
-    """What passed. kind: one of KINDS; host_s: monotonic time; data: empty where the link was opened or closed."""
+    """Event on the link. kind: one of KINDS; host_s: monotonic time; data: empty for opened and closed."""
 
     kind: str
     host_s: float
@@ -36,10 +38,14 @@ class CaptureEntry(NamedTuple):
 
 
 class LinkCaptureWriter:
-    """Writes entries in a thread of its own, so that a slow disk stops nobody. say: gets the one line when it ends."""
+    """Writer of a link capture. Its own thread writes to the disk, so a slow disk does not block the link.
+
+    recording: whether entries are still written
+    warn: called once if writing fails
+    """
 
     def __init__(self, path: Path, host_s: float, warn: Callable[[str], None]) -> None:
-        """Begin a new file; InputError where there is one already or it cannot be written."""
+        """Create the file. Raise InputError if it exists or cannot be written."""
         self.path = path
         self.recording = True
         self._warn = warn
@@ -48,23 +54,23 @@ class LinkCaptureWriter:
             self._file: BinaryIO = path.open("xb", buffering=0)
             self._file.write(HEADER.pack(MAGIC, VERSION, host_s, time.time()))
         except FileExistsError:
-            raise InputError("--record", str(path), "a name that is free: nothing is overwritten") from None
+            raise InputError("--capture", str(path), "a name that is free: nothing is overwritten") from None
         except OSError as error:
-            raise InputError("--record", str(path), f"a file that can be written ({error.strerror})") from None
-        self._thread = threading.Thread(target=self._write_all, name="tape", daemon=True)
+            raise InputError("--capture", str(path), f"a file that can be written ({error.strerror})") from None
+        self._thread = threading.Thread(target=self._write_all, name="link-capture", daemon=True)
         self._thread.start()
 
     def record(self, entry: CaptureEntry) -> None:
-        """Have an entry written; never waits, never raises."""
+        """Queue an entry for writing. Never block and never raise."""
         if not self.recording:
             return
         try:
             self._queue.put_nowait(entry)
         except Full:
-            self._stop(f"the disk is too slow, {QUEUE_MAX} entries wait")
+            self._stop(f"the disk is too slow, {QUEUE_MAX} entries are waiting")
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the waiting entries and close the file."""
         try:
             self._queue.put(None, timeout=1.0)
         except Full:
@@ -72,10 +78,10 @@ class LinkCaptureWriter:
         self._thread.join(timeout=5.0)
 
     def _stop(self, reason: str) -> None:
-        # The loop's thread and the writer's may both come here: one of them may speak.
+        # Both the calling thread and the writer thread may stop the capture. Only the first one warns.
         was_recording, self.recording = self.recording, False
         if was_recording:
-            self._warn(f"recording to {self.path} stopped: {reason}; the session goes on")
+            self._warn(f"capture to {self.path} stopped: {reason}; the session continues")
 
     def _write_all(self) -> None:
         with self._file:
@@ -92,25 +98,26 @@ class LinkCaptureWriter:
 
 
 def pack_entry(entry: CaptureEntry) -> bytes:
-    """An entry's bytes in the file."""
+    """Return the bytes of an entry in the file."""
     content = ENTRY.pack(KINDS.index(entry.kind), entry.host_s, len(entry.data)) + entry.data
     return content + CRC.pack(crc32(content))
 
 
 class LinkCapture:
-    """A recorded file, read entry by entry. ignored: bytes at its end that are no whole entry, known after `entries`.
+    """Reader of a link capture.
 
-    host_s, unix_s: when it began, monotonic and since 1970
+    ignored_bytes: bytes after the last complete entry, known after read_entries()
+    host_s, unix_s: monotonic time and Unix time at the start of the capture
     """
 
     def __init__(self, path: Path) -> None:
-        """Look at the head; InputError where it is no recording, or one of another version."""
+        """Read the header. Raise InputError if the file is no capture or has another version."""
         self.path = path
         self.ignored_bytes = 0
         with self._open() as file:
             header = file.read(HEADER.size)
         if len(header) < HEADER.size or not header.startswith(MAGIC):
-            raise InputError(str(path), header[:8], "a recording of a link, as `serve --record` writes it")
+            raise InputError(str(path), header[:8], "a link capture, as `serve --capture` writes it")
         _, version, self.host_s, self.unix_s = HEADER.unpack(header)
         if version != VERSION:
             raise InputError(f"{path}: version", version, f"{VERSION}, the one this release reads")
@@ -122,7 +129,7 @@ class LinkCapture:
             raise InputError(str(self.path), error.strerror, "a file that can be read") from None
 
     def read_entries(self) -> Iterator[CaptureEntry]:
-        """Every whole entry in order; what follows the last whole one is ignored and counted."""
+        """Yield every complete entry in order. Count the bytes after the last one as ignored."""
         with self._open() as file:
             file.seek(HEADER.size)
             whole_end = HEADER.size

@@ -1,4 +1,4 @@
-"""How a serial port stands, as far as the operating system tells: there, gone, forbidden, held by somebody."""
+"""State of a serial port according to the operating system: available, missing, denied or in use."""
 
 import os
 from dataclasses import dataclass
@@ -7,12 +7,12 @@ from typing import Literal
 
 ROOT = Path("/")
 SERIAL_NAMES = ("ttyACM*", "ttyUSB*")
-PortStatus = Literal["no file", "there", "gone", "denied", "held"]
+PortStatus = Literal["not_a_file", "available", "missing", "denied", "in_use"]
 
 
 @dataclass(frozen=True)
 class PortHolder:
-    """A process that has the port open."""
+    """Process that has a port open."""
 
     pid: int
     command: str
@@ -23,7 +23,11 @@ class PortHolder:
 
 @dataclass(frozen=True)
 class PortState:
-    """fate: "no file" for a transport that is none; holders: other processes; others: serial ports there are."""
+    """State of a port.
+
+    holders: other processes that have it open
+    other_ports: serial ports that exist instead of a missing one
+    """
 
     status: PortStatus
     holders: tuple[PortHolder, ...] = ()
@@ -31,23 +35,23 @@ class PortState:
 
 
 def join_root(root: Path, path: str | Path) -> Path:
-    """An absolute path within a folder that stands for /."""
+    """Return an absolute path inside a folder that represents the root."""
     return root / str(path).lstrip("/")
 
 
 def resolve_device(port: str, root: Path = ROOT) -> str:
-    """The device a port's name leads to, links followed: /dev/ttyACM0."""
+    """Return the device that a port name refers to, with symbolic links resolved: /dev/ttyACM0."""
     return "/" + str(join_root(root, port).resolve().relative_to(root.resolve()))
 
 
 def list_serial_ports(root: Path = ROOT) -> tuple[str, ...]:
-    """Serial ports of USB devices that are there."""
+    """Return the existing serial ports of USB devices."""
     found = [path.name for pattern in SERIAL_NAMES for path in join_root(root, "/dev").glob(pattern)]
     return tuple(f"/dev/{name}" for name in sorted(found))
 
 
 def find_holders(port: str, root: Path = ROOT) -> tuple[PortHolder, ...]:
-    """Other processes that have the port open, as far as /proc lets us see."""
+    """Return the other processes that have the port open, as far as /proc is readable."""
     names = {port, resolve_device(port, root)}
     pids = {
         int(process.name)
@@ -63,12 +67,12 @@ def _list_open_files(process: Path) -> set[str]:
         for link in (process / "fd").iterdir():
             found.add(str(link.readlink()))
     except OSError:
-        pass  # another user's, or it has just ended
+        pass  # the process belongs to another user or has just ended
     return found
 
 
 def read_command_name(pid: int, root: Path = ROOT) -> str:
-    """A process' name."""
+    """Return the command name of a process."""
     try:
         return join_root(root, f"/proc/{pid}/comm").read_text(errors="replace").strip()
     except OSError:
@@ -76,17 +80,17 @@ def read_command_name(pid: int, root: Path = ROOT) -> str:
 
 
 def read_port_state(port: str, root: Path = ROOT) -> PortState:
-    """How a port stands now; opens nothing."""
+    """Return the present state of a port without opening it."""
     if not port.startswith("/"):
-        return PortState("no file")
+        return PortState("not_a_file")
     path = join_root(root, port)
     try:
         exists = path.exists()
     except PermissionError:
         return PortState("denied")
     if not exists:
-        return PortState("gone", other_ports=list_serial_ports(root))
+        return PortState("missing", other_ports=list_serial_ports(root))
     if not os.access(path, os.R_OK | os.W_OK, effective_ids=True):
         return PortState("denied")
     port_holders = find_holders(port, root)
-    return PortState("held" if port_holders else "there", port_holders)
+    return PortState("in_use" if port_holders else "available", port_holders)

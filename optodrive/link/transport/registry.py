@@ -1,4 +1,4 @@
-"""Transports by the name the configuration gives."""
+"""Transports by their name in the configuration."""
 
 from collections.abc import Callable
 from functools import partial
@@ -18,20 +18,23 @@ TRANSPORTS: dict[str, Callable[[BoardSection], Transport]] = {
 
 
 def find_transport_factory(board: BoardSection) -> Callable[[], Transport]:
-    """What makes the transport, not yet open; InputError for a Helios, which does not speak the board's protocol."""
+    """Return a factory for the configured transport, which it does not open.
+
+    Raise InputError for a Helios, which does not use the board's protocol.
+    """
     if board.transport not in TRANSPORTS:
         raise InputError(
             "board.transport",
             board.transport,
-            f"one of {', '.join(TRANSPORTS)}: a Helios cannot serve a daemon, see `optodrive helios play`",
+            f"one of {', '.join(TRANSPORTS)}: the daemon cannot use a Helios, see `optodrive helios play`",
         )
     return partial(TRANSPORTS[board.transport], board)
 
 
 def build_bench_transport(board: BoardSection, display: str) -> tuple[Transport, str]:
-    """A transport, not yet open, and the port of the spot sensor that comes with it; '' where none does.
+    """Return an unopened transport and the port of its simulated spot sensor, '' without one.
 
-    display: the configuration's file or shipped name.
+    display: file or shipped name of the configuration
     """
     if board.transport == "simulated":
         simulated = SimulatedBoard(board.port, board.baud, display)

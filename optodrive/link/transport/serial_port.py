@@ -1,4 +1,4 @@
-"""A serial port, by pyserial."""
+"""Transport over a serial port, with pyserial."""
 
 from contextlib import suppress
 from pathlib import Path
@@ -12,7 +12,7 @@ WRITE_TIMEOUT_S = 0.5
 
 
 class SerialPort:
-    """A serial device opened exclusively, 8N1. key: where the configuration names it."""
+    """Serial device, opened exclusively, 8N1. config_key: configuration key of the port, for errors."""
 
     def __init__(self, port: str, baud: int, config_key: str = "board.port") -> None:
         self.name = port
@@ -21,7 +21,10 @@ class SerialPort:
         self._serial: serial.Serial | None = None
 
     def open(self) -> None:
-        """Open the port; InputError where it does not exist or may not be opened, LinkError where it is in use."""
+        """Open the port.
+
+        Raise InputError if it does not exist or access is denied, LinkError if it is in use.
+        """
         if not Path(self.name).exists():
             present = ", ".join(port.device for port in list_ports.comports()) or "none found"
             raise InputError(self._config_key, self.name, f"a serial port that exists ({present})", "no_port")
@@ -34,7 +37,7 @@ class SerialPort:
                 raise InputError(
                     self._config_key, self.name, "permission to open it (group dialout?)", "no_port"
                 ) from None
-            raise LinkError(f"{self.name} cannot be opened: {error}; does another program hold it?") from None
+            raise LinkError(f"{self.name} cannot be opened: {error}; is it in use by another program?") from None
         except OSError as error:
             raise LinkError(f"{self.name} cannot be opened: {error}") from None
 
@@ -44,7 +47,7 @@ class SerialPort:
         return self._serial
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes that have arrived; waits at most timeout_s for the first."""
+        """Return the bytes that have arrived. Wait at most timeout_s for the first."""
         port = self._require_open()
         try:
             port.timeout = timeout_s
@@ -54,23 +57,23 @@ class SerialPort:
             raise self._build_lost_error(error) from None
 
     def write(self, data: bytes) -> None:
-        """Write all of data; LinkError where the device does not take it within half a second."""
+        """Write all of data. Raise LinkError if the device does not accept it within half a second."""
         try:
             self._require_open().write(data)
         except OSError as error:
             raise self._build_lost_error(error) from None
 
     def _build_lost_error(self, error: Exception) -> LinkError:
-        detail = "" if Path(self.name).exists() else f"; {self.name} is gone: unplugged, or its power is off"
+        detail = "" if Path(self.name).exists() else f"; {self.name} is missing: unplugged, or its power is off"
         return LinkError(f"link to {self.name} lost: {error}{detail}")
 
     def close(self) -> None:
         """Close the port."""
         if self._serial is not None:
             port, self._serial = self._serial, None
-            with suppress(OSError):  # an unplugged device cannot be closed any better
+            with suppress(OSError):  # closing an unplugged device fails
                 port.close()
 
     def release(self) -> None:
-        """Close the port; nothing else was started."""
+        """Close the port."""
         self.close()

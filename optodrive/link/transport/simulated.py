@@ -1,4 +1,4 @@
-"""A board that runs as a process of its own on a pseudo-terminal, reached through a real serial port."""
+"""Transport to a simulated board, a process on a pseudo-terminal."""
 
 import subprocess
 import sys
@@ -11,13 +11,15 @@ from optodrive.link.transport.serial_port import SerialPort
 
 START_TIMEOUT_S = 15.0
 LINGER_S = 5.0
-"""The board outlives the host by this long, so that its log shows what it did when the host was gone."""
+"""The board process runs on for this time after the host has closed the port, so its log shows how it reacted."""
 
 
 class SimulatedBoard(SerialPort):
-    """Starts the board process when opened, and again when it has ended; `log` is the board's own.
+    """Serial port of a board process that open() starts if none is running.
 
-    display: a configuration's file or shipped name; with it the board brings a spot sensor, at `sensor_port`.
+    display: file or shipped name of the configuration; with it the process also simulates a spot sensor
+    log: path of the board's log
+    sensor_port: port of the spot sensor
     """
 
     def __init__(self, port: str, baud: int, display: str | None = None) -> None:
@@ -29,13 +31,13 @@ class SimulatedBoard(SerialPort):
         self._process: subprocess.Popen[bytes] | None = None
 
     def open(self) -> None:
-        """Start the board if it does not run, and open its port."""
+        """Start the board process if necessary and open its port."""
         if self._process is None or self._process.poll() is not None:
             self._start()
         super().open()
 
     def release(self) -> None:
-        """Close the port and end the board, which goes dark on its way out."""
+        """Close the port and terminate the board process, which turns the gate off before it exits."""
         self.close()
         if self._process is not None:
             self._process.terminate()
@@ -58,12 +60,12 @@ class SimulatedBoard(SerialPort):
             ],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
-            start_new_session=True,  # a Ctrl-C at the terminal is for the host; the board sees the link drop
+            start_new_session=True,  # Ctrl-C at the terminal reaches only the host
         )
         deadline_s = time.monotonic() + START_TIMEOUT_S
         while not Path(self.name).exists():
             if self._process.poll() is not None:
-                raise LinkError(f"the simulated board ended at once with status {self._process.returncode}")
+                raise LinkError(f"the simulated board exited at once with status {self._process.returncode}")
             if time.monotonic() > deadline_s:
-                raise LinkError(f"the simulated board made no port within {START_TIMEOUT_S:.0f} s")
+                raise LinkError(f"the simulated board created no port within {START_TIMEOUT_S:.0f} s")
             time.sleep(0.01)

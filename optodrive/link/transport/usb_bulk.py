@@ -1,4 +1,4 @@
-"""The board's byte stream over two bulk endpoints of a USB device, by pyusb."""
+"""Transport over two bulk endpoints of a USB device, with pyusb."""
 
 from contextlib import suppress
 from typing import Any, Self
@@ -12,13 +12,13 @@ from optodrive.link.transport.usb_device import build_lost_error, build_open_err
 
 WRITE_TIMEOUT_S = 0.5
 READ_BYTES = 4096
-"""Asked for at a time: a multiple of every packet size, so that no packet is cut."""
+"""Read size. It is a multiple of every packet size, so that no packet is truncated."""
 STALE_READS_MAX = 64
-"""What may wait from a session before, in reads of READ_BYTES."""
+"""Maximum number of reads that discard bytes of a previous session."""
 
 
 class UsbBulk:
-    """The first interface with a bulk endpoint each way, claimed for us alone. backend: pyusb's, None for libusb."""
+    """First interface with a bulk endpoint in each direction, claimed exclusively. backend: of pyusb, None for libusb."""
 
     def __init__(self, vendor_id: int, product_id: int, serial_number: str = "", backend: Any = None) -> None:
         self.name = f"usb {vendor_id:04x}:{product_id:04x}" + (f" {serial_number}" if serial_number else "")
@@ -30,13 +30,16 @@ class UsbBulk:
 
     @classmethod
     def from_config(cls, board: BoardSection) -> Self:
-        """The device a configuration names; InputError where it names none."""
+        """Build the transport of a configuration. Raise InputError if it names no device."""
         if board.vendor_id is None or board.product_id is None:
             raise InputError("board.vendor_id, board.product_id", None, "both, for transport 'usb'")
         return cls(board.vendor_id, board.product_id, board.serial_number)
 
     def open(self) -> None:
-        """Claim the device; InputError where there is none or it may not be opened, LinkError where it is in use."""
+        """Claim the device.
+
+        Raise InputError if there is none or access is denied, LinkError if it is in use.
+        """
         self._device = find_device(*self._ids, backend=self._backend)
         try:
             self._claim()
@@ -57,11 +60,11 @@ class UsbBulk:
             if len(endpoints) == 2:
                 self._in, self._out = endpoints[usb.util.ENDPOINT_IN], endpoints[usb.util.ENDPOINT_OUT]
                 usb.util.claim_interface(self._device, interface.bInterfaceNumber)
-                if interface.bAlternateSetting:  # a device with but one may refuse to be told
+                if interface.bAlternateSetting:  # a device with a single setting may reject the request
                     self._device.set_interface_altsetting(interface.bInterfaceNumber, interface.bAlternateSetting)
                 self._drain()
                 return
-        raise InputError("board", self.name, "a device with a bulk endpoint each way", "no_port")
+        raise InputError("board", self.name, "a device with a bulk endpoint in each direction", "no_port")
 
     def _drain(self) -> None:
         with suppress(usb.core.USBTimeoutError):
@@ -69,7 +72,7 @@ class UsbBulk:
                 self._in.read(READ_BYTES, timeout_ms(0.0))
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes that have arrived; waits at most timeout_s, to a millisecond, for the first."""
+        """Return the bytes that have arrived. Wait at most timeout_s, rounded to a millisecond, for the first."""
         self._require_open()
         try:
             return bytes(self._in.read(READ_BYTES, timeout_ms(timeout_s)))
@@ -79,26 +82,26 @@ class UsbBulk:
             raise build_lost_error(self.name, error) from None
 
     def write(self, data: bytes) -> None:
-        """Write all of data; LinkError where the device does not take it within half a second."""
+        """Write all of data. Raise LinkError if the device does not accept it within half a second."""
         self._require_open()
         try:
             written_bytes = self._out.write(data, timeout_ms(WRITE_TIMEOUT_S)) if data else 0
         except usb.core.USBError as error:
             raise build_lost_error(self.name, error) from None
         if written_bytes != len(data):
-            raise LinkError(f"link to {self.name} lost: it took {written_bytes} of {len(data)} bytes")
+            raise LinkError(f"link to {self.name} lost: it accepted {written_bytes} of {len(data)} bytes")
 
     def _require_open(self) -> None:
         if self._device is None:
             raise LinkError(f"{self.name} is not open")
 
     def close(self) -> None:
-        """Give the device back; the board, which cannot see that, goes dark when its lease ends."""
+        """Release the device. The board does not notice and turns the gate off when its lease expires."""
         device, self._device = self._device, None
         if device is not None:
-            with suppress(usb.core.USBError):  # an unplugged device cannot be closed any better
+            with suppress(usb.core.USBError):  # releasing an unplugged device fails
                 usb.util.dispose_resources(device)
 
     def release(self) -> None:
-        """Give the device back; nothing else was started."""
+        """Release the device."""
         self.close()

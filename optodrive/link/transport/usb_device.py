@@ -1,4 +1,4 @@
-"""A device on USB by its ids, through pyusb, with pyusb's complaints in this package's words."""
+"""Lookup of USB devices with pyusb, and translation of pyusb's errors."""
 
 import errno
 from typing import Any
@@ -11,9 +11,9 @@ PERMISSION_ERRNOS = (errno.EACCES, errno.EPERM)
 
 
 def find_device(vendor_id: int, product_id: int, serial_number: str = "", backend: Any = None) -> Any:
-    """The only device with these ids, a `usb.core.Device`; InputError where there is none, or more than one.
+    """Return the only device with these ids, a `usb.core.Device`.
 
-    backend: pyusb's, None for the libusb that is installed.
+    Raise InputError if there is none or more than one. backend: of pyusb, None for the installed libusb
     """
     ids = f"{vendor_id:04x}:{product_id:04x}"
     try:
@@ -26,7 +26,7 @@ def find_device(vendor_id: int, product_id: int, serial_number: str = "", backen
         raise build_open_error(ids, error) from None
     description = f"{ids} {serial_number}".rstrip()
     if not devices:
-        raise InputError("board", description, "a USB device that is plugged in", "no_port")
+        raise InputError("board", description, "a connected USB device", "no_port")
     if len(devices) > 1:
         raise InputError(
             "board", f"{len(devices)} times {description}", "one such USB device, or its serial_number", "no_port"
@@ -35,7 +35,7 @@ def find_device(vendor_id: int, product_id: int, serial_number: str = "", backen
 
 
 def _serial_number(device: Any) -> str | None:
-    """The device's serial number; USBError (EACCES) where it may not be asked, which pyusb calls a ValueError."""
+    """Return the serial number. Raise USBError (EACCES) without permission, where pyusb raises ValueError."""
     try:
         serial_number: str | None = device.serial_number
     except ValueError as error:
@@ -44,18 +44,18 @@ def _serial_number(device: Any) -> str | None:
 
 
 def build_open_error(name: str, error: Exception) -> InputError | LinkError:
-    """Why a device could not be opened."""
+    """Return the error for a device that could not be opened."""
     if getattr(error, "errno", None) in PERMISSION_ERRNOS:
         return InputError("board", name, "permission to open it (a udev rule for its ids?)", "no_port")
-    return LinkError(f"{name} cannot be opened: {error}; does another program hold it?")
+    return LinkError(f"{name} cannot be opened: {error}; is it in use by another program?")
 
 
 def build_lost_error(name: str, error: Exception) -> LinkError:
-    """A link that failed while in use."""
-    detail = "; it is gone: unplugged, or without power" if getattr(error, "errno", None) == errno.ENODEV else ""
+    """Return the error for a link that failed while open."""
+    detail = "; it is missing: unplugged, or without power" if getattr(error, "errno", None) == errno.ENODEV else ""
     return LinkError(f"link to {name} lost: {error}{detail}")
 
 
 def timeout_ms(timeout_s: float) -> int:
-    """A time-out as libusb takes it, where 0 would mean for ever."""
+    """Return a timeout for libusb, for which 0 would mean infinite."""
     return max(1, round(timeout_s * 1e3))

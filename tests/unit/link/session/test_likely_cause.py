@@ -25,7 +25,7 @@ from optodrive.link.simulator.faulty_link import FaultyLink
 from optodrive.link.transport.port_state import PortHolder, PortState
 
 LEASE_S = CONFIG.board.lease_s
-QUIET = LinkEvidence("/dev/ttyACM0", PortState("there"), silent=True, lease_s=LEASE_S)
+QUIET = LinkEvidence("/dev/ttyACM0", PortState("available"), silent=True, lease_s=LEASE_S)
 
 
 class Damaged(Rig):
@@ -157,14 +157,14 @@ def test_lost_frames_without_damage_are_told_as_lost_bytes():
 
 
 def test_the_port_tells_first():
-    gone = PortState("gone", other_ports=("/dev/ttyACM1",))
-    evidence = replace(QUIET, port_state=gone, host_bad_frames=5, stall_s=9.0)
+    missing = PortState("missing", other_ports=("/dev/ttyACM1",))
+    evidence = replace(QUIET, port_state=missing, host_bad_frames=5, stall_s=9.0)
     assert diagnose_link_loss(evidence).startswith("/dev/ttyACM0 is gone")
     assert "/dev/ttyACM1 there instead" in diagnose_link_loss(evidence)
     assert "dialout" in diagnose_port("/dev/ttyACM0", PortState("denied"))
-    held = PortState("held", (PortHolder(12, "ModemManager"),))
-    assert "held by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=held))
-    assert diagnose_port("/dev/ttyACM0", PortState("there")) is None
+    in_use = PortState("in_use", (PortHolder(12, "ModemManager"),))
+    assert "held by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=in_use))
+    assert diagnose_port("/dev/ttyACM0", PortState("available")) is None
     assert "is there again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
 
 

@@ -20,7 +20,7 @@ from optodrive.link.transport.link_capture import (
     LinkCapture,
     LinkCaptureWriter,
 )
-from optodrive.link.transport.recorded import CapturingTransport
+from optodrive.link.transport.capturing_transport import CapturingTransport
 
 SEED = 2
 

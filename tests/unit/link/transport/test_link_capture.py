@@ -30,7 +30,7 @@ from optodrive.link.transport.link_capture import (
     LinkCaptureWriter,
     pack_entry,
 )
-from optodrive.link.transport.recorded import CapturingTransport
+from optodrive.link.transport.capturing_transport import CapturingTransport
 
 ENTRIES = st.lists(
     st.builds(CaptureEntry, st.sampled_from(KINDS), st.floats(0, 1e9, allow_nan=False), st.binary(max_size=300)),
@@ -38,17 +38,17 @@ ENTRIES = st.lists(
 )
 
 
-def written(path, entries, said=None):
-    writer = LinkCaptureWriter(path, 3.5, (said if said is not None else []).append)
+def write_capture(path, entries):
+    writer = LinkCaptureWriter(path, 3.5, [].append)
     for entry in entries:
         writer.record(entry)
     writer.close()
     return LinkCapture(path)
 
 
-def test_what_passes_is_on_the_tape_with_its_time_and_the_link_does_not_notice(tmp_path):
+def test_the_capture_has_all_bytes_with_their_times_and_the_link_is_unchanged(tmp_path):
     clock = ManualClock(5.0)
-    writer = LinkCaptureWriter(tmp_path / "a", clock.now_s(), pytest.fail)
+    writer = LinkCaptureWriter(tmp_path / "capture", clock.now_s(), pytest.fail)
     link = CapturingTransport(MemoryLink(BoardCore(seed=3), clock), writer, clock)
     link.open()
     hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 7).encode_body()))
@@ -57,20 +57,20 @@ def test_what_passes_is_on_the_tape_with_its_time_and_the_link_does_not_notice(t
     assert link.read(0.01) == b""
     link.close()
     link.release()
-    tape = LinkCapture(tmp_path / "a")
-    assert list(tape.read_entries()) == [
+    capture = LinkCapture(tmp_path / "capture")
+    assert list(capture.read_entries()) == [
         CaptureEntry(OPENED, 5.0),
         CaptureEntry(TO_BOARD, 5.0, hello),
         CaptureEntry(FROM_BOARD, 5.0 + 1e-4, reply),
         CaptureEntry(CLOSED, pytest.approx(5.0 + 1e-4 + 0.01)),
     ]
-    assert (tape.host_s, tape.ignored_bytes) == (5.0, 0)
+    assert (capture.host_s, capture.ignored_bytes) == (5.0, 0)
 
 
 @given(ENTRIES, st.data())
-def test_a_tape_cut_or_damaged_anywhere_gives_the_whole_entries_before_that(tmp_path_factory, entries, data):
-    path = tmp_path_factory.mktemp("tape") / "a"
-    written(path, entries)
+def test_a_capture_truncated_or_damaged_anywhere_yields_the_complete_entries_before(tmp_path_factory, entries, data):
+    path = tmp_path_factory.mktemp("captures") / "capture"
+    write_capture(path, entries)
     whole = path.read_bytes()
     cut = data.draw(st.integers(HEADER.size, len(whole)))
     ends = [HEADER.size]
@@ -78,9 +78,9 @@ def test_a_tape_cut_or_damaged_anywhere_gives_the_whole_entries_before_that(tmp_
         ends.append(ends[-1] + len(pack_entry(entry)))
     kept = max(k for k, end in enumerate(ends) if end <= cut)
     path.write_bytes(whole[:cut])
-    tape = LinkCapture(path)
-    assert list(tape.read_entries()) == entries[:kept]
-    assert tape.ignored_bytes == cut - ends[kept]
+    capture = LinkCapture(path)
+    assert list(capture.read_entries()) == entries[:kept]
+    assert capture.ignored_bytes == cut - ends[kept]
     if cut < len(whole):
         damaged = bytearray(whole)
         damaged[cut] ^= 1 << data.draw(st.integers(0, 7))
@@ -88,17 +88,17 @@ def test_a_tape_cut_or_damaged_anywhere_gives_the_whole_entries_before_that(tmp_
         assert list(LinkCapture(path).read_entries()) == entries[:kept]
 
 
-def test_nothing_is_overwritten_and_other_files_are_refused_by_name(tmp_path):
-    path = tmp_path / "a"
-    written(path, [])
-    with pytest.raises(InputError, match=r"--record.*name that is free"):
+def test_no_file_is_overwritten_and_other_files_are_rejected_by_name(tmp_path):
+    path = tmp_path / "capture"
+    write_capture(path, [])
+    with pytest.raises(InputError, match=r"--capture.*name that is free"):
         LinkCaptureWriter(path, 0.0, print)
     with pytest.raises(InputError, match="can be written"):
         LinkCaptureWriter(tmp_path / "no" / "b", 0.0, print)
     with pytest.raises(InputError, match="can be read"):
         LinkCapture(tmp_path / "c")
-    path.write_bytes(b"some text that is none of ours, and long enough")
-    with pytest.raises(InputError, match="recording of a link"):
+    path.write_bytes(b"text of another program that is longer than a header")
+    with pytest.raises(InputError, match="a link capture"):
         LinkCapture(path)
     path.write_bytes(HEADER.pack(MAGIC, VERSION + 1, 0.0, 0.0))
     with pytest.raises(InputError, match=f"version.*{VERSION}, the one"):
@@ -111,40 +111,40 @@ from pathlib import Path
 from optodrive.link.transport.link_capture import CaptureEntry, LinkCaptureWriter
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-said = []
-writer = LinkCaptureWriter(Path(sys.argv[1]), 0.0, said.append)
+warnings = []
+writer = LinkCaptureWriter(Path(sys.argv[1]), 0.0, warnings.append)
 for k in range(200):
     writer.record(CaptureEntry("to board", float(k), bytes(100)))
 writer.close()
 writer.record(CaptureEntry("to board", 1e3, b"afterwards"))
 writer.close()
 assert not writer.recording
-assert len(said) == 1 and "stopped" in said[0] and "the session goes on" in said[0], said
+assert len(warnings) == 1 and "stopped" in warnings[0] and "the session continues" in warnings[0], warnings
 """
 
 
-def test_a_full_disk_is_said_once_and_what_was_written_can_be_read(tmp_path):
-    path = tmp_path / "a"
+def test_a_full_disk_is_reported_once_and_the_written_entries_are_readable(tmp_path):
+    path = tmp_path / "capture"
     subprocess.run([sys.executable, "-c", FULL, path], check=True)
     entries = list(LinkCapture(path).read_entries())
     assert len(entries) == (2000 - HEADER.size) // (ENTRY.size + 100 + CRC.size)
     assert [entry.host_s for entry in entries] == list(range(len(entries)))
 
 
-def test_a_disk_that_does_not_answer_costs_bounded_memory_and_no_time(tmp_path):
-    """A pipe that nobody reads stands for the disk: its writer hangs, whoever notes goes on."""
-    said = []
-    writer = LinkCaptureWriter(tmp_path / "a", 0.0, said.append)
+def test_a_disk_that_does_not_respond_costs_bounded_memory_and_no_time(tmp_path):
+    """A pipe without a reader replaces the disk: the writer thread blocks, record() does not."""
+    warnings = []
+    writer = LinkCaptureWriter(tmp_path / "capture", 0.0, warnings.append)
     reading, writing = os.pipe()
     os.dup2(writing, writer._file.fileno())
     assert stat.S_ISFIFO(os.fstat(writer._file.fileno()).st_mode)
     entry = CaptureEntry(TO_BOARD, 0.0, bytes(200))
     for _ in range(2 * QUEUE_MAX):
         writer.record(entry)
-    assert len(said) == 1
-    assert "too slow" in said[0]
+    assert len(warnings) == 1
+    assert "too slow" in warnings[0]
     assert writer._queue.qsize() <= QUEUE_MAX
     os.close(writing)
-    os.close(reading)  # the writer's thread gets an error and ends
+    os.close(reading)  # the writer thread gets an error and ends
     writer._thread.join(10)
     assert not writer._thread.is_alive()

@@ -18,7 +18,7 @@ from optodrive.link.transport.port_state import (
 
 @pytest.fixture
 def tmp_path():
-    """A folder that nobody else closes: pytest's own are for its user alone."""
+    """Folder that other users may enter. pytest's own folders are private."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         yield Path(folder)
@@ -29,7 +29,7 @@ NOBODY = 65534
 
 @pytest.fixture
 def tty(tmp_path):
-    """A pseudo-terminal under a name of its own, as the simulated board makes one."""
+    """Pseudo-terminal behind a symbolic link, as the simulated board creates one."""
     master, slave = os.openpty()
     path = tmp_path / "tty"
     path.symlink_to(os.ttyname(slave))
@@ -40,7 +40,7 @@ def tty(tmp_path):
 
 @contextmanager
 def as_nobody():
-    """Root may do anything: be somebody who may not."""
+    """Run as an unprivileged user, because root may open everything."""
     was = os.geteuid()
     if was == 0:
         os.seteuid(NOBODY)
@@ -50,11 +50,11 @@ def as_nobody():
         os.seteuid(was)
 
 
-def test_a_port_that_is_there_and_one_that_is_gone(tty):
-    assert read_port_state(str(tty)) == PortState("there")
+def test_an_available_and_a_missing_port(tty):
+    assert read_port_state(str(tty)) == PortState("available")
     assert resolve_device(str(tty)).startswith("/dev/pts/")
-    assert read_port_state(f"{tty}2").status == "gone"
-    assert read_port_state("simulated board, virtual time") == PortState("no file")
+    assert read_port_state(f"{tty}2").status == "missing"
+    assert read_port_state("simulated board, virtual time") == PortState("not_a_file")
 
 
 def test_a_port_without_permission(tty):
@@ -68,20 +68,20 @@ def test_a_port_without_permission(tty):
         Path(device).chmod(mode)
 
 
-def test_a_port_that_another_process_holds(tty):
+def test_a_port_in_use_by_another_process(tty):
     code = "import os, sys; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY); print(flush=True); sys.stdin.read()"
     with subprocess.Popen([sys.executable, "-c", code, tty], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
         process.stdout.readline()
         state = read_port_state(str(tty))
         process.stdin.close()
-    assert state.status == "held"
+    assert state.status == "in_use"
     (holder,) = state.holders
     assert holder.pid == process.pid
     assert str(process.pid) in str(holder)
-    assert read_port_state(str(tty)).status == "there"
+    assert read_port_state(str(tty)).status == "available"
 
 
-def test_a_tree_of_files_stands_for_the_system(tmp_path):
+def test_a_folder_can_represent_the_root(tmp_path):
     for folder in ("dev/serial/by-id", "proc/77/fd", "proc/78"):
         (tmp_path / folder).mkdir(parents=True)
     for name in ("ttyUSB1", "ttyACM0"):
@@ -90,13 +90,13 @@ def test_a_tree_of_files_stands_for_the_system(tmp_path):
     (tmp_path / "proc/77/fd/4").symlink_to("/dev/ttyACM0")
     (tmp_path / "proc/77/comm").write_text("minicom\n")
     assert list_serial_ports(tmp_path) == ("/dev/ttyACM0", "/dev/ttyUSB1")
-    held = PortState("held", (PortHolder(77, "minicom"),))
-    assert read_port_state("/dev/serial/by-id/usb-board", tmp_path) == held
-    assert read_port_state("/dev/ttyACM0", tmp_path) == held
-    assert read_port_state("/dev/ttyACM1", tmp_path) == PortState("gone", (), ("/dev/ttyACM0", "/dev/ttyUSB1"))
+    in_use = PortState("in_use", (PortHolder(77, "minicom"),))
+    assert read_port_state("/dev/serial/by-id/usb-board", tmp_path) == in_use
+    assert read_port_state("/dev/ttyACM0", tmp_path) == in_use
+    assert read_port_state("/dev/ttyACM1", tmp_path) == PortState("missing", (), ("/dev/ttyACM0", "/dev/ttyUSB1"))
 
 
-def test_a_port_in_a_folder_that_may_not_be_looked_into(tmp_path):
+def test_a_port_in_a_folder_without_access(tmp_path):
     closed = tmp_path / "closed"
     closed.mkdir(mode=0o700)
     with as_nobody():

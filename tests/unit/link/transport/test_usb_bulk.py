@@ -1,4 +1,4 @@
-"""The session over USB: the real pyusb, bulk endpoints, and the simulated board's core behind them."""
+"""Session over USB: the real pyusb with bulk endpoints of a simulated board core."""
 
 import errno
 
@@ -33,11 +33,11 @@ class Rig:
     def until(self, condition, patience_s=20.0, lease=True):
         give_up_s = self.clock.now_s() + patience_s
         while not condition():
-            assert self.clock.now_s() < give_up_s, f"in vain: {self.session.board}"
+            assert self.clock.now_s() < give_up_s, f"timed out: {self.session.board}"
             self.session.step(STEP_S, lease)
 
     def streaming(self):
-        """Connected, armed, and in the middle of a plan."""
+        """Connect, arm and start a plan. Return while it is running."""
         from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 
         sequence = FrameSequence(trains=(PulseTrain(5, 0.0, 1.0, 0.004, 0.02, 1.0),))
@@ -66,7 +66,7 @@ def test_a_plan_is_armed_streamed_and_reported_over_usb():
     assert not rig.usb.claimed
 
 
-def test_unplugged_in_mid_plan_the_board_goes_dark_and_it_is_told():
+def test_unplugging_during_a_plan_turns_the_gate_off_and_is_reported():
     rig = Rig().streaming()
     rig.usb.unplug()
     with pytest.raises(LinkError, match=r"link to usb 1209:0001 lost: .*unplugged, or without power"):
@@ -74,14 +74,14 @@ def test_unplugged_in_mid_plan_the_board_goes_dark_and_it_is_told():
     rig.session.disconnect()
     assert not rig.core.gate
     assert rig.core.state == "DISARMED"
-    with pytest.raises(InputError, match="a USB device that is plugged in"):
+    with pytest.raises(InputError, match="a connected USB device"):
         rig.session.connect()
     rig.usb.plugged = True
     rig.session.connect()
     assert rig.session.board.state == "DISARMED"
 
 
-def test_a_host_that_only_lets_go_is_ended_by_the_boards_lease():
+def test_the_lease_ends_emission_after_the_host_released_the_device():
     rig = Rig().streaming()
     rig.link.close()
     rig.clock.sleep(DISPLAY.config.board.lease_s + 1e-3)
@@ -90,14 +90,14 @@ def test_a_host_that_only_lets_go_is_ended_by_the_boards_lease():
     assert rig.core.fault == "LINK"
 
 
-def test_what_a_session_before_left_is_not_read():
+def test_bytes_of_a_previous_session_are_discarded():
     rig = Rig()
     rig.usb.waiting = b"old" * 5000
     rig.link.open()
     assert rig.link.read(0.01) == b""
 
 
-def test_a_board_that_takes_nothing_more_is_a_lost_link():
+def test_a_board_that_accepts_no_bytes_is_a_lost_link():
     rig = Rig()
     rig.link.open()
     rig.usb.stalled = True
@@ -107,15 +107,15 @@ def test_a_board_that_takes_nothing_more_is_a_lost_link():
     assert rig.clock.now_s() - began_s == pytest.approx(0.5)
 
 
-def test_a_board_that_takes_a_part_is_a_lost_link():
+def test_a_partial_write_is_a_lost_link():
     rig = Rig()
     rig.link.open()
     rig.usb.bulk_write = lambda *transfer: 1
-    with pytest.raises(LinkError, match="took 1 of 3 bytes"):
+    with pytest.raises(LinkError, match="accepted 1 of 3 bytes"):
         rig.link.write(b"abc")
 
 
-def test_of_several_boards_the_serial_number_tells_which():
+def test_the_serial_number_selects_one_of_several_boards():
     with pytest.raises(InputError, match="2 times 1209:0001', expected one such USB device, or its serial_number"):
         Rig(serials=("A1", "B2")).link.open()
     rig = Rig("B2", serials=("A1", "B2"))
@@ -126,24 +126,24 @@ def test_of_several_boards_the_serial_number_tells_which():
         Rig("C3", serials=("A1", "B2")).link.open()
 
 
-def test_what_keeps_it_from_being_opened_is_told():
+def test_the_reason_for_a_failed_open_is_reported():
     rig = Rig()
     rig.usb.open_errno = errno.EACCES
     with pytest.raises(InputError, match="udev rule"):
         rig.link.open()
     rig = Rig()
     rig.usb.claim_errno = errno.EBUSY
-    with pytest.raises(LinkError, match="does another program hold it"):
+    with pytest.raises(LinkError, match="is it in use by another program"):
         rig.link.open()
     rig = Rig(one_way=True)
-    with pytest.raises(InputError, match="a bulk endpoint each way"):
+    with pytest.raises(InputError, match="a bulk endpoint in each direction"):
         rig.link.open()
     with pytest.raises(LinkError, match="not open"):
         rig.link.read(0.0)
     rig.link.close()
 
 
-def test_without_libusb_it_says_so(monkeypatch):
+def test_a_missing_libusb_is_reported(monkeypatch):
     def none(**_):
         raise usb.core.NoBackendError("No backend available")
 
@@ -152,10 +152,10 @@ def test_without_libusb_it_says_so(monkeypatch):
         UsbBulk(1, 2).open()
 
 
-def test_the_registry_makes_what_the_configuration_names():
+def test_the_registry_builds_the_configured_transport():
     board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
     assert find_transport_factory(board)().name == "usb 1209:0001 A1"
     assert find_transport_factory(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
     assert set(TRANSPORTS) == {"serial", "simulated", "usb"}
-    with pytest.raises(InputError, match="a Helios cannot serve a daemon"):
+    with pytest.raises(InputError, match="the daemon cannot use a Helios"):
         find_transport_factory(BoardSection(transport="helios"))

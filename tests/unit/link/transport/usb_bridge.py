@@ -1,4 +1,4 @@
-"""A backend of pyusb with boards behind bulk endpoints: the simulated board's core, in virtual time."""
+"""pyusb backend that connects bulk endpoints to a simulated board core, in virtual time."""
 
 import errno
 from types import SimpleNamespace
@@ -13,7 +13,7 @@ STRINGS = {0: b"\x04\x03\x09\x04"}
 
 
 class UsbBridge(usb.backend.IBackend):
-    """Devices by number; the one at `place` is the core's. control: an interface without bulk endpoints comes first."""
+    """Backend with one device per serial number. Interface 0 of each has no bulk endpoints, interface 1 is the core's."""
 
     def __init__(self, core, clock, serials=("A1",), ids=(0x1209, 0x0001), one_way=False):
         self.core, self.clock, self.serials, self.ids, self.one_way = core, clock, serials, ids, one_way

@@ -1,4 +1,4 @@
-"""Any transport, with every byte that passes noted on a tape."""
+"""Transport that records all bytes of another transport in a link capture."""
 
 from optodrive.core.clock import Clock
 from optodrive.link.transport.base import Transport
@@ -6,7 +6,7 @@ from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO
 
 
 class CapturingTransport:
-    """Does what `transport` does; the tape cannot stop or delay it."""
+    """Wrapper around `transport`. The capture can neither stop nor delay it."""
 
     def __init__(self, transport: Transport, capture: LinkCaptureWriter, clock: Clock) -> None:
         self.name = transport.name
@@ -19,30 +19,30 @@ class CapturingTransport:
         self._capture.record(CaptureEntry(kind, self._clock.now_s(), data))
 
     def open(self) -> None:
-        """Open the link; noted once it is open."""
+        """Open the link and then record the event."""
         self._transport.open()
         self._open = True
         self._record(OPENED)
 
     def read(self, timeout_s: float) -> bytes:
-        """Bytes that have arrived; waits at most timeout_s for the first."""
+        """Return the bytes that have arrived. Wait at most timeout_s for the first."""
         data = self._transport.read(timeout_s)
         if data:
             self._record(FROM_BOARD, data)
         return data
 
     def write(self, data: bytes) -> None:
-        """Hand all of data to the operating system; noted before, for an answer must not come first."""
+        """Hand all of data to the operating system. Record it first, so that it precedes its answer in the capture."""
         self._record(TO_BOARD, data)
         self._transport.write(data)
 
     def close(self) -> None:
-        """Close the link, which may be opened again."""
+        """Close the link. It may be opened again."""
         self._record_close()
         self._transport.close()
 
     def release(self) -> None:
-        """Close for good, and end the tape."""
+        """Close permanently and close the capture."""
         self._record_close()
         self._transport.release()
         self._capture.close()
