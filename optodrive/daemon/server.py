@@ -22,8 +22,8 @@ from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
 from optodrive.daemon.web.tokens import load_daemon_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
-from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.capturing_transport import CapturingTransport
+from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.pipeline import DisplayModel
 

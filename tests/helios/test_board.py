@@ -62,7 +62,7 @@ def test_another_helios_than_the_configured_one_is_refused():
 
 @pytest.mark.parametrize(
     ("others", "plugged", "words"),
-    [(("helios two",), True, "2 times 1209:e500"), ((), False, "plugged in"), (((1, 2),), True, None)],
+    [(("helios two",), True, "2 times 1209:e500"), ((), False, "connected"), (((1, 2),), True, None)],
 )
 def test_it_must_be_there_and_the_only_one(others, plugged, words):
     emulated = EmulatedHelios(ManualClock(), others=others)

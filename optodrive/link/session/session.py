@@ -20,8 +20,8 @@ from optodrive.link.protocol.quantisation import WirePoints, WireScale
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
-from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
+from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 

@@ -19,7 +19,7 @@ def find_device(vendor_id: int, product_id: int, serial_number: str = "", backen
     try:
         devices = list(usb.core.find(find_all=True, backend=backend, idVendor=vendor_id, idProduct=product_id))
         if serial_number:
-            devices = [device for device in devices if _serial_number(device) == serial_number]
+            devices = [device for device in devices if _read_serial_number(device) == serial_number]
     except usb.core.NoBackendError:
         raise InputError("board.transport", "usb", "libusb 1.0 on this machine (libusb-1.0-0)", "no_port") from None
     except usb.core.USBError as error:
@@ -34,7 +34,7 @@ def find_device(vendor_id: int, product_id: int, serial_number: str = "", backen
     return devices[0]
 
 
-def _serial_number(device: Any) -> str | None:
+def _read_serial_number(device: Any) -> str | None:
     """Return the serial number. Raise USBError (EACCES) without permission, where pyusb raises ValueError."""
     try:
         serial_number: str | None = device.serial_number

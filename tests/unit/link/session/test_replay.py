@@ -12,6 +12,7 @@ from optodrive.link.session.replay import Replay, clock_shift_s, compare_traces
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import (
     CLOSED,
     FROM_BOARD,
@@ -20,7 +21,6 @@ from optodrive.link.transport.link_capture import (
     LinkCapture,
     LinkCaptureWriter,
 )
-from optodrive.link.transport.capturing_transport import CapturingTransport
 
 SEED = 2
 

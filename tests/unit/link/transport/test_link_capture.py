@@ -13,6 +13,7 @@ from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
+from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import (
     CLOSED,
     CRC,
@@ -30,7 +31,6 @@ from optodrive.link.transport.link_capture import (
     LinkCaptureWriter,
     pack_entry,
 )
-from optodrive.link.transport.capturing_transport import CapturingTransport
 
 ENTRIES = st.lists(
     st.builds(CaptureEntry, st.sampled_from(KINDS), st.floats(0, 1e9, allow_nan=False), st.binary(max_size=300)),
