@@ -27,8 +27,9 @@ from optodrive.link.simulator.virtual_run import execute
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.wall_coupling import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.scheduler import Scheduler
 
 RUNS = 7
@@ -60,15 +61,19 @@ def measure_child_cpu_s(arguments) -> float:
     return read_cpu_s() - before_s
 
 
+def schedule_batches(display, sequence, heat):
+    """Return an iterator over the batches of a plan without the limiter."""
+    scheduler = Scheduler(display.scan_head, sequence, display.build_cold_heat)
+    return scheduler.run(heat.copy(), lambda batch: batch)
+
+
 def measure_plan_rows(height_um):
     display, sequence = build_full_frame(height_m=height_um * 1e-6)
     heat, budget = display.build_cold_state()
     planned_sequence = plan_sequence(display, sequence, heat, budget)
-    batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat.copy())))
+    batch = next(schedule_batches(display, sequence, heat))
     count = len(planned_sequence.plan)
-    schedule_s = measure_median_s(
-        lambda: list(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat.copy()))
-    )
+    schedule_s = measure_median_s(lambda: list(schedule_batches(display, sequence, heat)))
     limit_s = measure_median_s(lambda: limit(batch, budget, display.budget))
     total_s = measure_median_s(lambda: plan_sequence(display, sequence, heat, budget))
     return [
@@ -252,12 +257,12 @@ def bench_limit():
     for height_um in (50, 400):
         display, sequence = build_full_frame(height_m=height_um * 1e-6)
         heat, state = display.build_cold_state()
-        batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat)))
+        batch = next(schedule_batches(display, sequence, heat))
         limit_s = measure_median_s(lambda piece=batch, state=state, budget=display.budget: limit(piece, state, budget))
         rows.append((f"{height_um} µm: a full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
     display, sequence = build_full_frame()
     heat, state = display.build_cold_state()
-    batch = next(iter(Scheduler(display.scan_head, sequence, display.build_cold_heat).pieces(heat)))
+    batch = next(schedule_batches(display, sequence, heat))
     period_s = float(batch.start_s[-1] + batch.width_s[-1]) + 1e-3
     samples_mib, count, begin_s = [], 0, time.process_time()
     while count < 1_000_000:

@@ -16,7 +16,8 @@ from rich.table import Table
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler import scheduler
 from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
 
@@ -47,12 +48,14 @@ def measure_last_cycles(display, result, train, period_s):
 
 def compute_beam_time_us(display, count, period_s):
     """Beam time of a pulse of one of so many trains that share a period."""
-    machine = display.machine
-    period_share_us = round((period_s - machine.pulse_rest_s) * 1e6)
+    machine = display.scan_head
+    period_share_us = round((period_s - machine.pulse_gap_s) * 1e6)
     if count == 1:
         return period_share_us
     x_rad, _ = machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
-    return min(period_share_us, int(1e6 * period_s / count) - machine.moves.time_us(x_rad[201] - x_rad[200], 0.0))
+    return min(
+        period_share_us, int(1e6 * period_s / count) - machine.settling.settling_us(x_rad[201] - x_rad[200], 0.0)
+    )
 
 
 def measure_train(display, count, rate_hz, target_um):
@@ -60,7 +63,7 @@ def measure_train(display, count, rate_hz, target_um):
     period_s = 1.0 / rate_hz
     display_model, drive = (
         display.build_cold_heat(),
-        limit_pulse_width(display.machine.drive, compute_beam_time_us(display, count, period_s)),
+        limit_pulse_width(display.scan_head.drive, compute_beam_time_us(display, count, period_s)),
     )
     duration_s = max(SECONDS, CYCLES * period_s)
     first = HeightTrain(PIXELS[0], 0.0, duration_s, period_s, target_um * 1e-6)

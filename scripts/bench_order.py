@@ -13,7 +13,8 @@ import numpy as np
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 

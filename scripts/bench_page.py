@@ -20,7 +20,8 @@ def measure_snapshots():
 
     from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
     from optodrive.device.config import load_config
-    from optodrive.planning.pipeline import DisplayModel, warm_up
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.planning.pipeline import warm_up
 
     display = DisplayModel.from_config(load_config("display-1511"))
     warm_up(display)

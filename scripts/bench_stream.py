@@ -56,8 +56,9 @@ def measure_planning():
     from optodrive.device.config import load_config
     from optodrive.link.protocol.quantisation import decode, quantise
     from optodrive.link.session.board_requirements import BoardRequirements
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.limiter.limiter import verify
-    from optodrive.planning.pipeline import DisplayModel, plan_sequence
+    from optodrive.planning.pipeline import plan_sequence
 
     display = DisplayModel.from_config(load_config("display-1511"))
     scale = BoardRequirements.from_config(display.config).scale
@@ -141,7 +142,7 @@ def measure_full_frames():
     from optodrive.daemon.engine.engine import Engine
     from optodrive.device.config import load_config
     from optodrive.link.transport.simulated import SimulatedBoard
-    from optodrive.planning.pipeline import DisplayModel
+    from optodrive.planning.display_model import DisplayModel
 
     display = DisplayModel.from_config(load_config("display-1511"))
     board = SimulatedBoard("", 1_000_000)

@@ -8,7 +8,8 @@ from PIL import Image, ImageDraw, ImageFont
 from optodrive.device.config import load_config
 from optodrive.link.simulator.traces import compute_traces
 from optodrive.link.simulator.virtual_run import execute
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 OUT = Path(__file__).parent.parent / "docs" / "pictures"

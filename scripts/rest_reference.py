@@ -5,7 +5,7 @@ from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.api import build_app
 from optodrive.device.config import load_config
 from optodrive.link.transport.registry import find_transport_factory
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 HEAD = """# REST
 

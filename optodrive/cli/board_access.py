@@ -32,7 +32,7 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient
     from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort
-    from optodrive.planning.pipeline import DisplayModel
+    from optodrive.planning.display_model import DisplayModel
 
     loaded = load_config(config)
     # Aimed by nominal numbers: a field that is no good any more must not keep anyone from measuring a new one.

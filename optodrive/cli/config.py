@@ -16,8 +16,8 @@ def register(app: typer.Typer) -> None:
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the resolved configuration, with every pixel and number filled in."""
     from optodrive.device.config import load_config
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.effective_config import build_effective_config
-    from optodrive.planning.pipeline import DisplayModel
 
     document = build_effective_config(DisplayModel.from_config(load_config(config)))
     if json:
@@ -38,7 +38,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check a configuration file whole."""
     from optodrive.device.config import load_config
-    from optodrive.planning.pipeline import DisplayModel
+    from optodrive.planning.display_model import DisplayModel
 
     display = DisplayModel.from_config(load_config(config))
     if json:

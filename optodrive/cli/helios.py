@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from optodrive.link.helios.heat_memory import HeatMemory
     from optodrive.link.helios.player import PlaybackReport
     from optodrive.link.helios.verification import VerifiedFrames
-    from optodrive.planning.pipeline import DisplayModel, PlannedSequence
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.planning.planned_sequence import PlannedSequence
 
 TERMINATING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -90,8 +91,9 @@ def play(
     from optodrive.link.helios.encoding import PointScale
     from optodrive.link.helios.heat_memory import HeatMemory
     from optodrive.link.helios.verification import encode_verified
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility import check_feasibility
-    from optodrive.planning.pipeline import DisplayModel, resolve_policy
+    from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan
     from optodrive.planning.stimuli.sequence_file import load_sequence
 

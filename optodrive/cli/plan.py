@@ -44,8 +44,9 @@ def plan(
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility import check_feasibility
-    from optodrive.planning.pipeline import DisplayModel, resolve_policy
+    from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
 

@@ -29,8 +29,9 @@ if TYPE_CHECKING:
     from optodrive.device.config import Config
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.physics.thermal_state import ThermalState
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility import FeasibilityReport
-    from optodrive.planning.pipeline import DisplayModel, PlannedSequence
+    from optodrive.planning.planned_sequence import PlannedSequence
 
 PIXELS_RECORDED_MAX = 16
 """Without --pixels, so many of the driven pixels are looked at, the tallest first."""
@@ -73,8 +74,8 @@ def simulate(
     from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
+    from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility import check_feasibility
-    from optodrive.planning.pipeline import DisplayModel
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
     if not 1e-6 <= dt <= 1.0:

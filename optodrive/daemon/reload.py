@@ -12,7 +12,7 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.tokens import read_private_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
 """Keys of [daemon]; the file of tokens is read again too."""

@@ -25,7 +25,7 @@ from optodrive.device.config import Config
 from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 SHUTDOWN_GRACE_S = 2
 

@@ -48,7 +48,7 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
         galvo_rad2_per_s4=limits.galvo_acceleration_rms_max_rad_per_s2**2,
         pulse_energy_j=limits.pulse_energy_max_j,
         pulse_width_s=limits.pulse_width_max_s,
-        pulse_rest_s=limits.pulse_gap_min_s,
+        pulse_gap_s=limits.pulse_gap_min_s,
         pixel_mean_w=limits.pixel_mean_power_max_w,
         pixel_window_s=limits.pixel_mean_window_s,
         display_mean_w=limits.display_mean_power_max_w,

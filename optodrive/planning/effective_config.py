@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 
 def build_effective_config(display: DisplayModel) -> dict[str, Any]:

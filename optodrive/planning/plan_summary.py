@@ -8,8 +8,9 @@ import numpy as np
 
 from optodrive.core.files import atomic_write
 from optodrive.core.units import m_to_um
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility import FeasibilityReport
-from optodrive.planning.pipeline import DisplayModel, PlannedSequence, Shortfall, describe_lateness
+from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, describe_lateness
 from optodrive.planning.scheduler.interleaving import SimultaneousFrame
 
 DEAD_LISTED_MAX = 20

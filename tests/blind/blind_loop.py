@@ -19,7 +19,9 @@ from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.recording import read_recording
-from optodrive.planning.pipeline import DisplayModel, PlannedSequence, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.planned_sequence import PlannedSequence
 
 WIDTH_M = 0.4e-3
 SHARES = (0.15, 0.6)

@@ -11,7 +11,8 @@ from optodrive.device.config import Config, load_config
 from optodrive.link.helios.dac import Helios
 from optodrive.link.helios.encoding import PointScale
 from optodrive.link.helios.verification import encode_verified
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 
 
 def config_of(name="display-16", **board):

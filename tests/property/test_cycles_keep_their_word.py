@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from pixel_ode import height_um
 
 PIXELS = (25, 26, 47, 46)

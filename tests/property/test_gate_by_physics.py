@@ -18,7 +18,8 @@ from optodrive.link.helios.encoding import PointScale, decode, encode
 from optodrive.link.helios.frames import parse_points
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
 from optodrive.link.session.board_requirements import BoardRequirements
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 
 GRID_S = 1e-6
@@ -221,17 +222,17 @@ def test_in_the_experiments_of_the_paper(number):
 
 
 def with_moves(display, moves):
-    return replace(display, scan_head=replace(display.machine, settling=moves))
+    return replace(display, scan_head=replace(display.scan_head, settling=moves))
 
 
 class Early:
     """The gate opens 15 % earlier."""
 
     def __init__(self, moves):
-        self._moves, self.lead_us = moves, moves.lead_us
+        self._moves, self.lead_in_us = moves, moves.lead_in_us
 
-    def time_us(self, *move):
-        return int(0.85 * self._moves.time_us(*move))
+    def settling_us(self, *move):
+        return int(0.85 * self._moves.settling_us(*move))
 
 
 @pytest.mark.parametrize("name", ["display-16", "display-437"])
@@ -267,8 +268,8 @@ def test_hasty_moves_taken_for_calm_ones_are_caught():
 
 def by_the_field(display, x_rad, y_rad):
     """Where the beam lands by the calibrated field."""
-    step_rad = display.config.scanner.code_rad
-    return display.machine.field.position_m(CENTRE_CODE + x_rad / step_rad, CENTRE_CODE + y_rad / step_rad)
+    step_rad = display.config.scanner.rad_per_code
+    return display.scan_head.field.position_m(CENTRE_CODE + x_rad / step_rad, CENTRE_CODE + y_rad / step_rad)
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,9 @@ from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.device.config import load_config
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_until, verify
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.pipeline import plan_sequence
 
 CONFIG = load_config()
 DISPLAY = DisplayModel.from_config(CONFIG)

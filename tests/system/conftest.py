@@ -5,7 +5,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.device.config import load_config
 from optodrive.link.transport.serial_port import SerialPort
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 from rig import config_text
 
 

@@ -27,7 +27,7 @@ from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
-from optodrive.planning import pipeline
+from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
 
 LAST_LINE = "lease_s = 1.0"
@@ -64,7 +64,7 @@ def running(folder):
 @pytest.fixture(scope="module")
 def app():
     """The application, whose engine was never started."""
-    engine = Engine(pipeline.DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
     return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
 
@@ -130,7 +130,7 @@ def test_what_the_login_needs_is_open_and_holds_no_secret(running):
 
 
 def test_a_route_without_an_entry_is_not_answered_and_is_caught():
-    engine = Engine(pipeline.DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
     mutant = build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
     @mutant.post("/v1/laser")

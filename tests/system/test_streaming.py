@@ -56,7 +56,7 @@ def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where
         tries.append(time.sleep(next(naps_s)))
         return plan_sequence(*arguments, **more)
 
-    monkeypatch.setattr(planner, "prepare", slowly)
+    monkeypatch.setattr(planner, "plan_sequence", slowly)
     second = stream(armed, frame(range(40, 60)))
     records = [ended(armed, answer) for answer in (first, second)]
     assert len(tries) in (3, 4)  # once more where what ran came late, so that its heat was otherwise

@@ -16,7 +16,7 @@ import pytest
 
 from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 
 

@@ -12,9 +12,9 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
 from optodrive.physics.nominal_display import DisplayState
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_executed, shift_state
 from optodrive.planning.limiter.usage import Usage, compute_usage
-from optodrive.planning.pipeline import DisplayModel
 
 
 class ExecutedBatch(NamedTuple):

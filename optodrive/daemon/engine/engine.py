@@ -29,9 +29,10 @@ from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility import FitMode
 from optodrive.planning.limiter.limiter import Policy
-from optodrive.planning.pipeline import DisplayModel, warm_up
+from optodrive.planning.pipeline import warm_up
 
 LOOP_WAIT_S = 0.002
 IDLE_LOOP_WAIT_S = 0.01

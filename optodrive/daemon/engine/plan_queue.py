@@ -22,8 +22,8 @@ from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_until, shift_state
-from optodrive.planning.pipeline import DisplayModel
 
 START_LEAD_S = 0.05
 """A plan starts so long after it is ready and the one before it has ended: its first points must be there in time."""

@@ -17,8 +17,8 @@ from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session.timing_error import TimingError
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.feasibility import FeasibilityReport
-from optodrive.planning.pipeline import PlannedSequence
 from optodrive.planning.plan_summary import PULSES_LISTED_MAX, list_pulse_columns, summarize_plan
+from optodrive.planning.planned_sequence import PlannedSequence
 
 RECORDS_MAX = 200
 PULSES_MAX = 1_000_000

@@ -14,9 +14,11 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.state_waiters import JsonObject
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.session import BoardSession
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility import FeasibilityReport, FitMode, check_feasibility
 from optodrive.planning.limiter.limiter import Policy, verify
-from optodrive.planning.pipeline import DisplayModel, PlannedSequence, plan_sequence
+from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
 STALL_TIMEOUT_S = 2.0

@@ -14,8 +14,8 @@ from optodrive.daemon.engine.plan_queue import compute_simulated_m
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session_recorder import SessionRecorder
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config
-from optodrive.planning.pipeline import DisplayModel
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.train_json import train_to_json
 

@@ -29,8 +29,8 @@ from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
-from optodrive.planning.pipeline import DisplayModel
 
 LOOP_STEP_S = 0.002
 SWITCH_INTERVAL_S = 2e-4

@@ -10,7 +10,8 @@ from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.planning.pipeline import DisplayModel, PlannedSequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.planned_sequence import PlannedSequence
 
 STEP_S = 0.005
 START_LEAD_S = 0.05

@@ -7,7 +7,7 @@ import numpy as np
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.planning.feasibility.order_search import Orders, OrderSearch
 from optodrive.planning.feasibility.sequence_edits import omit_pixels
-from optodrive.planning.pipeline import PlannedSequence
+from optodrive.planning.planned_sequence import PlannedSequence
 
 PASSES_MAX = 12
 

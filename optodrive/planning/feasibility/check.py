@@ -9,6 +9,7 @@ from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.nearest_feasible import find_height_factor, find_time_factor
 from optodrive.planning.feasibility.order_search import ORDERS_MAX, Orders, OrderSearch, count_orders
 from optodrive.planning.feasibility.reduction import reduce_sequence
@@ -21,14 +22,9 @@ from optodrive.planning.feasibility.report_builder import (
 from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence
 from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
 from optodrive.planning.limiter.limiter import Policy
-from optodrive.planning.pipeline import (
-    DisplayModel,
-    PlannedSequence,
-    Progress,
-    first_unreachable,
-    plan_sequence,
-    remove_dead_pixels,
-)
+from optodrive.planning.pipeline import Progress, plan_sequence
+from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.sequence_checks import first_unreachable, remove_dead_pixels
 
 PLANS_MAX = 1_000
 """So many plans at most are tried for each of the nearest sets."""

@@ -5,7 +5,7 @@ from optodrive.core.units import m_to_um
 from optodrive.planning.feasibility.report import NearestFeasible, SequenceReduction
 from optodrive.planning.feasibility.violation import Violation
 from optodrive.planning.limiter.limiter import PHRASES
-from optodrive.planning.pipeline import PlannedSequence, describe_lateness
+from optodrive.planning.planned_sequence import PlannedSequence, describe_lateness
 
 
 def name_source(sequence: FrameSequence, source: int) -> str:

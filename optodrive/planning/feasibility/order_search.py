@@ -15,6 +15,8 @@ from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.batch_limiter import BatchLimiter
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.violation import (
     Violation,
     beam_lower_bound_s,
@@ -22,16 +24,10 @@ from optodrive.planning.feasibility.violation import (
     find_first_violation,
     is_order_independent,
 )
-from optodrive.planning.limiter.limiter import limit
-from optodrive.planning.pipeline import (
-    TIME_TOLERANCE_S,
-    DisplayModel,
-    PlannedSequence,
-    find_galvo_pause,
-    first_unreachable,
-    plan_sequence,
-)
+from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.planned_sequence import TIME_TOLERANCE_S, PlannedSequence
 from optodrive.planning.scheduler.scheduler import Scheduler
+from optodrive.planning.sequence_checks import first_unreachable
 
 ORDERS_MAX = 14_000
 """A sequence with so many orders at most is small: three frames of four pixels have 13,824."""
@@ -151,28 +147,23 @@ class OrderSearch:
     def _plan_until_violation(
         self, sequence: FrameSequence, orders: Orders | None, through_limiter: bool
     ) -> Violation | None:
-        """The plan piece by piece up to its first breach, through the limiter or as if there were none."""
-        machine, cold_heat = self._display.scan_head, self._display.build_cold_heat
-        scheduler = Scheduler(machine, sequence, cold_heat, on_progress=self.on_progress, visiting_orders=orders)
+        """Plan batch by batch up to the first violation, through the limiter or as if there were no caps."""
+        scheduler = Scheduler(
+            self._display.scan_head,
+            sequence,
+            self._display.build_cold_heat,
+            on_progress=self.on_progress,
+            visiting_orders=orders,
+        )
+        limiter = BatchLimiter(scheduler, self._display.budget, self._budget, len(sequence.frames))
         deadline_s = deadlines_s(sequence, scheduler.lead_in_us * 1e-6)
-        heat, state = self._heat.copy(), self._budget
-        batches = scheduler.pieces(heat)
-        requested = next(batches, None)
-        while requested is not None:
+
+        def grant(batch: PulsePlan) -> PulsePlan | None:
             self.on_progress()
-            batch: PulsePlan = requested
-            if through_limiter:
-                pause = find_galvo_pause(self._display, requested, state, len(sequence.frames))
-                if pause is not None:
-                    requested = batches.send(pause)
-                    continue
-                batch, state = limit(requested, state, self._display.budget)
-            violation = find_first_violation(batch, deadline_s)
-            if violation is not None:
-                return violation
-            heat.apply_pulses(batch.pixel, batch.start_s, batch.width_s, batch.power_w, self.on_progress)
-            requested = next(batches, None)
-        return None
+            return limiter.grant(batch) if through_limiter else batch
+
+        violations = (find_first_violation(batch, deadline_s) for batch in scheduler.run(self._heat.copy(), grant))
+        return next((violation for violation in violations if violation is not None), None)
 
     def _search_depth_first(self, sequence: FrameSequence) -> Orders | None:
         """Orders one after the other, depth first: all that begin as one did up to where it broke are passed over."""

@@ -12,7 +12,7 @@ from optodrive.planning.feasibility.report import (
     SequenceReduction,
 )
 from optodrive.planning.feasibility.violation import Violation
-from optodrive.planning.pipeline import PlannedSequence
+from optodrive.planning.planned_sequence import PlannedSequence
 
 
 def build_feasible_report(plan: PlannedSequence, proof: Proof, fit: FitMode) -> FeasibilityReport:

@@ -12,8 +12,9 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import LimitedPlan, PulsePlan
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.physics.thermal_state import ThermalState
-from optodrive.planning.pipeline import TIME_TOLERANCE_S, DisplayModel
-from optodrive.planning.scheduler.scheduler import ScanHead
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.planned_sequence import TIME_TOLERANCE_S
+from optodrive.planning.scheduler.scan_head import ScanHead
 
 SLOPE_INTERVAL_S = 1e-6
 

@@ -21,7 +21,7 @@ class Caps(NamedTuple):
     galvo_rad2_per_s4: float
     pulse_energy_j: float
     pulse_width_s: float
-    pulse_rest_s: float
+    pulse_gap_s: float
     pixel_mean_w: float
     pixel_window_s: float
     display_mean_w: float

@@ -120,7 +120,7 @@ def _compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: P
     rise_k = absorber_after_k(budget.heat, pixel, workspace.nodes.absorber_k[pixel], 0.0, off_s)
     lower_bound_k = lower_bound_after_k(budget.heat, pixel, workspace.nodes.lower_bound_k[pixel], 0.0, off_s)
     bucket_j = max(0.0, budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)
-    has_rested = off_s >= budget.caps.pulse_rest_s - TOLERANCE
+    has_rested = off_s >= budget.caps.pulse_gap_s - TOLERANCE
     return PixelStartState(rise_k, lower_bound_k, bucket_j, 0.0 if has_rested else budgets.merged_width_s[pixel])
 
 

@@ -43,7 +43,7 @@ class CandidateSchedule:
     rounds: int
     simultaneity: float
     end_s: float
-    has_min_rest: bool
+    has_min_gaps: bool
 
 
 def split_pulses(single_pulses: Mapping[int, tuple[int, float]], rounds: int) -> PeriodsByPixel | None:
@@ -61,7 +61,7 @@ MIN_SIMULTANEITY_GAIN = 0.01
 
 def select_schedule(candidates: list[CandidateSchedule], deadline_s: float) -> CandidateSchedule:
     """Of those that end in time the one of fewest rounds within WORTH of the most simultaneous; else the first."""
-    feasible = [item for item in candidates if item.end_s <= deadline_s + 1e-9 and item.has_min_rest]
+    feasible = [item for item in candidates if item.end_s <= deadline_s + 1e-9 and item.has_min_gaps]
     max_simultaneity = max((item.simultaneity for item in feasible), default=0.0)
     return next(
         (item for item in feasible if item.simultaneity >= max_simultaneity - MIN_SIMULTANEITY_GAIN), candidates[0]
@@ -99,7 +99,7 @@ def concatenate_batches(batches: list[PulsePlan]) -> PulsePlan:
     )
 
 
-def has_min_rest(plan: PulsePlan, rest_s: float) -> bool:
+def has_min_gaps(plan: PulsePlan, rest_s: float) -> bool:
     """Whether every pulse comes rest_s or more after the last one on its pixel."""
     order = np.lexsort((plan.start_s, plan.pixel))
     start_s, end_s, pixel = plan.start_s[order], (plan.start_s + plan.width_s)[order], plan.pixel[order]

@@ -1,24 +1,25 @@
-"""Frames and trains onto one beam: when each pulse starts, and how strong it must be.
+"""Schedule frames and trains onto one beam: start, width and power of every pulse, batch by batch.
 
-Trains keep their times; a frame's pulses fill the beam time between them. What is asked by height is planned from the
-heat that is there. Times are whole microseconds inside.
+Trains keep their times; the pulses of a frame fill the beam time between them. Pulses requested by height are planned
+from the residual heat. All times inside the scheduler are whole microseconds.
 """
 
-from collections.abc import Callable, Generator, Mapping
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from math import inf
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import PulsePlan
-from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import PixelLayout
-from optodrive.device.scan_field import ScanField
-from optodrive.device.settling import SettlingTable
+from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.nominal_display import ignore_progress
-from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.scheduler.batch_draft import BatchDraft, BeamState, SkippedPulse
+from optodrive.planning.scheduler.batch_planner import BatchPlanner, Round
 from optodrive.planning.scheduler.interleaving import (
     ROUND_COUNTS,
     CandidateSchedule,
@@ -26,93 +27,57 @@ from optodrive.planning.scheduler.interleaving import (
     SimultaneousFrame,
     compute_simultaneity,
     concatenate_batches,
-    has_min_rest,
+    has_min_gaps,
     select_schedule,
     split_pulses,
 )
+from optodrive.planning.scheduler.scan_head import BeamPath, ScanHead
 from optodrive.planning.scheduler.train_pulses import TrainPulses
-from optodrive.planning.scheduler.visiting_path import compute_visiting_order
 
 TRAIN_BATCH = 1000
-"""Pulses of trains planned in one piece, unless told otherwise."""
+"""Default maximum number of train pulses in one batch."""
 
-PROGRESS_INTERVAL = 16
-"""Pulses of a frame between two ticks."""
-
-ALL = 2**60
+Granted = TypeVar("Granted", bound=PulsePlan)
 
 
 class GalvoPause(NamedTuple):
-    """Of a piece only the first rows may stay as they are; then the mirrors rest for so long, µs."""
+    """A pause of the mirrors after the first `rows` pulses of a batch, in which their coils cool."""
 
     rows: int
     pause_us: int
 
 
-Answer = int | GalvoPause | None
-Pieces = Generator[PulsePlan, Answer, None]
-"""Yields pieces of a plan; takes how much later, µs, the last one must come, a rest, or None where it may stay."""
+@dataclass(frozen=True)
+class _TrainsBefore:
+    """Step: all train pulses requested before `until_us`."""
+
+    until_us: float
 
 
 @dataclass(frozen=True)
-class ScanHead:
-    """What the scheduler knows of optics and laser. rest_s: dark time after which a pixel's next pulse counts anew."""
-
-    layout: PixelLayout
-    field: ScanField
-    settling: SettlingTable
-    drive: DriveRange
-    pulse_rest_s: float
-
-
-@dataclass(frozen=True)
-class SkippedPulse:
-    """A pixel that got no pulse from a frame or in a train's cycle: the heat left reaches its target by itself."""
+class _Frame:
+    """Step: a frame whose visiting order and rounds are decided when the plan reaches it."""
 
     source: int
-    pixel: int
-    target_m: float
-
-
-class _PlannedPulse(NamedTuple):
-    start_us: int
-    width_us: int
-    power_w: float
-    pixel: int
-    settling_us: int
-    target_m: float
-    requested_start_us: int
-    source: int
-
-
-@dataclass
-class _Cursor:
-    """How far a plan has come. place: in the frame's order; waited_us: pauses put in so far.
-
-    since_us, stay_us: when the gate first opened on the pixel `lit`, and how long the mirrors stayed there after that
-    """
-
-    free_us: int = 0
-    pixel: int | None = None
-    arrival_us: int = 0
-    dwell_us: int = 0
-    next_train: int = 0
-    position: int = 0
-    delay_us: int = 0
-    skipped_count: int = 0
 
 
 class Scheduler:
-    """Plans a sequence piece by piece, a frame and the train pulses beside it at a time.
+    """Plans a sequence batch by batch; a batch is a proposal until it is accepted.
 
-    tick: called again and again while a frame is planned.
-    at_rest: makes the display's heat before anybody lit it, for the cycles of trains that ask for heights.
-    orders: by source, the order [k] in which a frame's driven pixels are visited; the others by a short path.
-    standing_on: the pixel the mirrors stand on as the plan begins.
-    lead_us: dark time before the sequence's zero, in which the mirrors come to the first pixel from wherever they are;
-    none where it is known on which pixel they stand.
-    skipped: pixels that needed no pulse, together: how frames were split that ask for it; both so far.
-    Raises InputError for a train whose height or swing its cycles cannot have, or that leaves the beam no time.
+    Exactly one of `accept`, `delay` and `pause` answers each batch from `next_batch`. Accepted pulses are applied to
+    the heat before the next batch is planned, so the next batch accounts for what the limiter removed. `run` drives
+    this protocol.
+
+    build_cold_heat: makes the heat of a cold display, for the pulse recipes of trains by height
+    train_batch: maximum number of train pulses in one batch
+    on_progress: called repeatedly while a batch is planned
+    initial_pixel: pixel on which the mirrors stand at the start, None while unknown
+    visiting_orders: by source, the order [k] of a frame's active pixels; other frames follow a short path
+    lead_in_us: gate-off time before the sequence's zero, in which the mirrors reach the first pixel from anywhere; zero
+    if the initial pixel is known
+    skipped, simultaneous: skipped pulses and interleaved frames of the plan so far
+
+    Raises InputError for a train by height whose height or peak-to-peak value no cycle has, or that has no beam time.
     """
 
     def __init__(
@@ -125,276 +90,158 @@ class Scheduler:
         initial_pixel: int | None = None,
         visiting_orders: Mapping[int, IntArray] | None = None,
     ) -> None:
-        self._scan_head = scan_head
         self._sequence = sequence
-        self._train_batch = train_batch
+        self._scan_head = scan_head
         self._on_progress = on_progress
         self._visiting_orders = visiting_orders or {}
-        x_rad, y_rad = scan_head.field.angles_rad(scan_head.layout.x_m, scan_head.layout.y_m)
-        self._x_rad: list[float] = x_rad.tolist()
-        self._y_rad: list[float] = y_rad.tolist()
-        self._cursor = _Cursor(pixel=initial_pixel)
-        self._max_rows = ALL
         self.lead_in_us = scan_head.settling.lead_in_us if initial_pixel is None else 0
         self.skipped: list[SkippedPulse] = []
         self.simultaneous: list[SimultaneousFrame] = []
-        self._trains = TrainPulses(
+        self._path = BeamPath(scan_head, self.lead_in_us)
+        trains = TrainPulses(
             sequence.trains,
             len(sequence.frames),
             scan_head.drive,
-            round(scan_head.pulse_rest_s * 1e6),
-            self._compute_settling_us,
+            round(scan_head.pulse_gap_s * 1e6),
+            self._path.compute_settling_us,
             build_cold_heat,
             on_progress,
         )
+        self._planner = BatchPlanner(sequence, trains, self._path, scan_head.drive, train_batch, on_progress)
+        self._beam = BeamState(pixel=initial_pixel)
+        self._steps: deque[_TrainsBefore | _Frame | Round] = deque(_list_steps(sequence))
+        self._draft: BatchDraft | None = None
+        self._pending_pause: GalvoPause | None = None
 
-    def pieces(self, heat: ThermalState) -> Pieces:
-        """The plan in pieces; `heat`, on the plan's time line, must be brought up to date between them.
+    def run(self, heat: ThermalState, grant: Callable[[PulsePlan], Granted | None]) -> Iterator[Granted]:
+        """Plan every batch, submit it to `grant`, yield what is granted and then apply it to `heat`.
 
-        What the limiter takes from one piece is thereby known to the next: no pulse counts on heat that never came. A
-        piece that must come later is planned again for then, and all that follows comes as much later.
+        grant: returns the batch as the limiter passes it, or None after it called `delay` or `pause`.
         """
-        for source, frame in enumerate(self._sequence.frames):
-            yield from self._trains_before(frame.show_at_s, heat)
-            yield from self._frame(source, frame, heat)
-        yield from self._trains_before(float("inf"), heat)
+        while (batch := self.next_batch(heat)) is not None:
+            granted = grant(batch)
+            if granted is not None:
+                self.accept()
+                yield granted
+                heat.apply_pulses(granted.pixel, granted.start_s, granted.width_s, granted.power_w, self._on_progress)
 
-    def _offer(self, build: Callable[[], list[_PlannedPulse]]) -> Generator[PulsePlan, Answer, bool]:
-        """Yield what build makes, later or less of it as the answers ask; False where it makes nothing."""
-        rest_us = 0
-        while True:
-            before = replace(self._cursor)
-            rows = build()
-            if not rows:
-                return False
-            answer = yield self._build_plan(rows)
-            if not answer:
-                self._cursor.free_us += rest_us
-                self._max_rows = ALL
-                return True
-            self._cursor = before
-            del self.skipped[before.skipped_count :]
-            if isinstance(answer, int):
-                self._cursor.free_us += answer
-                self._cursor.delay_us += answer
-            elif answer.rows:
-                self._max_rows, rest_us = answer.rows, answer.pause_us
+    def next_batch(self, heat: ThermalState) -> PulsePlan | None:
+        """Plan the next batch from `heat`, which is on the plan's time line; return None after the last batch."""
+        while self._steps:
+            step = self._steps[0]
+            if isinstance(step, _Frame):
+                self._steps.popleft()
+                self._steps.extendleft(reversed(self._plan_frame(step.source, heat)))
+                continue
+            if isinstance(step, Round):
+                max_rows = None if self._pending_pause is None else self._pending_pause.rows
+                draft = self._planner.plan_round(self._beam, step, heat, max_rows)
             else:
-                self._cursor.free_us += answer.pause_us
+                draft = self._planner.plan_trains(self._beam, step.until_us, heat)
+            if draft.rows:
+                self._draft = draft
+                return draft.to_plan()
+            self._commit(draft)
+            self._beam.position = 0
+            self._steps.popleft()
+        return None
 
-    def _compute_requested_us(self, time_s: float) -> int:
-        return self.lead_in_us + round(time_s * 1e6)
+    def accept(self) -> None:
+        """Keep the proposed batch; a pause requested for it follows its last pulse."""
+        self._commit(self._take_draft())
+        if self._pending_pause is not None:
+            self._beam.free_us += self._pending_pause.pause_us
+            self._pending_pause = None
 
-    def _compute_settling_us(self, origin: int | None, pixel: int, dwell_us: int = 0) -> int:
-        if origin is None:
-            return self.lead_in_us
-        return self._scan_head.settling.settling_us(
-            self._x_rad[pixel] - self._x_rad[origin], self._y_rad[pixel] - self._y_rad[origin], dwell_us
-        )
+    def delay(self, delay_us: int) -> None:
+        """Withdraw the proposed batch; it is planned again, and everything from it on starts `delay_us` later."""
+        self._take_draft()
+        self._beam.free_us += delay_us
+        self._beam.delay_us += delay_us
 
-    def _compute_order(self, frame: TactileFrame) -> list[int]:
-        layout, active = self._scan_head.layout, np.flatnonzero(frame.target_m > 0)
-        mirrors = np.array(self._x_rad), np.array(self._y_rad)
-        order: list[int] = compute_visiting_order(
-            active, layout.row, layout.column, *mirrors, self._cursor.pixel
-        ).tolist()
-        return order
-
-    def _place_pulse(
-        self, pixel: int, width_us: int, power_w: float, requested_us: int, target_m: float, source: int
-    ) -> _PlannedPulse:
-        cursor = self._cursor
-        settling_us = self._compute_settling_us(cursor.pixel, pixel, cursor.dwell_us)
-        start_us = max(requested_us + cursor.delay_us, cursor.free_us + settling_us)
-        if pixel != cursor.pixel:
-            cursor.arrival_us = start_us
-        cursor.free_us, cursor.pixel = start_us + width_us, pixel
-        cursor.dwell_us = cursor.free_us - cursor.arrival_us
-        return _PlannedPulse(start_us, width_us, power_w, pixel, settling_us, target_m, requested_us, source)
-
-    def _build_train_rows(self, heat: ThermalState) -> list[_PlannedPulse]:
-        """The next train pulse as a row, or none where it asks for a height that the heat there reaches by itself."""
-        cursor, index = self._cursor, self._cursor.next_train
-        pulse = self._trains[index]
-        requested_us = self.lead_in_us + pulse.requested_start_us
-        cursor.next_train += 1
-        if not pulse.is_by_height:
-            return [
-                self._place_pulse(pulse.pixel, pulse.width_us, pulse.power_w, requested_us, float("nan"), pulse.source)
-            ]
-        start_us = max(
-            requested_us + cursor.delay_us,
-            cursor.free_us + self._compute_settling_us(cursor.pixel, pulse.pixel, cursor.dwell_us),
-        )
-        planned = self._trains.plan_pulse(index, heat, start_us, start_us - requested_us - cursor.delay_us)
-        target_m = self._trains.get_target_m(pulse.source)
-        if planned is None:
-            self.skipped.append(SkippedPulse(pulse.source, pulse.pixel, target_m))
-            cursor.skipped_count += 1
-            return []
-        return [self._place_pulse(pulse.pixel, *planned, requested_us, target_m, pulse.source)]
-
-    def _is_heat_known(self, rows: list[_PlannedPulse]) -> bool:
-        """Whether the next train pulse can be planned after rows that the limiter has not seen."""
-        pulse = self._trains[self._cursor.next_train]
-        return not pulse.is_by_height or all(row.pixel != pulse.pixel for row in rows)
-
-    def _trains_before(self, until_s: float, heat: ThermalState) -> Pieces:
-        def build() -> list[_PlannedPulse]:
-            rows: list[_PlannedPulse] = []
-            while self._cursor.next_train < len(self._trains) and len(rows) < self._train_batch:
-                if self._trains[self._cursor.next_train].requested_start_us >= until_s * 1e6:
-                    break
-                if not self._is_heat_known(rows):
-                    break
-                rows += self._build_train_rows(heat)
-            return rows
-
-        while (yield from self._offer(build)):
-            pass
-
-    def _is_train_due(self, end_us: int, pixel: int, dwell_us: int) -> bool:
-        """Whether the next train pulse would come late if the beam lit `pixel` for lit_us until end_us."""
-        cursor = self._cursor
-        if cursor.next_train >= len(self._trains):
-            return False
-        pulse = self._trains[cursor.next_train]
-        deadline_us = self.lead_in_us + pulse.requested_start_us + cursor.delay_us
-        return deadline_us < end_us + self._compute_settling_us(pixel, pulse.pixel, dwell_us)
-
-    def _frame(self, source: int, frame: TactileFrame, heat: ThermalState) -> Pieces:
-        """A frame's pulses, one a pixel, or several where its pixels shall stand up together."""
-        order = (
-            self._visiting_orders[source].tolist() if source in self._visiting_orders else self._compute_order(frame)
-        )
-        if frame.simultaneous and len(order) > 1:
-            yield from self._together(source, frame, order, heat)
+    def pause(self, pause: GalvoPause) -> None:
+        """Withdraw the proposed batch; its first pulses are planned again as a batch, which the pause follows."""
+        self._take_draft()
+        if pause.rows:
+            self._pending_pause = pause
         else:
-            yield from self._round(source, frame, order, heat)
+            self._beam.free_us += pause.pause_us
 
-    def _together(self, source: int, frame: TactileFrame, order: list[int], heat: ThermalState) -> Pieces:
-        """A frame in as many rounds as bring its pixels up together best, in the time it has."""
-        drive, waited_us = self._scan_head.drive, self._cursor.delay_us
-        begin_us = max(self._compute_requested_us(frame.show_at_s) + waited_us, self._cursor.free_us)
-        single = {}
+    def _take_draft(self) -> BatchDraft:
+        if self._draft is None:
+            raise RuntimeError("no batch is proposed")
+        draft, self._draft = self._draft, None
+        return draft
+
+    def _commit(self, draft: BatchDraft) -> None:
+        self._beam = draft.beam
+        self.skipped += draft.skipped
+
+    def _plan_frame(self, source: int, heat: ThermalState) -> list[Round]:
+        """Decide the visiting order of a frame and, if it is simultaneous, its number of interleaved rounds."""
+        frame, drive = self._sequence.frames[source], self._scan_head.drive
+        if source in self._visiting_orders:
+            order = self._visiting_orders[source].tolist()
+        else:
+            order = self._path.compute_order(np.flatnonzero(frame.target_m > 0), self._beam.pixel)
+        if not frame.simultaneous or len(order) < 2:
+            return [Round(source, order)]
+        delay_us = self._beam.delay_us
+        begin_us = max(self._planner.compute_requested_us(frame.show_at_s) + delay_us, self._beam.free_us)
+        single_pulses = {}
         for pixel in order:
             pulse = heat.solve_pulse(pixel, begin_us * 1e-6, float(frame.target_m[pixel]), drive)
             if pulse is not None:
-                single[pixel] = pulse
-        if not single:
-            yield from self._round(source, frame, order, heat)
-            return
-        split = {rounds: shares for rounds in ROUND_COUNTS if (shares := split_pulses(single, rounds)) is not None}
-        rehearsals = [self._rehearsal(source, frame, order, heat, *item) for item in split.items()]
-        due_us = self._compute_requested_us(frame.show_at_s + frame.duration_s) + waited_us
-        chosen, unsplit = select_schedule(rehearsals, due_us * 1e-6), rehearsals[0]
-        extra_s = chosen.end_s - unsplit.end_s
+                single_pulses[pixel] = pulse
+        if not single_pulses:
+            return [Round(source, order)]
+        rounds = {
+            count: _list_rounds(source, order, count, periods)
+            for count in ROUND_COUNTS
+            if (periods := split_pulses(single_pulses, count)) is not None
+        }
+        candidates = [self._evaluate_rounds(source, each, heat) for each in rounds.values()]
+        deadline_us = self._planner.compute_requested_us(frame.show_at_s + frame.duration_s) + delay_us
+        selected, single = select_schedule(candidates, deadline_us * 1e-6), candidates[0]
         self.simultaneous.append(
-            SimultaneousFrame(source, chosen.rounds, chosen.simultaneity, unsplit.simultaneity, extra_s)
+            SimultaneousFrame(
+                source, selected.rounds, selected.simultaneity, single.simultaneity, selected.end_s - single.end_s
+            )
         )
-        yield from self._rounds(source, frame, order, heat, chosen.rounds, split[chosen.rounds])
+        return rounds[selected.rounds]
 
-    def _rehearsal(
-        self,
-        source: int,
-        frame: TactileFrame,
-        order: list[int],
-        heat: ThermalState,
-        rounds: int,
-        shares: PeriodsByPixel,
-    ) -> CandidateSchedule:
-        """What a number of rounds would come to, on a copy of the heat; the plan stays where it is."""
-        before, trial, pieces, last_round_s = replace(self._cursor), heat.copy(), [], 0.0
-        for piece in self._rounds(source, frame, order, trial, rounds, shares):
-            trial.apply_pulses(piece.pixel, piece.start_s, piece.width_s, piece.power_w, self._on_progress)
-            pieces.append(piece)
-            if np.isfinite(piece.target_m[piece.source == source]).any() and last_round_s == 0.0:
-                last_round_s = float(piece.start_s[0])
-        self._cursor = before
-        del self.skipped[before.skipped_count :]
-        plan = concatenate_batches(pieces)
-        target_m = {pixel: float(frame.target_m[pixel]) for pixel in order}
-        share = compute_simultaneity(heat, plan, target_m, last_round_s, self._on_progress)
+    def _evaluate_rounds(self, source: int, rounds: list[Round], heat: ThermalState) -> CandidateSchedule:
+        """Plan the rounds of a frame without the limiter, on copies of the beam state and the heat."""
+        trial = self._fork(rounds)
+        batches, last_round_start_s = [], 0.0
+        for batch in trial.run(heat.copy(), lambda proposed: proposed):
+            batches.append(batch)
+            if np.isfinite(batch.target_m[batch.source == source]).any() and last_round_start_s == 0.0:
+                last_round_start_s = float(batch.start_s[0])
+        plan = concatenate_batches(batches)
+        target_m = {pixel: float(self._sequence.frames[source].target_m[pixel]) for pixel in rounds[-1].order}
+        simultaneity = compute_simultaneity(heat, plan, target_m, last_round_start_s, self._on_progress)
         end_s = float(plan.start_s[-1] + plan.width_s[-1])
-        return CandidateSchedule(rounds, share, end_s, rounds == 1 or has_min_rest(plan, self._scan_head.pulse_rest_s))
+        is_separated = len(rounds) == 1 or has_min_gaps(plan, self._scan_head.pulse_gap_s)
+        return CandidateSchedule(len(rounds), simultaneity, end_s, is_separated)
 
-    def _rounds(
-        self,
-        source: int,
-        frame: TactileFrame,
-        order: list[int],
-        heat: ThermalState,
-        rounds: int,
-        shares: PeriodsByPixel,
-    ) -> Pieces:
-        """Slices of so many PWM periods in every round but the last, in which each pixel gets what it still needs."""
-        for _ in range(rounds - 1):
-            yield from self._round(source, frame, [pixel for pixel in order if pixel in shares], heat, shares)
-        yield from self._round(source, frame, order, heat)
+    def _fork(self, rounds: list[Round]) -> "Scheduler":
+        """Return a scheduler that plans only `rounds` from the present state and leaves this one unchanged."""
+        fork = copy(self)
+        fork._beam = replace(self._beam, position=0)
+        fork._steps = deque(rounds)
+        fork.skipped = []
+        return fork
 
-    def _round(
-        self,
-        source: int,
-        frame: TactileFrame,
-        order: list[int],
-        heat: ThermalState,
-        shares: PeriodsByPixel | None = None,
-    ) -> Pieces:
-        """One pulse a pixel, cut where a train's pulse comes between; to its height, or as wide as its share."""
-        self._cursor.position = 0
-        while (yield from self._offer(lambda: self._round_rows(source, frame, order, heat, shares))):
-            pass
 
-    def _round_rows(
-        self, source: int, frame: TactileFrame, order: list[int], heat: ThermalState, shares: PeriodsByPixel | None
-    ) -> list[_PlannedPulse]:
-        """The round's rows from where it stands, up to the next train pulse or its own end."""
-        cursor, drive, requested_us = self._cursor, self._scan_head.drive, self._compute_requested_us(frame.show_at_s)
-        rows: list[_PlannedPulse] = []
-        while cursor.position < len(order) and len(rows) < self._max_rows:
-            pixel = order[cursor.position]
-            target_m = float(frame.target_m[pixel])
-            start_us = max(
-                requested_us + cursor.delay_us,
-                cursor.free_us + self._compute_settling_us(cursor.pixel, pixel, cursor.dwell_us),
-            )
-            if cursor.position % PROGRESS_INTERVAL == 0:
-                self._on_progress()
-            if shares is None:
-                pulse = heat.solve_pulse(pixel, start_us * 1e-6, target_m, drive)
-            else:
-                pulse, target_m = (shares[pixel], 1.0), float("nan")
-            if pulse is None:
-                self.skipped.append(SkippedPulse(source, pixel, target_m))
-                cursor.skipped_count += 1
-                cursor.position += 1
-                continue
-            width_us = round(pulse[0] * drive.period_s * 1e6)
-            if self._is_train_due(start_us + width_us, pixel, width_us):
-                if not self._is_heat_known(rows):
-                    return rows
-                rows += self._build_train_rows(heat)
-                if rows:
-                    return rows
-                continue
-            rows.append(
-                self._place_pulse(pixel, width_us, pulse[1] * drive.max_power_w, requested_us, target_m, source)
-            )
-            cursor.position += 1
-        return rows
+def _list_steps(sequence: FrameSequence) -> Iterator[_TrainsBefore | _Frame]:
+    for source, frame in enumerate(sequence.frames):
+        yield _TrainsBefore(frame.show_at_s * 1e6)
+        yield _Frame(source)
+    yield _TrainsBefore(inf)
 
-    def _build_plan(self, rows: list[_PlannedPulse]) -> PulsePlan:
-        start_us, width_us, power_w, pixel, settling_us, target_m, requested_start_us, source = zip(*rows, strict=True)
-        index = np.array(pixel, dtype=np.int64)
-        return PulsePlan(
-            start_s=np.array(start_us) * 1e-6,
-            width_s=np.array(width_us) * 1e-6,
-            x_rad=np.array(self._x_rad)[index],
-            y_rad=np.array(self._y_rad)[index],
-            power_w=np.array(power_w),
-            pixel=index,
-            settling_s=np.array(settling_us) * 1e-6,
-            target_m=np.array(target_m),
-            requested_start_s=np.array(requested_start_us) * 1e-6,
-            source=np.array(source, dtype=np.int64),
-        )
+
+def _list_rounds(source: int, order: list[int], count: int, periods: PeriodsByPixel) -> list[Round]:
+    """Return `count` rounds: sub-pulses of fixed width in all but the last, which brings each pixel to its height."""
+    sub_pulses = Round(source, [pixel for pixel in order if pixel in periods], periods)
+    return [sub_pulses] * (count - 1) + [Round(source, order)]

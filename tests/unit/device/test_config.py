@@ -4,8 +4,8 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.device.config import build_pixel_layout, list_shipped_configs, load_config, locate_shipped
 from optodrive.physics.parameters import load_parameters
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config
-from optodrive.planning.pipeline import DisplayModel
 
 
 @pytest.mark.parametrize("name", list_shipped_configs())

@@ -12,7 +12,8 @@ from optodrive.device.scan_field import IdealField
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.budget_setup import build_galvo_model
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 
 
 @pytest.fixture(scope="module")

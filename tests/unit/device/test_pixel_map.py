@@ -20,8 +20,9 @@ from optodrive.device.pixel_map import (
     write_pixel_map,
 )
 from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility import check_feasibility
-from optodrive.planning.pipeline import DisplayModel, plan_sequence, warm_up
+from optodrive.planning.pipeline import plan_sequence, warm_up
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator
@@ -142,7 +143,7 @@ def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
     x_codes, y_codes = requirements.scale.to_codes(plan.x_rad), requirements.scale.to_codes(plan.y_rad)
     assert limits.x_min <= x_codes.min() <= x_codes.max() <= limits.x_max
     assert limits.y_min <= y_codes.min() <= y_codes.max() <= limits.y_max
-    moves = display.scan_head.moves
+    moves = display.scan_head.settling
     for dx_rad, dy_rad, settle_s in zip(np.diff(plan.x_rad), np.diff(plan.y_rad), plan.settling_s[1:], strict=True):
         assert settle_s * 1e6 >= moves.min_settling_us(np.array([dx_rad]), np.array([dy_rad])) - 1
 

@@ -5,7 +5,7 @@ import pytest
 
 from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 DISPLAY = DisplayModel.from_config(load_config("display-16"))
 

@@ -16,7 +16,7 @@ from optodrive.link.protocol.quantisation import DUTY_MAX
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.galvos import CENTRE_CODE, SimulatedGalvos
 from optodrive.link.simulator.memory_link import MemoryLink
-from optodrive.planning.pipeline import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 
 CENTRE = (CENTRE_CODE, CENTRE_CODE)
 

@@ -114,7 +114,7 @@ def test_each_cap_trims_the_last_pulse_and_gives_its_reason(cause):
 def test_a_cap_taken_away_is_noticed(cause):
     rows = CASES[cause][1]
     if cause == "pulse_width":
-        assert run(roomy(pulse_rest_s=1e-6), *rows).reason[-1] == ""
+        assert run(roomy(pulse_gap_s=1e-6), *rows).reason[-1] == ""
     else:
         assert run(ROOMY, *rows).reason[-1] == ""
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from optodrive.device.config import load_config
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import cold_state, commit_executed, shift_state
 from optodrive.planning.limiter.usage import compute_usage
-from optodrive.planning.pipeline import DisplayModel
 
 DISPLAY = DisplayModel.from_config(load_config("display-16"))
 BUDGET = DISPLAY.budget

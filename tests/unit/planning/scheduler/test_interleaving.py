@@ -15,7 +15,7 @@ from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.scheduler.interleaving import (
     ROUND_COUNTS,
     CandidateSchedule,
-    has_min_rest,
+    has_min_gaps,
     select_schedule,
     split_pulses,
 )
@@ -65,7 +65,7 @@ def test_sliced_pixels_reach_their_heights(heights_um):
     assert shares(result, heights_um).max(axis=0) == pytest.approx(np.ones(len(heights_um)), rel=0.03)
     last = np.isfinite(result.plan.target_m)
     assert sorted(result.plan.pixel[last]) == sorted(heights_um)
-    assert has_min_rest(result.plan, DISPLAY.scan_head.pulse_rest_s)
+    assert has_min_gaps(result.plan, DISPLAY.scan_head.pulse_gap_s)
 
 
 def test_it_ends_in_time_or_is_not_split():
@@ -85,7 +85,7 @@ def test_slices_have_no_height_of_their_own_to_answer_for():
     assert told["predicted_max_um"] == pytest.approx(100.0, rel=0.01)
     assert told["frames"][0]["simultaneous"] == {
         key: getattr(result.simultaneous[0], key)
-        for key in ("rounds", "simultaneity", "simultaneity_unsplit", "extra_s")
+        for key in ("interleaved_rounds", "simultaneity", "simultaneity_single_pulse", "extra_s")
     }
     assert summarize_plan(prepared(frame(FOUR, together=False)))["frames"][0]["simultaneous"] is None
 
@@ -141,11 +141,11 @@ def test_the_best_that_ends_in_time_and_rests():
     assert select_schedule([one, two, four], 1.0) == four
     assert select_schedule([one, two, four], 0.3) == two
     assert select_schedule([one, two, four], 0.01) == one
-    assert select_schedule([one, two, replace(four, has_min_rest=False)], 1.0) == two
+    assert select_schedule([one, two, replace(four, has_min_gaps=False)], 1.0) == two
 
 
 def test_a_short_rest_between_slices_is_no_rest():
-    far = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_rest_s=0.01))
+    far = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_gap_s=0.01))
     two = frame({200: 100, 201: 100})
     assert prepared(two).simultaneous[0].interleaved_rounds > 1
     assert prepared(two, display=far).simultaneous[0].interleaved_rounds == 1

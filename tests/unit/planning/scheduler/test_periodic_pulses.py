@@ -9,7 +9,8 @@ from displays import DISPLAYS
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.pipeline import DisplayModel, plan_sequence
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.scheduler import periodic_pulses
 from optodrive.planning.scheduler.periodic_pulses import (
@@ -92,7 +93,7 @@ def test_no_pulse_is_left_out_where_the_membrane_still_rises_as_the_next_one_com
 
 
 def test_planned_for_their_peaks_such_cycles_leave_out_every_other_pulse(monkeypatch):
-    monkeypatch.setattr(periodic_pulses, "EARLY", np.inf)
+    monkeypatch.setattr(periodic_pulses, "EARLY_PEAK_FRACTION", np.inf)
     train = HeightTrain(17, 0.0, 0.5, 0.01, 100e-6, 2e-6)
     peaks_um, troughs_um = felt(prepared(train), train)
     assert (peaks_um - troughs_um)[10:].min() > 4.0

@@ -23,10 +23,10 @@ def gaps(plan):
 def test_one_beam_with_time_for_every_move(any_display):
     result = prepared(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
     plan = result.plan
-    moves = any_display.scan_head.moves
+    moves = any_display.scan_head.settling
     lit_us = np.rint(plan.width_s[:-1] * 1e6)
     steps = zip(np.diff(plan.x_rad), np.diff(plan.y_rad), lit_us, strict=True)
-    needed = [moves.time_us(*step) * 1e-6 for step in steps]
+    needed = [moves.settling_us(*step) * 1e-6 for step in steps]
     assert np.all(gaps(plan) >= np.array(needed) - 1e-9)
     assert len(plan) == len(any_display.layout)
 
@@ -84,7 +84,7 @@ def test_a_plan_leaves_time_to_come_from_any_pixel_to_its_first(any_display):
     last = len(layout) - 1
     result = prepared(any_display, frame(any_display, {last: 40}))
     x_rad, y_rad = field.angles_rad(layout.x_m, layout.y_m)
-    longest = max(moves.time_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
+    longest = max(moves.settling_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
     assert result.plan.start_s[0] >= longest * 1e-6 - 1e-12
     assert result.lead_in_s == pytest.approx(result.plan.start_s[0])
 

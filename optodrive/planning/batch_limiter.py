@@ -1,0 +1,88 @@
+"""Pass the batches of one plan through the limiter, and have the scheduler delay or pause where the limiter demands."""
+
+from math import ceil, inf
+
+import numpy as np
+
+from optodrive.core.errors import OverBudgetError
+from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
+from optodrive.planning.limiter.budget import Budget
+from optodrive.planning.limiter.limiter import Policy, compute_wait_s, galvo_feasible_prefix, limit
+from optodrive.planning.planned_sequence import Delay, Shortfall
+from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
+
+PAUSE_FRACTION = 0.1
+"""Length of a galvo pause, as a fraction of the time over which the mirrors' acceleration is averaged."""
+COLD_AFTER_AVERAGING_TIMES = 50.0
+"""Number of averaging times after which the mirrors' coils are cold."""
+
+
+class BatchLimiter:
+    """Limits the batches of a scheduler in order; `grant` is the callback of `Scheduler.run`.
+
+    state: budget state after the batches granted so far
+    delays: under policy "delay", every delay in order; galvo_pause_s: total of all pauses
+    """
+
+    def __init__(
+        self, scheduler: Scheduler, budget: Budget, state: BudgetState, frame_count: int, policy: Policy = "trim"
+    ) -> None:
+        self.state = state
+        self.delays: list[Delay] = []
+        self.galvo_pause_s = 0.0
+        self._scheduler = scheduler
+        self._budget = budget
+        self._frame_count = frame_count
+        self._policy = policy
+        self._first_trimmed: tuple[PulsePlan, LimitedPlan, BudgetState] | None = None
+
+    def grant(self, batch: PulsePlan) -> LimitedPlan | None:
+        """Limit a batch; return None after telling the scheduler to pause or delay it.
+
+        Raises OverBudgetError under policy "refuse" for a pulse above a cap, and under "delay" for one that never fits.
+        """
+        pause = self._find_galvo_pause(batch)
+        if pause is not None:
+            self.galvo_pause_s += pause.pause_us * 1e-6
+            self._scheduler.pause(pause)
+            return None
+        try:
+            granted, state = limit(batch, self.state, self._budget, self._policy)
+        except OverBudgetError as error:
+            if self._policy != "delay" or error.earliest_s == inf:
+                raise
+            self.delays.append(Delay(int(batch.source[0]), error.pixel, error.cap, error.earliest_s))
+            self._scheduler.delay(ceil(error.earliest_s * 1e6))
+            return None
+        if self._first_trimmed is None and granted.trimmed_j.any():
+            self._first_trimmed = batch, granted, self.state
+        self.state = state
+        return granted
+
+    def build_shortfall(self) -> Shortfall | None:
+        """Describe the first trimmed pulse; return None if no pulse was trimmed."""
+        if self._first_trimmed is None:
+            return None
+        batch, granted, state = self._first_trimmed
+        row = int(np.flatnonzero(granted.reason != "")[0])
+        return Shortfall(
+            pixel=int(batch.pixel[row]),
+            cap=str(granted.reason[row]),
+            margin_j=float(granted.trimmed_j[row]),
+            fits_after_s=compute_wait_s(batch, state, self._budget),
+        )
+
+    def _find_galvo_pause(self, batch: PulsePlan) -> GalvoPause | None:
+        """Return the pause that the mirrors need within a frame's batch; None if none is needed or none helps.
+
+        No reduction of power makes a move feasible that exceeds the galvo cap, so a frame is drawn more slowly instead
+        of with missing pulses. Trains keep their times and leave such pulses to the limiter.
+        """
+        row = galvo_feasible_prefix(batch, self.state, self._budget)
+        averaging_s = self._budget.galvo.averaging_s
+        if row == len(batch) or batch.source[row] >= self._frame_count:
+            return None
+        cold_s = COLD_AFTER_AVERAGING_TIMES * averaging_s
+        if row == 0 and galvo_feasible_prefix(batch, self.state, self._budget, cold_s) == 0:
+            return None
+        return GalvoPause(row, ceil(1e6 * PAUSE_FRACTION * averaging_s))

@@ -1,0 +1,99 @@
+"""The result of planning a sequence: the limited plan, its predicted effect and its timing."""
+
+from dataclasses import dataclass
+
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.plans import BudgetState, LimitedPlan
+from optodrive.core.types.stimuli import FrameSequence
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.scheduler.batch_draft import SkippedPulse
+from optodrive.planning.scheduler.interleaving import SimultaneousFrame
+
+TIME_TOLERANCE_S = 1e-9
+"""Rounding error of sums of times, which are whole microseconds."""
+
+
+@dataclass(frozen=True)
+class FrameTiming:
+    """Timing of a frame against its deadline; on_time: number of its pulses that end by the deadline."""
+
+    source: int
+    frame_id: str
+    show_at_s: float
+    deadline_s: float
+    first_pulse_s: float
+    end_s: float
+    pulses: int
+    on_time: int
+
+    @property
+    def late_s(self) -> float:
+        """Time from the deadline to the end of the last pulse, s; 0 if the frame meets its deadline."""
+        late_s = self.end_s - self.deadline_s
+        return late_s if late_s > TIME_TOLERANCE_S else 0.0
+
+
+@dataclass(frozen=True)
+class Shortfall:
+    """The first trimmed pulse: the energy removed from it, and the delay after which its whole batch would fit."""
+
+    pixel: int
+    cap: str
+    margin_j: float
+    fits_after_s: float
+
+
+@dataclass(frozen=True)
+class Delay:
+    """Total delay of a frame or train for one cap; pixel: the first pixel that caused it."""
+
+    source: int
+    pixel: int
+    cap: str
+    wait_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class PlannedSequence:
+    """A limited plan with its prediction; heat and budget are those after the plan, on the plan's time line.
+
+    predicted_m: [n] largest displacement from each pulse's start to the pixel's next pulse
+    simultaneous: frames split into interleaved rounds
+    shortfall: under policy "trim", None if no pulse was trimmed; delays: under policy "delay"
+    galvo_pause_s: total of the pauses in which the mirrors' coils cool
+    dead_pixels: dead pixels that frames requested and that were omitted
+    """
+
+    sequence: FrameSequence
+    plan: LimitedPlan
+    predicted_m: FloatArray
+    lead_in_s: float
+    skipped: tuple[SkippedPulse, ...]
+    frames: tuple[FrameTiming, ...]
+    simultaneous: tuple[SimultaneousFrame, ...]
+    shortfall: Shortfall | None
+    delays: tuple[Delay, ...]
+    galvo_pause_s: float
+    heat: ThermalState
+    budget: BudgetState
+    dead_pixels: tuple[int, ...] = ()
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the plan's start to the end of its last pulse, s."""
+        return float(self.plan.start_s[-1] + self.plan.width_s[-1]) if len(self.plan) else 0.0
+
+    @property
+    def train_lateness_max_s(self) -> float:
+        """Largest delay of a train pulse after its requested start, s."""
+        late = (self.plan.start_s - self.plan.requested_start_s)[self.plan.source >= len(self.sequence.frames)]
+        return float(late.max()) if len(late) else 0.0
+
+
+def describe_lateness(timing: FrameTiming) -> str:
+    """Return a sentence that gives the numbers of a frame that misses its deadline."""
+    return (
+        f"frame {timing.frame_id} needs {timing.end_s - timing.show_at_s:.4f} s of beam time and has "
+        f"{timing.deadline_s - timing.show_at_s:.4f} s: {timing.on_time} of {timing.pulses} pulses come in time, "
+        f"the last ends {timing.late_s:.4f} s late"
+    )
