@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as npst
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.recording import RecordingIndex, hdf5, read_recording, sandboxed_probe, write_recording
+from optodrive.lab.recording import RecordingIndex, read_recording, reader, sandboxed_probe, write_recording
 from optodrive.lab.recording.storage import SIGNALS
 
 T_S = np.linspace(0.0, 1.0, 20)
@@ -190,7 +190,7 @@ def test_members_attributes_and_datasets_replaced(valid, path, data):
             except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError):
                 continue
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(hdf5, "probe_in_sandbox", lambda path: None)  # written by the library itself, so no harm to it
+        patch.setattr(reader, "probe_in_sandbox", lambda path: None)  # written by the library itself, so no harm to it
         reads_or_refuses(path)
 
 
@@ -262,7 +262,7 @@ def test_every_number_and_text_comes_back_from_both_forms(
         base.mkdir()
         write_recording(path, Measurement((run,)))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(hdf5, "probe_in_sandbox", lambda path: None)
+            patch.setattr(reader, "probe_in_sandbox", lambda path: None)
             (read,) = read_recording(path).runs
         assert (read.ambient_k, read.attributes) == (ambient_k, attributes)
         assert read.signals["force_N"].sigma == sigma

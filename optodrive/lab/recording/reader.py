@@ -9,7 +9,8 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.csv_folder import CsvTree
-from optodrive.lab.recording.hdf5 import Hdf5Tree
+from optodrive.lab.recording.hdf5 import Hdf5Tree, import_h5py
+from optodrive.lab.recording.sandboxed_probe import probe_in_sandbox
 from optodrive.lab.recording.storage import (
     COMMANDS,
     PULSES,
@@ -55,7 +56,10 @@ def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
         if path.is_dir():
             return CsvTree(path)
         if path.is_file():
-            return Hdf5Tree(path, trusted)
+            import_h5py()
+            if not trusted:
+                probe_in_sandbox(path)
+            return Hdf5Tree(path)
         description = "something that is no file" if path.exists() else "nothing of this name"
         raise InputError(str(path), Unquoted(description), "a recording: an HDF5 file or a folder")
 

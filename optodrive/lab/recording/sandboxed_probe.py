@@ -12,13 +12,10 @@ from contextlib import suppress
 from math import ceil
 from pathlib import Path
 from time import process_time
-from typing import TYPE_CHECKING
 
 from optodrive.core.errors import InputError
+from optodrive.lab.recording.hdf5 import Hdf5Tree
 from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS, Unquoted
-
-if TYPE_CHECKING:
-    from optodrive.lab.recording.hdf5 import Hdf5Tree
 
 CPU_LIMIT_S = 5
 RUN_BYTES_PER_CPU_S = 20_000_000
@@ -73,21 +70,19 @@ def _extend_cpu_limit(run_limit_s: int) -> None:
 
 
 def _read_all(path: Path, run_limit_s: int) -> None:
-    from optodrive.lab.recording.hdf5 import Hdf5Tree
-
     runs: list[str] = []
     _extend_cpu_limit(run_limit_s)
-    with suppress(InputError), Hdf5Tree(path, trusted=True) as tree:
+    with suppress(InputError), Hdf5Tree(path) as tree:
         tree.read_root_attributes()
         runs = tree.list_runs()
     for run in runs:
         _extend_cpu_limit(run_limit_s)
-        with suppress(InputError), Hdf5Tree(path, trusted=True) as tree:
+        with suppress(InputError), Hdf5Tree(path) as tree:
             tree.read_run_attributes(run)
             _read_members(tree, run, tree.list_members(run))
 
 
-def _read_members(tree: "Hdf5Tree", run: str, members: list[str]) -> None:
+def _read_members(tree: Hdf5Tree, run: str, members: list[str]) -> None:
     for name in members:
         with suppress(InputError):
             if name in TABLE_COLUMNS:

@@ -169,7 +169,7 @@ def test_nothing_is_left_where_writing_fails_halfway(tmp_path, monkeypatch):
     def fail(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(csv_folder, "_write", fail)
+    monkeypatch.setattr(csv_folder, "_write_csv", fail)
     with pytest.raises(InputError, match="No space left"):
         write_recording(tmp_path / "recording", recording())
     assert not list(tmp_path.iterdir())

@@ -10,7 +10,7 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.lab.recording import convert_recording, hdf5, read_recording, sandboxed_probe, write_recording
+from optodrive.lab.recording import convert_recording, read_recording, reader, sandboxed_probe, write_recording
 from optodrive.lab.recording.storage import natural_sort_key
 from recording_samples import T_S, assert_same, recording, sorted_attributes
 
@@ -294,7 +294,7 @@ REFUSALS = {
 
 @pytest.mark.parametrize("kind", REFUSALS)
 def test_refused_in_one_line_that_names_the_place(kind, path, monkeypatch):
-    monkeypatch.setattr(hdf5, "probe_in_sandbox", lambda path: None)  # the library itself is sure of these files
+    monkeypatch.setattr(reader, "probe_in_sandbox", lambda path: None)  # the library itself is sure of these files
     damage, words = REFUSALS[kind]
     with h5py.File(path, "r+") as file:
         damage(file)
@@ -324,9 +324,11 @@ def test_truncated_files_are_refused(path, share):
 
 def test_a_process_that_hangs_or_crashes_is_refused(path, monkeypatch):
     monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
-    for program in ("_confine(1)\nwhile True: pass", "import os; os.abort()"):
+    for program in ("_limit_resources(1)\nwhile True: pass", "import os; os.abort()"):
         monkeypatch.setattr(
-            sandboxed_probe, "_PROGRAM", f"from optodrive.lab.recording.sandboxed_probe import _confine\n{program}"
+            sandboxed_probe,
+            "_PROGRAM",
+            f"from optodrive.lab.recording.sandboxed_probe import _limit_resources\n{program}",
         )
         assert "hangs or crashes" in refusal(path)
 
