@@ -63,10 +63,12 @@ class Dataset:
     drive_groups: tuple["DriveGroup", ...]
     value: FloatArray
 
+    @property
     def kinds(self) -> list[int]:
         """Kinds of signals that occur."""
         return sorted({block.kind for block in self.blocks})
 
+    @property
     def pixels(self) -> list[int]:
         """Pixels measured."""
         return sorted({block.pixel for block in self.blocks if block.kind in PIXEL_KINDS})
@@ -80,6 +82,7 @@ class Dataset:
                 subsystems.append(self.select(runs, kinds))
         return subsystems
 
+    @property
     def groups(self) -> dict[str, list[int]]:
         """Runs of each group, by number."""
         by_group: dict[str, list[int]] = {}
@@ -87,9 +90,10 @@ class Dataset:
             by_group.setdefault(run.group, []).append(number)
         return by_group
 
+    @property
     def contrast_count(self) -> int:
         """So many runs repeat an earlier one: what the noise model is estimated from."""
-        return len(self.runs) - len(self.groups())
+        return len(self.runs) - len(self.groups)
 
     def select(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
         """The same with these runs, and kinds of signals, alone; doses and session times stay as they were."""

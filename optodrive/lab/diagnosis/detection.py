@@ -76,7 +76,7 @@ def detect(
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
     columns = np.column_stack([known, candidates / scale, residual])
-    total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total()
+    total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
     width = known.shape[1]
     total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)
     projected = project_out(total, list(range(width)), list(range(width, len(total))))
@@ -84,13 +84,13 @@ def detect(
     omnibus = compute_omnibus(problem, np.column_stack([known, residual]), sensitivity)
     scores, p_score = _compute_scores(trials, projected, scale, independent, seed, count_noise_degrees(data))
     residual_chi2 = float(projected[-1, -1])
-    return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value(), residual_chi2)
+    return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value, residual_chi2)
 
 
 def count_noise_degrees(data: Dataset) -> int:
     """Degrees of freedom of the noise model; a mirror's is held above what repeats show, and thus sure."""
-    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds())
-    return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count() else NOISE_PRIOR_DEGREES + data.contrast_count()
+    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds)
+    return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count else NOISE_PRIOR_DEGREES + data.contrast_count
 
 
 def _select_starts(item: Hypothesis) -> tuple[dict[str, float], ...]:

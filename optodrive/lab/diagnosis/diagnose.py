@@ -93,7 +93,7 @@ def diagnose(
     for subsystem in subsystems:
         parameters |= _compute_estimates(subsystem)
         terms |= {key: dict(own) for key, own in subsystem.final.point.terms.items()}
-    has_pixels = any(kind < 3 for kind in main.data.kinds())
+    has_pixels = any(kind < 3 for kind in main.data.kinds)
     base = (
         dict(zip(BASE_PARAMETERS, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if has_pixels else {}
     )
@@ -161,7 +161,7 @@ def _diagnose_subsystem(
     gain = None if chosen is None else compute_held_out_gain(problem, held_out, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
     final = fit(everything, start.point, start.free, iterations=6)
-    if all(kind in MIRROR_KINDS for kind in data.kinds()):  # jitters may lead astray: each place by its own slopes
+    if all(kind in MIRROR_KINDS for kind in data.kinds):  # jitters may lead astray: each place by its own slopes
         points = (start.point, final.point)
         final = min((fit(everything, place, start.free, iterations=1) for place in points), key=lambda one: one.chi2)
     if verdict.verdict == "none" and held_out_runs:
@@ -205,7 +205,7 @@ def _compute_estimates(subsystem: _SubsystemFit) -> dict[str, Estimate]:
     sigma = np.sqrt(np.maximum(np.diag(subsystem.covariance), 0.0))
     out: dict[str, Estimate] = {}
     t_quantile = float(student.ppf(0.975, count_noise_degrees(subsystem.data)))
-    if any(kind < 3 for kind in subsystem.data.kinds()):
+    if any(kind < 3 for kind in subsystem.data.kinds):
         for row, name in enumerate(BASE_PARAMETERS):
             log_value, width = final.point.base[row], t_quantile * float(sigma[row])
             out[name] = Estimate(exp(log_value), BASE_UNITS[name], exp(log_value - width), exp(log_value + width))

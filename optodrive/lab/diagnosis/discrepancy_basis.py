@@ -78,7 +78,7 @@ def compute_covariance(
     count, basis_size = jacobian.shape[1], basis.shape[1]
     total = compute_normal_equations(
         data, np.hstack([jacobian, basis]), problem.noise, sensitivity.power, sensitivity.timing
-    ).total()
+    ).total
     base_count = len(problem.prior.sigma)
     weights = np.concatenate(
         [

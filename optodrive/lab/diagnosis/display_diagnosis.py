@@ -83,7 +83,7 @@ class DisplayAnswer:
         """Pixels without an answer."""
         return [item for item in self.pixels if item.discrepancy is None]
 
-    def groups(self) -> list[PixelGroup]:
+    def build_groups(self) -> list[PixelGroup]:
         """Pixels that suffer from the same, most pixels first; nothing found is a group too."""
         by_causes: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
         for item in self.pixels:
@@ -99,7 +99,7 @@ class DisplayAnswer:
 
         Medians over the pixels of the largest group, if that is more than half of all and has a definite verdict.
         """
-        groups = self.groups()
+        groups = self.build_groups()
         largest = groups[0] if groups else None
         if largest is None or 2 * len(largest.answers) <= len(self.pixels):
             return None, None, "no one set of causes holds for most pixels"

@@ -13,7 +13,7 @@ MAX_ERRORS = 6
 
 def build_display_narrative(answer: DisplayAnswer) -> list[str]:
     """How many pixels suffer from what, which, how much, what mending gains; then what has no answer."""
-    groups = answer.groups()
+    groups = answer.build_groups()
     lines = [build_headline(answer), ""]
     for group in groups:
         lines.append(
@@ -101,7 +101,7 @@ def build_display_answer(found: DisplayAnswer) -> dict[str, Any]:
                     "parameters": {name: _spread_to_json(item) for name, item in group.parameters.items()},
                     "gain": None if group.gain is None else _spread_to_json(group.gain),
                 }
-                for group in found.groups()
+                for group in found.build_groups()
             ],
             "model": {"written": model is not None, "why": reason},
         },

@@ -57,7 +57,7 @@ def _assign_marks(answer: DisplayAnswer) -> dict[int, PixelMark]:
         if item.pixel is not None
     }
     named = 0
-    for group in answer.groups():
+    for group in answer.build_groups():
         if group.verdict == "cause":
             mark = PixelMark(LETTERS[named % len(LETTERS)], COLOURS[named % len(COLOURS)], describe_group(group))
             named += 1
@@ -112,7 +112,7 @@ def _build_tooltip(item: PixelAnswer, mark: PixelMark) -> str:
 
 
 def _build_legend(answer: DisplayAnswer, marks: dict[int, PixelMark]) -> Iterator[tuple[str, ...]]:
-    groups = [group.pixels for group in answer.groups()]
+    groups = [group.pixels for group in answer.build_groups()]
     for pixels in [*groups, [item.pixel for item in answer.failed if item.pixel is not None]]:
         if pixels:
             mark = marks[pixels[0]]

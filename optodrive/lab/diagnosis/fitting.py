@@ -129,7 +129,7 @@ def fit(
         deviation = np.concatenate([trial.base, np.zeros(len(free))]) - centre
         residual = (data.value - prediction)[:, None]
         cost = float(
-            compute_normal_equations(data, residual, problem.noise, sensitivity.power, sensitivity.timing).total()[0, 0]
+            compute_normal_equations(data, residual, problem.noise, sensitivity.power, sensitivity.timing).total[0, 0]
         )
         cost += float(precision @ deviation**2)
         if best is not None and not cost <= best.chi2 - 1e-9:

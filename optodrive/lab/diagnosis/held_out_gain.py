@@ -23,7 +23,7 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
     """
     kinds: dict[str, list[tuple[float, str]]] = {}
     drive_counts: dict[bytes, int] = {}
-    for name, runs in data.groups().items():
+    for name, runs in data.groups.items():
         pulses = data.runs[runs[0]].pulses
         drive_counts[pulses.tobytes()] = drive_counts.get(pulses.tobytes(), 0) + 1
         measured = {block.pixel for block in data.blocks if block.run in runs}
@@ -40,11 +40,11 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
         eligible = [
             (energy_j, name)
             for energy_j, name in sorted(members, reverse=True)
-            if drive_counts[data.runs[data.groups()[name][0]].pulses.tobytes()] == 1
+            if drive_counts[data.runs[data.groups[name][0]].pulses.tobytes()] == 1
         ]
         if len(members) >= 3:
             held_out += [name for _, name in eligible[::3][: max(1, len(members) // 4)]]
-    groups = data.groups()
+    groups = data.groups
     held_out_runs = sorted(run for name in held_out for run in groups[name])
     return [run for run in range(len(data.runs)) if run not in held_out_runs], held_out_runs
 
@@ -70,7 +70,7 @@ def compute_held_out_gain(
         return None
     floor2 = _compute_noise_floor2(problem, extended)
     residuals = [data.value - predict(data, point, problem.epsilon) for point in (nominal, extended)]
-    kinds = data.kinds()
+    kinds = data.kinds
     sums = np.zeros((len(kinds), 4))
     for block in data.blocks:
         sums[kinds.index(block.kind)] += [

@@ -99,9 +99,9 @@ SEARCH_GRIDS: dict[str, dict[str, tuple[float, ...]]] = {
 def build_hypotheses(data: Dataset) -> list[Hypothesis]:
     """Every hypothesis that this data could show at all."""
     found: list[Hypothesis] = []
-    measured = data.pixels()
+    measured = data.pixels
     pulsed = {int(pixel) for run in data.runs for pixel in run.pulses[:, 3]}
-    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds())
+    mirrors = all(kind in MIRROR_KINDS for kind in data.kinds)
     powers = {round(float(power), 3) for run in data.runs for power in run.pulses[:, 2]}
     for key in CAUSE_KEYS:
         names = [item.name for item in discover_terms()[key].parameters]
@@ -153,7 +153,7 @@ def build_hypotheses(data: Dataset) -> list[Hypothesis]:
 
 def _build_clock_hypotheses(data: Dataset) -> list[Hypothesis]:
     key, signals = "clock_offset", ("temperature", "displacement", "force", "mirrors")
-    present = list(dict.fromkeys(signals[min(kind, 3)] for kind in data.kinds()))
+    present = list(dict.fromkeys(signals[min(kind, 3)] for kind in data.kinds))
     zero = dict.fromkeys(signals, 0.0)
     tied = [signals, *((name,) for name in present if len(present) > 1)]
     return [

@@ -223,7 +223,7 @@ def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis
 
     def cost(point: ParameterPoint) -> float:
         residual = problem.data.value - predict(problem.data, point, problem.epsilon)
-        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total()[0, 0])
+        return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
 
     points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts)
     return sorted(points, key=cost)[:MAX_STARTS]
@@ -285,7 +285,7 @@ def _is_imitation(problem: FitProblem, rival: RefittedCandidate, best: RefittedC
         float(
             compute_normal_equations(
                 problem.data, difference, problem.noise, sensitivity.power, sensitivity.timing
-            ).total()[0, 0]
+            ).total[0, 0]
         )
         < CHI2_EQUIVALENT
     )

@@ -28,7 +28,7 @@ def propose_experiment(
 ) -> NextExperiment | None:
     """The most telling run of the grid, repeated until it tells; None where no signal is measured, or none would."""
     data = problem.data
-    kinds = tuple(kind for kind in data.kinds() if kind in PIXEL_KINDS)
+    kinds = tuple(kind for kind in data.kinds if kind in PIXEL_KINDS)
     if not kinds:
         return None
     pixel = Counter(block.pixel for block in data.blocks if block.kind in PIXEL_KINDS).most_common(1)[0][0]
@@ -96,7 +96,7 @@ def _compute_separation(problem: FitProblem, first: ModelFit, second: ModelFit, 
     second_jacobian = compute_jacobian(synthetic, second.point, second.free, second_prediction)
     columns = np.column_stack([first_jacobian, second_jacobian, first_prediction - second_prediction])
     gram = (
-        repeats * compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total()
+        repeats * compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
     )
     count = columns.shape[1] - 1
     precision = np.zeros((count, count))

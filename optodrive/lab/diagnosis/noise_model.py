@@ -125,14 +125,14 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
     """
     found = compute_contrasts(data, residual, power, timing)
     coloured: dict[int, ColouredNoise] = {}
-    for kind in data.kinds():
+    for kind in data.kinds:
         members = [item for item in found if item.kind == kind]
         if not members:
             members = build_residual_contrasts(data, residual, power, timing, kind)
         coloured[kind] = _fit_coloured(members)
     if not found:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
-    power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(found, coloured, data.kinds())
+    power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(found, coloured, data.kinds)
     model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True)
     return replace(
         model,

@@ -71,7 +71,7 @@ def _raise_mirror_noise(data: Dataset, coloured: dict[int, ColouredNoise]) -> di
 
 def _estimate_crude_noise(data: Dataset) -> NoiseModel:
     coloured, baseline = {}, {}
-    for kind in data.kinds():
+    for kind in data.kinds:
         blocks = [block for block in data.blocks if block.kind == kind]
         steps = np.concatenate([np.diff(data.value[block.part]) for block in blocks])
         span = float(np.ptp(np.concatenate([data.value[block.part] for block in blocks])))

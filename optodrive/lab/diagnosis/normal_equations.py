@@ -15,6 +15,7 @@ class NormalEquations:
 
     gram: FloatArray
 
+    @property
     def total(self) -> FloatArray:
         """[k, k]."""
         return np.asarray(self.gram.sum(axis=0))
@@ -24,7 +25,7 @@ def compute_normal_equations(
     data: Dataset, columns: FloatArray, noise: NoiseModel, power: FloatArray, timing: FloatArray
 ) -> NormalEquations:
     """Of columns [m, k]; power, timing: [m] as for `noise.estimate`."""
-    kinds, count = data.kinds(), columns.shape[1]
+    kinds, count = data.kinds, columns.shape[1]
     size = 2 + len(kinds)
     grams = np.zeros((len(data.runs), count + size, count + size))
     for block in data.blocks:

@@ -33,6 +33,7 @@ class OmnibusStatistic:
     noise_chi2: float
     noise_degrees: int
 
+    @property
     def p_value(self) -> float:
         """Of an F: the noise that repeats show is the scale, as far as it is more than the noise model has."""
         if not self.degrees:
@@ -45,7 +46,7 @@ class OmnibusStatistic:
 
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
     """Of the last of columns [m, k] in the omnibus' bins, beside the others."""
-    data, noise, kinds = problem.data, problem.noise, problem.data.kinds()
+    data, noise, kinds = problem.data, problem.noise, problem.data.kinds
     labels, width = assign_bins(data), columns.shape[1]
     count = int(labels.max()) + 1
     total = np.zeros((width + count, width + count))
@@ -117,7 +118,7 @@ def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitiv
     """χ² of a residual in each group's bins, and its degrees: [groups, 2]."""
     data = problem.data
     out = []
-    for runs in data.groups().values():
+    for runs in data.groups.values():
         group_data = data.select(runs)
         part = np.concatenate([np.arange(b.part.start, b.part.stop) for b in data.blocks if b.run in runs])
         group_sensitivity = JitterSensitivity(sensitivity.power[part], sensitivity.timing[part])

@@ -33,7 +33,7 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
         (block.run, block.kind, block.pixel): number for number, block in enumerate(data.blocks)
     }
     pair = 0
-    for runs in data.groups().values():
+    for runs in data.groups.values():
         for later in range(1, len(runs)):
             used = False
             for number, kind, pixel in list(blocks):

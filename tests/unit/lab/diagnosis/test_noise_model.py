@@ -34,7 +34,7 @@ def test_normal_equations_with_shared_jitters_are_those_of_the_dense_covariance(
     rng = np.random.default_rng(2)
     columns = rng.standard_normal((len(data.value), 2))
     power, timing = rng.standard_normal(len(data.value)), rng.standard_normal(len(data.value))
-    noise = NoiseModel(dict.fromkeys(data.kinds(), NOISE), 0.7, 0.5, dict.fromkeys(data.kinds(), 0.4), True)
+    noise = NoiseModel(dict.fromkeys(data.kinds, NOISE), 0.7, 0.5, dict.fromkeys(data.kinds, 0.4), True)
     ours = compute_normal_equations(data, columns, noise, power, timing).gram
     for run in range(len(data.runs)):
         rows = [block for block in data.blocks if block.run == run]

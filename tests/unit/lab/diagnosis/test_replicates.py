@@ -66,11 +66,11 @@ def hopping():
 def test_the_omnibus_keeps_its_level_whatever_the_noise_really_is(scale):
     rng = np.random.default_rng(1)
     draws = scale * rng.chisquare(150, 4000), scale * rng.chisquare(80, 4000)
-    p = np.array([OmnibusStatistic(a, 150, b, 80).p_value() for a, b in zip(*draws, strict=True)])
+    p = np.array([OmnibusStatistic(a, 150, b, 80).p_value for a, b in zip(*draws, strict=True)])
     assert np.mean(p < 0.05) < 0.06
     assert np.mean(p < 0.001) < 0.003
-    assert OmnibusStatistic(150.0 + 300.0, 150, 80.0, 80).p_value() < 1e-5
-    assert OmnibusStatistic(150.0 + 50.0, 150, 0.0, 0).p_value() < 0.01
+    assert OmnibusStatistic(150.0 + 300.0, 150, 80.0, 80).p_value < 1e-5
+    assert OmnibusStatistic(150.0 + 50.0, 150, 0.0, 0).p_value < 0.01
 
 
 def test_a_ratio_is_judged_by_how_many_contrasts_the_noise_comes_from():
@@ -100,8 +100,8 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
     for chi2, degrees in ((found.chi2, found.degrees), (found.noise_chi2, found.noise_degrees)):
         assert abs(chi2 - degrees) < 4.5 * np.sqrt(2.0 * degrees)
     # Noise half as strong again as the model has it is no effect; what all repeats share is one.
-    assert compute_omnibus(problem, 1.5 * residual[:, None], shared).p_value() > 1e-3
-    assert compute_omnibus(problem, (residual + 1.5 * swing)[:, None], shared).p_value() < 1e-4
+    assert compute_omnibus(problem, 1.5 * residual[:, None], shared).p_value > 1e-3
+    assert compute_omnibus(problem, (residual + 1.5 * swing)[:, None], shared).p_value < 1e-4
 
 
 def test_power_that_hops_within_pulses_is_not_named(hopping):
