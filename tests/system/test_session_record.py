@@ -84,5 +84,5 @@ def test_a_full_disk_ends_the_recording_and_the_display_goes_on(board, make_daem
 
 def test_a_name_that_is_taken_is_refused_before_anything_starts(board, make_daemon, tmp_path):
     (tmp_path / "taken.h5").write_text("dear")
-    with pytest.raises(AssertionError, match="a name that is free"):
+    with pytest.raises(AssertionError, match="does not exist"):
         make_daemon(board, options=("--record-session", str(tmp_path / "taken.h5")))

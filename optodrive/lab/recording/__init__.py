@@ -1,4 +1,4 @@
-"""Recordings of measured data, format "optotactile-recording", version 1: one HDF5 file, or a folder of CSV files."""
+"""Recordings of measured data in format "optotactile-recording", version 1: one HDF5 file or a folder of CSV files."""
 
 from optodrive.lab.recording.display_runs import DisplayRuns, PixelRuns
 from optodrive.lab.recording.index import RecordingIndex, RunIndex, SignalIndex

@@ -1,4 +1,4 @@
-"""What a recording must hold; every function raises InputError, naming the place, where it does not."""
+"""Validity checks of a recording; every function raises InputError that names the place of the violation."""
 
 import numpy as np
 
@@ -22,13 +22,13 @@ from optodrive.lab.recording.storage import (
 AMBIENT_MIN_K, AMBIENT_MAX_K = 150.0, 600.0
 PIXEL_MAX = 10**6
 OVERLAP_MAX_S = 1e-9
-"""Rounding of the times of abutting pulses."""
+"""Tolerated overlap of consecutive pulses: the rounding error of their times."""
 MODEL_PARAMETER_COUNT = 6
-"""Parameters of the nominal model of a pixel; fewer samples than that say nothing about it."""
+"""Number of parameters of the nominal pixel model, which is the minimum number of finite samples in a recording."""
 
 
 def check_format(where: str, head: Attributes) -> None:
-    """Format and version."""
+    """Check the format name and the version in the root attributes."""
     for field, expected in (("format", FORMAT), ("version", VERSION)):
         if field not in head:
             raise InputError(f"{where}: {field}", None, f"{expected!r}")
@@ -37,7 +37,7 @@ def check_format(where: str, head: Attributes) -> None:
 
 
 def pop_ambient_k(where: str, attributes: Attributes) -> float:
-    """The ambient temperature, taken out of a run's attributes."""
+    """Remove the ambient temperature from a run's attributes and return it, K."""
     value = attributes.pop("ambient_K", None)
     if value is None:
         near = [name for name in attributes if name.lower().startswith("ambient")]
@@ -51,7 +51,7 @@ def pop_ambient_k(where: str, attributes: Attributes) -> float:
 
 
 def select_signals(where: str, members: list[str]) -> list[str]:
-    """The signals of a run in the format's order, once it is sure that all it needs is there and nothing unknown."""
+    """Return the signals of a run in the format's order after checking that its members are known and complete."""
     for member in members:
         if member not in RUN_MEMBERS:
             raise InputError(
@@ -60,22 +60,22 @@ def select_signals(where: str, members: list[str]) -> list[str]:
                 suggest_nearest(member, list(RUN_MEMBERS)),
             )
     if PULSES not in members:
-        raise InputError(f"{where}/{PULSES}", None, f"one row a pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
+        raise InputError(f"{where}/{PULSES}", None, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
     signals = [name for name in SIGNALS if name in members]
     if not signals:
         raise InputError(where, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
     if COMMANDS not in members and set(signals) & set(MIRROR_SIGNALS):
         raise InputError(
-            f"{where}/{COMMANDS}", None, f"what the mirrors were told: {', '.join(TABLE_COLUMNS[COMMANDS])}"
+            f"{where}/{COMMANDS}", None, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
         )
     return signals
 
 
 def check_pulses(where: str, pulses: FloatArray) -> None:
-    """Finite entries, nothing negative, whole pixels, one beam. pulses: [n, 4]."""
+    """Check that pulses [n, 4] are finite and nonnegative, have integer pixel indices and do not overlap in time."""
     _check_finite(where, pulses, TABLE_COLUMNS[PULSES])
     for column, name in ((1, "width_s"), (2, "power_W")):
-        _check_rows(f"{where}: {name}", pulses[:, column], pulses[:, column] >= 0, "no negative number")
+        _check_rows(f"{where}: {name}", pulses[:, column], pulses[:, column] >= 0, "a number of at least 0")
     pixel = pulses[:, 3]
     whole = (pixel >= 0) & (pixel <= PIXEL_MAX) & (pixel == np.floor(pixel))
     _check_rows(f"{where}: pixel", pixel, whole, f"a whole number from 0 to {PIXEL_MAX}")
@@ -83,9 +83,10 @@ def check_pulses(where: str, pulses: FloatArray) -> None:
 
 
 def _check_no_overlap(where: str, pulses: FloatArray) -> None:
+    """Check that no pulse starts before all earlier pulses have ended."""
     order = np.argsort(pulses[:, 0], kind="stable")
     start_s = pulses[order, 0]
-    # The longest reach of all pulses before, as a long pulse may still be on when the next but one begins.
+    # The maximum over all earlier pulses: a long pulse may still be on when the pulse after next begins.
     end_s = np.maximum.accumulate(start_s + pulses[order, 1])
     overlapping = np.flatnonzero(start_s[1:] < end_s[:-1] - OVERLAP_MAX_S)
     if overlapping.size:
@@ -93,31 +94,29 @@ def _check_no_overlap(where: str, pulses: FloatArray) -> None:
         raise InputError(
             f"{where}[{order[first + 1]}]: start_s",
             float(start_s[first + 1]),
-            f"at least {float(end_s[first])!r}, where the pulse before ends: one beam lights one pixel at a time",
+            f"at least {float(end_s[first])!r}, the end of the previous pulse: the beam addresses one pixel at a time",
         )
 
 
 def check_commands(where: str, commands: FloatArray) -> None:
-    """Finite entries at increasing times. commands: [n, 3]."""
+    """Check that mirror commands [n, 3] are finite and that their times increase."""
     _check_finite(where, commands, TABLE_COLUMNS[COMMANDS])
     _check_increasing(f"{where}: t_s", commands[:, 0])
 
 
 def check_samples(where: str, t_s: FloatArray, value: FloatArray) -> None:
-    """Times that increase; values that are finite or missing, not all of them missing."""
+    """Check that sample times increase and that values are finite or NaN, with at least one finite value."""
     if not t_s.size:
         raise InputError(where, Unquoted("no samples"), "at least one")
     _check_rows(f"{where}/t_s", t_s, np.isfinite(t_s), "a finite time in s")
     _check_increasing(f"{where}/t_s", t_s)
     _check_rows(f"{where}/value", value, ~np.isinf(value), "a finite value, or NaN where a sample is missing")
     if np.all(np.isnan(value)):
-        raise InputError(
-            f"{where}/value", Unquoted(f"{value.size} times NaN"), "at least one value that is not missing"
-        )
+        raise InputError(f"{where}/value", Unquoted(f"{value.size} times NaN"), "at least one finite value")
 
 
 def parse_pixel(where: str, signal: str, attributes: Attributes) -> int:
-    """The index of the pixel measured."""
+    """Return the index of the measured pixel; mirror signals may omit it."""
     value = attributes.get("pixel")
     if value is None and signal in MIRROR_SIGNALS:
         return 0
@@ -129,29 +128,33 @@ def parse_pixel(where: str, signal: str, attributes: Attributes) -> int:
 
 
 def parse_sigma(where: str, attributes: Attributes) -> float | None:
-    """The instrument's stated noise; None where none is stated, which 0 says as well."""
+    """Return the stated noise of the instrument, or None where it is absent or 0."""
     value = attributes.get("sigma")
     if value is None or value == 0:
         return None
     if isinstance(value, str) or not 0 < value < np.inf:
-        raise InputError(f"{where}: sigma", value, "the instrument's noise, a positive number in the signal's unit")
+        raise InputError(
+            f"{where}: sigma", value, "the instrument's noise: a positive number in the unit of the signal"
+        )
     return float(value)
 
 
 def check_unit(where: str, signal: str, attributes: Attributes) -> None:
-    """A unit beside the signal, if there is one, is the one its name says."""
+    """Check that a unit attribute, if present, agrees with the unit in the signal's name."""
     for field in ("unit", "units"):
         if attributes.get(field, UNITS[signal]) != UNITS[signal]:
-            raise InputError(f"{where}: {field}", attributes[field], f"'{UNITS[signal]}', as the signal's name says")
+            raise InputError(
+                f"{where}: {field}", attributes[field], f"'{UNITS[signal]}', as stated in the signal's name"
+            )
 
 
 def check_sample_count(where: str, finite: int) -> None:
-    """At least as many samples as the nominal model has parameters."""
+    """Check that there are at least as many finite samples as the nominal model has parameters."""
     if finite < MODEL_PARAMETER_COUNT:
         raise InputError(
             where,
-            Unquoted(f"{finite} samples that are not missing"),
-            f"at least {MODEL_PARAMETER_COUNT}, as many as the model has parameters",
+            Unquoted(f"{finite} finite samples"),
+            f"at least {MODEL_PARAMETER_COUNT}, the number of model parameters",
         )
 
 
@@ -164,7 +167,7 @@ def _check_increasing(where: str, t_s: FloatArray) -> None:
     falling = np.flatnonzero(t_s[1:] <= t_s[:-1])
     if falling.size:
         row = int(falling[0]) + 1
-        expected = f"a time axis that rises: more than {float(t_s[row - 1])!r}, the time before"
+        expected = f"an increasing time axis: more than {float(t_s[row - 1])!r}, the previous time"
         raise InputError(f"{where}[{row}]", float(t_s[row]), expected)
 
 

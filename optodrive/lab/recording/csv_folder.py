@@ -1,4 +1,4 @@
-"""The recording as a folder: `recording.toml`, and in a folder a run `pulses.csv` and one CSV file a signal."""
+"""Recording as a folder: `recording.toml`, and per run a subfolder with `pulses.csv` and one CSV file per signal."""
 
 import csv
 import json
@@ -37,7 +37,7 @@ TOML_BYTES_MAX = 64 * TEXT_BYTES_MAX
 
 
 class CsvTree:
-    """A recording in a folder; a `Tree`."""
+    """Recording in a folder of CSV files; implements `RecordingTree`."""
 
     def __init__(self, path: Path) -> None:
         """Read `recording.toml`."""
@@ -49,48 +49,48 @@ class CsvTree:
         return self
 
     def __exit__(self, *details: object) -> None:
-        """Nothing is kept open."""
+        """Do nothing; no file stays open."""
 
     def format_place(self, *names: str) -> str:
-        """The place in words."""
+        """Return the place of a run, signal or field for messages."""
         return f"{self._path}: /{'/'.join(('runs', *names))}"
 
     def read_root_attributes(self) -> Attributes:
-        """Attributes of the whole."""
+        """Return the attributes of the recording."""
         return normalize_attributes(self._toml)
 
     def list_runs(self) -> list[str]:
-        """Names of the runs: of tables, and of folders that somebody forgot to describe."""
+        """Return the run names: tables of `recording.toml`, and folders with pulses that lack a table."""
         with convert_errors(str(self._path), "a readable folder"):
             folders = [entry.name for entry in self._path.iterdir() if (entry / f"{PULSES}.csv").is_file()]
             folder_names = sorted(name for name in folders if not name.startswith("."))
         return list(dict.fromkeys([*self._get_run_tables(), *folder_names]))
 
     def read_run_attributes(self, run: str) -> Attributes:
-        """Attributes of a run."""
+        """Return the attributes of a run."""
         return normalize_attributes(self._get_run_table(run))
 
     def list_members(self, run: str) -> list[str]:
-        """Names of a run's tables and signals: described, or there as a file."""
+        """Return the names of a run's tables and signals, from `recording.toml` and from the files."""
         tables = [name for name, value in self._get_run_table(run).items() if isinstance(value, dict)]
         return list(dict.fromkeys([*tables, *self._list_files(run)]))
 
     def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Attributes of a signal."""
+        """Return the attributes of a signal."""
         described = self._get_run_table(run).get(signal, {})
         return normalize_attributes(described) if isinstance(described, dict) else {}
 
     def read_table(self, run: str, name: str) -> FloatArray:
-        """A table of a run, [n, columns]."""
+        """Return a table of a run, [n, columns]."""
         return self._read_csv(run, name, TABLE_COLUMNS[name], missing=False)
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
-        """Times and values of a signal."""
+        """Return the times and values of a signal."""
         columns = self._read_csv(run, signal, SAMPLE_COLUMNS, missing=True)
         return columns[:, 0].copy(), columns[:, 1].copy()
 
     def count_samples(self, run: str, signal: str) -> int:
-        """How many samples a signal has: lines are counted, not read."""
+        """Return the number of samples of a signal by counting lines."""
         path = self._find_file(run, signal)
         with convert_errors(str(path), "a readable CSV file"), path.open("rb") as file:
             return max(0, sum(1 for line in file if line.strip()) - 1)
@@ -101,7 +101,7 @@ class CsvTree:
     def _get_run_tables(self) -> dict[str, dict[str, Any]]:
         runs = self._toml.get("runs")
         if not isinstance(runs, dict) or not all(isinstance(run, dict) for run in runs.values()):
-            raise InputError(f"{self._path / TOML_NAME}: runs", runs, "a table a run: [runs.NAME]")
+            raise InputError(f"{self._path / TOML_NAME}: runs", runs, "one table per run: [runs.NAME]")
         return runs
 
     def _list_files(self, run: str) -> list[str]:
@@ -129,7 +129,7 @@ class CsvTree:
                     continue
                 self._budget.reserve(where, len(columns))
                 if len(row) == len(columns):
-                    with suppress(ValueError):  # what is not all numbers is looked at cell by cell
+                    with suppress(ValueError):  # rows with other than numbers are parsed per cell
                         numbers.extend([float(cell) for cell in row])
                         continue
                 numbers.extend(_parse_row(f"{where}, line {lines.line_num}", row, columns, missing))
@@ -159,7 +159,7 @@ def _parse_row(where: str, row: list[str], columns: tuple[str, ...], missing: bo
         raise InputError(where, Unquoted(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
     numbers = []
     for cell, column in zip(row, columns, strict=True):
-        # Only a value may be missing; nothing else has a meaning when it is not there.
+        # Only a sample's value may be missing.
         blank = missing and column == "value" and not cell.strip()
         try:
             numbers.append(float("nan" if blank else cell))
@@ -170,27 +170,27 @@ def _parse_row(where: str, row: list[str], columns: tuple[str, ...], missing: bo
 
 @contextmanager
 def atomic_folder(path: Path) -> Iterator[Path]:
-    """Give a temporary folder beside `path` that takes its place if the block ends well, and is gone if it does not.
+    """Yield a temporary folder that replaces `path` if the block succeeds and is removed if it fails.
 
-    InputError where it cannot be written, or where something is there already: a folder may hold more than a recording.
+    Raises InputError if the folder cannot be written or `path` is a file or a folder with content.
     """
     temporary: Path | None = None
     try:
         if path.is_file() or (path.is_dir() and any(path.iterdir())):
-            raise InputError(str(path), Unquoted("something that is there already"), "a folder that is new or empty")
+            raise InputError(str(path), Unquoted("an existing file or folder"), "a new or empty folder")
         temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
         yield temporary
         temporary.chmod(0o755)
         temporary.replace(path)
     except OSError as error:
-        raise InputError(str(path), error.strerror or str(error), "a folder that can be written") from None
+        raise InputError(str(path), error.strerror or str(error), "a writable folder") from None
     finally:
         if temporary is not None:
             shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_folder(folder: Path, runs: tuple[Run, ...], instrument_notes: str) -> None:
-    """Write runs, known to fit, into an empty folder."""
+    """Write normalized runs into an empty folder."""
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}"]
     if instrument_notes:
         lines.append(f"instrument_notes = {_format_value(instrument_notes)}")
@@ -222,7 +222,7 @@ def _format_key(key: str) -> str:
 
 def _format_value(value: str | float) -> str:
     if isinstance(value, str):
-        # JSON's escapes are TOML's, but for the one control character that JSON lets stand.
+        # JSON escapes are valid in TOML; JSON leaves only the control character DEL unescaped.
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     return repr(value)
 
@@ -239,6 +239,6 @@ def _write_run(folder: Path, run: Run) -> None:
 def _write_csv(path: Path, columns: tuple[str, ...], rows: FloatArray) -> None:
     with path.open("w", encoding="ascii", newline="") as file:
         file.write(",".join(columns) + "\n")
-        # `repr` gives the shortest digits that read back as the same number; the last column is the pixel or a value.
+        # `repr` gives the shortest digits that read back as the same number. The last column is a pixel or a value.
         rest = "nan" if columns == SAMPLE_COLUMNS else ".0"
         file.writelines(f"{','.join(map(repr, row)).removesuffix(rest)}\n" for row in rows.tolist())

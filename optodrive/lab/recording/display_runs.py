@@ -1,7 +1,7 @@
-"""A whole display's recordings, pixel by pixel: which runs each pixel needs, read only where they are wanted.
+"""Recordings of a whole display grouped by pixel; the runs of a pixel are read where they are diagnosed.
 
-A run goes to the pixels it measured, with its whole drive; light on a pixel in a run that did not measure it is not
-known to that pixel. What mirrors did belongs to no pixel and is kept apart.
+A pixel gets the runs in which it was measured, with the whole drive of each run. Light on a pixel in a run that did not
+measure it is unknown to that pixel. Mirror signals belong to no pixel and form a group of their own.
 """
 
 from dataclasses import dataclass, replace
@@ -21,7 +21,10 @@ FileStamp = tuple[int, int]
 
 @dataclass(frozen=True)
 class RecordingPart:
-    """Runs of one recording. prefix: before their names, where several are joined; stamp: of the file as tried out."""
+    """Some runs of one recording.
+
+    prefix: precedes the run names where several recordings are joined; stamp: of the file when it was probed
+    """
 
     path: Path
     prefix: str
@@ -31,13 +34,13 @@ class RecordingPart:
 
 @dataclass(frozen=True)
 class PixelRuns:
-    """Where one pixel's runs lie; pixel: None for what mirrors did. Small: it travels to whoever reads them."""
+    """References to the runs of one pixel, small enough to be sent to a worker; pixel: None for the mirrors."""
 
     pixel: int | None
     parts: tuple[RecordingPart, ...]
 
     def read(self) -> Measurement:
-        """These runs, with this pixel's signals and no others; InputError where the data are bad."""
+        """Read the runs with this pixel's signals only; raises InputError if the data are invalid."""
         runs = [self._select_signals(part, run) for part in self.parts for run in _read_part(part)]
         values = [signal.value for run in runs for signal in run.signals.values()]
         subject = "mirrors" if self.pixel is None else f"pixel {self.pixel}"
@@ -61,14 +64,14 @@ class PixelRuns:
 
 @dataclass(frozen=True)
 class DisplayRuns:
-    """Recordings of one display: the runs of each pixel, pixels sorted, and of the mirrors where they were measured."""
+    """Recordings of one display: runs per pixel, sorted by pixel, and the runs with mirror signals."""
 
     pixels: tuple[PixelRuns, ...]
     mirrors: PixelRuns | None
 
     @classmethod
     def open(cls, paths: list[Path]) -> "DisplayRuns":
-        """Look into recordings, without their samples; InputError where one is none."""
+        """Index recordings without reading samples; raises InputError if a path is not a recording."""
         pixels: dict[int, list[RecordingPart]] = {}
         mirrors: list[RecordingPart] = []
         for path in paths:
@@ -87,14 +90,14 @@ class DisplayRuns:
 
 
 def _read_part(part: RecordingPart) -> tuple[Run, ...]:
-    """What was tried out once when the recording was opened is trusted for as long as the file stays as it was."""
+    """Read the runs of a part; a file that was probed once is trusted while its stamp is unchanged."""
     if part.stamp is not None and part.path.is_file() and _stat_file(part.path) != part.stamp:
-        raise InputError(str(part.path), Unquoted("another file"), "the file that was there when the diagnosis began")
+        raise InputError(str(part.path), Unquoted("a changed file"), "the file as it was when the diagnosis began")
     return read_runs(part.path, list(part.names), trusted=part.stamp is not None).runs
 
 
 def _stat_file(path: Path) -> FileStamp | None:
-    """Size and time of a file; None for a folder, which needs no trial."""
+    """Return size and modification time of a file, or None for a folder, which is not probed."""
     if not path.is_file():
         return None
     status = path.stat()

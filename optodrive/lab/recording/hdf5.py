@@ -1,4 +1,4 @@
-"""The recording as one HDF5 file."""
+"""Recording as one HDF5 file."""
 
 from contextlib import suppress
 from math import prod
@@ -29,7 +29,7 @@ from optodrive.lab.recording.storage import (
 
 
 def import_h5py() -> Any:
-    """The library, which only an extra installs; InputError where it is not there."""
+    """Return the module h5py; raises InputError if the extra that provides it is not installed."""
     try:
         import h5py
     except ImportError:
@@ -38,10 +38,10 @@ def import_h5py() -> Any:
 
 
 class Hdf5Tree:
-    """A recording in an HDF5 file that is open for reading; a `Tree`."""
+    """Recording in an HDF5 file that is open for reading; implements `RecordingTree`."""
 
     def __init__(self, path: Path) -> None:
-        """Open a file that `sandboxed_probe` has read without damage."""
+        """Open a file that `probe_in_sandbox` has accepted."""
         self._h5 = import_h5py()
         self._path = path
         self._budget = MemoryBudget()
@@ -57,31 +57,31 @@ class Hdf5Tree:
             self._file.close()
 
     def format_place(self, *names: str) -> str:
-        """The place in words."""
+        """Return the place of a run, signal or field for messages."""
         return f"{self._path}: /{'/'.join(('runs', *names))}"
 
     def read_root_attributes(self) -> Attributes:
-        """Attributes of the whole."""
+        """Return the attributes of the recording."""
         return self._read_attributes(str(self._path), self._file)
 
     def list_runs(self) -> list[str]:
-        """Names of the runs."""
+        """Return the run names."""
         return self._list_names(self.format_place(), self._open_group(self.format_place(), self._file, "runs"))
 
     def read_run_attributes(self, run: str) -> Attributes:
-        """Attributes of a run."""
+        """Return the attributes of a run."""
         return self._read_attributes(self.format_place(run), self._open_run(run))
 
     def list_members(self, run: str) -> list[str]:
-        """Names of a run's tables and signals."""
+        """Return the names of a run's tables and signals."""
         return self._list_names(self.format_place(run), self._open_run(run))
 
     def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Attributes of a signal."""
+        """Return the attributes of a signal."""
         return self._read_attributes(self.format_place(run, signal), self._open_signal(run, signal))
 
     def read_table(self, run: str, name: str) -> FloatArray:
-        """A table of a run, [n, columns]."""
+        """Return a table of a run, [n, columns]."""
         where, columns = self.format_place(run, name), TABLE_COLUMNS[name]
         dataset = self._open_dataset(where, self._open_run(run), name)
         with convert_errors(where, "readable data"):
@@ -91,7 +91,7 @@ class Hdf5Tree:
             return self._read_numbers(where, dataset)
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
-        """Times and values of a signal."""
+        """Return the times and values of a signal."""
         t_s, value = self._open_series(run, signal)
         with convert_errors(self.format_place(run, signal), "readable data"):
             return (
@@ -100,11 +100,13 @@ class Hdf5Tree:
             )
 
     def count_samples(self, run: str, signal: str) -> int:
-        """How many samples a signal has."""
+        """Return the number of samples of a signal."""
         return int(self._open_series(run, signal)[0].shape[0])
 
     def _open_run(self, run: str) -> Any:
-        if self._cached_run is None or self._cached_run[0] != run:  # one after the other: the way from the root is long
+        if (
+            self._cached_run is None or self._cached_run[0] != run
+        ):  # consecutive calls concern one run; traversal is slow
             self._cached_run = (
                 run,
                 self._open_group(
@@ -121,7 +123,9 @@ class Hdf5Tree:
         t_s, value = (self._open_dataset(self.format_place(run, signal, name), group, name) for name in SAMPLE_COLUMNS)
         if len(t_s.shape) != 1:
             raise InputError(
-                self.format_place(run, signal, "t_s"), Unquoted(f"the shape {t_s.shape}"), "one row of times"
+                self.format_place(run, signal, "t_s"),
+                Unquoted(f"the shape {t_s.shape}"),
+                "a one-dimensional array of times",
             )
         if value.shape != t_s.shape:
             expected = f"as many values as times, {t_s.shape}"
@@ -136,7 +140,7 @@ class Hdf5Tree:
         values: dict[str, Any] = {}
         with convert_errors(where, "readable attributes"):
             for name in group.attrs:
-                with suppress(TypeError):  # of a type that h5py has no word for, and so neither text nor number
+                with suppress(TypeError):  # h5py cannot represent the type
                     attribute = group.attrs.get_id(name)
                     if prod(attribute.shape) * attribute.dtype.itemsize <= TEXT_BYTES_MAX:
                         values[name] = group.attrs[name]
@@ -147,9 +151,9 @@ class Hdf5Tree:
             link = group.get(name, getlink=True)
             if link is None:
                 raise InputError(where, None, expected)
-            # A link may lead to any file of this machine, or in circles; a recording is one file.
+            # A link may lead to another file or form a cycle; a recording is one file.
             if not isinstance(link, self._h5.HardLink):
-                raise InputError(where, Unquoted("a link"), f"{expected}, stored here")
+                raise InputError(where, Unquoted("a link"), f"{expected}, stored in this file")
             member = group[name]
             if not isinstance(member, kind):
                 raise InputError(where, Unquoted(f"a {type(member).__name__.lower()}"), expected)
@@ -165,7 +169,7 @@ class Hdf5Tree:
                 kind = "nothing" if dataset.shape is None else f"entries of type {dataset.dtype}"
                 raise InputError(where, Unquoted(" ".join(kind.split())), "a dataset of numbers (float64)")
             if dataset.is_virtual or dataset.external:
-                raise InputError(where, Unquoted("data kept in other files"), "a dataset stored here")
+                raise InputError(where, Unquoted("data stored in other files"), "a dataset stored in this file")
             if dataset.chunks and prod(dataset.chunks) > NUMBERS_MAX:
                 raise InputError(where, Unquoted(f"chunks of {dataset.chunks}"), f"chunks of at most {NUMBERS_MAX}")
             return dataset
@@ -176,7 +180,7 @@ class Hdf5Tree:
 
 
 def write_file(path: Path, runs: tuple[Run, ...], instrument_notes: str) -> None:
-    """Write runs, known to fit, to a new HDF5 file."""
+    """Write normalized runs to a new HDF5 file."""
     with import_h5py().File(path, "w") as file:
         file.attrs["format"] = FORMAT
         file.attrs["version"] = VERSION

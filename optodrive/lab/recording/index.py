@@ -1,4 +1,4 @@
-"""What a recording holds, without its samples: whole displays are read pixel by pixel."""
+"""Index of a recording: names, attributes and counts, without samples."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from optodrive.lab.recording.storage import COMMANDS, MIRROR_SIGNALS, Attributes
 
 @dataclass(frozen=True)
 class SignalIndex:
-    """One signal of a run. samples: how many, missing ones counted; sigma: stated noise."""
+    """One signal of a run; sample_count includes missing samples, sigma is the stated noise."""
 
     pixel: int
     sample_count: int
@@ -23,7 +23,7 @@ class SignalIndex:
 
 @dataclass(frozen=True)
 class RunIndex:
-    """One run. lit: pixels with a pulse, sorted; pulses: how many; signals: by the format's names."""
+    """One run; pulsed_pixels: pixels with a pulse, sorted; signals: by the format's names."""
 
     name: str
     ambient_k: float
@@ -41,7 +41,7 @@ class RunIndex:
 
 @dataclass(frozen=True)
 class RecordingIndex:
-    """What a recording holds; the samples stay where they are until `read` asks for them."""
+    """Index of a recording; `read` reads the samples of selected runs."""
 
     path: Path
     instrument_notes: str
@@ -49,13 +49,13 @@ class RecordingIndex:
 
     @classmethod
     def open(cls, path: Path) -> Self:
-        """Look into a recording; InputError where it is not one, as far as that shows without its samples."""
+        """Index a recording; raises InputError if it is invalid, as far as that shows without its samples."""
         with open_tree(path) as tree, convert_errors(str(path), "a recording that can be read"):
             names, notes = read_header(tree)
             return cls(path, notes, tuple(_build_run_index(tree, name) for name in names))
 
     def group_runs_by_pixel(self) -> dict[int, tuple[str, ...]]:
-        """Names of the runs that measured each pixel, in their order; pixels sorted."""
+        """Return the names of the runs that measured each pixel, in order, keyed by pixel in ascending order."""
         by_pixel: dict[int, list[str]] = {}
         for run in self.runs:
             for pixel in run.measured_pixels:
@@ -63,7 +63,7 @@ class RecordingIndex:
         return {pixel: tuple(by_pixel[pixel]) for pixel in sorted(by_pixel)}
 
     def read(self, names: list[str]) -> Measurement:
-        """Read these runs."""
+        """Read the named runs."""
         return read_runs(self.path, names)
 
 

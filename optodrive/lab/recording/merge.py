@@ -1,4 +1,4 @@
-"""A session's pulses and what a lab measured meanwhile, as one recording."""
+"""Merge of a session's executed pulses with separately measured signals into one recording."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +13,10 @@ from optodrive.lab.recording.storage import PULSES, Unquoted, convert_errors
 
 
 def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measurement:
-    """Runs of a session with the signals measured in them; runs are matched by name.
+    """Return the measured runs with the pulses of the session's runs of the same name.
 
-    measured: a recording whose runs have no pulses of their own; shift_s is added to its times. Runs that were not
-    measured are left out. InputError, naming run and file, where the two do not belong together.
+    measured: a recording whose runs have no pulses; shift_s: added to its times. Session runs without a measurement are
+    omitted. Raises InputError that names run and file if the two do not match.
     """
     session_runs = _read_session_runs(session)
     measurement = read_recording(measured)
@@ -24,7 +24,7 @@ def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measur
 
 
 def _read_session_runs(session: Path) -> dict[str, Run]:
-    """A session's runs, which have no signals."""
+    """Read the runs of a session, which have no signals."""
     with open_tree(session) as tree, convert_errors(str(session), "a session's recording"):
         names, _ = read_header(tree)
         runs = {}
@@ -41,7 +41,7 @@ def _merge_run(run: Run, session_runs: dict[str, Run], session: Path, measured: 
     if session_run is None:
         raise InputError(where, run.name, f"a run of {session}, {suggest_nearest(run.name, list(session_runs))}")
     if len(run.pulses):
-        expected = f"none: those of {session} are taken"
+        expected = f"none: the pulses are taken from {session}"
         raise InputError(f"{where}/{PULSES}", Unquoted(f"{len(run.pulses)} pulses"), expected)
     signals = {
         name: Signal(signal.pixel, np.asarray(signal.t_s + shift_s), signal.value, signal.sigma)

@@ -1,4 +1,4 @@
-"""A picture of a recording: one row a run, one column a signal, over the pulses that drove it."""
+"""Plot of a recording: one row per run and one column per signal, with the pulses shaded behind the curves."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
 RUNS_MAX = 400
-"""Runs drawn; a taller picture than theirs is opened by few programs."""
+"""Maximum number of plotted runs; few programs open a taller image."""
 NAME_WIDTH, LABEL_WIDTH, PANEL_WIDTH, GAP, HEAD_HEIGHT = 170, 70, 360, 14, 30
 HEIGHT_MIN, HEIGHT_MAX, TOTAL_HEIGHT = 44, 150, 8000
 BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSING_COLOUR = (
@@ -29,10 +29,10 @@ BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSIN
 
 
 def write_plot(path: Path, measurement: Measurement) -> int:
-    """Write the picture, a PNG, whole or not at all; how many runs it shows, the first `RUNS_MAX` at most."""
+    """Write the plot as a PNG file atomically; return the number of plotted runs, which is at most `RUNS_MAX`."""
     if path.suffix.lower() != ".png":
         raise InputError(str(path), path.suffix, "a name that ends in .png")
-    with np.errstate(over="ignore"):  # a pulse may end beyond the largest number
+    with np.errstate(over="ignore"):  # a pulse may end beyond the largest finite number
         image, count = _draw(measurement)
     with atomic_write(path) as temporary, temporary.open("wb") as file:
         image.save(file, format="PNG")
@@ -74,7 +74,7 @@ def _draw_run(draw: "ImageDraw", run: Run, columns: list[str], top: int, height:
 
 
 def _abbreviate(text: str) -> str:
-    # The font that Pillow brings has Latin letters only; a run of another script keeps its place in the order.
+    # Pillow's built-in font has Latin letters only; other letters become placeholders.
     text = text.encode("latin-1", "replace").decode("latin-1")
     return text if len(text) <= 24 else f"{text[:23]}~"
 
@@ -100,7 +100,7 @@ def _draw_panel(draw: "ImageDraw", signal: Signal, pulses: FloatArray, box: tupl
 
 
 def _normalize(values: FloatArray, low: float, high: float) -> FloatArray:
-    """Where values lie between two others, 0 to 1. Halves, as a difference of the largest numbers is none."""
+    """Map values between low and high to 0 to 1. Halved operands avoid overflow of the difference."""
     span = high / 2 - low / 2
     if not span > 0:
         return np.full(values.shape, 0.5)
@@ -108,7 +108,7 @@ def _normalize(values: FloatArray, low: float, high: float) -> FloatArray:
 
 
 def _draw_curve(draw: "ImageDraw", x: Any, y: FloatArray, is_finite: Any) -> None:
-    """A line through the samples, broken where one is missing: for each column of the picture first, extremes, last."""
+    """Draw a line broken at missing samples; per image column through first, minimum, maximum and last sample."""
     edges = np.flatnonzero(np.diff(is_finite.astype(np.int8))) + 1
     for part in np.split(np.arange(len(x)), edges):
         if not is_finite[part[0]]:

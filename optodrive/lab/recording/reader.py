@@ -1,4 +1,4 @@
-"""Reading a recording in either form, checked whole."""
+"""Reading and complete checking of a recording in either form."""
 
 from pathlib import Path
 
@@ -23,13 +23,13 @@ from optodrive.lab.recording.storage import (
 
 
 def read_recording(path: Path) -> Measurement:
-    """Read a recording, HDF5 file or folder; InputError with file, run, signal and expectation where it is not one."""
+    """Read a recording; raises InputError with file, run, signal and expectation if it is invalid."""
     return read_with_notes(path)[0]
 
 
 def read_with_notes(path: Path) -> tuple[Measurement, str]:
-    """A recording, and what it notes of the instruments."""
-    with open_tree(path) as tree, convert_errors(str(path), "a recording that can be read"):
+    """Return a recording and its notes on the instruments."""
+    with open_tree(path) as tree, convert_errors(str(path), "a readable recording"):
         names, instrument_notes = read_header(tree)
         measurement = Measurement(tuple(_read_run(tree, name) for name in names))
         values = [signal.value for run in measurement.runs for signal in run.signals.values()]
@@ -40,8 +40,8 @@ def read_with_notes(path: Path) -> tuple[Measurement, str]:
 
 
 def read_runs(path: Path, names: list[str], trusted: bool = False) -> Measurement:
-    """Read only these runs of a recording, in this order. trusted: a file that has been tried out already."""
-    with open_tree(path, trusted) as tree, convert_errors(str(path), "a recording that can be read"):
+    """Read only the named runs, in this order; trusted: the file has been probed already."""
+    with open_tree(path, trusted) as tree, convert_errors(str(path), "a readable recording"):
         known, _ = read_header(tree)
         for name in names:
             if name not in known:
@@ -50,7 +50,7 @@ def read_runs(path: Path, names: list[str], trusted: bool = False) -> Measuremen
 
 
 def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
-    """Open a recording in whichever form it is. trusted: without trying a file out in a process of its own before."""
+    """Open a recording in either form; trusted: skip the probe of an HDF5 file in a sandboxed process."""
     path = Path(path)
     with convert_errors(str(path), "a recording: an HDF5 file or a folder"):
         if path.is_dir():
@@ -60,12 +60,12 @@ def open_tree(path: Path, trusted: bool = False) -> RecordingTree:
             if not trusted:
                 probe_in_sandbox(path)
             return Hdf5Tree(path)
-        description = "something that is no file" if path.exists() else "nothing of this name"
+        description = "neither file nor folder" if path.exists() else "no file of this name"
         raise InputError(str(path), Unquoted(description), "a recording: an HDF5 file or a folder")
 
 
 def read_header(tree: RecordingTree) -> tuple[list[str], str]:
-    """The runs of a recording in their natural order, and its notes, once format and version are known to be right."""
+    """Check format and version; return the run names in natural order and the notes on the instruments."""
     head = tree.read_root_attributes()
     checks.check_format(tree.format_place(), head)
     names = tree.list_runs()
@@ -77,7 +77,7 @@ def read_header(tree: RecordingTree) -> tuple[list[str], str]:
 
 
 def read_pulses(tree: RecordingTree, run: str) -> FloatArray:
-    """The drive of a run, checked."""
+    """Return the checked pulses of a run."""
     pulses = tree.read_table(run, PULSES)
     checks.check_pulses(tree.format_place(run, PULSES), pulses)
     return pulses
@@ -102,7 +102,7 @@ def _read_commands(tree: RecordingTree, run: str) -> FloatArray:
 
 
 def read_signal_attributes(tree: RecordingTree, run: str, signal: str) -> tuple[int, float | None]:
-    """Pixel and stated noise of a signal, checked."""
+    """Return the checked pixel and stated noise of a signal."""
     where = tree.format_place(run, signal)
     attributes = tree.read_signal_attributes(run, signal)
     checks.check_unit(where, signal, attributes)

@@ -1,7 +1,7 @@
-"""A trial of an HDF5 file in a process of its own.
+"""Probe of an HDF5 file in a process with limited CPU time and memory.
 
-The HDF5 library was not made for damaged files: some bytes changed make it run for ever or crash, and the process that
-called it with it. What a short-lived process has read from end to end is safe to be read here.
+The HDF5 library is not hardened against damaged files: a few changed bytes can make it crash or loop forever. A file
+that a short-lived process has read from end to end is safe to be read in this process.
 """
 
 import os
@@ -19,9 +19,9 @@ from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS, Unquoted
 
 CPU_LIMIT_S = 5
 RUN_BYTES_PER_CPU_S = 20_000_000
-"""A run may take `CPU_S`, and a second more for so many bytes of the file; even compressed data is read faster."""
+"""CPU limit of one run: `CPU_LIMIT_S` plus one second per so many bytes of the file; reading is always faster."""
 FILE_BYTES_PER_CPU_S = 200_000
-"""The whole may take `CPU_S`, and a second more for so many bytes: a run takes milliseconds, however small it is."""
+"""CPU limit of the file: `CPU_LIMIT_S` plus one second per so many bytes; even a small run takes milliseconds."""
 MEMORY_BYTES = 2**32
 _PROGRAM = "from optodrive.lab.recording.sandboxed_probe import main; main()"
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}
@@ -29,7 +29,7 @@ _probed_files: set[tuple[str, int, int, int, int]] = set()
 
 
 def probe_in_sandbox(path: Path) -> None:
-    """Read the file in a process of its own; InputError where that process comes to grief. Once a file and process."""
+    """Read a file in a sandboxed process, once per file and process; raises InputError if that process fails."""
     status = path.stat()
     identity = (str(path.resolve()), status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns)
     if identity in _probed_files:
@@ -64,7 +64,7 @@ def _limit_resources(file_limit_s: int) -> None:
 
 
 def _extend_cpu_limit(run_limit_s: int) -> None:
-    """Let the process run for so many seconds from now on, and then be killed, for then it makes no headway."""
+    """Set the CPU limit to run_limit_s from now; the kernel kills the process if it makes no progress until then."""
     _, hard_s = resource.getrlimit(resource.RLIMIT_CPU)
     resource.setrlimit(resource.RLIMIT_CPU, (min(ceil(process_time()) + run_limit_s, hard_s), hard_s))
 
@@ -93,9 +93,9 @@ def _read_members(tree: Hdf5Tree, run: str, members: list[str]) -> None:
 
 
 def main() -> None:
-    """The process: read the file named first, each run within the seconds named second, all within those named third.
+    """Read the file argv[1], each run within argv[2] seconds of CPU time and all runs within argv[3].
 
-    What is merely wrong is passed over.
+    Invalid content is ignored here; only a crash or a timeout matters.
     """
     _limit_resources(int(sys.argv[3]))
     _read_all(Path(sys.argv[1]), int(sys.argv[2]))

@@ -1,10 +1,10 @@
-"""A session as a recording: what was asked, planned, executed and reckoned, plan by plan, in one HDF5 file.
+"""Recorder of a session: target, plan, execution and prediction of every plan, in one HDF5 file.
 
-Written by a process of its own: the HDF5 library holds the interpreter while it waits for the disk, and a daemon that
-stands still for a tenth of a second loses its board's lease. The daemon's side is a thread that feeds a pipe.
+A separate process writes the file: the HDF5 library holds the interpreter lock while it waits for the disk, and a
+daemon that is blocked for a tenth of a second loses its board's lease. The daemon's side is a thread that feeds a pipe.
 
-file: a recording (docs/reference/recordings.md) whose runs have pulses as executed and no signals yet, and beside them
-/plans/ID. A run begins where the display had been dark for REST_S; a plan's attribute `run` names its own.
+The file is a recording (docs/reference/recordings.md) whose runs have pulses as executed and no signals yet, with one group
+/plans/ID per plan. A run begins after a pause of COLD_AFTER_S; a plan's attribute `run` names its run.
 """
 
 import io
@@ -25,17 +25,17 @@ from optodrive.core.errors import InputError
 from optodrive.lab.recording.hdf5 import import_h5py
 
 QUEUE_MAX = 200
-"""Plans that may wait for the disk."""
+"""Maximum number of plans that wait to be written."""
 CLOSE_TIMEOUT_S = 10.0
 LENGTH_PREFIX = struct.Struct("<Q")
 ACKNOWLEDGEMENT = b"."
 Arrays = Mapping[str, np.ndarray[Any, Any]]
 SessionEntry = tuple[dict[str, Any], Arrays]
-"""What is known of a plan in plain words and numbers, and its arrays."""
+"""Metadata of a plan and its arrays."""
 
 
 def encode_entry(metadata: Mapping[str, Any], arrays: Arrays) -> bytes:
-    """A note as the writer takes it."""
+    """Encode an entry for the writer process."""
     body = io.BytesIO()
     text = np.frombuffer(json.dumps(metadata).encode(), dtype=np.uint8)
     np.savez(body, about_=text, **arrays)  # type: ignore[arg-type]
@@ -43,13 +43,13 @@ def encode_entry(metadata: Mapping[str, Any], arrays: Arrays) -> bytes:
 
 
 class SessionRecorder:
-    """The daemon's side. say: gets the one line when recording ends early; `note` never waits and never raises."""
+    """The daemon's side of the recorder; on_failure receives one line when recording ends early."""
 
     def __init__(self, path: Path, metadata: Mapping[str, Any], on_failure: Callable[[str], None]) -> None:
-        """Begin a new file; InputError where there is one already, or it cannot be written."""
+        """Create a new file; raises InputError if the path exists or cannot be written."""
         import_h5py()
         if path.exists():
-            raise InputError("--record-session", str(path), "a name that is free: nothing is overwritten")
+            raise InputError("--record-session", str(path), "a path that does not exist: no file is overwritten")
         self.path = path
         self.is_recording = True
         self._on_failure = on_failure
@@ -60,28 +60,26 @@ class SessionRecorder:
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "OPENBLAS_NUM_THREADS": "1"},
-            start_new_session=True,  # a Ctrl-C meant for the daemon is not meant for it: it ends when its pipe does
+            start_new_session=True,  # Ctrl-C ends the daemon only: the writer ends with its pipe
         )
         try:
             self._send(encode_entry(metadata, {}))
         except OSError:
-            raise InputError(
-                "--record-session", str(path), f"a file that can be written ({self._read_failure()})"
-            ) from None
+            raise InputError("--record-session", str(path), f"a writable file ({self._read_failure()})") from None
         self._thread = threading.Thread(target=self._run_feeder, name="session recorder", daemon=True)
         self._thread.start()
 
     def record(self, build_entry: Callable[[], SessionEntry]) -> None:
-        """Have a plan written; what is to be written is made in the recorder's own thread."""
+        """Queue a plan; the recorder's thread calls build_entry. Never blocks and never raises."""
         if not self.is_recording:
             return
         try:
             self._queue.put_nowait(build_entry)
         except Full:
-            self._stop(f"the disk is too slow, {QUEUE_MAX} plans wait")
+            self._stop(f"the disk is too slow, {QUEUE_MAX} plans are queued")
 
     def close(self) -> None:
-        """Write what waits, and end."""
+        """Write the queued plans and end."""
         try:
             self._queue.put(None, timeout=1.0)
         except Full:
@@ -94,7 +92,7 @@ class SessionRecorder:
                 self._send(encode_entry(*make()))
         except OSError:
             self._stop(self._read_failure())
-        except Exception as error:  # a note that cannot be made must not end the recording in silence
+        except Exception as error:  # a failing build_entry must not end the recording silently
             self._stop(repr(error))
         finally:
             self._close_writer()
@@ -108,12 +106,12 @@ class SessionRecorder:
             raise BrokenPipeError
 
     def _read_failure(self) -> str:
-        """The writer's own line; it has ended, or is about to."""
+        """Return the last line of the writer's stderr, or its exit status."""
         try:
             _, message = self._writer.communicate(timeout=CLOSE_TIMEOUT_S)
         except (subprocess.TimeoutExpired, OSError, ValueError):
             self._writer.kill()
-            return "its writer hangs"
+            return "the writer process does not respond"
         return message.decode("utf-8", "replace").strip().rpartition("\n")[2] or f"status {self._writer.returncode}"
 
     def _close_writer(self) -> None:
@@ -122,7 +120,7 @@ class SessionRecorder:
                 try:
                     pipe.close()
                 except OSError:
-                    continue  # what could not be written is what was told
+                    continue  # the failure has been reported already
         try:
             self._writer.wait(timeout=CLOSE_TIMEOUT_S)
         except subprocess.TimeoutExpired:

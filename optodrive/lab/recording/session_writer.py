@@ -1,6 +1,6 @@
-"""The process that writes a session's file: notes in on stdin, a dot out for each that is on disk; ends with stdin.
+"""Writer process of a session's file: reads entries on stdin, acknowledges each written one, and ends with stdin.
 
-Before each note room is taken on the disk, and the file is closed after it: a full disk finds it whole.
+Disk space is reserved before each entry, and the file is closed after it: a full disk leaves the file intact.
 """
 
 import io
@@ -17,19 +17,19 @@ from optodrive.lab.recording.hdf5 import import_h5py
 from optodrive.lab.recording.session_recorder import ACKNOWLEDGEMENT, LENGTH_PREFIX, Arrays
 from optodrive.lab.recording.storage import FORMAT, PULSES, TABLE_COLUMNS, VERSION
 
-SESSION_VERSION = 1
+SESSION_VERSION = 2
 COLD_AFTER_S = 10.0
-"""A display that was dark for so long begins a new run: its absorbers are cold again, though its walls need minutes."""
+"""Pause without pulses after which a new run begins: absorbers are cold again, although walls need minutes."""
 RESERVED_BYTES = 1 << 18
-"""More than HDF5 takes for a plan beside its arrays."""
+"""More than HDF5 needs per plan beside its arrays."""
 INSTRUMENT_NOTES = "executed pulses of a session of the driver; signals are merged in afterwards"
 
 
 class SessionRecordingFile:
-    """A session's file, open only while it is written."""
+    """A session's file, open only during a write."""
 
     def __init__(self, path: Path, metadata: dict[str, Any]) -> None:
-        """Begin it; OSError where it cannot be written."""
+        """Create the file; raises OSError if it cannot be written."""
         self._path = path
         self._metadata = metadata
         self._run_number = 0
@@ -45,17 +45,17 @@ class SessionRecordingFile:
             file.create_group("plans").create_dataset("config", data=metadata["config"])
 
     def add_plan(self, metadata: dict[str, Any], arrays: Arrays) -> None:
-        """A plan; OSError where there is no room for it, and then the file is as before."""
+        """Write a plan; raises OSError if the disk is full and then leaves the file unchanged."""
         reserve_disk_space(self._path, 2 * sum(array.nbytes for array in arrays.values()) + RESERVED_BYTES)
         with import_h5py().File(self._path, "r+") as file:
             executed = arrays.get("executed")
             if executed is not None and len(executed):
                 self._append_to_run(file, metadata, executed)
-                metadata["run"], metadata["run_zero_s"] = f"run{self._run_number}", self._run_start_s
+                metadata["run"], metadata["run_start_s"] = f"run{self._run_number}", self._run_start_s
             self._write_plan(file["plans"].create_group(metadata["plan"]), metadata, arrays)
 
     def _append_to_run(self, file: Any, metadata: dict[str, Any], executed: np.ndarray[Any, Any]) -> None:
-        """Append pulses to the last run, or to a new one after a rest, or where the board's clock was set anew."""
+        """Append pulses to the last run, or to a new run after a pause or a reset of the board's clock."""
         first_s = float(executed[0, 0])
         starts_run = first_s - self._end_s >= COLD_AFTER_S or first_s < self._run_start_s
         if self._run_number == 0 or starts_run:
@@ -77,7 +77,7 @@ class SessionRecordingFile:
 
     def _write_plan(self, group: Any, metadata: dict[str, Any], arrays: Arrays) -> None:
         for key, value in metadata.items():
-            if key in ("summary", "trains"):  # longer than an attribute may be
+            if key in ("summary", "trains"):  # too long for an HDF5 attribute
                 group.create_dataset(key, data=value)
             elif value is not None:
                 group.attrs[key] = value
@@ -86,7 +86,7 @@ class SessionRecordingFile:
 
 
 def reserve_disk_space(path: Path, size: int) -> None:
-    """Have the disk keep room beyond the file's end, which closing it gives back; OSError where there is none."""
+    """Allocate disk space beyond the end of the file, released on close; raises OSError if the disk is full."""
     with path.open("r+b") as file:
         end = file.seek(0, os.SEEK_END)
         try:
@@ -97,7 +97,7 @@ def reserve_disk_space(path: Path, size: int) -> None:
 
 
 def read_entry(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]] | None:
-    """The next note; None at the end, or where it ends in the middle of one."""
+    """Read the next entry; return None at the end of the stream, also in the middle of an entry."""
     head = stream.read(LENGTH_PREFIX.size)
     if len(head) < LENGTH_PREFIX.size:
         return None
@@ -112,9 +112,9 @@ def read_entry(stream: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray[A
 
 
 def main() -> int:
-    """Write notes until there are none."""
+    """Write entries until the stream ends."""
     for number in (signal.SIGXFSZ, signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.SIG_IGN)  # it ends when its pipe does, with what the daemon had to say at the end
+        signal.signal(number, signal.SIG_IGN)  # it ends with its pipe, after the daemon's last entry
     first = read_entry(sys.stdin.buffer)
     if first is None:
         return 0
@@ -127,7 +127,7 @@ def main() -> int:
             sys.stdout.buffer.write(ACKNOWLEDGEMENT)
             sys.stdout.buffer.flush()
     except BrokenPipeError:
-        return 0  # whoever fed it is gone: what came is written
+        return 0  # the daemon is gone; all complete entries are written
     except OSError as error:
         sys.stderr.write(f"{error.strerror or error}\n")
         return 1

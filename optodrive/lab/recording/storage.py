@@ -1,4 +1,4 @@
-"""What both forms of a recording, the HDF5 file and the folder of CSV files, have in common."""
+"""Definitions and helpers common to both forms of a recording, HDF5 file and folder of CSV files."""
 
 import datetime
 import re
@@ -25,87 +25,87 @@ UNITS = {
 }
 SIGNALS = tuple(UNITS)
 MIRROR_SIGNALS = ("mirror_x_rad", "mirror_y_rad")
-"""Signals of the scanner: they need the run's commands, and belong to no pixel."""
+"""Signals of the scanner: they require the run's commands and belong to no pixel."""
 PULSES = "pulses"
 COMMANDS = "commands"
 TABLE_COLUMNS = {PULSES: ("start_s", "width_s", "power_W", "pixel"), COMMANDS: ("t_s", "x_rad", "y_rad")}
 """Tables of a run and their columns."""
 SAMPLE_COLUMNS = ("t_s", "value")
-"""What a signal consists of."""
+"""Columns of a signal."""
 RUN_MEMBERS = (*TABLE_COLUMNS, *SIGNALS)
 
 NUMBERS_MAX = 2**27
-"""Numbers held in memory for one call: 1 GiB."""
+"""Maximum of numbers read into memory per call: 1 GiB."""
 TEXT_BYTES_MAX = 2**20
 NAME_BYTES_MAX = 200
 _INTEGER_MIN, _INTEGER_MAX = -(2**63), 2**64 - 1
 
 
 class RecordingTree(Protocol):
-    """A recording that is open, in either form: names and attributes at once, arrays when they are asked for."""
+    """An open recording in either form; arrays are read on request."""
 
     def __enter__(self) -> Self: ...
 
     def __exit__(self, *details: object) -> None: ...
 
     def format_place(self, *names: str) -> str:
-        """The place in words: the recording, and the run, signal and field in it."""
+        """Return the place of a run, signal or field for messages, preceded by the recording's path."""
 
     def read_root_attributes(self) -> Attributes:
-        """Attributes of the whole."""
+        """Return the attributes of the recording."""
 
     def list_runs(self) -> list[str]:
-        """Names of the runs, in any order."""
+        """Return the run names in any order."""
 
     def read_run_attributes(self, run: str) -> Attributes:
-        """Attributes of a run."""
+        """Return the attributes of a run."""
 
     def list_members(self, run: str) -> list[str]:
-        """Names of a run's tables and signals, known or not."""
+        """Return the names of a run's tables and signals, known or not."""
 
     def read_signal_attributes(self, run: str, signal: str) -> Attributes:
-        """Attributes of a signal."""
+        """Return the attributes of a signal."""
 
     def read_table(self, run: str, name: str) -> FloatArray:
-        """A table of a run, [n, columns]."""
+        """Return a table of a run, [n, columns]."""
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
-        """Times and values of a signal, as many of the one as of the other."""
+        """Return the times and values of a signal, of equal length."""
 
     def count_samples(self, run: str, signal: str) -> int:
-        """How many samples a signal has, found without reading them."""
+        """Return the number of samples of a signal without reading them."""
 
 
 class MemoryBudget:
-    """How many numbers may still be read into memory; a file may claim any size, and is asked before it is believed."""
+    """Limit on the numbers read into memory; a damaged file may claim any size."""
 
     def __init__(self, numbers: int = NUMBERS_MAX) -> None:
         self._remaining = numbers
 
     def reserve(self, where: str, numbers: int) -> None:
-        """Count numbers that are about to be read; InputError where that is too many."""
+        """Count numbers that are about to be read; raises InputError if the limit is exceeded."""
         self._remaining -= numbers
         if self._remaining < 0:
             raise InputError(
-                where, f"{numbers} numbers", f"at most {NUMBERS_MAX} together; read large recordings in parts"
+                where, f"{numbers} numbers", f"at most {NUMBERS_MAX} in total; read large recordings in parts"
             )
 
 
 @contextmanager
 def convert_errors(place: str, expected: str) -> Iterator[None]:
-    """Turn whatever a library raises at damaged data into one InputError."""
+    """Convert every exception that a library raises on damaged data into one InputError."""
     try:
         with np.errstate(all="ignore"):
             yield
     except InputError:
         raise
     except Exception as error:
-        # What h5py raises at damage is hardly limited: OSError, RuntimeError, KeyError, ValueError, TypeError, …
+        # h5py raises almost any type on damage: OSError, RuntimeError, KeyError, ValueError, TypeError, …
         raise InputError(place, Unquoted(_describe_error(error)), expected) from None
 
 
 class Unquoted:
-    """Text that an error message shows as it is, without quotes."""
+    """Text that an error message shows without quotes."""
 
     def __init__(self, text: str) -> None:
         self._text = text
@@ -116,21 +116,21 @@ class Unquoted:
 
 def _describe_error(error: Exception) -> str:
     if isinstance(error, MemoryError | RecursionError):
-        return "too much to be read"
+        return "too much data"
     text = " ".join((getattr(error, "strerror", None) or str(error)).split()).strip("'\" ")
-    # HDF5 says what it could not do and why in brackets: Unable to open file (truncated file: …)
+    # HDF5 states the reason in parentheses: Unable to open file (truncated file: …)
     why = re.fullmatch(r"(?:Unable|Can't|Couldn't) .*?\((.+)\)", text)
     return (why[1] if why else text) or type(error).__name__
 
 
 def format_name(name: object) -> str:
-    """A name from a file, fit for one line of a message."""
+    """Return a name from a file shortened and escaped for a one-line message."""
     text = str(name)
     return text if text.isprintable() and len(text) <= NAME_BYTES_MAX else abbreviate(text)
 
 
 def check_run_name(where: str, name: str) -> None:
-    """Refuse a run's name that not both forms can carry: it is a group there and a folder here."""
+    """Check that both forms can store a run's name, as an HDF5 group and as a folder."""
     encoded = name.encode("utf-8", "replace")
     fits = name.isprintable() and not set(name) & {"/", "\\"} and not name.startswith(".")
     if not (fits and 0 < len(encoded) <= NAME_BYTES_MAX and name == name.strip()):
@@ -140,15 +140,15 @@ def check_run_name(where: str, name: str) -> None:
 
 
 def natural_sort_key(name: str) -> tuple[object, ...]:
-    """Sorting key by which run2 comes before run10."""
+    """Return a sort key that orders run2 before run10."""
     parts = re.split(r"([0-9]+)", name)
     return (*(int(part) if index % 2 else part for index, part in enumerate(parts)), name)
 
 
 def normalize_attribute(value: Any) -> str | float | None:
-    """An attribute as str, int or float; None for what is none of them.
+    """Return an attribute as str, int or float, or None for any other type.
 
-    Tools write the same attribute as a scalar, as an array of one, as bytes or as text.
+    Writers store one attribute as a scalar, as an array of one element, as bytes or as text.
     """
     if isinstance(value, np.ndarray):
         return normalize_attribute(value.reshape(-1)[0]) if value.size == 1 else None
@@ -166,16 +166,16 @@ def normalize_attribute(value: Any) -> str | float | None:
 
 
 def _decode_text(value: bytes) -> str:
-    # HDF5 ends text at a NUL; without any, both forms carry the same.
+    # HDF5 ends text at a NUL character, so neither form stores one.
     return value[:TEXT_BYTES_MAX].decode("utf-8", "replace").replace("\0", "")
 
 
 def normalize_attributes(values: dict[str, Any]) -> Attributes:
-    """Those attributes that are text or a number."""
+    """Return those attributes that are text or numbers."""
     converted = {name: normalize_attribute(value) for name, value in values.items() if name and name.isprintable()}
     return {name: value for name, value in converted.items() if value is not None}
 
 
 def is_hdf5(path: Path) -> bool:
-    """Whether a recording of this name is one HDF5 file rather than a folder."""
+    """Return whether a recording of this name is an HDF5 file rather than a folder."""
     return path.suffix.lower() in (".h5", ".hdf5")

@@ -1,4 +1,4 @@
-"""A recording in figures, one row a run: what `optodrive recording show` prints."""
+"""Statistics of a recording, one row per run: the output of `optodrive recording show`."""
 
 from typing import Any
 
@@ -9,7 +9,7 @@ from optodrive.core.types.measurements import Measurement, Run, Signal
 
 
 def build_summary(measurement: Measurement) -> list[dict[str, Any]]:
-    """Figures of each run, SI units, fit for JSON."""
+    """Return statistics of each run in SI units as JSON values."""
     return [_summarize_run(run) for run in measurement.runs]
 
 
@@ -21,7 +21,7 @@ def _summarize_run(run: Run) -> dict[str, Any]:
         "ambient_K": run.ambient_k,
         "attributes": {key: _finite_or_none(value) for key, value in run.attributes.items()},
         "pulses": len(run.pulses),
-        "lit": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
+        "pulsed_pixels": [int(pixel) for pixel in np.unique(run.pulses[:, 3])],
         "energy_J": _finite_or_none(_compute_energy_j(run.pulses)),
         "commands": None if run.commands is None else len(run.commands),
         "signals": {name: _summarize_signal(signal) for name, signal in run.signals.items()},
@@ -41,12 +41,12 @@ def _summarize_signal(signal: Signal) -> dict[str, Any]:
         "missing": len(signal.t_s) - len(measured),
         "start_s": float(signal.t_s[0]),
         "end_s": float(signal.t_s[-1]),
-        "least": float(measured.min()),
-        "most": float(measured.max()),
+        "min": float(measured.min()),
+        "max": float(measured.max()),
         "sigma": signal.sigma,
     }
 
 
 def _finite_or_none(value: str | float) -> str | float | None:
-    # JSON has no word for NaN and infinity.
+    # JSON cannot represent NaN and infinity.
     return None if isinstance(value, float) and not np.isfinite(value) else value

@@ -1,4 +1,4 @@
-"""Writing a recording in either form, whole or not at all."""
+"""Writing of a recording in either form; the target is replaced as a whole or stays unchanged."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -27,34 +27,34 @@ from optodrive.lab.recording.storage import (
 
 
 def write_recording(path: Path, measurement: Measurement, instrument_notes: str = "") -> None:
-    """Write a recording: HDF5 where the name ends so, else a folder of CSV files; whole or not at all.
+    """Write a recording atomically: HDF5 if the suffix says so, else a folder of CSV files.
 
-    InputError where it cannot be written, or holds names, attributes or shapes that not both forms can carry.
+    Raises InputError if the target cannot be written, or if names, attributes or shapes do not fit both forms.
     """
     path = Path(path)
     runs = _normalize_runs(str(path), measurement)
     _check_attribute(str(path), "instrument_notes", instrument_notes)
     if is_hdf5(path):
         hdf5.import_h5py()
-        with atomic_write(path) as file, convert_errors(str(path), "a file that can be written"):
+        with atomic_write(path) as file, convert_errors(str(path), "a writable file"):
             hdf5.write_file(file, runs, instrument_notes)
     else:
-        with csv_folder.atomic_folder(path) as folder, convert_errors(str(path), "a folder that can be written"):
+        with csv_folder.atomic_folder(path) as folder, convert_errors(str(path), "a writable folder"):
             csv_folder.write_folder(folder, runs, instrument_notes)
 
 
 def convert_recording(source: Path, target: Path) -> Measurement:
-    """Read a recording and write it in the form that the target's name says; what was converted is returned."""
+    """Read a recording, write it in the form implied by the target's suffix, and return it."""
     measurement, notes = read_with_notes(source)
     write_recording(target, measurement, notes)
     return measurement
 
 
 def _normalize_runs(where: str, measurement: Measurement) -> tuple[Run, ...]:
-    """The runs, numbers and text as plain as the forms carry them."""
+    """Check the runs and convert their numbers and text to the types that both forms store."""
     names = [run.name for run in measurement.runs]
     if not names or len(set(names)) < len(names):
-        raise InputError(f"{where}: /runs", names, "at least one run, and no name twice")
+        raise InputError(f"{where}: /runs", names, "at least one run, and unique names")
     for name in names:
         check_run_name(f"{where}: /runs", name)
     return tuple(_normalize_run(f"{where}: /runs/{run.name}", run) for run in measurement.runs)
@@ -71,7 +71,7 @@ def _normalize_run(where: str, run: Run) -> Run:
             raise InputError(
                 f"{where}/{format_name(name)}", name, f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
             )
-    # Numbers of numpy print otherwise than Python's own.
+    # NumPy scalars have another repr than Python's own numbers.
     attributes = normalize_attributes(run.attributes)
     signals = {name: _normalize_signal(f"{where}/{name}", signal) for name, signal in run.signals.items()}
     return replace(run, ambient_k=float(run.ambient_k), attributes=attributes, signals=signals)
@@ -90,7 +90,7 @@ def _check_shape(where: str, table: np.ndarray[Any, Any], columns: int) -> None:
 
 def _check_attribute(where: str, key: str, value: object) -> None:
     if not key or not key.isprintable() or key in RUN_MEMBERS or key == "ambient_K":
-        raise InputError(where, key, "an attribute's name: printable, and not the name of a part of a run")
+        raise InputError(where, key, "an attribute's name: printable, and not the name of a run's member")
     converted = normalize_attribute(value)
     if converted is None or (isinstance(value, str) and converted != value):
-        raise InputError(f"{where}: {key}", value, "text without NUL, or a number of 64 bits")
+        raise InputError(f"{where}: {key}", value, "text without NUL, or a 64-bit number")

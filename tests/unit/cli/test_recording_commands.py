@@ -61,7 +61,7 @@ def test_show_as_json_is_one_object(path, tmp_path, capsys):
     assert document["recording"] == str(path)
     assert document["picture"] == {"file": str(out), "runs": 2}
     first = document["runs"][0]
-    assert (first["run"], first["group"], first["lit"]) == ("run2", "a", [17, 18])
+    assert (first["run"], first["group"], first["pulsed_pixels"]) == ("run2", "a", [17, 18])
     assert first["energy_J"] == pytest.approx(0.02 * (2.45 + 1 / 3))
     assert first["signals"]["displacement_m"]["missing"] == 2
     assert document["runs"][1]["commands"] == 11

@@ -105,7 +105,7 @@ REFUSALS = {
         renamed("run2/absorber_temperature_K.csv", "run2/absorber_temperature_C.csv"),
         ["/runs/run2/absorber_temperature_C", "nearest is 'absorber_temperature_K'"],
     ),
-    "no pulses": (gone("run2/pulses.csv"), ["/runs/run2/pulses", "one row a pulse"]),
+    "no pulses": (gone("run2/pulses.csv"), ["/runs/run2/pulses", "one row per pulse"]),
     "no signal file": (gone(HEIGHT), ["/runs/run2/displacement_m", "the file run2/displacement_m.csv"]),
     "header": (text(HEIGHT, "t_s,value", "t_ms,value"), ["displacement_m, line 1", "'t_ms,value'", "t_s,value"]),
     "semicolons": (text("run2/pulses.csv", ",", ";"), ["pulses, line 1", "start_s,width_s,power_W,pixel"]),
@@ -116,11 +116,11 @@ REFUSALS = {
     "a decimal comma": (text("run2/pulses.csv", "2.45", "2,45"), ["pulses, line 2", "5 cells"]),
     "time missing": (text(HEIGHT, "0.003,", ","), ["displacement_m, line 5: t_s", "''"]),
     "time NaN": (text(HEIGHT, "0.003,", "nan,"), ["displacement_m/t_s[3]", "nan"]),
-    "time backwards": (text(HEIGHT, "0.003,", "0.001,"), ["displacement_m/t_s[3]", "rises"]),
+    "time backwards": (text(HEIGHT, "0.003,", "0.001,"), ["displacement_m/t_s[3]", "increasing"]),
     "infinite": (text(HEIGHT, "0.003,", "0.003,inf"), ["displacement_m/value[3]", "inf"]),
     "pulse missing": (text("run2/pulses.csv", "2.45", ""), ["pulses, line 2: power_W", "''"]),
-    "pulses overlap": (text("run2/pulses.csv", "0.05", "0.01"), ["pulses[1]: start_s", "one beam"]),
-    "commands repeat": (text("run10/commands.csv", "0.01,", "0.0,"), ["/runs/run10/commands: t_s[1]", "rises"]),
+    "pulses overlap": (text("run2/pulses.csv", "0.05", "0.01"), ["pulses[1]: start_s", "the beam"]),
+    "commands repeat": (text("run10/commands.csv", "0.01,", "0.0,"), ["/runs/run10/commands: t_s[1]", "increasing"]),
     "NUL": (content(HEIGHT, b"t_s,value\n0,\0\n"), ["displacement_m"]),
     "other bytes": (content(HEIGHT, b"t_s,value\n\xff\xfe"), ["displacement_m", "CSV"]),
     "an endless cell": (content(HEIGHT, b't_s,value\n0,"' + b"1" * 200_000), ["displacement_m", "CSV"]),
@@ -153,7 +153,7 @@ def test_what_is_there_already_stays(folder):
     (folder.parent / "file").write_text("x")
     with pytest.raises(InputError, match="new or empty"):
         write_recording(folder.parent / "file", recording())
-    with pytest.raises(InputError, match="can be written"):
+    with pytest.raises(InputError, match="writable"):
         write_recording(folder.parent / "nowhere" / "recording", recording())
     assert {path: path.stat().st_mtime_ns for path in folder.rglob("*")} == before
     assert sorted(path.name for path in folder.parent.iterdir()) == ["file", "recording"]

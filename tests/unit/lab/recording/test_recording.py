@@ -243,7 +243,7 @@ REFUSALS = {
     "pulse at half a pixel": (entry(f"{RUN}/pulses", (1, 3), 17.5), ["pulses: pixel[1]", "17.5", "whole"]),
     "pulse at pixel -1": (entry(f"{RUN}/pulses", (1, 3), -1), ["pulses: pixel[1]", "-1.0"]),
     "pulse at pixel 1e300": (entry(f"{RUN}/pulses", (1, 3), 1e300), ["pulses: pixel[1]", "1e+300"]),
-    "pulses overlap": (entry(f"{RUN}/pulses", (1, 0), 0.019), ["pulses[1]: start_s", "0.019", "0.02", "one beam"]),
+    "pulses overlap": (entry(f"{RUN}/pulses", (1, 0), 0.019), ["pulses[1]: start_s", "0.019", "0.02", "the beam"]),
     "pulses overlap out of order": (
         data(RUN, "pulses", np.array([[1.0, 0.1, 1, 1], [0.0, 5.0, 1, 1], [0.5, 0.1, 1, 1]])),
         ["pulses[2]: start_s", "0.5", "5.0"],
@@ -278,8 +278,8 @@ REFUSALS = {
     "sigma below 0": (setting(HEIGHT, "sigma", -1.0), ["displacement_m: sigma", "-1.0", "positive"]),
     "sigma infinite": (setting(HEIGHT, "sigma", np.inf), ["displacement_m: sigma", "inf"]),
     "sigma text": (setting(HEIGHT, "sigma", "small"), ["displacement_m: sigma", "'small'"]),
-    "time backwards": (entry(f"{HEIGHT}/t_s", 5, 9.0), ["displacement_m/t_s[6]", "0.006", "rises", "9.0"]),
-    "time repeats": (entry(f"{HEIGHT}/t_s", 5, T_S[4]), ["displacement_m/t_s[5]", "rises"]),
+    "time backwards": (entry(f"{HEIGHT}/t_s", 5, 9.0), ["displacement_m/t_s[6]", "0.006", "increasing", "9.0"]),
+    "time repeats": (entry(f"{HEIGHT}/t_s", 5, T_S[4]), ["displacement_m/t_s[5]", "increasing"]),
     "time NaN": (entry(f"{HEIGHT}/t_s", 5, np.nan), ["displacement_m/t_s[5]", "nan", "finite"]),
     "time infinite": (entry(f"{HEIGHT}/t_s", 100, np.inf), ["displacement_m/t_s[100]", "inf", "finite"]),
     "value infinite": (entry(f"{HEIGHT}/value", 7, -np.inf), ["displacement_m/value[7]", "-inf", "NaN where"]),
@@ -287,7 +287,7 @@ REFUSALS = {
     "mirror without commands": (deleting("runs/run10/commands"), ["/runs/run10/commands", "t_s, x_rad, y_rad"]),
     "commands of two": (data("runs/run10", "commands", np.zeros((5, 2))), ["/runs/run10/commands", "3 columns"]),
     "commands NaN": (entry("runs/run10/commands", (2, 2), np.nan), ["commands: y_rad[2]", "nan"]),
-    "commands repeat": (entry("runs/run10/commands", (2, 0), 0.01), ["commands: t_s[2]", "rises"]),
+    "commands repeat": (entry("runs/run10/commands", (2, 0), 0.01), ["commands: t_s[2]", "increasing"]),
     "mirror all NaN": (entry(f"{MIRROR}/value", slice(None), np.nan), ["/runs/run10/mirror_x_rad/value", "NaN"]),
 }
 
@@ -312,7 +312,7 @@ def test_what_is_no_hdf5_file_is_refused(tmp_path):
     assert "readable HDF5" in refusal(path)
     path.unlink()
     os.mkfifo(path)  # would wait for a writer for ever
-    assert "something that is no file" in refusal(path)
+    assert "neither file nor folder" in refusal(path)
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1, 0.5, 0.9, 0.999])
@@ -355,10 +355,10 @@ def test_damage_on_which_hdf5_2_0_searches_for_ever_comes_to_an_end(path, monkey
 
 
 def test_nothing_is_left_where_writing_fails(tmp_path):
-    with pytest.raises(InputError, match="can be written"):
+    with pytest.raises(InputError, match="writable"):
         write_recording(tmp_path / "nowhere" / "r.h5", recording())
     (tmp_path / "folder.h5").mkdir()
-    with pytest.raises(InputError, match="can be written"):
+    with pytest.raises(InputError, match="writable"):
         write_recording(tmp_path / "folder.h5", recording())
     assert [path.name for path in tmp_path.iterdir()] == ["folder.h5"]
 
@@ -367,7 +367,7 @@ ONE = recording().runs[0]
 SIGNAL = ONE.signals["displacement_m"]
 UNFIT = {
     "no runs": ((), "at least one run"),
-    "a name twice": ((ONE, ONE), "no name twice"),
+    "a name twice": ((ONE, ONE), "unique names"),
     "a name of two parts": ((Run("a/b", 293.0, ONE.pulses, ONE.signals),), "'a/b'"),
     "the folder above": ((Run("..", 293.0, ONE.pulses, ONE.signals),), "'..'"),
     "an unknown signal": ((Run("a", 293.0, ONE.pulses, {"displacement_mm": SIGNAL}),), "nearest is 'displacement_m'"),

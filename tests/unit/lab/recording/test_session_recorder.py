@@ -122,7 +122,7 @@ def test_a_note_that_cannot_be_made_is_told(tmp_path):
 
 def test_nothing_is_overwritten_and_a_bad_path_is_one_line(tmp_path):
     (tmp_path / "a.h5").write_text("dear")
-    with pytest.raises(InputError, match="name that is free"):
+    with pytest.raises(InputError, match="does not exist"):
         SessionRecorder(tmp_path / "a.h5", ABOUT, print)
     with pytest.raises(InputError, match="No such file"):
         SessionRecorder(tmp_path / "no" / "a.h5", ABOUT, print)
