@@ -1,4 +1,4 @@
-"""An HTML page that needs nothing beside itself, and what reports put on it."""
+"""Self-contained HTML pages for reports."""
 
 from collections.abc import Iterable
 from html import escape
@@ -12,13 +12,13 @@ th { border-bottom: 1px solid #999; } td.n { text-align: right; font-variant-num
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr)); gap: 1rem; }
 figure { margin: 0; } figcaption { font-size: .85rem; color: #444; }
 svg { width: 100%; height: auto; background: #fafafa; border: 1px solid #ddd; }
-.before { stroke: #c2571a; fill: none; } .after { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
+.nominal { stroke: #c2571a; fill: none; } .extended { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
 .other { fill: #b5b5b5; } text { font: 11px system-ui, sans-serif; fill: #333; }
 """
 
 
 def render_page(title: str, verdict: str, narrative: list[str], body: Iterable[str]) -> str:
-    """HTML. story: its first line becomes the heading; body: what follows, HTML already."""
+    """Return an HTML page; the first line of the narrative is its heading, body is HTML that follows the narrative."""
     lines = [line for line in narrative if line]
     parts = [
         "<!doctype html><html lang='en'><head><meta charset='utf-8'>",
@@ -34,7 +34,7 @@ def render_page(title: str, verdict: str, narrative: list[str], body: Iterable[s
 def render_table(
     header: Iterable[str], rows: Iterable[Iterable[str]], numeric_columns: frozenset[int] = frozenset()
 ) -> str:
-    """Cells are HTML already; numbers: columns set to the right."""
+    """Return an HTML table; cells are HTML, numeric_columns are aligned to the right."""
     header_cells = "".join(f"<th>{name}</th>" for name in header)
     cells = (
         "".join(
@@ -46,5 +46,5 @@ def render_table(
 
 
 def _class_attribute(line: str) -> str:
-    """Lines of a list, and what belongs to the line above, stand closer."""
+    """Return the class attribute of a narrative line; list items and continuation lines have less spacing."""
     return " class='item'" if line.startswith(("- ", "  ")) else ""

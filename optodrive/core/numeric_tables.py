@@ -1,4 +1,4 @@
-"""Plain tables of numbers with a head line, read and written a million rows at a time."""
+"""CSV tables of numbers with a header line, written in blocks of rows."""
 
 from pathlib import Path
 
@@ -9,11 +9,14 @@ from optodrive.core.files import atomic_write
 from optodrive.core.types.arrays import FloatArray
 
 ROWS_PER_WRITE = 50_000
-"""Rows written at a time."""
+"""Rows formatted per write."""
 
 
 def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
-    """Rows of a CSV file with just this head, [n, columns], all finite; InputError names row, column and value."""
+    """Read a CSV file with exactly this header into a finite array [n, columns].
+
+    Raises InputError that names row, column and value.
+    """
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
@@ -37,7 +40,7 @@ def read_columns(path: Path, columns: tuple[str, ...]) -> FloatArray:
 
 
 def _parse_all(body: str, rows: int, columns: int) -> FloatArray | None:
-    """The table, or None where something is not as it should be."""
+    """Return the table, or None if any cell is invalid."""
     if body.count(",") != rows * (columns - 1):
         return None
     try:
@@ -70,7 +73,7 @@ def _is_number(cell: str) -> bool:
 
 
 def write_columns(path: Path, columns: tuple[str, ...], table: FloatArray, formats: tuple[str, ...]) -> None:
-    """Write a table [n, columns], whole or not at all; formats: one a column, as %.3f."""
+    """Write a table [n, columns] atomically; formats: one printf format per column, such as %.3f."""
     line = ",".join(formats) + "\n"
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(columns) + "\n")

@@ -144,7 +144,7 @@ def score(
     if after is not None and verdict == "ambiguous":
         final = tuple(after.get("causes") or ())
         marks["resolved"] = after.get("verdict") == "cause" and set(final) == truth
-    seconds = answer.get("seconds")
+    seconds = answer.get("elapsed_s")
     return Score(
         block=case.block,
         seed=case.seed,

@@ -225,7 +225,7 @@ def case_of(block, *causes, textbook=True):
 
 
 def said(verdict, *causes, **more):
-    return {"verdict": verdict, "causes": list(causes), "seconds": 3.0, "parameters": {}, "gain": None} | more
+    return {"verdict": verdict, "causes": list(causes), "elapsed_s": 3.0, "parameters": {}, "gain": None} | more
 
 
 def test_score_without_an_effect():

@@ -1,4 +1,4 @@
-"""Result of a diagnosis: causes, gain, candidate ranking, next experiment."""
+"""Result of a diagnosis: causes, held-out gain, candidate ranking, next experiment."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ from optodrive.core.types.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Estimate:
-    """A fitted number: value, unit, its 95 % interval."""
+    """Fitted value with its unit and 95 % interval."""
 
     value: float
     unit: str
@@ -17,7 +17,10 @@ class Estimate:
 
 @dataclass(frozen=True)
 class HeldOutGain:
-    """RMSE on runs that were held out, by signal, SI; reduction: (before − after) / (before − floor), 95 % interval."""
+    """RMSE on held-out runs by signal, SI, and the share of the avoidable error that the extended model removes.
+
+    reduction: (nominal − extended) / (nominal − noise floor), with its 95 % interval low to high
+    """
 
     nominal: dict[str, float]
     extended: dict[str, float]
@@ -29,7 +32,11 @@ class HeldOutGain:
 
 @dataclass(frozen=True)
 class CandidateCause:
-    """One cause as judged. statistic: likelihood ratio beside the nominal fit; smallest: what would have been seen."""
+    """Judgement of one hypothesis.
+
+    statistic: likelihood ratio against the nominal fit; detection_limit: the smallest effect that the data would have
+    shown
+    """
 
     cause: str
     label: str
@@ -42,12 +49,12 @@ class CandidateCause:
 
 @dataclass(frozen=True, eq=False)
 class NextExperiment:
-    """The experiment that tells rivals apart.
+    """Experiment that separates two rival causes.
 
-    pulses: [n, 4]; pixel: the one to look at; repeats: how often; separation: χ² between rivals; seconds: of lab time
+    pulses: [n, 4] start_s, width_s, power_w, pixel; pixel: to be measured; separation: expected χ² between the rivals
     """
 
-    rationale: str
+    description: str
     pulses: FloatArray
     pixel: int
     repeats: int
@@ -58,7 +65,10 @@ class NextExperiment:
 
 @dataclass(frozen=True, eq=False)
 class ResidualTrace:
-    """One signal of one group: measured, and residuals before and after in units of sigma, one sample's noise; [m]."""
+    """One signal of one group: measured values and residuals, [m].
+
+    nominal, extended: residuals in units of sigma, the noise of one sample
+    """
 
     group: str
     signal: str
@@ -71,9 +81,10 @@ class ResidualTrace:
 
 @dataclass(frozen=True, eq=False)
 class Discrepancy:
-    """What a recording says of the model: verdict "cause", "none", "unexplained" or "ambiguous", and all behind it.
+    """Diagnosis of a recording.
 
-    terms: the extension, term → parameter → value; base: nominal parameters as refitted with it
+    verdict: "cause", "none", "unexplained" or "ambiguous"; terms: the extension, term → parameter → value; base:
+    nominal parameters as refitted with it; explained_fraction: share of the detected excess
     """
 
     verdict: str

@@ -7,7 +7,10 @@ from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 
 @dataclass(frozen=True, eq=False)
 class PixelTrace:
-    """What pixels do in time. t_s [m]; absorber_k, gas_k (rises above ambient), displacement_m, force_n: [m, p]."""
+    """Simulated signals of p pixels over time.
+
+    t_s: [m]; absorber_k and gas_k (rises above ambient), displacement_m, force_n: [m, p]
+    """
 
     t_s: FloatArray
     pixel: IntArray
@@ -22,7 +25,7 @@ class PixelTrace:
 
 @dataclass(frozen=True, eq=False)
 class Signal:
-    """One measured signal of one pixel: t_s [m] increasing; value [m], NaN where missing; sigma: stated noise."""
+    """Measured signal of one pixel: t_s [m] increasing; value [m], NaN where missing; sigma: stated noise, if any."""
 
     pixel: int
     t_s: FloatArray
@@ -35,9 +38,10 @@ class Signal:
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run of a recording: the drive as commanded, and the signals measured meanwhile.
+    """Run of a recording: the drive as commanded and the signals measured meanwhile.
 
-    pulses: [n, 4] start_s, width_s, power_w, pixel; signals: by the format's names; attributes: as in the file
+    pulses: [n, 4] start_s, width_s, power_w, pixel; signals: by the names of the recording format; attributes: as in
+    the file; commands: [n, 3] t_s, x_rad, y_rad of the mirrors
     """
 
     name: str
@@ -53,6 +57,6 @@ class Run:
 
 @dataclass(frozen=True)
 class Measurement:
-    """A recording: runs in order."""
+    """Recording: runs in order."""
 
     runs: tuple[Run, ...]

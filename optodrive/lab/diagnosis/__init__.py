@@ -1,1 +1,1 @@
-"""Measured data against the model: what it gets wrong, which cause explains it, and what that gains."""
+"""Diagnosis of model errors from measured data: detection, cause, parameters and held-out gain."""

@@ -1,4 +1,4 @@
-"""Many tasks on Dask, in processes here or on a cluster. A lost worker costs the time of the tasks it had."""
+"""Execution of many tasks on Dask, in local processes or on a cluster; losing a worker only costs time."""
 
 import logging
 import re
@@ -16,14 +16,14 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 SCHEDULER_TIMEOUT_S = 3.0
-"""A scheduler that has not answered by then is not there."""
+"""Time within which a scheduler must answer."""
 WORKER_TIMEOUT_S = 30.0
-"""A scheduler to which no worker has come by then has none."""
+"""Time within which a scheduler must have a worker."""
 DASK_SETTINGS = {
-    # A task whose worker was lost comes back at once, to be done alone: only so is it known whose fault it was.
+    # A task whose worker was lost returns at once and runs again alone, which shows whether it is at fault.
     "distributed.scheduler.allowed-failures": 0,
     "distributed.scheduler.worker-saturation": 1.0,
-    # Results are small: a worker short of memory has nothing to write to disk, and one that pauses never goes on.
+    # Results are small: spilling frees no memory, and a paused worker would never resume.
     "distributed.worker.memory.target": False,
     "distributed.worker.memory.spill": False,
     "distributed.worker.memory.pause": False,
@@ -37,17 +37,17 @@ DASK_SETTINGS = {
 def open_client(
     address: str | None = None, workers: int | None = None, max_workers: int | None = None
 ) -> Iterator[Any]:
-    """A Dask client: of the scheduler at an address, or of as many processes here, by default one a core.
+    """Yield a Dask client of the scheduler at an address, or of local processes, by default one per core.
 
-    most: so many processes can be used at all. They listen on loopback only. InputError where the address is none, or
-    nothing answers there.
+    max_workers: upper limit of useful processes. Local processes listen on loopback only. Raises InputError if the
+    address is invalid or no scheduler answers there.
     """
     try:
         import dask
         import distributed
     except ImportError:
         raise InputError("dask", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra") from None
-    # What becomes of a lost worker is told by the answers; Dask would tell it in a page.
+    # The answers report a lost worker; Dask's own messages are a page long.
     for name in ("distributed", "distributed.client"):
         logging.getLogger(name).setLevel(logging.CRITICAL)
     with ExitStack() as stack:
@@ -74,8 +74,8 @@ def open_client(
 
 @contextmanager
 def _block_sigint() -> Iterator[None]:
-    """Processes begun here, now or later, do not hear Ctrl-C: ending them is this process's task."""
-    resource_tracker.ensure_running()  # else it begins later, and opens the ears of the thread that begins it
+    """Block SIGINT in processes started within the block; this process ends them."""
+    resource_tracker.ensure_running()  # a later start would unblock SIGINT in the calling thread
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -93,9 +93,7 @@ def _connect(distributed: Any, address: str) -> Any:
     try:
         client = distributed.Client(address, timeout=SCHEDULER_TIMEOUT_S, set_as_default=False)
     except (OSError, ValueError, OverflowError):
-        raise InputError(
-            "--dask", address, f"{expected}, at which one answers within {SCHEDULER_TIMEOUT_S:g} s"
-        ) from None
+        raise InputError("--dask", address, f"{expected}, that answers within {SCHEDULER_TIMEOUT_S:g} s") from None
     try:
         client.wait_for_workers(1, timeout=WORKER_TIMEOUT_S)
     except TimeoutError:
@@ -107,10 +105,9 @@ def _connect(distributed: Any, address: str) -> Any:
 def run_tasks(
     client: Any, function: Callable[[Task], Result], tasks: list[Task]
 ) -> Iterator[tuple[Task, Result | None, str]]:
-    """Each task with its result, or with one line that says why it has none; in the order in which they end.
+    """Yield each task with its result, or with a one-line error, in the order of completion.
 
-    A task that lost its worker is done again, by itself, when nothing else is left to do; if that costs another worker
-    it is the task's own fault.
+    A task whose worker was lost runs again alone after all others; if that costs another worker, the task is at fault.
     """
     from distributed import KilledWorker, as_completed
 
@@ -131,7 +128,7 @@ def run_tasks(
             error = _wait_for_error(future)
             del futures[future]
             if isinstance(error, KilledWorker):
-                yield task, None, "the worker died each time, the last time with nothing else to do: out of memory?"
+                yield task, None, "the worker died each time, the last time with no other task running: out of memory?"
             else:
                 yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
     finally:
@@ -140,10 +137,10 @@ def run_tasks(
 
 
 def _wait_for_error(future: Any) -> Exception | None:
-    """How a future ended; OptodriveError where the scheduler is gone and it never will."""
+    """Return the exception of a future; raises OptodriveError if the scheduler is lost."""
     error: Exception | None = future.exception()
     if future.status in ("cancelled", "lost"):
-        raise OptodriveError("the Dask scheduler was lost before all was done; nothing is written")
+        raise OptodriveError("the Dask scheduler was lost before all tasks ended; no file is written")
     return error
 
 

@@ -1,4 +1,4 @@
-"""A recording as one long vector of finite samples, in blocks: one signal of one run each."""
+"""Recording as one vector of finite samples, divided into blocks of one signal of one run each."""
 
 from dataclasses import dataclass, replace
 from datetime import datetime
@@ -12,17 +12,17 @@ from optodrive.core.types.measurements import Measurement, Run
 from optodrive.physics.pixel_ode import PixelExperiment
 
 SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad", "mirror_y_rad")
-"""Kinds of signals, by number; the first three are a pixel's."""
+"""Signal kinds by number; the first three belong to a pixel, the others to the mirrors."""
 BoolArray = NDArray[np.bool_]
 PIXEL_KINDS, MIRROR_KINDS = (0, 1, 2), (3, 4)
 FULL_POWER_W = 2.45
 EDGE_EXCLUSION_S = 6e-5
-"""Temperature has a corner at each edge of the light: samples so near to one depend on jitter in no linear way."""
+"""Temperature samples closer to a gate edge are excluded: timing jitter acts nonlinearly on the kink there."""
 
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """One signal of one run: kind as in SIGNALS, its place in the vector, sample times."""
+    """Samples of one signal of one run: kind is an index into SIGNALS, part the slice of the data vector."""
 
     run: int
     kind: int
@@ -33,7 +33,7 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """What is known of a run beside its samples; group: runs that repeat one experiment share it."""
+    """Properties of a run other than its samples; runs that repeat one experiment share a group."""
 
     name: str
     group: str
@@ -44,7 +44,10 @@ class RunInfo:
 
 @dataclass(frozen=True, eq=False)
 class DriveGroup:
-    """Scenes under the same drive: one with all their samples' times, and where each block finds its own."""
+    """Experiments with identical drive: one with the union of all sample times, and the rows of each block therein.
+
+    block_rows: (kind, block number, rows)
+    """
 
     experiment: PixelExperiment
     block_rows: tuple[tuple[int, int, IntArray], ...]
@@ -52,9 +55,11 @@ class DriveGroup:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A recording laid out. alike: the scenes again, repeats together.
+    """Recording in vector form.
 
-    value: [m] temperature rise over the stated ambient, displacement, force, mirror angle; SI
+    experiments: one per run and pixel, with the numbers of its blocks by kind (−1: not measured); drive_groups: the
+    same experiments grouped by drive; value: [m] temperature rise over the stated ambient, displacement, force, mirror
+    angle; SI
     """
 
     runs: tuple[RunInfo, ...]
@@ -65,16 +70,16 @@ class Dataset:
 
     @property
     def kinds(self) -> list[int]:
-        """Kinds of signals that occur."""
+        """Signal kinds that occur, sorted."""
         return sorted({block.kind for block in self.blocks})
 
     @property
     def pixels(self) -> list[int]:
-        """Pixels measured."""
+        """Measured pixels, sorted."""
         return sorted({block.pixel for block in self.blocks if block.kind in PIXEL_KINDS})
 
     def split_subsystems(self) -> list["Dataset"]:
-        """What pixels do and what mirrors do, as far as there is any: they share nothing but the clock."""
+        """Split the data into pixel signals and mirror signals, which share only the clock; empty parts are omitted."""
         subsystems = []
         for kinds in (PIXEL_KINDS, MIRROR_KINDS):
             runs = sorted({block.run for block in self.blocks if block.kind in kinds})
@@ -84,7 +89,7 @@ class Dataset:
 
     @property
     def groups(self) -> dict[str, list[int]]:
-        """Runs of each group, by number."""
+        """Run numbers of each group."""
         by_group: dict[str, list[int]] = {}
         for number, run in enumerate(self.runs):
             by_group.setdefault(run.group, []).append(number)
@@ -92,11 +97,11 @@ class Dataset:
 
     @property
     def contrast_count(self) -> int:
-        """So many runs repeat an earlier one: what the noise model is estimated from."""
+        """Number of runs that repeat an earlier run, from which the noise model is estimated."""
         return len(self.runs) - len(self.groups)
 
     def select(self, runs: list[int], kinds: tuple[int, ...] = (*PIXEL_KINDS, *MIRROR_KINDS)) -> "Dataset":
-        """The same with these runs, and kinds of signals, alone; doses and session times stay as they were."""
+        """Return the data of these runs and signal kinds; doses and session times stay unchanged."""
         new_numbers = {old: number for number, old in enumerate(runs)}
         blocks: list[Block] = []
         values: list[FloatArray] = []
@@ -113,10 +118,10 @@ class Dataset:
             values.append(self.value[block.part])
             offset += count
         experiments = []
-        for scene, places in self.experiments:
-            if any(place in new_blocks for place in places):
-                first, second, third = (new_blocks.get(place, -1) for place in places)
-                experiments.append((scene, (first, second, third)))
+        for experiment, numbers in self.experiments:
+            if any(number in new_blocks for number in numbers):
+                first, second, third = (new_blocks.get(number, -1) for number in numbers)
+                experiments.append((experiment, (first, second, third)))
         return Dataset(
             tuple(self.runs[old] for old in runs),
             tuple(blocks),
@@ -127,14 +132,14 @@ class Dataset:
 
 
 def build_dataset(measurement: Measurement) -> Dataset:
-    """Lay out a recording; InputError where nothing in it can be compared with the model."""
+    """Convert a recording to vector form; raises InputError if it has no finite sample."""
     runs = measurement.runs
     start_times_s = _compute_start_times_s(runs)
     order = np.argsort(start_times_s, kind="stable")
     session_span_s = max(float(start_times_s.max() - start_times_s.min()), 1e-9)
     full_power_w = max([FULL_POWER_W, *(float(run.pulses[:, 2].max()) for run in runs if len(run.pulses))])
     total_doses_j, doses_before_j = _compute_doses_j(runs, order)
-    max_total_j = max([1e-12, *total_doses_j.values()])  # a joule wears one pixel as it wears another
+    max_total_j = max([1e-12, *total_doses_j.values()])  # dose per joule is equal for all pixels
     blocks: list[Block] = []
     experiments: list[tuple[PixelExperiment, tuple[int, int, int]]] = []
     values: list[FloatArray] = []
@@ -155,9 +160,9 @@ def build_dataset(measurement: Measurement) -> Dataset:
             blocks.append(Block(number, kind, signal.pixel, slice(offset, offset + len(value)), signal.t_s[is_used]))
             values.append(value)
             offset += len(value)
-        for pixel, places in by_pixel.items():
-            block_numbers = (places.get(0, -1), places.get(1, -1), places.get(2, -1))
-            times = tuple(blocks[place].t_s if place >= 0 else np.zeros(0) for place in block_numbers)
+        for pixel, by_kind in by_pixel.items():
+            block_numbers = (by_kind.get(0, -1), by_kind.get(1, -1), by_kind.get(2, -1))
+            times = tuple(blocks[number].t_s if number >= 0 else np.zeros(0) for number in block_numbers)
             experiment = PixelExperiment(
                 pulses=run.pulses[np.argsort(run.pulses[:, 0], kind="stable")],
                 pixel=pixel,
@@ -183,16 +188,16 @@ def build_dataset(measurement: Measurement) -> Dataset:
 
 def _group_by_drive(experiments: list[tuple[PixelExperiment, tuple[int, int, int]]]) -> tuple[DriveGroup, ...]:
     by_drive: dict[tuple[bytes, int], list[tuple[PixelExperiment, tuple[int, int, int]]]] = {}
-    for scene, places in experiments:
-        by_drive.setdefault((scene.pulses.tobytes(), scene.pixel), []).append((scene, places))
+    for experiment, numbers in experiments:
+        by_drive.setdefault((experiment.pulses.tobytes(), experiment.pixel), []).append((experiment, numbers))
     groups = []
     for members in by_drive.values():
-        times = [np.unique(np.concatenate([scene.t_s[kind] for scene, _ in members])) for kind in PIXEL_KINDS]
+        times = [np.unique(np.concatenate([experiment.t_s[kind] for experiment, _ in members])) for kind in PIXEL_KINDS]
         rows = tuple(
-            (kind, places[kind], np.searchsorted(times[kind], scene.t_s[kind]))
-            for scene, places in members
+            (kind, numbers[kind], np.searchsorted(times[kind], experiment.t_s[kind]))
+            for experiment, numbers in members
             for kind in PIXEL_KINDS
-            if places[kind] >= 0
+            if numbers[kind] >= 0
         )
         groups.append(DriveGroup(replace(members[0][0], t_s=(times[0], times[1], times[2])), rows))
     return tuple(groups)
@@ -210,18 +215,18 @@ def _build_run_info(run: Run) -> RunInfo:
 
 
 def _compute_start_times_s(runs: tuple[Run, ...]) -> FloatArray:
-    """Start of each run, s: as stated, else one after the other."""
+    """Return the start time of each run, s: the stated one, or the run's number if any run states none."""
     timestamps = [run.attributes.get("started_at") for run in runs]
-    if all(isinstance(word, str) for word in timestamps):
+    if all(isinstance(timestamp, str) for timestamp in timestamps):
         try:
-            return np.array([datetime.fromisoformat(str(word)).timestamp() for word in timestamps])
+            return np.array([datetime.fromisoformat(str(timestamp)).timestamp() for timestamp in timestamps])
         except ValueError:
             pass
     return np.arange(float(len(runs)))
 
 
 def _compute_doses_j(runs: tuple[Run, ...], order: IntArray) -> tuple[dict[int, float], list[dict[int, float]]]:
-    """Energy on each pixel in all, and before each run, J."""
+    """Return the total energy on each pixel, and that before each run, J."""
     accumulated_j: dict[int, float] = {}
     before_j: list[dict[int, float]] = [{} for _ in runs]
     for number in order.tolist():

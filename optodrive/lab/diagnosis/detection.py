@@ -1,9 +1,9 @@
-"""Is there anything to explain, and where? Candidates by score, and an omnibus over bins, both against the noise model.
+"""Detection of model errors: a score per hypothesis and an omnibus test over bins, both under the noise model.
 
-Every candidate is a column beside the base fit, at a finite size; its likelihood ratio follows from one matrix of all
-columns. The level of the best of all candidates comes from draws of the same matrix (bounded numbers and time constants
-that vanish with their effect have no textbook distribution). The noise model is an estimate itself, from as many
-contrasts as runs repeat others: ratios are judged as F with so many degrees below, not as χ².
+Each start of a hypothesis is a column beside the base fit, at a finite size; its likelihood ratio follows from one
+matrix of all columns. The distribution of the best score is simulated with the same matrix, because bounded parameters
+and time constants that vanish with their effect have no textbook distribution. The noise model is an estimate from a
+finite number of contrasts, so ratios are judged by an F distribution with that many denominator degrees, not by χ².
 """
 
 from dataclasses import dataclass
@@ -22,14 +22,15 @@ from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, 
 
 DRAWS = 4000
 NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000
-"""What is known of a lab's noise beforehand counts as so many contrasts; degrees where there is nothing to learn."""
+"""Degrees of freedom of the prior knowledge of noise; degrees of freedom where the noise model counts as known."""
 
 
 @dataclass(frozen=True)
 class Score:
-    """One start of a hypothesis beside the base fit: likelihood ratio, its degrees, amplitudes of its columns.
+    """Best start of a hypothesis beside a fit: likelihood ratio and amplitudes of its columns.
 
-    seen: likelihood ratio that its start's size would give; own: share of its column that nothing else imitates
+    start_ratio: likelihood ratio at the size of the start; independent_fraction: share of the column that is orthogonal
+    to all fitted parameters
     """
 
     hypothesis: Hypothesis
@@ -43,9 +44,9 @@ class Score:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """scores: the best start of every hypothesis, strongest first; p values of the best score and of the omnibus.
+    """Scores of all hypotheses, strongest first, with the p values of the best score and of the omnibus test.
 
-    omnibus, bins: its χ² and degrees; left: χ² of what the fit leaves
+    residual_chi2: χ² of the residuals of the fit
     """
 
     scores: tuple[Score, ...]
@@ -63,7 +64,7 @@ def detect(
     seed: int,
     extra_columns: FloatArray | None = None,
 ) -> Detection:
-    """Score every hypothesis beside a fit (nominal, or with terms already in it), and beside more columns [m, k]."""
+    """Score every hypothesis beside a fit, nominal or extended; extra_columns [m, k] are marginalised too."""
     data = problem.data
     sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
     known = compute_jacobian(problem, base.point, base.free, base.prediction)
@@ -71,7 +72,9 @@ def detect(
         known = np.column_stack([known, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)])
     trials = [(item, start) for item in hypotheses for start in _select_starts(item)]
     terms = [{**base.point.terms, item.key: start} for item, start in trials]
-    effects = [predict(data, ParameterPoint(base.point.base, own), problem.epsilon) - base.prediction for own in terms]
+    effects = [
+        predict(data, ParameterPoint(base.point.base, values), problem.epsilon) - base.prediction for values in terms
+    ]
     candidates = np.stack(effects, axis=1) if effects else np.zeros((len(data.value), 0))
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
@@ -88,7 +91,7 @@ def detect(
 
 
 def count_noise_degrees(data: Dataset) -> int:
-    """Degrees of freedom of the noise model; a mirror's is held above what repeats show, and thus sure."""
+    """Return the degrees of freedom of the noise model; mirror noise, raised above its estimate, counts as known."""
     mirrors = all(kind in MIRROR_KINDS for kind in data.kinds)
     return NOISE_KNOWN_DEGREES if mirrors or not data.contrast_count else NOISE_PRIOR_DEGREES + data.contrast_count
 
@@ -118,12 +121,12 @@ def _compute_scores(
         return [], 1.0
     gram, right = projected[:-1, :-1], projected[:-1, -1]
     best: dict[str, Score] = {}
-    for item, start, places in column_sets:
-        ratio, amplitude = _compute_likelihood_ratio(gram, right, list(places), item.is_linear)
-        last = places[-1]
+    for item, start, indices in column_sets:
+        ratio, amplitude = _compute_likelihood_ratio(gram, right, list(indices), item.is_linear)
+        last = indices[-1]
         start_ratio = float(gram[last, last] * scale[last] ** 2)
-        amplitudes = tuple((amplitude / scale[list(places)]).tolist())
-        score = Score(item, start, ratio, amplitudes, places, start_ratio, float(independent[last]))
+        amplitudes = tuple((amplitude / scale[list(indices)]).tolist())
+        score = Score(item, start, ratio, amplitudes, indices, start_ratio, float(independent[last]))
         if item.label not in best or ratio > best[item.label].ratio:
             best[item.label] = score
     observed = max(_compute_surprisal(score.ratio, len(score.columns), noise_degrees) for score in best.values())
@@ -132,15 +135,15 @@ def _compute_scores(
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     draws = root @ generator.standard_normal((len(gram), DRAWS))
     max_surprisal = np.zeros(DRAWS)
-    for item, _, places in column_sets:
-        rows = list(places)
+    for item, _, indices in column_sets:
+        rows = list(indices)
         solved = solve(gram[np.ix_(rows, rows)], draws[rows])
         ratio_drawn = (draws[rows] * solved).sum(axis=0)
         if not item.is_linear:
             ratio_drawn = np.where(solved[0] > 0.0, ratio_drawn, 0.0)
         max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, len(rows)))
     level = float(np.quantile(max_surprisal, 0.99))
-    # Beyond the draws, the best of so many looks as if it were the best of e^(level) × 1 % independent ones.
+    # Beyond the draws, extrapolate as for the maximum of 1 % × e^level independent scores.
     exceedance = float((max_surprisal >= observed).mean())
     p = (
         max(exceedance, 1.0 / DRAWS)
@@ -155,10 +158,10 @@ def _compute_surprisal(ratio: float, degrees: int, noise_degrees: int) -> float:
 
 
 def _compute_likelihood_ratio(
-    gram: FloatArray, right: FloatArray, places: list[int], either_sign: bool
+    gram: FloatArray, right: FloatArray, indices: list[int], either_sign: bool
 ) -> tuple[float, FloatArray]:
-    inner = gram[np.ix_(places, places)]
-    amplitude = solve(inner, right[places])
+    inner = gram[np.ix_(indices, indices)]
+    amplitude = solve(inner, right[indices])
     if not either_sign and amplitude[0] <= 0.0:
-        return 0.0, np.zeros(len(places))
-    return float(right[places] @ amplitude), amplitude
+        return 0.0, np.zeros(len(indices))
+    return float(right[indices] @ amplitude), amplitude

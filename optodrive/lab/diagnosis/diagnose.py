@@ -1,4 +1,4 @@
-"""A recording to its answer: pixels and mirrors each for themselves, joined; nothing here knows files or words."""
+"""Diagnosis of a recording: pixels and mirrors separately, then combined; independent of files and output formats."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -41,9 +41,9 @@ from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, predict
 
 DETECTABLE_RATIO = 30.0
-"""A likelihood ratio that is found nine times in ten."""
+"""Likelihood ratio of an effect that is detected nine times in ten."""
 MIN_INDEPENDENT_FRACTION = 1e-4
-"""Less of its effect than this left beside the nominal numbers: this data cannot show it."""
+"""Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 TRACE_POINTS = 300
 
 ProgressCallback = Callable[[str], None]
@@ -51,7 +51,7 @@ ProgressCallback = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class _SubsystemFit:
-    """Pixels or mirrors: everything found about them. covariance: of the final numbers, other forms allowed."""
+    """Results for the pixels or for the mirrors; covariance: of the final parameters, discrepancy marginalised."""
 
     data: Dataset
     held_out: Dataset
@@ -72,14 +72,14 @@ def diagnose(
     epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = lambda what: None,
 ) -> Discrepancy:
-    """What the recording says; raises InputError where it holds nothing to compare."""
+    """Diagnose a recording; raises InputError if it has no data to compare with the model."""
     began_s = perf_counter()
     subsystems: list[_SubsystemFit] = []
     for part in build_dataset(measurement).split_subsystems():
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)
         candidates = build_hypotheses(part)
         if subsystems:
-            # One clock for all: what the pixels say of it holds, and a late mirror is a mirror that lags.
+            # All signals share one clock, determined by the pixels; a late mirror then is a lag of the mirror.
             candidates = [item for item in candidates if item.key != "clock_offset"]
         subsystems.append(
             _diagnose_subsystem(
@@ -97,27 +97,31 @@ def diagnose(
     base = (
         dict(zip(BASE_PARAMETERS, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if has_pixels else {}
     )
-    held_out = tuple(sorted({run.name for half in subsystems for run in half.held_out.runs}))
-    fitted = tuple(sorted({run.name for half in subsystems for run in half.data.runs}.difference(held_out)))
-    explained_fractions = [half.verdict.explained_fraction for half in subsystems if half.verdict.verdict != "none"]
+    held_out = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.held_out.runs}))
+    fitted = tuple(sorted({run.name for subsystem in subsystems for run in subsystem.data.runs}.difference(held_out)))
+    explained_fractions = [
+        subsystem.verdict.explained_fraction for subsystem in subsystems if subsystem.verdict.verdict != "none"
+    ]
     return Discrepancy(
         verdict=verdict,
         causes=causes,
         hypothesis_labels=tuple(
             item.label
-            for half in subsystems
-            if half.verdict.chosen is not None
-            for item in half.verdict.chosen.hypotheses
+            for subsystem in subsystems
+            if subsystem.verdict.chosen is not None
+            for item in subsystem.verdict.chosen.hypotheses
         ),
         parameters=parameters,
         base=base,
         terms=terms if verdict == "cause" or verdict == "ambiguous" else {},
-        gain=next((half.gain for half in subsystems if half.verdict.chosen is not None), None),
-        candidates=tuple(item for half in subsystems for item in half.candidates),
-        next_experiment=next((half.next_experiment for half in subsystems if half.next_experiment is not None), None),
+        gain=next((subsystem.gain for subsystem in subsystems if subsystem.verdict.chosen is not None), None),
+        candidates=tuple(item for subsystem in subsystems for item in subsystem.candidates),
+        next_experiment=next(
+            (subsystem.next_experiment for subsystem in subsystems if subsystem.next_experiment is not None), None
+        ),
         fitted_runs=fitted,
         held_out_runs=held_out,
-        residual_traces=tuple(course for half in subsystems for course in _compute_residual_traces(half)),
+        residual_traces=tuple(trace for subsystem in subsystems for trace in _compute_residual_traces(subsystem)),
         remarks=_build_remarks(subsystems),
         explained_fraction=min(explained_fractions, default=0.0),
         elapsed_s=perf_counter() - began_s,
@@ -139,7 +143,7 @@ def _diagnose_subsystem(
     on_progress("noise and nominal model")
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
     if has_replicate_excess(problem):
-        # A jitter acts along the slopes of the true model: a large cause moves them, and repeats seem to differ.
+        # Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ.
         best = find_best_candidate(problem, base, known, seed, on_progress)
         if best is not None:
             other = update_noise(problem, best.fit, min_timing_sigma_s)
@@ -155,32 +159,32 @@ def _diagnose_subsystem(
         candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
         if candidate_gain is not None:
             gains[candidate.label] = candidate_gain.reduction
-    everything = FitProblem(data, problem.noise, prior, epsilon)
-    on_progress("all runs together")
+    all_data = FitProblem(data, problem.noise, prior, epsilon)
+    on_progress("fitting all runs")
     chosen = verdict.chosen
     gain = None if chosen is None else compute_held_out_gain(problem, held_out, base.point, chosen.fit.point, seed)
     start = base if chosen is None else chosen.fit
-    final = fit(everything, start.point, start.free, iterations=6)
-    if all(kind in MIRROR_KINDS for kind in data.kinds):  # jitters may lead astray: each place by its own slopes
+    final = fit(all_data, start.point, start.free, iterations=6)
+    if all(kind in MIRROR_KINDS for kind in data.kinds):  # judge each point by its own jitter sensitivities
         points = (start.point, final.point)
-        final = min((fit(everything, place, start.free, iterations=1) for place in points), key=lambda one: one.chi2)
+        final = min((fit(all_data, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
     if verdict.verdict == "none" and held_out_runs:
-        # What only the hottest runs show is seen with them alone: nothing is held out then.
-        wider = select_causes(everything, final, known, seed, on_progress)
+        # Only the held-out, hottest runs may show an effect: repeat the selection with all runs.
+        wider = select_causes(all_data, final, known, seed, on_progress)
         if wider.verdict != "none":
-            problem, base, held_out, verdict = everything, final, data.select([]), wider
+            problem, base, held_out, verdict = all_data, final, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
     experiment = _propose_experiment(problem, verdict, on_progress)
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
-    covariance = compute_covariance(everything, final, named, known)
+    covariance = compute_covariance(all_data, final, named, known)
     return _SubsystemFit(
         data, held_out, problem, base, verdict, final, covariance, gain, _judge_candidates(verdict, gains), experiment
     )
 
 
 def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
-    """By how much all clocks are late, as far as is known."""
+    """Return the identified common offset of all clocks, s, or 0."""
     for subsystem in subsystems:
         clock = subsystem.final.point.terms.get("clock_offset")
         if "clock_offset" in subsystem.verdict.causes and clock is not None and clock["mirrors"] != 0.0:
@@ -189,14 +193,14 @@ def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
 
 
 def _combine_verdicts(subsystems: list[_SubsystemFit]) -> tuple[str, tuple[str, ...]]:
-    """The verdict on all: as weak as its weakest part; a part without anything to explain does not weaken it."""
-    verdicts = [half.verdict for half in subsystems if half.verdict.verdict != "none"]
+    """Return the weakest verdict of the subsystems that have an error, with all their causes."""
+    verdicts = [subsystem.verdict for subsystem in subsystems if subsystem.verdict.verdict != "none"]
     if not verdicts:
         return "none", ()
     causes = tuple(dict.fromkeys(cause for item in verdicts for cause in item.causes))
-    for word in ("unexplained", "ambiguous"):
-        if any(item.verdict == word for item in verdicts):
-            return word, causes if word == "ambiguous" else ()
+    for verdict in ("unexplained", "ambiguous"):
+        if any(item.verdict == verdict for item in verdicts):
+            return verdict, causes if verdict == "ambiguous" else ()
     return "cause", causes
 
 
@@ -226,13 +230,13 @@ def _judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candid
     for score in verdict.nominal_detection.scores:
         item = score.hypothesis
         if chosen is not None and item.label in {part.label for part in chosen.hypotheses}:
-            judgement = "named" if verdict.verdict == "cause" else "cannot be told apart"
+            judgement = "identified" if verdict.verdict == "cause" else "indistinguishable"
         elif item.key in verdict.causes:
-            judgement = "cannot be told apart" if verdict.verdict == "ambiguous" else "another form of a named cause"
+            judgement = "indistinguishable" if verdict.verdict == "ambiguous" else "alternative form"
         elif score.independent_fraction < MIN_INDEPENDENT_FRACTION:
-            judgement = "this data cannot show it"
+            judgement = "not observable"
         else:
-            judgement = "nothing of it seen" if score.ratio < DETECTABLE_RATIO else "ruled out"
+            judgement = "not detected" if score.ratio < DETECTABLE_RATIO else "ruled out"
         p_value = min(1.0, tests * float(chi_squared.sf(score.ratio, len(score.columns))))
         out.append(
             CandidateCause(
@@ -249,13 +253,13 @@ def _judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candid
 
 
 def _describe_detection_limit(score: Score) -> str:
-    """The size that would have been seen, in words."""
+    """Return the smallest detectable size as text."""
     if score.hypothesis.key == "mirror_lag":
-        return "any lag of the mirrors beyond half a sample"
+        return "mirror lag of more than subsystem a sample"
     free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
     start = score.start.get(free.names[0], 0.0) or 1.0
     if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:
-        return "not visible in this data"
+        return "not observable"
     size = abs(start) * float(np.sqrt(DETECTABLE_RATIO / score.start_ratio))
     if size > 3.0 * free.parameter.high:
         return f"more than {free.parameter.high:g} {free.parameter.unit}"
@@ -263,7 +267,7 @@ def _describe_detection_limit(score: Score) -> str:
 
 
 def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: ProgressCallback) -> NextExperiment | None:
-    """For rivals that this data cannot tell apart: what would."""
+    """Return the experiment that separates the best candidate from its first rival, if the verdict is ambiguous."""
     if verdict.verdict != "ambiguous" or not verdict.candidates:
         return None
     best = verdict.candidates[0]
@@ -279,17 +283,17 @@ def _propose_experiment(problem: FitProblem, verdict: Verdict, on_progress: Prog
 
 
 def _compute_residual_traces(subsystem: _SubsystemFit) -> list[ResidualTrace]:
-    """Each group's mean residuals per signal, thinned, in units of the white noise."""
+    """Return each group's mean residuals per signal, thinned, in units of the white noise."""
     data = subsystem.data
     nominal = predict(data, subsystem.base.point, subsystem.problem.epsilon)
     extended = predict(data, subsystem.final.point, subsystem.problem.epsilon)
-    seen: set[tuple[str, int]] = set()
+    done: set[tuple[str, int]] = set()
     out = []
     for block in data.blocks:
         group = data.runs[block.run].group
-        if (group, block.kind) in seen:
+        if (group, block.kind) in done:
             continue
-        seen.add((group, block.kind))
+        done.add((group, block.kind))
         stride = max(1, len(block.t_s) // TRACE_POINTS)
         edges = np.arange(0, len(block.t_s), stride)
         count = np.diff(np.append(edges, len(block.t_s)))
@@ -306,20 +310,19 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
     for subsystem in subsystems:
         if subsystem.problem.noise.replicate_excess > MAX_REPLICATE_EXCESS:
             out.append(
-                "Runs that should repeat one experiment differ by far more than noise and jitter: something "
-                "changes from run to run."
+                "Repeats of one experiment differ by far more than noise and jitter: something changes from run to run."
             )
         if subsystem.problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS:
-            out.append("Repeats differ more while lit: the power is unsteady within pulses.")
+            out.append("Repeats differ more during pulses: the power fluctuates within pulses.")
         if not subsystem.problem.noise.from_replicates:
-            out.append("No run repeats another: the noise is a guess, so nothing is named for certain.")
+            out.append("No run repeats another: the noise is only guessed, so no cause is certain.")
         if subsystem.verdict.chosen is not None and subsystem.verdict.residual_detection is not None:
             detection = subsystem.verdict.residual_detection
             if subsystem.verdict.verdict == "cause" and detection.p_omnibus < 1e-3:
                 causes = " and ".join(subsystem.verdict.causes)
                 out.append(
-                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of what was wrong stays, for the cause acts in a form "
-                    "a little other than the term's."
+                    f"{causes}: {1 - subsystem.verdict.explained_fraction:.1%} of the error remains, because the real "
+                    "effect deviates slightly from the form of its term."
                 )
         out += _describe_range_limits(subsystem.final)
     return tuple(dict.fromkeys(out))
@@ -332,7 +335,7 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
         if _is_shape_parameter(free):
             continue
         if value >= 0.999 * free.parameter.high or (free.parameter.low > 0 and value <= 1.001 * free.parameter.low):
-            out.append(f"{free.label} came out at the end of its plausible range, {value:g} {free.parameter.unit}.")
+            out.append(f"{free.label} is at the limit of its plausible range, {value:g} {free.parameter.unit}.")
     return out
 
 

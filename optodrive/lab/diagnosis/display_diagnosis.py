@@ -1,4 +1,4 @@
-"""A whole display, each pixel for itself: its task, its answer, and what the answers have in common."""
+"""Diagnosis of a whole display pixel by pixel: task, answer, and groups of equal answers."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -16,12 +16,12 @@ from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
 MAX_JOINT_PIXELS = 4
-"""So many pixels are fitted together, as one set of numbers; of more, each for itself."""
+"""Maximum number of pixels that are fitted together with one set of parameters; more are fitted separately."""
 
 
 @dataclass(frozen=True)
 class PixelTask:
-    """One pixel to be diagnosed, wherever that is done. pixel: None for the mirrors; read: gives its own runs."""
+    """Diagnosis of one pixel, for any worker; pixel: None for the mirrors; read: reads the pixel's runs."""
 
     pixel: int | None
     read: Callable[[], Measurement]
@@ -31,7 +31,7 @@ class PixelTask:
 
 @dataclass(frozen=True, eq=False)
 class PixelAnswer:
-    """What was found, without courses; or why nothing was. width_m: the bridge's, where it is known."""
+    """Diagnosis of one pixel without residual traces, or the error that prevented it; width_m: if known."""
 
     pixel: int | None
     discrepancy: Discrepancy | None
@@ -41,7 +41,7 @@ class PixelAnswer:
 
 @dataclass(frozen=True)
 class PixelSpread:
-    """A number over pixels."""
+    """Median and range of a value over pixels."""
 
     median: float
     low: float
@@ -50,13 +50,13 @@ class PixelSpread:
 
     @classmethod
     def from_values(cls, values: list[float], unit: str) -> "PixelSpread":
-        """Median and range."""
+        """Return median and range of values."""
         return cls(float(np.median(values)), min(values), max(values), unit)
 
 
 @dataclass(frozen=True, eq=False)
 class PixelGroup:
-    """Pixels with the same verdict and causes. parameters: of named causes; gain: reductions on held-out runs."""
+    """Pixels with the same verdict and causes; parameters: of the named causes; gain: reduction on held-out runs."""
 
     verdict: str
     causes: tuple[str, ...]
@@ -66,13 +66,13 @@ class PixelGroup:
 
     @property
     def pixels(self) -> list[int]:
-        """Sorted."""
+        """Pixel indices, sorted."""
         return sorted(item.pixel for item in self.answers if item.pixel is not None)
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayAnswer:
-    """All answers. pixels: by index; mirrors: where they were measured."""
+    """Answers of all pixels, sorted by index, and of the mirrors where they were measured."""
 
     pixels: tuple[PixelAnswer, ...]
     mirrors: PixelAnswer | None
@@ -80,11 +80,11 @@ class DisplayAnswer:
 
     @property
     def failed(self) -> list[PixelAnswer]:
-        """Pixels without an answer."""
+        """Answers that are errors."""
         return [item for item in self.pixels if item.discrepancy is None]
 
     def build_groups(self) -> list[PixelGroup]:
-        """Pixels that suffer from the same, most pixels first; nothing found is a group too."""
+        """Return the pixels grouped by verdict and causes, largest group first."""
         by_causes: dict[tuple[str, tuple[str, ...]], list[PixelAnswer]] = {}
         for item in self.pixels:
             if item.discrepancy is not None:
@@ -95,19 +95,20 @@ class DisplayAnswer:
         return sorted(groups, key=lambda item: (-len(item.answers), item.verdict, item.causes))
 
     def build_model(self) -> tuple[Discrepancy | None, float | None, str]:
-        """One pixel model for the display, its bridge width, and what it stands for; or None and why there is none.
+        """Return one pixel model of the display, its bridge width and its description; or None, None and the reason.
 
-        Medians over the pixels of the largest group, if that is more than half of all and has a definite verdict.
+        The model has the medians over the largest group, provided that it holds more than half of all pixels and has a
+        definite verdict.
         """
         groups = self.build_groups()
         largest = groups[0] if groups else None
         if largest is None or 2 * len(largest.answers) <= len(self.pixels):
-            return None, None, "no one set of causes holds for most pixels"
+            return None, None, "no set of causes holds for most pixels"
         if largest.verdict not in ("none", "cause"):
             return None, None, f"most pixels are {largest.verdict}"
         widths_m = {item.width_m for item in largest.answers}
         if len(widths_m) > 1:
-            return None, None, "the pixels' bridges differ in width"
+            return None, None, "the bridge widths of the pixels differ"
         discrepancies = [
             item.discrepancy for item in largest.answers if item.discrepancy is not None and item.discrepancy.base
         ]
@@ -122,7 +123,7 @@ class DisplayAnswer:
 
 
 def diagnose_pixel(task: PixelTask) -> PixelAnswer:
-    """One task done; bad data become its error."""
+    """Run one task; invalid data yield an answer with an error."""
     try:
         measurement = task.read()
         prior, epsilon, width_m = build_prior(measurement, task.config)
@@ -133,7 +134,7 @@ def diagnose_pixel(task: PixelTask) -> PixelAnswer:
 
 
 def compile_kernels() -> None:
-    """Compile what a diagnosis needs, so that workers find it compiled."""
+    """Compile all kernels that a diagnosis needs, so that workers load them from the cache."""
     t_s = np.array([0.01, 0.02])
     experiment = PixelExperiment(np.array([[0.0, 0.01, 1.0, 0.0]]), 0, 293.15, (t_s, t_s, t_s))
     simulate_signals(experiment, load_parameters(DEFAULT_PARAMETER_SET).build_pixel(4e-4), ActiveTerms.from_values({}))

@@ -1,4 +1,4 @@
-"""A display's answer in plain words, and as JSON."""
+"""Diagnosis of a display as narrative text and as JSON."""
 
 from importlib.metadata import version
 from itertools import pairwise
@@ -8,11 +8,11 @@ from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer
 from optodrive.lab.diagnosis.narrative import CAUSE_PHRASES, build_answer, build_narrative, format_quantity
 
 MAX_ERRORS = 6
-"""So many errors are told one by one."""
+"""Maximum number of errors listed individually."""
 
 
 def build_display_narrative(answer: DisplayAnswer) -> list[str]:
-    """How many pixels suffer from what, which, how much, what mending gains; then what has no answer."""
+    """Return the lines of the narrative: headline, groups with parameters and gain, errors, mirrors and model."""
     groups = answer.build_groups()
     lines = [build_headline(answer), ""]
     for group in groups:
@@ -23,7 +23,7 @@ def build_display_narrative(answer: DisplayAnswer) -> list[str]:
         if group.gain is not None:
             gain = group.gain
             lines.append(
-                f"  Of the avoidable error on held-out runs, {gain.median:.0%} goes "
+                f"  The extended model removes {gain.median:.0%} of the avoidable error on held-out runs "
                 f"(median; from {gain.low:.0%} to {gain.high:.0%})."
             )
     failed = answer.failed
@@ -42,41 +42,44 @@ def build_display_narrative(answer: DisplayAnswer) -> list[str]:
 
 
 def build_headline(answer: DisplayAnswer) -> str:
-    """One sentence."""
+    """Return a one-sentence summary."""
     counts = [
-        (sum(item.verdict == word for item in _list_discrepancies(answer)), word) for word in ("cause", "ambiguous")
+        (sum(item.verdict == verdict for item in _list_discrepancies(answer)), verdict)
+        for verdict in ("cause", "ambiguous")
     ]
     wrong = [
-        f"{count} with {'a named cause' if word == 'cause' else 'rival causes'}" for count, word in counts if count
+        f"{count} with {'a named cause' if verdict == 'cause' else 'rival causes'}"
+        for count, verdict in counts
+        if count
     ]
     unexplained = sum(item.verdict == "unexplained" for item in _list_discrepancies(answer))
     wrong += [f"{unexplained} with no known cause"] if unexplained else []
     total = sum(item.verdict != "none" for item in _list_discrepancies(answer))
-    of = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed for itself,"
+    prefix = f"Of {format_pixel_count(len(answer.pixels))}, each diagnosed separately,"
     if not total:
-        return f"{of} none shows anything that the nominal model gets wrong."
-    return f"{of} {total} show that the nominal model is wrong: {', '.join(wrong)}."
+        return f"{prefix} none shows an error of the nominal model."
+    return f"{prefix} {total} show an error of the nominal model: {', '.join(wrong)}."
 
 
 def describe_group(group: PixelGroup) -> str:
-    """What a group suffers from, in words and keys."""
+    """Return the causes of a group as text with their keys."""
     named = [f"{CAUSE_PHRASES.get(key, key)} ({key})" for key in group.causes]
     if group.verdict == "none":
-        return "nothing found"
+        return "no error found"
     if group.verdict == "cause":
         return " and ".join(named)
     if group.verdict == "ambiguous" and named:
-        return f"cannot be told apart: {'; or '.join(named)}"
-    return "something is wrong, and none of the known causes explains it"
+        return f"indistinguishable: {'; or '.join(named)}"
+    return "an error that no known cause explains"
 
 
 def format_pixel_count(pixels: int) -> str:
-    """As words."""
+    """Return a number of pixels as text."""
     return f"{pixels:,} pixel{'s' if pixels != 1 else ''}"
 
 
 def format_ranges(pixels: list[int]) -> str:
-    """3, 7, 12 to 15."""
+    """Return sorted pixel indices as text, such as "3, 7, 12 to 15"."""
     breaks = [at for at, (one, two) in enumerate(pairwise(pixels), start=1) if two != one + 1]
     runs = [pixels[a:b] for a, b in pairwise([0, *breaks, len(pixels)])]
     return ", ".join(
@@ -84,15 +87,17 @@ def format_ranges(pixels: list[int]) -> str:
     )
 
 
-def build_display_answer(found: DisplayAnswer) -> dict[str, Any]:
-    """JSON: a summary, and under each pixel's index what a recording of it alone would have as its answer."""
-    model, _, reason = found.build_model()
+def build_display_answer(answer: DisplayAnswer) -> dict[str, Any]:
+    """Return JSON values: a summary, and per pixel index the same answer as for a recording of that pixel only."""
+    model, _, reason = answer.build_model()
     verdicts = ("none", "cause", "ambiguous", "unexplained")
     return {
         "summary": {
-            "pixels": len(found.pixels),
-            "verdicts": {word: sum(item.verdict == word for item in _list_discrepancies(found)) for word in verdicts},
-            "errors": _list_indices(found.failed),
+            "pixels": len(answer.pixels),
+            "verdicts": {
+                verdict: sum(item.verdict == verdict for item in _list_discrepancies(answer)) for verdict in verdicts
+            },
+            "errors": _list_indices(answer.failed),
             "groups": [
                 {
                     "verdict": group.verdict,
@@ -101,13 +106,13 @@ def build_display_answer(found: DisplayAnswer) -> dict[str, Any]:
                     "parameters": {name: _spread_to_json(item) for name, item in group.parameters.items()},
                     "gain": None if group.gain is None else _spread_to_json(group.gain),
                 }
-                for group in found.build_groups()
+                for group in answer.build_groups()
             ],
-            "model": {"written": model is not None, "why": reason},
+            "model": {"written": model is not None, "reason": reason},
         },
-        "pixels": {str(item.pixel): _build_entry(item) for item in found.pixels},
-        "mirrors": None if found.mirrors is None else _build_entry(found.mirrors),
-        "seconds": found.elapsed_s,
+        "pixels": {str(item.pixel): _build_entry(item) for item in answer.pixels},
+        "mirrors": None if answer.mirrors is None else _build_entry(answer.mirrors),
+        "elapsed_s": answer.elapsed_s,
         "version": version("optodrive"),
     }
 
@@ -119,8 +124,8 @@ def _build_entry(item: PixelAnswer) -> dict[str, Any]:
     return {**build_answer(item.discrepancy), "error": None}
 
 
-def _list_discrepancies(found: DisplayAnswer) -> list[Any]:
-    return [item.discrepancy for item in found.pixels if item.discrepancy is not None]
+def _list_discrepancies(answer: DisplayAnswer) -> list[Any]:
+    return [item.discrepancy for item in answer.pixels if item.discrepancy is not None]
 
 
 def _list_indices(answers: list[PixelAnswer]) -> list[int]:

@@ -1,4 +1,4 @@
-"""The report on a display: a map of what each pixel suffers from, and a table; one HTML file, without scripts."""
+"""Report on a display: a map of the pixels' verdicts and a table, in one HTML file without scripts."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from optodrive.lab.diagnosis.display_narrative import (
 from optodrive.lab.diagnosis.narrative import format_quantity
 
 COLOURS = ("#e69f00", "#56b4e9", "#009e73", "#f0e442", "#5e9bd6", "#d55e00", "#cc79a7", "#b39ddb")
-"""Told apart by colour-blind readers too (Okabe and Ito's, lightened for the letters on them)."""
+"""Palette of Okabe and Ito, distinguishable by colour-blind readers, lightened for the letters on it."""
 LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 CELL_PX = 20
 NOTHING_COLOUR, UNCERTAIN_COLOUR, FAILED_COLOUR = "#e8e8e8", "#bdbdbd", "#ffffff"
@@ -26,7 +26,7 @@ NOTHING_COLOUR, UNCERTAIN_COLOUR, FAILED_COLOUR = "#e8e8e8", "#bdbdbd", "#ffffff
 
 @dataclass(frozen=True)
 class PixelMark:
-    """How pixels of one kind are drawn, and what that means."""
+    """Letter and colour of the pixels of one group, with their meaning."""
 
     letter: str
     colour: str
@@ -34,23 +34,22 @@ class PixelMark:
 
 
 def build_display_report(answer: DisplayAnswer, title: str, config: Config | None) -> str:
-    """HTML. config: says where pixels lie."""
+    """Return the report as HTML; config: provides the pixel layout."""
+    columns = ("pixel", "verdict", "parameters, 95 %", "gain")
     marks = _assign_marks(answer)
     positions, caption = _place_pixels(answer, config)
     body = [
-        f"<h2>Map</h2><p>{escape(caption)} Each mark tells its pixel's answer where the pointer rests.</p>",
+        f"<h2>Map</h2><p>{escape(caption)} Hover over a mark for the pixel's answer.</p>",
         _draw_map(answer, marks, positions),
-        render_table(("", "pixels", "", "which"), _build_legend(answer, marks), frozenset({1})),
+        render_table(("", "pixels", "meaning", "indices"), _build_legend(answer, marks), frozenset({1})),
         "<h2>Pixels</h2>",
-        render_table(
-            ("pixel", "verdict", "sizes, 95 %", "gain"), (_build_row(item) for item in answer.pixels), frozenset({0})
-        ),
+        render_table(columns, (_build_row(item) for item in answer.pixels), frozenset({0})),
     ]
     return render_page(title, build_headline(answer), build_display_narrative(answer), body)
 
 
 def _assign_marks(answer: DisplayAnswer) -> dict[int, PixelMark]:
-    """Of each pixel: a letter and a colour for each set of causes, signs for what has none."""
+    """Return the mark of each pixel: a letter and a colour per set of causes, and signs for other verdicts."""
     out = {
         item.pixel: PixelMark("×", FAILED_COLOUR, "without an answer")
         for item in answer.failed
@@ -74,14 +73,14 @@ def _build_sign(group: PixelGroup) -> PixelMark:
 
 
 def _place_pixels(answer: DisplayAnswer, config: Config | None) -> tuple[dict[int, tuple[int, int]], str]:
-    """Column and row, from the top, of every place drawn; and which lattice that is."""
+    """Return column and row from the top of every drawn pixel, and a caption for the layout."""
     measured = [item.pixel for item in answer.pixels if item.pixel is not None]
     if config is not None and max(measured) < (layout := len(build_pixel_layout(config.display))):
         row, column = build_pixel_layout(config.display).row, build_pixel_layout(config.display).column
         positions = {pixel: (int(column[pixel]), config.display.rows - 1 - int(row[pixel])) for pixel in range(layout)}
-        return positions, f"Pixels where they lie on {config.name}, seen from the front; empty: not measured."
+        return positions, f"Pixels at their places on {config.name}, front view; empty: not measured."
     side = ceil(sqrt(len(measured)))
-    reason = "no place is known" if config is None else f"{config.name} has no pixel {max(measured)}"
+    reason = "no layout is known" if config is None else f"{config.name} has no pixel {max(measured)}"
     positions = {pixel: (at % side, at // side) for at, pixel in enumerate(measured)}
     return positions, f"Pixels by index, row by row from the top left; {reason}."
 
@@ -134,7 +133,7 @@ def _build_row(item: PixelAnswer) -> tuple[str, ...]:
 
 
 def _format_parameters(discrepancy: Discrepancy) -> list[str]:
-    """The causes' numbers with their intervals."""
+    """Return the parameters of the causes with their intervals."""
     return [
         f"{name} {format_quantity(item.value, item.unit)} "
         f"({format_quantity(item.low, item.unit)} to {format_quantity(item.high, item.unit)})"

@@ -1,4 +1,4 @@
-"""Generalised least squares: the nominal parameters, and free numbers of terms, under the noise model and priors."""
+"""Generalised least squares for base parameters and free term parameters under the noise model and priors."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -14,15 +14,15 @@ from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, 
 
 BASE_LOG_STEP = 1e-3
 BASE_LOG_SPAN = 1.8
-"""Logarithm of the factor by which a base parameter may leave its prior: a gas ever quicker would take ever longer."""
+"""Maximum deviation of a base parameter's logarithm from its prior; a very short gas time constant costs many steps."""
 POWER_STEP, DELAY_STEP_S = 5e-3, 1e-5
 CHI2_CONVERGED = 0.02
-"""A step that promises less χ² than this is the last."""
+"""Predicted or achieved decrease of χ² below which the iteration ends."""
 
 
 @dataclass(frozen=True)
 class BaseParameterPrior:
-    """Of the logarithms of the base parameters."""
+    """Normal prior of the logarithms of the base parameters."""
 
     mean: tuple[float, ...]
     sigma: tuple[float, ...]
@@ -30,7 +30,7 @@ class BaseParameterPrior:
 
 @dataclass(frozen=True, eq=False)
 class JitterSensitivity:
-    """[m] each: the prediction's change with the logarithm of the power, and with a delay, per second."""
+    """Derivatives of the prediction [m] with respect to the logarithm of the power and to a delay, per second."""
 
     power: FloatArray
     timing: FloatArray
@@ -38,7 +38,10 @@ class JitterSensitivity:
 
 @dataclass(frozen=True, eq=False)
 class ModelFit:
-    """chi2: with priors; covariance: of base then free, as fitted; gram: [runs, k + 1, k + 1], the residual last."""
+    """Result of a fit.
+
+    chi2: with priors; covariance: of base, then free parameters; gram: [runs, k + 1, k + 1], the residual last
+    """
 
     point: ParameterPoint
     free: tuple[FreeParameter, ...]
@@ -50,7 +53,7 @@ class ModelFit:
 
 @dataclass(frozen=True, eq=False)
 class FitProblem:
-    """Everything that stays while models are fitted."""
+    """Data, noise model and prior of a fit."""
 
     data: Dataset
     noise: NoiseModel
@@ -61,7 +64,7 @@ class FitProblem:
 def compute_jitter_sensitivity(
     data: Dataset, point: ParameterPoint, epsilon: float, prediction: FloatArray
 ) -> JitterSensitivity:
-    """By differences."""
+    """Compute the sensitivities to power and timing by finite differences."""
     more_power = predict(data, point, epsilon, power_factor=1.0 + POWER_STEP)
     later = predict(data, point, epsilon, delay_s=DELAY_STEP_S)
     earlier = predict(data, point, epsilon, delay_s=-DELAY_STEP_S)
@@ -71,7 +74,7 @@ def compute_jitter_sensitivity(
 def apply_step(
     problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter], step: FloatArray
 ) -> ParameterPoint:
-    """The point after a step in base and free numbers, within their ranges."""
+    """Return the point after a step in base and free parameters, clipped to their ranges."""
     centre = np.array(problem.prior.mean)
     stepped = np.add(point.base, np.clip(step[: len(BASE_PARAMETERS)], -0.5, 0.5))
     base = tuple(np.clip(stepped, centre - BASE_LOG_SPAN, centre + BASE_LOG_SPAN).tolist())
@@ -86,7 +89,7 @@ def apply_step(
 def compute_jacobian(
     problem: FitProblem, point: ParameterPoint, free: Sequence[FreeParameter], prediction: FloatArray
 ) -> FloatArray:
-    """[m, k] derivatives with base and free numbers."""
+    """Compute derivatives [m, k] with respect to base and free parameters by finite differences."""
     columns = np.empty((len(prediction), len(BASE_PARAMETERS) + len(free)))
     for row in range(len(BASE_PARAMETERS)):
         base = list(point.base)
@@ -112,9 +115,9 @@ def fit(
     iterations: int = 12,
     chi2_abandon: float = np.inf,
 ) -> ModelFit:
-    """From a point to the nearest minimum, by Gauss–Newton with shorter steps where one was too long.
+    """Minimise χ² from a point by Gauss–Newton with step reduction.
 
-    hopeless: a χ² that it must promise to come below to be worth going on, from the second step on.
+    chi2_abandon: from the second step on, the fit ends early if its predicted χ² stays above this value.
     """
     data, count = problem.data, len(BASE_PARAMETERS) + len(free)
     prediction = predict(data, point, problem.epsilon)

@@ -1,4 +1,4 @@
-"""What an extension gains on runs that it was not fitted to."""
+"""Gain of an extended model on runs that were held out of its fit."""
 
 from dataclasses import replace
 
@@ -13,13 +13,13 @@ from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 
 BOOTSTRAP_DRAWS = 400
 MIN_EXCESS_SIGMA = 4.0
-"""Less excess than so many σ in held-out runs says nothing of any gain."""
+"""Minimum significance, in σ, of the nominal model's error in held-out runs for a gain to be stated."""
 
 
 def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
-    """Runs to fit, and runs held out: whole groups, of each kind of experiment one in four, the hottest first.
+    """Return the runs to fit and the runs to hold out: one in four groups of each kind of experiment, hottest first.
 
-    Kinds: a neighbour lit, mirrors, trains, single pulses. A kind with fewer than three groups is fitted whole.
+    Kinds are neighbour pulsed, mirrors, trains and single pulses; a kind with fewer than three groups is not held out.
     """
     kinds: dict[str, list[tuple[float, str]]] = {}
     drive_counts: dict[bytes, int] = {}
@@ -36,7 +36,7 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
         kinds.setdefault(f"{kind} {sorted(measured)}", []).append((energy_j, name))
     held_out: list[str] = []
     for members in kinds.values():
-        # The same drive early and late shows what ages: neither is spared.
+        # A drive repeated early and late shows ageing and is never held out.
         eligible = [
             (energy_j, name)
             for energy_j, name in sorted(members, reverse=True)
@@ -52,10 +52,11 @@ def split_runs(data: Dataset) -> tuple[list[int], list[int]]:
 def compute_held_out_gain(
     problem: FitProblem, data: Dataset, nominal: ParameterPoint, extended: ParameterPoint, seed: int
 ) -> HeldOutGain | None:
-    """Both models on held-out runs; None where there are none, or where they show nothing of what is wrong.
+    """Compare both models on held-out runs; return None if no held-out run shows an error of the nominal model.
 
-    The reduction is of residuals averaged over repeats in bins of time: what a model misses is far below the noise of
-    one sample. Its interval is cut at −1: draws of groups that hardly show the effect give any number.
+    The reduction is that of residuals averaged over repeats in time bins, because model errors lie far below the noise
+    of one sample. Its interval is clipped at −1: bootstrap draws of groups that hardly show the effect give arbitrary
+    ratios.
     """
     if not len(data.value):
         return None
@@ -94,14 +95,14 @@ def compute_held_out_gain(
 
 
 def _compute_reduction(chi2_pairs: FloatArray) -> float:
-    """From [before and after, groups, 2] χ² and degrees; the floor is χ² = degrees."""
+    """Return the reduction from [nominal and extended, groups, 2] χ² and degrees; the floor is χ² = degrees."""
     (nominal, degrees), (extended, _) = chi2_pairs.sum(axis=1)
     rms_nominal, rms_extended = np.sqrt(nominal / degrees), np.sqrt(max(extended, degrees) / degrees)
     return float((rms_nominal - rms_extended) / max(rms_nominal - 1.0, 1e-9))
 
 
 def _compute_noise_floor2(problem: FitProblem, point: ParameterPoint) -> FloatArray:
-    """Expected square of a residual of the true model: [m]."""
+    """Return the expected square of each residual of the true model, [m]."""
     data, noise = problem.data, problem.noise
     sensitivity = compute_jitter_sensitivity(data, point, problem.epsilon, predict(data, point, problem.epsilon))
     out = (noise.power_sigma * sensitivity.power) ** 2 + (noise.timing_sigma_s * sensitivity.timing) ** 2

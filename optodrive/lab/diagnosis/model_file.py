@@ -1,4 +1,4 @@
-"""The extended model as a parameter file that planner and daemon load as it is."""
+"""Extended model as a parameter file that planner and daemon load unchanged."""
 
 from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.physics.terms import discover_terms
@@ -8,9 +8,9 @@ VALUE_UNITS = {"tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
 def build_model_toml(discrepancy: Discrepancy, recording: str, width_m: float, estimator: str = "") -> str:
-    """TOML of format optodrive-parameters, version 1.
+    """Return TOML of format optodrive-parameters, version 1.
 
-    width_m: of the bridge the recording was made with; what: the numbers are, where they are not of one fit
+    width_m: bridge width of the recorded pixel; estimator: how values were combined, where they are not of a single fit
     """
     base, source = discrepancy.base, f'source = "fitted on {_sanitize(recording)}"'
     claim = "; ".join(

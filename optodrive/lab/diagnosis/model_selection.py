@@ -1,4 +1,4 @@
-"""Which cause: refitted candidates ranked, a verdict, a second cause where one is not enough, and what stays alike."""
+"""Selection of the causes: refits ranked by BIC, a verdict, a second cause where one is insufficient, and rivals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,37 +13,37 @@ from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 
 FAMILY_ALPHA = 0.001
-"""Level of the whole family. False alarms are to stay below 1 %, and the noise model is itself an estimate."""
+"""Significance level of the family of tests: keeps false alarms below 1 % although the noise model is an estimate."""
 MAX_REPLICATE_EXCESS = 6.0
-"""Repeats that differ by more than this do not repeat one experiment."""
+"""Maximum replicate excess, in σ, for runs of one group to count as repeats."""
 MAX_INTRA_PULSE_POWER_EXCESS = 25.0
-"""Likewise, as if the power changed within pulses."""
+"""Maximum significance, in σ, of power changes within pulses."""
 CHI2_ABANDON = 300.0
-"""A fit that does not promise to come within so much χ² of the best one is given up."""
+"""A fit that is predicted to stay this far above the best χ² is abandoned."""
 MAX_REFITS = 9
-"""So many of the strongest hypotheses are refitted."""
+"""Number of the strongest hypotheses that are refitted."""
 BIC_INDISTINGUISHABLE = 10.0
-"""Rivals whose BIC is within this of the best one's cannot be told apart: odds of less than about 150.
+"""Rivals within this BIC difference of the best cannot be told apart: odds below about 150.
 
-No more, or a rival that only imitates the best one with a number more, which costs ln samples, would stay for ever.
+A larger value would keep rivals that imitate the best one with one more parameter, which costs ln samples.
 """
 CHI2_EQUIVALENT = 9.0
-"""Predictions that differ by less χ² than this are one prediction."""
+"""Predictions that differ by less χ² than this are equivalent."""
 MIN_EXPLAINED, MIN_EXPLAINED_BY_TERM = 0.9, 0.5
-"""A cause is named for so much of the excess; for less, if other forms of it take the rest."""
+"""Share of the excess that a named cause explains; the share that suffices if its discrepancy basis takes the rest."""
 MIN_EXPLAINED_OTHER_FORM = 0.985
-"""A cause in another form than its term's leaves a rest: it is still named if so much of the excess is explained."""
+"""A cause with significant residuals is still named if it explains this share of the excess."""
 MAX_STARTS, MAX_RESTARTS = 6, 6
-"""So many starts are tried of a hypothesis with many, each fitted again so often at most."""
+"""Number of starts refitted of a hypothesis with many, and maximum number of restarts of each."""
 MAX_SECOND_CAUSES, MAX_FIRST_CAUSES = 4, 2
-"""So many second causes are refitted beside each of so many best first ones."""
+"""Number of second causes refitted beside each of the best first causes, and number of those."""
 
 ProgressCallback = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class RefittedCandidate:
-    """One or two hypotheses, refitted. bic: χ² and the price of the free numbers."""
+    """One or two hypotheses, refitted; bic: χ² plus ln samples per free parameter."""
 
     hypotheses: tuple[Hypothesis, ...]
     fit: ModelFit
@@ -51,20 +51,21 @@ class RefittedCandidate:
 
     @property
     def causes(self) -> tuple[str, ...]:
-        """Keys."""
+        """Keys of the causes."""
         return tuple(item.key for item in self.hypotheses)
 
     @property
     def label(self) -> str:
-        """In words."""
+        """Labels of the hypotheses, joined."""
         return " and ".join(item.label for item in self.hypotheses)
 
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """verdict, causes: as in the answer; chosen: the model to go on with; candidates: best first.
+    """Verdict on a subsystem.
 
-    first, rest: detection beside the nominal fit, and beside the chosen model; explained: share of the excess
+    chosen: the model for all later steps; candidates: best first; nominal_detection, residual_detection: beside the
+    nominal fit and beside the chosen model; explained_fraction: share of the detected excess
     """
 
     verdict: str
@@ -77,12 +78,12 @@ class Verdict:
 
 
 def is_rejected(detection: Detection) -> bool:
-    """Whether the family rejects what was fitted: the better of two tests, at half the level each."""
+    """Return whether the better of the two tests, at half the level each, rejects the fit."""
     return min(detection.p_score, detection.p_omnibus) < 0.5 * FAMILY_ALPHA
 
 
 def has_replicate_excess(problem: FitProblem) -> bool:
-    """Whether repeats differ by more than noise and jitters."""
+    """Return whether repeats differ by more than noise and jitters."""
     return (
         problem.noise.replicate_excess > MAX_REPLICATE_EXCESS
         or problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS
@@ -92,72 +93,72 @@ def has_replicate_excess(problem: FitProblem) -> bool:
 def find_best_candidate(
     problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> RefittedCandidate | None:
-    """The best of the strongest, refitted; None where none is worth it."""
+    """Return the best refit of the strongest hypotheses, or None if none is promising."""
     return next(iter(_refit(problem, base, (), detect(problem, base, known, seed).scores, on_progress)), None)
 
 
 def select_causes(
     problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> Verdict:
-    """The verdict on one recording."""
-    on_progress("looking for anything to explain")
-    first = detect(problem, base, known, seed)
+    """Return the verdict on one subsystem."""
+    on_progress("testing the nominal model")
+    nominal_detection = detect(problem, base, known, seed)
     if has_replicate_excess(problem):
-        return Verdict("unexplained", (), None, (), first, None, 0.0)
-    if not is_rejected(first):
-        return Verdict("none", (), None, (), first, None, 0.0)
-    singles = _refit(problem, base, (), first.scores, on_progress)
+        return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
+    if not is_rejected(nominal_detection):
+        return Verdict("none", (), None, (), nominal_detection, None, 0.0)
+    singles = _refit(problem, base, (), nominal_detection.scores, on_progress)
     if not singles:
-        return Verdict("unexplained", (), None, (), first, None, 0.0)
+        return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
     best = singles[0]
-    on_progress(f"what {best.label} leaves")
+    on_progress(f"testing the residuals of {best.label}")
     others = [item for item in known if item.key not in best.causes]
     residual_detection = detect(problem, best.fit, others, seed)
     single_explained = _compute_explained_fraction(residual_detection, base, best)
     if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
-        return _build_verdict(problem, singles, first, residual_detection, single_explained)
-    basis = compute_discrepancy_basis(problem, best.fit, best.hypotheses, known)
-    basis_detection = detect(problem, best.fit, others, seed, basis)
+        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
+    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, known)
+    basis_detection = detect(problem, best.fit, others, seed, basis_columns)
     if (
         not is_rejected(basis_detection)
         and single_explained >= MIN_EXPLAINED_BY_TERM
         and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= MIN_EXPLAINED
     ):
-        return _build_verdict(problem, singles, first, residual_detection, single_explained)
+        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
     form_gain = (
         residual_detection.residual_chi2
         - basis_detection.residual_chi2
-        - basis.shape[1] * np.log(len(problem.data.value))
+        - basis_columns.shape[1] * np.log(len(problem.data.value))
     )
     candidates = _refit_pairs(problem, base, known, singles, residual_detection, seed, on_progress)
     pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
     if pairs:
         pair = pairs[0]
-        on_progress(f"what {pair.label} leave")
+        on_progress(f"testing the residuals of {pair.label}")
         others = [item for item in known if item.key not in pair.causes]
         pair_detection = detect(problem, pair.fit, others, seed)
         pair_explained = _compute_explained_fraction(pair_detection, base, pair)
-        # Beside a cause in another form than its term's, a second one patches: it must leave nothing to be believed.
+        # A second cause may only correct the first one's form; it is named if the residuals are insignificant.
         if not is_rejected(pair_detection) or (pair_explained >= MIN_EXPLAINED_OTHER_FORM > single_explained):
-            return _build_verdict(problem, pairs, first, pair_detection, pair_explained)
+            return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
         if pair_explained >= MIN_EXPLAINED and not is_rejected(
             detect(
                 problem, pair.fit, others, seed, compute_discrepancy_basis(problem, pair.fit, pair.hypotheses, known)
             )
         ):
-            return _build_verdict(problem, pairs, first, pair_detection, pair_explained)
-    # Where only one cause is known at all, no other can be taken for it.
+            return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
+    # If only one cause can occur, no other can be confused with it.
     min_explained = MIN_EXPLAINED_OTHER_FORM if len({item.key for item in known}) > 1 else MIN_EXPLAINED
     if (
         single_explained >= MIN_EXPLAINED
         and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= min_explained
     ):
-        return _build_verdict(problem, singles, first, residual_detection, single_explained)
-    return Verdict("unexplained", (), None, (*pairs, *singles), first, residual_detection, single_explained)
+        return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
+    return Verdict("unexplained", (), None, (*pairs, *singles), nominal_detection, residual_detection, single_explained)
 
 
 def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
-    """Terms as the score found them, at the amplitude it found, within their ranges."""
+    """Return the point of a score's start at the amplitude found, within its ranges."""
     item = score.hypothesis
     terms = {**point.terms, item.key: dict(score.start)}
     if item.is_linear and item.degrees > 1:
@@ -178,7 +179,7 @@ def _refit(
     scores: Sequence[Score],
     on_progress: ProgressCallback,
 ) -> list[RefittedCandidate]:
-    """The strongest scores as full fits, best first."""
+    """Refit the strongest scores in full, best first."""
     samples = len(problem.data.value)
     candidates: list[RefittedCandidate] = []
     promising = [score for score in scores[:MAX_REFITS] if score.ratio > max(6.0, 0.05 * scores[0].ratio)]
@@ -201,9 +202,9 @@ def _refit(
 def _refit_every_start(
     problem: FitProblem, base: ModelFit, item: Hypothesis, free: Sequence[FreeParameter]
 ) -> ModelFit:
-    """The best place that fits from the nearest starts come to, each begun again where it ended until it stays.
+    """Return the best fit from the nearest starts, each restarted at its end until χ² is stationary.
 
-    Jitters act along the slopes of where a fit began: a place is judged by a fit that begins there.
+    Jitters act along the sensitivities at the start of a fit, so an end point is judged by a fit that starts there.
     """
     fits: list[ModelFit] = []
     for point in _select_nearest_starts(problem, base, item):
@@ -214,11 +215,11 @@ def _refit_every_start(
             if abs(second.chi2 - first.chi2) < 1.0:
                 break
             point = second.point
-    return min(fits, key=lambda one: one.chi2)
+    return min(fits, key=lambda item: item.chi2)
 
 
 def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis) -> list[ParameterPoint]:
-    """The starts that come nearest to the data as it is."""
+    """Return the starts with the smallest χ² without a fit."""
     zero = np.zeros(len(problem.data.value))
 
     def cost(point: ParameterPoint) -> float:
@@ -234,7 +235,7 @@ def _compute_excess(detection: Detection) -> float:
 
 
 def _compute_explained_fraction(residual_detection: Detection, base: ModelFit, best: RefittedCandidate) -> float:
-    """Share of the excess that a candidate took: of what it gained, and what is clearly left."""
+    """Return the share of the excess that a candidate explains: its decrease of χ², relative to that plus the rest."""
     reduction = base.chi2 - best.fit.chi2
     score = residual_detection.scores[0].ratio if residual_detection.scores else 0.0
     remaining = max(
@@ -252,7 +253,7 @@ def _refit_pairs(
     seed: int,
     on_progress: ProgressCallback,
 ) -> list[RefittedCandidate]:
-    """Best pairs: the second beside each of the best few first ones."""
+    """Refit second causes beside each of the best first causes; best pairs first."""
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
         others = [item for item in known if item.key not in first.causes]
@@ -265,15 +266,15 @@ def _refit_pairs(
 
 
 def _is_pair_needed(pair: RefittedCandidate, singles: list[RefittedCandidate], form_gain: float) -> bool:
-    """Whether the pair beats every single one by more than chance among so many pairs, and by more than its price.
+    """Return whether a pair beats the best single cause by more than the rivals' margin and its discrepancy basis.
 
-    bending: what the best single cause would gain by another form, its price paid; a second cause must do better.
+    form_gain: decrease of χ² by the basis of the best single cause, minus its BIC penalty
     """
     return singles[0].bic - pair.bic > BIC_INDISTINGUISHABLE + max(0.0, form_gain)
 
 
 def _is_imitation(problem: FitProblem, rival: RefittedCandidate, best: RefittedCandidate) -> bool:
-    """Whether a rival of more numbers, one of them at its end, says what the best one says."""
+    """Return whether a rival with more parameters, one of them at a limit, predicts the same as the best candidate."""
     terms = rival.fit.point.terms
     if len(rival.fit.free) <= len(best.fit.free) or not any(
         not item.parameter.low < terms[item.key][item.names[0]] < item.parameter.high for item in rival.fit.free

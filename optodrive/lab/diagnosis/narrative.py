@@ -1,4 +1,4 @@
-"""The answer in plain words, and as the JSON of the format."""
+"""Diagnosis as narrative text and as JSON."""
 
 from importlib.metadata import version
 from math import isfinite
@@ -33,7 +33,7 @@ MAX_RULED_OUT = 6
 
 
 def format_quantity(value: float, unit: str) -> str:
-    """With a prefix where the unit takes one."""
+    """Return a value with three digits and an SI prefix where the unit takes one."""
     if unit in UNPREFIXED_UNITS or value == 0.0:
         return f"{value:.3g} {unit}".removesuffix(" 1").rstrip()
     for limit, scale, prefix in UNIT_PREFIXES:
@@ -43,15 +43,16 @@ def format_quantity(value: float, unit: str) -> str:
 
 
 def _format_interval(item: Estimate) -> str:
-    return f"{format_quantity(item.value, item.unit)} (95 %: {format_quantity(item.low, item.unit)} to {format_quantity(item.high, item.unit)})"
+    value, low, high = (format_quantity(number, item.unit) for number in (item.value, item.low, item.high))
+    return f"{value} (95 %: {low} to {high})"
 
 
 def build_narrative(discrepancy: Discrepancy) -> list[str]:
-    """What was wrong, where it shows, what causes it, how sure, what was ruled out, what it gains, what to measure."""
+    """Return the lines of the narrative: headline, causes, gain, rejected causes, next experiment and remarks."""
     lines = [_build_headline(discrepancy), ""]
     if discrepancy.causes and discrepancy.verdict != "none":
         lines += [
-            f"- {CAUSE_PHRASES.get(key, key)} ({key}); it shows in {discover_terms()[key].signature}."
+            f"- {CAUSE_PHRASES.get(key, key)} ({key}); visible in {discover_terms()[key].signature}."
             for key in discrepancy.causes
         ]
         lines += [
@@ -59,29 +60,30 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         ]
         lines.append("")
     if discrepancy.verdict in ("cause", "ambiguous"):
-        lines.append(f"It explains {discrepancy.explained_fraction:.1%} of what the nominal model gets wrong.")
+        lines.append(f"This explains {discrepancy.explained_fraction:.1%} of the error of the nominal model.")
     lines += _describe_locations(discrepancy)
     lines += _describe_gain(discrepancy)
     if discrepancy.verdict == "none":
-        lines += ["The smallest effect of each kind that would have been seen:"]
+        lines += ["Detection limit of each effect:"]
         lines += [f"- {item.label}: {item.detection_limit}" for item in _deduplicate_by_label(discrepancy.candidates)]
     else:
         ruled_out = [item for item in discrepancy.candidates if item.verdict == "ruled out"]
         if ruled_out:
-            lines += ["Ruled out, because with it the residuals stay:"]
+            lines += ["Ruled out, because residuals remain:"]
             lines += [
-                f"- {item.label} (it alone would explain χ² {item.statistic:.0f})" for item in ruled_out[:MAX_RULED_OUT]
+                f"- {item.label} (alone it reduces χ² by {item.statistic:.0f})" for item in ruled_out[:MAX_RULED_OUT]
             ]
-        not_observable = [item.label for item in discrepancy.candidates if item.verdict == "this data cannot show it"]
+        not_observable = [item.label for item in discrepancy.candidates if item.verdict == "not observable"]
         if not_observable:
-            lines.append(f"This data cannot show: {', '.join(not_observable)}.")
+            lines.append(f"Not observable in this data: {', '.join(not_observable)}.")
     if discrepancy.verdict == "ambiguous" and discrepancy.next_experiment is None:
-        lines.append("No pulse or train on a pixel, repeated up to 30 times, would tell them apart at this noise.")
+        lines.append("No pulse or train on a pixel, repeated up to 30 times, would separate them at this noise.")
     if discrepancy.next_experiment is not None:
         experiment = discrepancy.next_experiment
         lines += [
             "",
-            f"Measure next: {experiment.rationale}; about {experiment.lab_time_s:.0f} s in the lab, χ² {experiment.separation:.0f} between them.",
+            f"Measure next: {experiment.description}; about {experiment.lab_time_s:.0f} s in the lab, "
+            f"χ² {experiment.separation:.0f} between them.",
         ]
     lines += list(discrepancy.remarks)
     return lines
@@ -90,16 +92,16 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
 def _build_headline(discrepancy: Discrepancy) -> str:
     names = [CAUSE_PHRASES.get(key, key) for key in discrepancy.causes]
     if discrepancy.verdict == "none":
-        return "Nothing found: the nominal model, refitted, agrees with this recording within its noise."
+        return "No error found: the refitted nominal model agrees with this recording within its noise."
     if discrepancy.verdict == "cause":
         return f"The nominal model is wrong because {' and '.join(names)}."
     if discrepancy.verdict == "ambiguous" and names:
-        return f"Something is wrong, and this data cannot tell which of these it is: {'; or '.join(names)}."
-    return "Something is wrong, and none of the known causes explains it."
+        return f"The nominal model is wrong; this data cannot separate these causes: {'; or '.join(names)}."
+    return "The nominal model is wrong, and no known cause explains it."
 
 
 def _describe_locations(discrepancy: Discrepancy) -> list[str]:
-    """The groups in which residuals fell, or stay, the most."""
+    """Return the two groups with the largest change of residuals, or the largest residuals if unexplained."""
     if discrepancy.verdict == "none":
         return []
     rows = []
@@ -108,10 +110,10 @@ def _describe_locations(discrepancy: Discrepancy) -> list[str]:
         rows.append((nominal if discrepancy.verdict == "unexplained" else nominal - extended, nominal, extended, trace))
     rows.sort(key=lambda row: -row[0])
     return [
-        f"It shows in {course.signal} of {course.group}: residuals of {before**0.5:.1f} σ a sample"
-        + (f", {after**0.5:.1f} σ with the cause." if discrepancy.causes else ".")
-        for _, before, after, course in rows[:2]
-        if before > 0
+        f"Visible in {trace.signal} of {trace.group}: residuals of {nominal**0.5:.1f} σ per sample"
+        + (f", {extended**0.5:.1f} σ with the cause." if discrepancy.causes else ".")
+        for _, nominal, extended, trace in rows[:2]
+        if nominal > 0
     ]
 
 
@@ -119,24 +121,24 @@ def _describe_gain(discrepancy: Discrepancy) -> list[str]:
     gain = discrepancy.gain
     if gain is None:
         if discrepancy.verdict in ("cause", "ambiguous"):
-            return ["What it gains cannot be measured: no held-out run shows the effect."]
+            return ["The gain cannot be measured: no held-out run shows the effect."]
         return []
     lines = [
-        f"On {len(discrepancy.held_out_runs)} runs held out before naming, {gain.reduction:.0%} of the avoidable error goes "
-        f"(95 %: {gain.low:.0%} to {gain.high:.0%})."
+        f"On {len(discrepancy.held_out_runs)} runs held out of the selection, the extended model removes "
+        f"{gain.reduction:.0%} of the avoidable error (95 %: {gain.low:.0%} to {gain.high:.0%})."
     ]
     for name, nominal in gain.nominal.items():
         unit = name.rsplit("_", 1)[1]
         extended, floor = gain.extended[name], gain.noise_floor[name]
         lines.append(
-            f"  {name}: RMSE {format_quantity(nominal, unit)} before, {format_quantity(extended, unit)} after, "
+            f"  {name}: RMSE {format_quantity(nominal, unit)} nominal, {format_quantity(extended, unit)} extended, "
             f"noise {format_quantity(floor, unit)}"
         )
     return lines
 
 
 def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[CandidateCause]:
-    """By label, each once: what pixels and mirrors both show is said of the pixels."""
+    """Return the first candidate of each label, sorted; pixels come before mirrors."""
     first: dict[str, CandidateCause] = {}
     for item in candidates:
         first.setdefault(item.label, item)
@@ -144,7 +146,7 @@ def _deduplicate_by_label(candidates: tuple[CandidateCause, ...]) -> list[Candid
 
 
 def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
-    """The JSON of the format."""
+    """Return the diagnosis as JSON values."""
     gain, experiment = discrepancy.gain, discrepancy.next_experiment
     return {
         "verdict": discrepancy.verdict,
@@ -153,12 +155,12 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
             name: {"value": item.value, "unit": item.unit, "ci95": [item.low, item.high]}
             for name, item in discrepancy.parameters.items()
         },
-        "explained": discrepancy.explained_fraction,
+        "explained_fraction": discrepancy.explained_fraction,
         "gain": None
         if gain is None
         else {
-            "heldout_rmse_before": gain.nominal,
-            "heldout_rmse_after": gain.extended,
+            "heldout_rmse_nominal": gain.nominal,
+            "heldout_rmse_extended": gain.extended,
             "noise_floor": gain.noise_floor,
             "reduction": gain.reduction,
             "ci95": [gain.low, gain.high],
@@ -171,23 +173,23 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
                 "p_value": item.p_value,
                 "heldout_gain": item.heldout_gain,
                 "verdict": item.verdict,
-                "smallest_detectable": item.detection_limit,
+                "detection_limit": item.detection_limit,
             }
             for item in discrepancy.candidates
         ],
         "next_experiment": None
         if experiment is None
         else {
-            "why": experiment.rationale,
+            "description": experiment.description,
             "pulses": experiment.pulses.tolist(),
             "pixel": experiment.pixel,
             "repeats": experiment.repeats,
             "signals": list(experiment.signals),
             "expected_separation": experiment.separation,
-            "seconds": experiment.lab_time_s,
+            "duration_s": experiment.lab_time_s,
         },
         "runs": {"fitted": list(discrepancy.fitted_runs), "held_out": list(discrepancy.held_out_runs)},
         "remarks": list(discrepancy.remarks),
-        "seconds": discrepancy.elapsed_s,
+        "elapsed_s": discrepancy.elapsed_s,
         "version": version("optodrive"),
     }

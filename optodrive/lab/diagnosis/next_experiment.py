@@ -1,4 +1,4 @@
-"""The experiment that separates two rivals most per second of lab time, over a finite grid of what a display can do."""
+"""Search for the experiment that separates two rivals in the least lab time, over a finite grid of experiments."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -15,18 +15,18 @@ from optodrive.lab.diagnosis.prediction import predict
 from optodrive.physics.pixel_ode import PixelExperiment
 
 MIN_REPEATS, MAX_REPEATS = 3, 30
-"""How often an experiment is done, at least and at most."""
+"""Minimum and maximum number of repeats of an experiment."""
 CHI2_SEPARATED = 24.0
-"""χ² between rivals that tells them apart."""
+"""χ² between rivals that separates them."""
 SETUP_S = 2.0
-"""Between two runs."""
+"""Time between two runs."""
 SAMPLES = 400
 
 
 def propose_experiment(
     problem: FitProblem, first: ModelFit, second: ModelFit, labels: tuple[str, str]
 ) -> NextExperiment | None:
-    """The most telling run of the grid, repeated until it tells; None where no signal is measured, or none would."""
+    """Return the cheapest experiment of the grid that separates two fits, or None if none does."""
     data = problem.data
     kinds = tuple(kind for kind in data.kinds if kind in PIXEL_KINDS)
     if not kinds:
@@ -42,7 +42,7 @@ def propose_experiment(
         if separation < CHI2_SEPARATED / 2 or (best is not None and duration_s >= best.lab_time_s):
             continue
         signals = tuple(SIGNALS[kind] for kind in kinds)
-        text = f"{description}, {repeats} times, pixel {pixel} looked at: {labels[0]} and {labels[1]} differ there"
+        text = f"{description}, {repeats} times, measured on pixel {pixel}, separates {labels[0]} and {labels[1]}"
         best = NextExperiment(text, pulses, pixel, repeats, signals, separation, duration_s)
     return best
 
@@ -53,7 +53,7 @@ def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray,
     for power_w in (0.25 * full_power_w, 0.5 * full_power_w, full_power_w):
         for width_s in (0.002, 0.01, 0.05):
             for pulsed in (pixel, neighbour):
-                where = "" if pulsed == pixel else f" on pixel {pulsed} beside it"
+                where = "" if pulsed == pixel else f" on neighbouring pixel {pulsed}"
                 pulses = np.array([[0.02, width_s, power_w, pulsed]])
                 description = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{where}"
                 yield description, pulses, 0.02 + width_s + 0.25
@@ -64,7 +64,7 @@ def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray,
 
 
 def _list_pulsed_pixels(data: Dataset) -> list[int]:
-    """Pixels that got light, the most often lit first."""
+    """Return the pulsed pixels, most frequent first."""
     return [pixel for pixel, _ in Counter(int(lit) for run in data.runs for lit in run.pulses[:, 3]).most_common()]
 
 
@@ -78,16 +78,16 @@ def _build_synthetic_dataset(pulses: FloatArray, pixel: int, span_s: float, kind
     experiment = PixelExperiment(
         pulses, pixel, 293.15, (times[0], times[1], times[2]), dose_before=1.0, session_time=1.0
     )
-    place = {kind: row for row, kind in enumerate(kinds)}
+    numbers_by_kind = {kind: row for row, kind in enumerate(kinds)}
     rows = np.arange(SAMPLES)
-    drive_group = DriveGroup(experiment, tuple((kind, place[kind], rows) for kind in kinds))
-    places = (place.get(0, -1), place.get(1, -1), place.get(2, -1))
+    drive_group = DriveGroup(experiment, tuple((kind, numbers_by_kind[kind], rows) for kind in kinds))
+    numbers = (numbers_by_kind.get(0, -1), numbers_by_kind.get(1, -1), numbers_by_kind.get(2, -1))
     info = RunInfo("next", "next", 293.15, pulses, None)
-    return Dataset((info,), blocks, ((experiment, places),), (drive_group,), np.zeros(SAMPLES * len(kinds)))
+    return Dataset((info,), blocks, ((experiment, numbers),), (drive_group,), np.zeros(SAMPLES * len(kinds)))
 
 
 def _compute_separation(problem: FitProblem, first: ModelFit, second: ModelFit, data: Dataset, repeats: int) -> float:
-    """χ² between both predictions, what either could still be moved by taken out."""
+    """Return χ² between both predictions with the remaining freedom of either model projected out."""
     first_prediction = predict(data, first.point, problem.epsilon)
     second_prediction = predict(data, second.point, problem.epsilon)
     sensitivity = compute_jitter_sensitivity(data, first.point, problem.epsilon, first_prediction)

@@ -1,8 +1,8 @@
-"""Noise of each kind of signal: white, and two coloured parts, on any sample times; what a run shares beside it.
+"""Noise of each signal kind, white plus two coloured parts, on arbitrary sample times, and jitters common to a run.
 
-Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt), whitened by a Kalman filter, which takes missing
-samples as they come. Beside it each run has a power jitter, a timing jitter and a baseline per signal. All of it is
-estimated from repeats: contrasts between runs of one group hold no model at all.
+Σ = white + σ₁² exp(−|Δt| / τ₁) + σ₂² exp(−|Δt| / τ₂) cos(ω Δt), whitened by a Kalman filter, which handles missing
+samples. Each run also has a power jitter, a timing jitter and a baseline per signal. All parameters are estimated from
+repeats: contrasts between runs of one group are independent of any pixel model.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,10 @@ EPS = 1e-12
 
 @dataclass(frozen=True)
 class ColouredNoise:
-    """white: σ; two parts: σ and correlation time, s; swing_per_s: angular frequency of the second part."""
+    """White noise and two exponentially correlated parts, the second of which may oscillate.
+
+    white, sigma: standard deviations; tau_s: correlation times; omega_rad_per_s: angular frequency of the second part
+    """
 
     white: float
     sigma: tuple[float, float]
@@ -32,10 +35,11 @@ class ColouredNoise:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """coloured: by kind of signal; power: relative; timing: s; baseline: by kind; measured: from repeats.
+    """Noise of all signals.
 
-    uneven: by how many of its own σ the worst pair of repeats differs more than this model has it; unsteady: likewise
-    what repeats differ by as if the power changed within pulses
+    coloured, baseline_sigma: by signal kind; power_sigma: relative; from_replicates: estimated from repeats;
+    replicate_excess: largest excess of χ² of a contrast over its expectation, in σ; intra_pulse_power_excess:
+    significance, in σ, of contrasts that look like power changes within pulses
     """
 
     coloured: dict[int, ColouredNoise]
@@ -59,7 +63,7 @@ def _whiten(
     omega: float,
     out: FloatArray,
 ) -> float:
-    """Whitened columns [n, k] into out; returns ln |Σ|. States: the first part, the second and its quadrature."""
+    """Write whitened columns [n, k] to out and return ln |Σ|; states: first part, second part and its quadrature."""
     n, k = columns.shape
     x = np.zeros((k, 3))
     v1, v2, q = sigma_1 * sigma_1, sigma_2 * sigma_2, white * white
@@ -102,7 +106,7 @@ def _whiten(
 
 
 def whiten(t_s: FloatArray, columns: FloatArray, noise: ColouredNoise) -> tuple[FloatArray, float]:
-    """Columns [n, k] of one block with unit white noise, and ln |Σ|."""
+    """Return the columns [n, k] of one block with unit white noise, and ln |Σ|."""
     out = np.empty_like(columns, order="C")
     logdet = _whiten(
         np.ascontiguousarray(t_s),
@@ -119,9 +123,9 @@ def whiten(t_s: FloatArray, columns: FloatArray, noise: ColouredNoise) -> tuple[
 
 
 def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> NoiseModel:
-    """The noise model by maximum likelihood of the contrasts; without repeats, of the residuals themselves.
+    """Estimate the noise model by maximum likelihood from the contrasts, or from the residuals if no run is repeated.
 
-    power, timing: [m] the prediction's change with the logarithm of the power, and with a delay, per second.
+    power, timing: sensitivities [m] as in `JitterSensitivity`
     """
     found = compute_contrasts(data, residual, power, timing)
     coloured: dict[int, ColouredNoise] = {}
@@ -143,7 +147,7 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
 
 
 def _compute_replicate_excess(contrast: Contrast, model: NoiseModel) -> float:
-    """χ² of a contrast, its jitters allowed for, in σ above what it should be."""
+    """Return the excess of a contrast's χ², jitters marginalised, over its expectation, in σ."""
     size = np.array([model.power_sigma, model.timing_sigma_s, model.baseline_sigma[contrast.kind]])
     columns = np.column_stack([contrast.value, contrast.jitter * size])
     whitened, _ = whiten(contrast.t_s, columns, model.coloured[contrast.kind])
@@ -159,7 +163,7 @@ def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: 
 
 
 def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
-    """One kind's noise, each contrast's jitters projected out."""
+    """Fit the noise of one signal kind with the jitters of each contrast projected out."""
     differences = np.concatenate([np.diff(item.value) for item in contrasts])
     std = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
     white = min(std, float(1.4826 * np.median(np.abs(differences)) / sqrt(2.0)) + 1e-3 * std)
@@ -181,7 +185,7 @@ def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
             inner = gram[1:, 1:] + 1e-9 * np.eye(len(gram) - 1) * np.trace(gram)
             total += logdet + gram[0, 0] - gram[0, 1:] @ np.linalg.solve(inner, gram[0, 1:])
             total += float(np.linalg.slogdet(inner)[1])
-        # Weak priors keep parts that the data does not show from wandering off.
+        # Weak priors regularise parameters that the data does not determine.
         return total + 0.02 * float((x[:5] ** 2).sum()) + 1e3 * float(np.maximum(0.0, np.abs(x[:5]) - 8.0).sum())
 
     smooth_start = np.array([-0.1, -0.7, -1.0, 1.0, 3.0])
@@ -192,7 +196,7 @@ def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
 
 
 def _find_dominant_omega(contrasts: list[Contrast], dt_s: float) -> float:
-    """Angular frequency of the strongest swing: the peak of the mean spectrum over its own smooth course."""
+    """Return the angular frequency at which the mean spectrum exceeds its smoothed form the most."""
     count, power = 256, np.zeros(129)
     for item in contrasts:
         for start in range(0, len(item.value) - count + 1, count):
@@ -212,7 +216,7 @@ def _normalize_columns(jitter: FloatArray) -> FloatArray:
 def _fit_jitter(
     contrasts: list[Contrast], coloured: dict[int, ColouredNoise], kinds: list[int]
 ) -> tuple[float, float, dict[int, float]]:
-    """σ of power (relative), timing (s) and baselines, by the likelihood of what each contrast shows of them."""
+    """Return σ of power (relative), of timing (s) and of baselines by maximum likelihood of the contrasts."""
     pairs: dict[int, list[Contrast]] = {}
     for item in contrasts:
         pairs.setdefault(item.pair, []).append(item)
@@ -223,9 +227,9 @@ def _fit_jitter(
         for item in own:
             whitened, _ = whiten(item.t_s, np.column_stack([item.jitter, item.value]), coloured[item.kind])
             small = whitened.T @ whitened
-            places = [0, 1, 2 + kinds.index(item.kind)]
-            gram[np.ix_(places, places)] += small[:3, :3]
-            right[places] += small[:3, 3]
+            indices = [0, 1, 2 + kinds.index(item.kind)]
+            gram[np.ix_(indices, indices)] += small[:3, :3]
+            right[indices] += small[:3, 3]
         grams.append((gram, right))
     start = np.log(np.array([0.005, 2e-5, *(coloured[kind].white for kind in kinds)]))
 

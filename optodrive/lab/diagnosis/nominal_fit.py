@@ -1,4 +1,4 @@
-"""Before anything is named: the noise model, from repeats, and the nominal model fitted under it."""
+"""Noise model from repeats, and the nominal model fitted under it."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ DEFAULT_EPSILON = 0.66
 BROAD_PRIOR = BaseParameterPrior(
     (np.log(150.0), np.log(101e-6), np.log(3e-3), np.log(4e-6), np.log(2.3e-4)), (0.7, 0.16, 0.5, 0.5, 0.5)
 )
-"""The whole of Table S3; gas and membrane as the paper's peaks have them."""
+"""Prior over the whole of Table S3; gas and membrane from the peak values in the paper."""
 MIRROR_NOISE_FRACTION = 1e-3
 R_STARTS_K_PER_W = (100.0, 180.0, 320.0)
 
@@ -26,9 +26,9 @@ def fit_nominal(
     min_timing_sigma_s: float = 0.0,
     clock_offset_s: float = 0.0,
 ) -> tuple[FitProblem, ModelFit]:
-    """Noise model and base fit.
+    """Estimate the noise model and fit the nominal model.
 
-    timing_s: the runs' timing jitter at least, known from other signals; late_s: all clocks late, likewise
+    min_timing_sigma_s: lower limit of the timing jitter, from other signals; clock_offset_s: known offset of all clocks
     """
     crude_noise = _estimate_crude_noise(data)
     clocks = ("temperature", "displacement", "force", "mirrors")
@@ -47,7 +47,7 @@ def fit_nominal(
 
 
 def update_noise(problem: FitProblem, fitted: ModelFit, min_timing_sigma_s: float) -> FitProblem:
-    """The same with the noise that repeats show, jitters acting along the slopes of this fit."""
+    """Return the problem with the noise model estimated from repeats, with jitter sensitivities at this fit."""
     data = problem.data
     sensitivity = compute_jitter_sensitivity(data, fitted.point, problem.epsilon, fitted.prediction)
     noise = estimate_noise_model(data, data.value - fitted.prediction, sensitivity.power, sensitivity.timing)
@@ -60,7 +60,7 @@ def update_noise(problem: FitProblem, fitted: ModelFit, min_timing_sigma_s: floa
 
 
 def _raise_mirror_noise(data: Dataset, coloured: dict[int, ColouredNoise]) -> dict[int, ColouredNoise]:
-    """Mirrors are read so finely that jitter bends their steps: no servo is believed beyond a share of its range."""
+    """Raise the white noise of mirror signals to a share of their range: jitter is nonlinear at mirror steps."""
     out = dict(coloured)
     for kind in MIRROR_KINDS:
         if kind in out:

@@ -1,4 +1,4 @@
-"""Normal equations run by run: columns against each other under the noise model, what a run shares taken out."""
+"""Normal equations per run under the noise model, with the jitters of the run marginalised."""
 
 from dataclasses import dataclass
 
@@ -11,29 +11,29 @@ from optodrive.lab.diagnosis.noise_model import NoiseModel, whiten
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations:
-    """gram: [runs, k, k] of k columns, whitened, jitters of the run marginalised."""
+    """Gram matrices [runs, k, k] of k whitened columns with jitters marginalised."""
 
     gram: FloatArray
 
     @property
     def total(self) -> FloatArray:
-        """[k, k]."""
+        """Sum over runs, [k, k]."""
         return np.asarray(self.gram.sum(axis=0))
 
 
 def compute_normal_equations(
     data: Dataset, columns: FloatArray, noise: NoiseModel, power: FloatArray, timing: FloatArray
 ) -> NormalEquations:
-    """Of columns [m, k]; power, timing: [m] as for `noise.estimate`."""
+    """Compute the gram matrices of columns [m, k]; power, timing: sensitivities [m] as in `JitterSensitivity`."""
     kinds, count = data.kinds, columns.shape[1]
     size = 2 + len(kinds)
     grams = np.zeros((len(data.runs), count + size, count + size))
     for block in data.blocks:
-        part, place = block.part, kinds.index(block.kind)
+        part, index = block.part, kinds.index(block.kind)
         jitters = np.zeros((part.stop - part.start, size))
         jitters[:, 0] = noise.power_sigma * power[part]
         jitters[:, 1] = noise.timing_sigma_s * timing[part]
-        jitters[:, 2 + place] = noise.baseline_sigma[block.kind]
+        jitters[:, 2 + index] = noise.baseline_sigma[block.kind]
         whitened, _ = whiten(block.t_s, np.hstack([columns[part], jitters]), noise.coloured[block.kind])
         grams[block.run] += whitened.T @ whitened
     out = np.empty((len(data.runs), count, count))
@@ -44,7 +44,7 @@ def compute_normal_equations(
 
 
 def solve(gram: FloatArray, right: FloatArray) -> FloatArray:
-    """gram⁻¹ right, with columns that mean nothing here set aside."""
+    """Return gram⁻¹ right, restricted to the well-conditioned directions of gram."""
     scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
     correlation = gram / scale / scale[:, None]
     values, vectors = np.linalg.eigh(correlation)
@@ -57,6 +57,6 @@ def solve(gram: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def project_out(gram: FloatArray, removed: list[int], kept: list[int]) -> FloatArray:
-    """What is left of the columns `kept` beside those in `out`: their gram."""
+    """Return the gram matrix of the columns `kept` orthogonal to the columns `removed`."""
     cross = gram[np.ix_(removed, kept)]
     return np.asarray(gram[np.ix_(kept, kept)] - cross.T @ solve(gram[np.ix_(removed, removed)], cross))

@@ -1,6 +1,6 @@
-"""Whether whitened residuals agree with zero in bins of group × signal × time after an edge.
+"""Omnibus test of whitened residuals against zero in bins of group, signal and time after a gate edge.
 
-The same bins of the differences between repeats hold noise alone: their size is the scale.
+The same bins of the differences between repeats hold noise only and set the scale.
 """
 
 from dataclasses import dataclass, replace
@@ -18,15 +18,15 @@ from optodrive.lab.diagnosis.normal_equations import project_out
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS
 
 EDGE_BINS_S = np.geomspace(5e-4, 1.0, 9)
-"""Edges of the bins: time after an edge of the light."""
+"""Bin edges of the time after a gate edge."""
 RUN_BINS = 4
-"""Bins over a whole run, for what is slower."""
+"""Number of bins over a whole run, for slow effects."""
 RIDGE = 1e-4
 
 
 @dataclass(frozen=True)
 class OmnibusStatistic:
-    """χ² in bins and its degrees; the same of the differences between repeats, which hold noise alone."""
+    """χ² in bins with its degrees of freedom, and the same of differences between repeats, which hold noise only."""
 
     chi2: float
     degrees: int
@@ -35,7 +35,7 @@ class OmnibusStatistic:
 
     @property
     def p_value(self) -> float:
-        """Of an F: the noise that repeats show is the scale, as far as it is more than the noise model has."""
+        """Value of p by an F distribution scaled by the noise between repeats where it exceeds the noise model."""
         if not self.degrees:
             return 1.0
         if not self.noise_degrees:
@@ -45,7 +45,7 @@ class OmnibusStatistic:
 
 
 def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: JitterSensitivity) -> OmnibusStatistic:
-    """Of the last of columns [m, k] in the omnibus' bins, beside the others."""
+    """Compute the statistic of the last of the columns [m, k], with the others projected out."""
     data, noise, kinds = problem.data, problem.noise, problem.data.kinds
     labels, width = assign_bins(data), columns.shape[1]
     count = int(labels.max()) + 1
@@ -55,14 +55,14 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
     noise_chi2, noise_degrees = 0.0, 0
     groups: dict[str, tuple[FloatArray, FloatArray]] = {}
     by_run: dict[int, list[int]] = {}
-    for place, block in enumerate(data.blocks):
-        by_run.setdefault(block.run, []).append(place)
-    for run, places in by_run.items():
-        run_bins = _list_bins(np.concatenate([labels[data.blocks[place].part] for place in places]))
+    for number, block in enumerate(data.blocks):
+        by_run.setdefault(block.run, []).append(number)
+    for run, numbers in by_run.items():
+        run_bins = _list_bins(np.concatenate([labels[data.blocks[number].part] for number in numbers]))
         size = 2 + len(kinds)
         gram = np.zeros((width + len(run_bins) + size, width + len(run_bins) + size))
-        for place in places:
-            block = data.blocks[place]
+        for number in numbers:
+            block = data.blocks[number]
             part, kind = block.part, kinds.index(block.kind)
             block_bins = _list_bins(labels[part])
             indicators = (labels[part][:, None] == block_bins).astype(np.float64)
@@ -105,7 +105,7 @@ def compute_omnibus(problem: FitProblem, columns: FloatArray, sensitivity: Jitte
 
 
 def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float, int]:
-    """rightᵀ among⁻¹ right, and over how many bins that say anything."""
+    """Return rightᵀ gram⁻¹ right and the number of informative bins."""
     scale = np.sqrt(np.diag(gram))
     is_informative = scale > 1e-9 * scale.max(initial=0.0)
     kept = np.flatnonzero(is_informative)
@@ -115,7 +115,7 @@ def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float,
 
 
 def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitivity: JitterSensitivity) -> FloatArray:
-    """χ² of a residual in each group's bins, and its degrees: [groups, 2]."""
+    """Return χ² of a residual in each group's bins and its degrees of freedom, [groups, 2]."""
     data = problem.data
     out = []
     for runs in data.groups.values():
@@ -132,7 +132,10 @@ def _list_bins(labels: IntArray) -> IntArray:
 
 
 def assign_bins(data: Dataset) -> IntArray:
-    """[m] the omnibus' bin of each sample, −1 for none: group × signal × pixel × (log time after an edge, time)."""
+    """Return the bin of each sample [m], or −1 for none.
+
+    Bins: group × signal × pixel × (edge, logarithm of the time after it, time in the run)
+    """
     names: dict[tuple[object, ...], int] = {}
     label = np.full(len(data.value), -1, dtype=np.int64)
     for block in data.blocks:

@@ -1,7 +1,7 @@
-"""Whether the power is steady within pulses: repeats that differ as if each slice of light had a power of its own.
+"""Test for power that fluctuates within pulses, from repeats.
 
-A run's power jitter is one number for the whole run. Light that hops within pulses is shared by no repeat and looks
-like slow noise to a noise model; but it comes with the light, and fades as the absorber cools.
+The power jitter of a run is one value for the whole run. A power that fluctuates within pulses differs between repeats
+and resembles slow noise, but it appears with the pulse and decays as the absorber cools.
 """
 
 from dataclasses import replace
@@ -17,29 +17,29 @@ from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
 SLICE_S = 0.012
-"""About a thermal time: what is quicker is smoothed, what is slower spans several slices."""
+"""Length of a pulse slice, about the thermal time constant: faster fluctuations are smoothed, slower span slices."""
 
 RUN_POWER_SIGMA = 1.0
-"""A run as a whole may have any power here: wear and drift between repeats are no unsteadiness."""
+"""Prior σ of a run's relative power here: ageing and drift between repeats are no fluctuation within pulses."""
 
 
 def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> float:
-    """Score of a variance of the slices' powers beside the noise model, in its own σ."""
+    """Return the score statistic, in σ, for independent powers of the pulse slices added to the noise model."""
     data, noise = problem.data, problem.noise
     sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
     pixel = base.point.pixel(problem.epsilon)
-    experiments = {place: scene for scene, places in data.experiments for place in places}
+    experiments = {number: experiment for experiment, numbers in data.experiments for number in numbers}
     pairs: dict[int, list[Contrast]] = {}
     for item in compute_contrasts(data, data.value - base.prediction, sensitivity.power, sensitivity.timing):
         if item.kind in PIXEL_KINDS:
             pairs.setdefault(item.pair, []).append(item)
     excess = variance = 0.0
-    for own in pairs.values():
-        slices = _slice_pulses(experiments[own[0].block].pulses)
+    for members in pairs.values():
+        slices = _slice_pulses(experiments[members[0].block].pulses)
         count = 1 + len(slices)
         size = 2 + len(PIXEL_KINDS)
         gram = np.zeros((count + size, count + size))
-        for item in own:
+        for item in members:
             sigma = np.array([RUN_POWER_SIGMA, noise.timing_sigma_s, noise.baseline_sigma[item.kind]])
             responses = _compute_slice_responses(experiments[item.block], slices, item, pixel)
             columns = np.column_stack([item.value, responses, item.jitter * sigma])
@@ -54,18 +54,18 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
 
 
 def _slice_pulses(pulses: FloatArray) -> FloatArray:
-    """[k, 4] pulses cut into equal pieces."""
+    """Return pulses [k, 4] cut into equal slices."""
     rows = []
-    for start_s, width_s, power_w, lit in pulses.tolist():
+    for start_s, width_s, power_w, pixel in pulses.tolist():
         count = max(1, round(width_s / SLICE_S))
-        rows += [[start_s + k * width_s / count, width_s / count, power_w, lit] for k in range(count)]
+        rows += [[start_s + k * width_s / count, width_s / count, power_w, pixel] for k in range(count)]
     return np.array(rows, dtype=np.float64).reshape(-1, 4)
 
 
 def _compute_slice_responses(
     experiment: PixelExperiment, slices: FloatArray, item: Contrast, pixel: Pixel
 ) -> FloatArray:
-    """[n, k] the nominal answer to each slice alone: its change with the logarithm of that slice's power."""
+    """Return the nominal response [n, k] to each slice: the derivative with respect to the logarithm of its power."""
     empty = np.zeros(0)
     times = tuple(item.t_s if kind == item.kind else empty for kind in PIXEL_KINDS)
     out = np.empty((len(item.t_s), len(slices)))

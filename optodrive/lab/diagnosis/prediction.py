@@ -1,4 +1,4 @@
-"""The model's answer to a recording's drive: one long vector beside the measured one."""
+"""Model prediction for a recording's drive, as one vector aligned with the measured one."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,19 +14,19 @@ from optodrive.physics.term import TermValues
 from optodrive.physics.terms import discover_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
-"""The nominal parameters that are fitted, all by their logarithms."""
+"""Fitted nominal parameters, all by their logarithms."""
 BASE_UNITS = {"R": "K/W", "C": "J/K", "tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
 @dataclass(frozen=True)
 class ParameterPoint:
-    """A model: logarithms of the base parameters, and terms with their values."""
+    """Parameters of a model: logarithms of the base parameters, and terms with their values."""
 
     base: tuple[float, ...]
     terms: Mapping[str, TermValues]
 
     def pixel(self, epsilon: float) -> Pixel:
-        """As the physics takes it."""
+        """Return the nominal pixel of the base parameters."""
         r, c, tau_g, kappa, phi = np.exp(np.array(self.base)).tolist()
         return Pixel(r, c, epsilon, tau_g, kappa, phi)
 
@@ -34,7 +34,7 @@ class ParameterPoint:
 def predict(
     data: Dataset, point: ParameterPoint, epsilon: float = 0.66, power_factor: float = 1.0, delay_s: float = 0.0
 ) -> FloatArray:
-    """[m]; power: all light so much stronger; late_s: all signals so much later."""
+    """Predict all samples [m]; power_factor scales all optical power, delay_s delays all signals."""
     out = np.zeros(len(data.value))
     pixel = point.pixel(epsilon * power_factor)
     clock = point.terms.get("clock_offset", {})
@@ -42,19 +42,19 @@ def predict(
     delays_s = [delay_s + clock.get(name, 0.0) for name in ("temperature", "displacement", "force", "mirrors")]
     delays_s[0] += lag.get("time", 0.0) * lag.get("delay_share", 0.0)
     active = ActiveTerms.from_values(
-        {key: own for key, own in point.terms.items() if key not in ("clock_offset", "mirror_lag")}
+        {key: values for key, values in point.terms.items() if key not in ("clock_offset", "mirror_lag")}
     )
     if any(discover_terms()[key].varies_between_runs for key in point.terms):
-        for scene, places in data.experiments:
-            signals = simulate_signals(scene, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
+        for experiment, numbers in data.experiments:
+            signals = simulate_signals(experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
             for kind in PIXEL_KINDS:
-                if places[kind] >= 0:
-                    out[data.blocks[places[kind]].part] = signals[kind]
+                if numbers[kind] >= 0:
+                    out[data.blocks[numbers[kind]].part] = signals[kind]
     else:
         for item in data.drive_groups:
             signals = simulate_signals(item.experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
-            for kind, place, rows in item.block_rows:
-                out[data.blocks[place].part] = signals[kind][rows]
+            for kind, number, rows in item.block_rows:
+                out[data.blocks[number].part] = signals[kind][rows]
     servo = Servo(**point.terms["mirror_lag"]) if "mirror_lag" in point.terms else None
     for block in data.blocks:
         commands = data.runs[block.run].commands

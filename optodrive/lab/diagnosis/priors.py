@@ -1,4 +1,4 @@
-"""What is known of a pixel before its recording is looked at."""
+"""Prior knowledge of a pixel's base parameters."""
 
 from math import log
 
@@ -11,11 +11,14 @@ from optodrive.physics.pixel import Pixel
 
 DEFAULT_PARAMETER_SET = "calibrated"
 R_SIGMA, C_SIGMA, GAS_SIGMA = 0.25, 0.16, 0.4
-"""Relative: one sample against its row of Table S3; gas, membrane and force against the calibrated set."""
+"""Relative σ: one sample against its row of Table S3; gas, membrane and force against the calibrated set."""
 
 
 def build_prior(measurement: Measurement, config: Config | None) -> tuple[BaseParameterPrior, float, float | None]:
-    """Prior, epsilon and bridge width: the config's pixel, else the recording's width, else the whole of Table S3."""
+    """Return prior, epsilon and bridge width.
+
+    The prior is centred on the configured pixel, else on the stated bridge width, else it covers the whole of Table S3.
+    """
     widths_m = [run.attributes.get("bridge_width_m") for run in measurement.runs]
     stated_m = next((float(width) for width in widths_m if isinstance(width, (int, float))), None)
     if config is not None:

@@ -1,4 +1,4 @@
-"""What repeats differ by: contrasts between runs of one group hold noise and jitters, and no model at all."""
+"""Contrasts between repeats: differences between runs of one group hold noise and jitters but no model."""
 
 from dataclasses import dataclass
 from math import sqrt
@@ -13,9 +13,10 @@ MIRROR_SETTLED_S = 4e-3
 
 @dataclass(frozen=True, eq=False)
 class Contrast:
-    """Difference between repeats in one kind of signal: number of its pair; [n] and [n, 3] power, timing, baseline.
+    """Contrast between repeats in one signal kind.
 
-    block: number of the last repeat's, in the dataset
+    value: [n]; jitter: sensitivities [n, 3] to power, timing and baseline; pair: number of the pair of runs; block:
+    number of the last repeat's block in the dataset
     """
 
     pair: int
@@ -27,7 +28,7 @@ class Contrast:
 
 
 def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
-    """Helmert contrasts between the runs of each group, on the samples that all of them have."""
+    """Compute Helmert contrasts between the runs of each group on their common samples."""
     found: list[Contrast] = []
     blocks: dict[tuple[int, int, int], int] = {
         (block.run, block.kind, block.pixel): number for number, block in enumerate(data.blocks)
@@ -62,7 +63,7 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
 
 
 def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
-    """Rows at which mirrors have long arrived: what a lag makes of jitter is no noise of the instrument."""
+    """Select rows at which the mirrors have settled: the effect of jitter on a moving mirror is no instrument noise."""
     times = t_s[common[0]]
     row = np.searchsorted(steps_s, times, side="right") - 1
     kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > MIRROR_SETTLED_S)
@@ -70,7 +71,7 @@ def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray
 
 
 def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
-    """Rows of each time axis that all of them share, to 0.1 µs; None for fewer than 16."""
+    """Return the rows of each time axis that all axes share to 0.1 µs, or None for fewer than 16."""
     keys = [np.round(times * 1e7).astype(np.int64) for times in (first, *others)]
     shared = keys[0]
     for key in keys[1:]:
@@ -83,7 +84,7 @@ def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntAr
 def build_residual_contrasts(
     data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
 ) -> list[Contrast]:
-    """The residuals themselves, where nothing repeats."""
+    """Return the residuals of one signal kind in place of contrasts, for recordings without repeats."""
     found = []
     for number, block in enumerate(data.blocks):
         if block.kind == kind:

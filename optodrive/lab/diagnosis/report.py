@@ -1,4 +1,4 @@
-"""The report: one HTML file that needs nothing beside itself. Numbers come from the answer, pictures from numbers."""
+"""Diagnosis report: one self-contained HTML file built from the same data as the answer."""
 
 from html import escape
 
@@ -15,7 +15,7 @@ MAX_BARS = 14
 
 
 def build_report(discrepancy: Discrepancy, title: str) -> str:
-    """HTML."""
+    """Return the report as HTML."""
     nominal = "<span style='color:#c2571a'>nominal model</span>"
     legend, name = (
         (f"{nominal}, <span style='color:#1a6fc2'>extended model</span>", "extended model")
@@ -25,17 +25,17 @@ def build_report(discrepancy: Discrepancy, title: str) -> str:
     parts = [
         "<h2>Evidence for each cause</h2>",
         _draw_bars(discrepancy),
-        "<h2>Numbers</h2>",
+        "<h2>Parameters</h2>",
         _build_parameter_table(discrepancy),
         "<h2>Residuals by experiment, in units of the noise of one sample</h2>",
         f"<p>{legend}</p>",
         "<div class='grid'>",
-        *(_draw_residuals(course, bool(discrepancy.terms)) for course in _select_traces(discrepancy.residual_traces)),
+        *(_draw_residuals(trace, bool(discrepancy.terms)) for trace in _select_traces(discrepancy.residual_traces)),
         "</div>",
         f"<h2>Predicted against measured, {name}</h2><div class='grid'>",
         *(
             _draw_scatter(signal, discrepancy.residual_traces)
-            for signal in dict.fromkeys(course.signal for course in discrepancy.residual_traces)
+            for signal in dict.fromkeys(trace.signal for trace in discrepancy.residual_traces)
         ),
         "</div>",
     ]
@@ -57,23 +57,24 @@ def _draw_polyline(x: FloatArray, y: FloatArray, limits: tuple[float, float, flo
 def _draw_residuals(trace: ResidualTrace, extended: bool) -> str:
     max_residual = float(max(np.abs(trace.nominal).max(), np.abs(trace.extended).max(), 1.0))
     limits = (float(trace.t_s[0]), float(trace.t_s[-1]), -max_residual, max_residual)
-    lines = _draw_polyline(trace.t_s, trace.nominal, limits, "before")
-    lines += _draw_polyline(trace.t_s, trace.extended, limits, "after") if extended else ""
+    end = format_quantity(float(trace.t_s[-1]), "s")
+    lines = _draw_polyline(trace.t_s, trace.nominal, limits, "nominal")
+    lines += _draw_polyline(trace.t_s, trace.extended, limits, "extended") if extended else ""
     return (
         f"<figure><svg viewBox='0 0 {FIGURE_WIDTH} {FIGURE_HEIGHT}' role='img'>{lines}"
         f"<text x='2' y='14'>{max_residual:.1f} σ</text><text x='2' y='{FIGURE_HEIGHT - 20}'>−{max_residual:.1f}</text>"
-        f"<text x='{FIGURE_WIDTH - 60}' y='{FIGURE_HEIGHT - 4}'>{format_quantity(float(trace.t_s[-1]), 's')}</text></svg>"
+        f"<text x='{FIGURE_WIDTH - 60}' y='{FIGURE_HEIGHT - 4}'>{end}</text></svg>"
         f"<figcaption>{escape(trace.signal)}, {escape(trace.group)}</figcaption></figure>"
     )
 
 
 def _draw_scatter(signal: str, traces: tuple[ResidualTrace, ...]) -> str:
-    signal_traces = [course for course in traces if course.signal == signal]
-    measured = np.concatenate([course.measured for course in signal_traces])
+    signal_traces = [trace for trace in traces if trace.signal == signal]
+    measured = np.concatenate([trace.measured for trace in signal_traces])
     scale = float(np.ptp(measured)) or 1.0
-    noise = np.concatenate([course.extended for course in signal_traces])
+    noise = np.concatenate([trace.extended for trace in signal_traces])
     unit = signal.rsplit("_", 1)[1]
-    # The residual is in σ; its size in the signal's unit follows from the courses themselves.
+    # Residuals are in units of sigma.
     sigma = float(signal_traces[0].sigma)
     predicted = measured - noise * sigma
     low, high = float(measured.min()), float(measured.max())
@@ -85,10 +86,10 @@ def _draw_scatter(signal: str, traces: tuple[ResidualTrace, ...]) -> str:
     ends = np.array([low, high])
     return (
         f"<figure><svg viewBox='0 0 {FIGURE_WIDTH} {FIGURE_HEIGHT}' role='img'>"
-        f"{_draw_polyline(ends, ends, (low, high, low, high), 'before')}{dots}"
+        f"{_draw_polyline(ends, ends, (low, high, low, high), 'nominal')}{dots}"
         f"<text x='{MARGIN}' y='{FIGURE_HEIGHT - 4}'>{format_quantity(low, unit)}</text>"
         f"<text x='{FIGURE_WIDTH - 70}' y='{FIGURE_HEIGHT - 4}'>{format_quantity(high, unit)}</text></svg>"
-        f"<figcaption>{escape(signal)}: measured (up) against predicted</figcaption></figure>"
+        f"<figcaption>{escape(signal)}: measured (vertical) against predicted</figcaption></figure>"
     )
 
 
@@ -98,7 +99,7 @@ def _draw_bars(discrepancy: Discrepancy) -> str:
     rows = []
     for item in shown:
         width = 260 * np.log10(1.0 + item.statistic) / max_log_ratio
-        css_class = "bar" if item.verdict in ("named", "cannot be told apart") else "other"
+        css_class = "bar" if item.verdict in ("identified", "indistinguishable") else "other"
         bar = (
             "<svg viewBox='0 0 262 14' style='width:262px;border:0'>"
             f"<rect class='{css_class}' x='0' y='2' width='{width:.1f}' height='10'/></svg>"

@@ -112,7 +112,7 @@ def test_what_is_told_of_a_display(told):
     pixels = tuple(told[pixel][0] for pixel in [*HIDDEN, BAD])
     found = DisplayAnswer(pixels, None, 1.0)
     lines = build_display_narrative(found)
-    assert lines[0].startswith("Of 7 pixels, each diagnosed for itself, 2 show that the nominal model is wrong")
+    assert lines[0].startswith("Of 7 pixels, each diagnosed separately, 2 show an error of the nominal model")
     assert any("2 pixels: the laser's power falls while it is on (laser_droop): 21, 25." in line for line in lines)
     assert any(line.startswith("  laser_droop.share: median 0.") for line in lines)
     assert lines[-1] == "Model of the display: medians over 4 of 7 pixels."

@@ -106,7 +106,7 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
 
 def test_power_that_hops_within_pulses_is_not_named(hopping):
     assert (hopping.verdict, hopping.causes) == ("unexplained", ())
-    assert any("the power is unsteady within pulses" in line for line in build_narrative(hopping))
+    assert any("the power fluctuates within pulses" in line for line in build_narrative(hopping))
 
 
 def test_steady_power_is_steady_and_hops_are_far_from_it():
@@ -167,7 +167,7 @@ def test_a_lag_at_the_end_of_its_range_is_no_rival_of_a_late_clock():
 
 
 def test_the_experiment_says_which_pixel_and_no_size_is_said_twice(hopping):
-    ask = NextExperiment("why", np.array([[0.0, 0.01, 1.0, 1.0]]), 4, 3, ("force_N",), 9.0, 6.0)
+    ask = NextExperiment("description", np.array([[0.0, 0.01, 1.0, 1.0]]), 4, 3, ("force_N",), 9.0, 6.0)
     told = build_answer(replace(hopping, next_experiment=ask))["next_experiment"]
     assert (told["pixel"], told["repeats"]) == (4, 3)
     twice = tuple(CandidateCause("gas_leak", "gas_leak", 1.0, 1.0, None, "", size) for size in ("rate 1", "rate 2"))
@@ -193,4 +193,4 @@ def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_
     told = rivals_of(quiet, {"gas_leak": {"rate": 0.02}}, {"wall_heating": {"resistance": 6.0, "capacity": 0.05}})
     assert told.separation >= 12.0
     assert 3 <= told.repeats <= 30
-    assert f"{told.repeats} times" in told.rationale
+    assert f"{told.repeats} times" in told.description

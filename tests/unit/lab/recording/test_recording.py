@@ -234,7 +234,7 @@ REFUSALS = {
         every(deleting(f"{RUN}/pulses"), lambda f: f.create_group(f"{RUN}/pulses")),
         ["/runs/run2/pulses", "a group", "dataset"],
     ),
-    "pulses elsewhere": (linked, ["/runs/run2/pulses", "a link", "stored here"]),
+    "pulses elsewhere": (linked, ["/runs/run2/pulses", "a link", "stored in this file"]),
     "pulses of another file": (stored_elsewhere, ["/runs/run2/pulses", "other files"]),
     "pulse NaN": (entry(f"{RUN}/pulses", (1, 0), np.nan), ["pulses: start_s[1]", "nan", "finite"]),
     "pulse infinite": (entry(f"{RUN}/pulses", (0, 2), np.inf), ["pulses: power_W[0]", "inf", "finite"]),
@@ -269,7 +269,7 @@ REFUSALS = {
         ["/runs/run2/displacement_m", "no samples"],
     ),
     "samples too many": (huge, ["displacement_m/t_s", "1099511627776 numbers", "at most"]),
-    "samples too few": (few, ["/runs", "4 samples", "at least 6", "parameters"]),
+    "samples too few": (few, ["/runs", "4 finite samples", "at least 6", "parameters"]),
     "no pixel": (unsetting(HEIGHT, "pixel"), ["/runs/run2/displacement_m: pixel", "index"]),
     "pixel half": (setting(HEIGHT, "pixel", 1.5), ["displacement_m: pixel", "1.5", "whole"]),
     "pixel below 0": (setting(HEIGHT, "pixel", -1), ["displacement_m: pixel", "-1"]),
@@ -305,13 +305,13 @@ def test_refused_in_one_line_that_names_the_place(kind, path, monkeypatch):
 
 def test_what_is_no_hdf5_file_is_refused(tmp_path):
     path = tmp_path / "r.h5"
-    assert "nothing of this name" in refusal(path)
+    assert "no file of this name" in refusal(path)
     path.write_bytes(b"no HDF5")
     assert "readable HDF5" in refusal(path)
     path.write_bytes(b"")
     assert "readable HDF5" in refusal(path)
     path.unlink()
-    os.mkfifo(path)  # would wait for a writer for ever
+    os.mkfifo(path)  # opening it would block until a writer appears
     assert "neither file nor folder" in refusal(path)
 
 
@@ -355,10 +355,10 @@ def test_damage_on_which_hdf5_2_0_searches_for_ever_comes_to_an_end(path, monkey
 
 
 def test_nothing_is_left_where_writing_fails(tmp_path):
-    with pytest.raises(InputError, match="writable"):
+    with pytest.raises(InputError, match="can be written"):
         write_recording(tmp_path / "nowhere" / "r.h5", recording())
     (tmp_path / "folder.h5").mkdir()
-    with pytest.raises(InputError, match="writable"):
+    with pytest.raises(InputError, match="can be written"):
         write_recording(tmp_path / "folder.h5", recording())
     assert [path.name for path in tmp_path.iterdir()] == ["folder.h5"]
 
