@@ -44,7 +44,7 @@ def test_a_hidden_cause_is_named_measured_and_gains(droop):
     assert droop.gain is not None
     assert droop.gain.reduction > 0.9
     assert droop.gain.extended["absorber_temperature_K"] < droop.gain.nominal["absorber_temperature_K"]
-    assert set(droop.held_out).isdisjoint(droop.fitted)
+    assert set(droop.held_out_runs).isdisjoint(droop.fitted_runs)
     text = "\n".join(build_narrative(droop))
     assert "the laser's power falls while it is on" in text
     assert "Ruled out" in text
