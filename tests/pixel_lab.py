@@ -23,7 +23,7 @@ def run_json(capsys, *arguments, status=0):
 
 def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
     """Recordings of a sweep over hidden pixels, of some aims or all."""
-    asked = run_json(capsys, "calibrate", "--pixels-sweep", folder / "sweep", "--config", display, "--json")
+    asked = run_json(capsys, "calibrate", "pixels", "--sweep", folder / "sweep", "--config", display, "--json")
     recordings = []
     for k, aim in enumerate(asked["aims"]):
         if aims is not None and aim["name"] not in aims:
@@ -31,8 +31,8 @@ def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
         played, out = folder / "sweep" / aim["name"], folder / f"{aim['name']}.h5"
         told = run_json(
             capsys,
-            *("simulate", f"{played}.json", "--pixels-map", f"{played}.pixels.toml", "--config", display),
-            *("--pixel-seed", seed, "--pixels", "all", "--near", 0.1, "--noise", noise, "--seed", 100 * seed + k),
+            *("simulate", f"{played}.json", "--pixel-map", f"{played}.pixels.toml", "--config", display),
+            *("--pixel-seed", seed, "--pixels", "all", "--post-pulse", 0.1, "--noise", noise, "--seed", 100 * seed + k),
             *("--out", out, "--json"),
         )
         assert not told["summary"]["trimmed"]["pulses"]
@@ -43,7 +43,7 @@ def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
 def calibrate_map(capsys, folder, display, recordings):
     """pixels.toml, and what was said."""
     out = folder / "pixels.toml"
-    told = run_json(capsys, "calibrate", "--config", display, "--out", out, "--json", "--pixels", *recordings)
+    told = run_json(capsys, "calibrate", "pixels", "--config", display, "--out", out, "--json", *recordings)
     return out, told
 
 
@@ -58,11 +58,11 @@ def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
     }
     frames = Path(folder / "frames.json")
     frames.write_text(json.dumps({"frames": [frame]}))
-    more = () if pixels_map is None else ("--pixels-map", pixels_map)
+    more = () if pixels_map is None else ("--pixel-map", pixels_map)
     told = run_json(
         capsys,
         *("simulate", frames, "--config", display, "--pixel-seed", seed, "--pixels", "all"),
-        *("--near", 0.1, "--dt", 2e-4, "--json", *more),
+        *("--post-pulse", 0.1, "--dt", 2e-4, "--json", *more),
     )
     return np.array([pixel["measured_max_um"] for pixel in told["pixels"]]), told
 

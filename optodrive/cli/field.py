@@ -23,7 +23,8 @@ def register(app: typer.Typer) -> None:
 
 def field(
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", metavar="field.toml", help="The field, as `calibrate` writes it.")
+        Path | None,
+        typer.Option("--calibration", metavar="field.toml", help="Calibrated field, an output of `calibrate`."),
     ] = None,
     points: Annotated[
         Path | None, typer.Option("--points", metavar="points.csv", help="x_m,y_m; with --inverse x_code,y_code.")

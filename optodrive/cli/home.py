@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 def home(
     config: ConfigOption = None,
     spot_power_mw: Annotated[
-        float, typer.Option("--spot", metavar="POWER_MW", min=0.0, help="Look with a spot of this power; else dark.")
+        float, typer.Option("--spot-power-mw", metavar="POWER_MW", min=0.0, help="Power of the spot; 0: gate off.")
     ] = 0.0,
     acknowledge: Annotated[
         bool,

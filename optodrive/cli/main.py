@@ -23,7 +23,7 @@ from optodrive.cli import (
     validate,
     wire,
 )
-from optodrive.cli.calibrate import field as calibrate
+from optodrive.cli.calibrate import group as calibrate
 from optodrive.core.errors import OptodriveError
 
 EXIT_INTERRUPTED = 130

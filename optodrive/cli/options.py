@@ -23,15 +23,18 @@ ModelOption = Annotated[
     typer.Option("--model", metavar="model.toml", help="Plan with this parameter set, as `diagnose` writes it."),
 ]
 FieldOption = Annotated[
-    Path | None, typer.Option("--field", metavar="field.toml", help="Aim by this field, as `calibrate` writes it.")
+    Path | None,
+    typer.Option("--field", metavar="field.toml", help="Aim by this calibrated field, an output of `calibrate`."),
 ]
 MirrorsOption = Annotated[
     Path | None,
-    typer.Option("--mirrors", metavar="mirrors.toml", help="Time moves by these mirrors, as `calibrate` writes them."),
+    typer.Option("--mirrors", metavar="mirrors.toml", help="Use these mirror servos, an output of `calibrate servo`."),
 ]
 PixelMapOption = Annotated[
     Path | None,
-    typer.Option("--pixels-map", metavar="pixels.toml", help="Plan with this map of pixels, as `calibrate` writes it."),
+    typer.Option(
+        "--pixel-map", metavar="pixels.toml", help="Plan with this pixel map, an output of `calibrate pixels`."
+    ),
 ]
 UrlOption = Annotated[str, typer.Option("--url", help="Where the daemon listens; unix:PATH for its socket.")]
 StrictOption = Annotated[bool, typer.Option("--strict", help="The same as --policy refuse.")]

@@ -69,7 +69,7 @@ def merge(
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
     out: Annotated[Path, typer.Option("--out", metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a folder.")],
     time_offset_s: Annotated[
-        float, typer.Option("--shift", metavar="SECONDS", help="Added to every time measured.")
+        float, typer.Option("--time-offset", metavar="SECONDS", help="Added to every measured time.")
     ] = 0.0,
     json: JsonOption = False,
 ) -> None:

@@ -35,7 +35,7 @@ def serve(
     ] = None,
     capture: Annotated[
         Path | None,
-        typer.Option("--record", metavar="FILE", help="Note every byte on the link to the board in a new file."),
+        typer.Option("--capture", metavar="FILE", help="Write every byte on the link to the board to a new file."),
     ] = None,
     record_session: Annotated[
         Path | None,

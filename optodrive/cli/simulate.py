@@ -66,7 +66,11 @@ def simulate(
     ] = None,
     post_pulse_s: Annotated[
         float | None,
-        typer.Option("--near", metavar="SECONDS", help="Record each pixel only until so long after its own pulses."),
+        typer.Option(
+            "--post-pulse",
+            metavar="SECONDS",
+            help="Record each pixel only around its own pulses, until this long after.",
+        ),
     ] = None,
     json: JsonOption = False,
 ) -> None:
@@ -83,7 +87,7 @@ def simulate(
     if not 0.0 <= noise <= 1000.0:
         raise InputError("--noise", noise, "a factor between 0 and 1000")
     if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
-        raise InputError("--near", post_pulse_s, "a time between 0.001 and 10 s")
+        raise InputError("--post-pulse", post_pulse_s, "a time between 0.001 and 10 s")
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None

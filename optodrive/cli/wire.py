@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 LISTED_MAX = 8
 """A column longer than this is only counted on a line for people; --json lists it whole."""
 INVALID_SHOWN_BYTES = 32
-CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="What `optodrive serve --record` wrote.")]
+CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Output of `optodrive serve --capture`.")]
 
 
 def register(app: typer.Typer) -> None:

@@ -398,7 +398,7 @@ class GalvoSection(Section):
 
 
 class MirrorsFile(Section):
-    """mirrors.toml, as `optodrive calibrate --mirrors` writes it; about and axes are for people."""
+    """mirrors.toml, as `optodrive calibrate servo` writes it; about and axes are for people."""
 
     format: Literal["optodrive-mirrors"]
     version: Literal[1]

@@ -1,4 +1,4 @@
-"""`optodrive calibrate` on a board's process and its sensor, before geometries that only test and sensor know."""
+"""`optodrive calibrate board` on a board's process and its sensor, before geometries that only test and sensor know."""
 
 import json
 import re
@@ -17,7 +17,7 @@ from rig import wait_for
 from test_home import LATENESS_US, LEASE_US, assert_dark, step_of
 
 CONFIG = load_config()
-ENDLESS = ("--goal-um", "0.1", "--spots-max", "100")
+ENDLESS = ("--target-rms-um", "0.1", "--spots-max", "100")
 
 
 def since_light(kind, name):
@@ -50,10 +50,10 @@ def session_spots(out):
 )
 def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, more):
     board, out = make_board(sensor=("--geometry", str(geometry), *more)), tmp_path / "field.toml"
-    status, told, errors = start(board, "calibrate", "--out", out, "--json").ended()
+    status, told, errors = start(board, "calibrate", "board", "--out", out, "--json").ended()
     assert status == 0, errors
     answer = json.loads(told)
-    assert answer["goal_reached"] is True
+    assert answer["target_reached"] is True
     assert answer["spots"] <= 25
     field = load_field(out)
     assert rms_um(missed_m(field, geometry)) <= 10.0
@@ -71,7 +71,7 @@ def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, mo
 @pytest.mark.slow
 def test_ctrl_c_and_on(make_board, start, tmp_path):
     board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "--out", out)
+    command = start(board, "calibrate", "board", "--out", out)
     wait_for(lambda: len(session_spots(out)) >= 6, "six spots", 90.0)
     command.process.send_signal(signal.SIGINT)
     status, _, errors = command.ended()
@@ -81,9 +81,9 @@ def test_ctrl_c_and_on(make_board, start, tmp_path):
     kept = session_spots(out)
     lit = len(assert_dark(board).of("pulse"))
 
-    status, told, errors = start(board, "calibrate", "--out", out, "--json").ended()
+    status, told, errors = start(board, "calibrate", "board", "--out", out, "--json").ended()
     assert status == 0, errors
-    assert f"going on with {len(kept)} spots" in errors
+    assert f"resuming with {len(kept)} spots" in errors
     answer = json.loads(told)
     assert read_spots(tmp_path / "field.spots.csv").to_table()[: len(kept)] == pytest.approx(np.array(kept))
     assert len(assert_dark(board).of("pulse")) - lit <= 3 * (answer["spots"] - len(kept)) + 3
@@ -93,7 +93,7 @@ def test_ctrl_c_and_on(make_board, start, tmp_path):
 @pytest.mark.slow
 def test_a_display_that_moved_meanwhile_is_not_mixed_in(make_board, start, tmp_path):
     board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "--out", out, *ENDLESS)
+    command = start(board, "calibrate", "board", "--out", out, *ENDLESS)
     wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
     command.process.send_signal(signal.SIGINT)
     assert command.ended()[0] == 130
@@ -103,7 +103,7 @@ def test_a_display_that_moved_meanwhile_is_not_mixed_in(make_board, start, tmp_p
     path.write_text(json.dumps(kept))
     lit = len(assert_dark(board).of("pulse"))
 
-    status, _, errors = start(board, "calibrate", "--out", out).ended()
+    status, _, errors = start(board, "calibrate", "board", "--out", out).ended()
     assert status == 1
     found = re.search(r"moved since: .* (\d+) µm off and (\d+) µm off, expected at most (\d+) µm; delete", errors)
     assert found, errors
@@ -114,7 +114,7 @@ def test_a_display_that_moved_meanwhile_is_not_mixed_in(make_board, start, tmp_p
 
 def test_kill_9(make_board, start, tmp_path):
     board, out = make_board(sensor=()), tmp_path / "field.toml"
-    command = start(board, "calibrate", "--out", out, *ENDLESS)
+    command = start(board, "calibrate", "board", "--out", out, *ENDLESS)
     wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
     command.process.kill()
     killed_us = board.events()[-1]["t_us"]
@@ -144,7 +144,7 @@ def test_kill_9(make_board, start, tmp_path):
 )
 def test_what_ends_it_is_named(make_board, start, tmp_path, script, says):
     board, out = make_board(sensor=(), script=script), tmp_path / "field.toml"
-    status, told, errors = start(board, "calibrate", "--out", out, "--json", *ENDLESS).ended()
+    status, told, errors = start(board, "calibrate", "board", "--out", out, "--json", *ENDLESS).ended()
     assert status == 1
     last = errors.splitlines()[-1]
     assert re.match(f"optodrive: {says}", last), errors
@@ -154,10 +154,10 @@ def test_what_ends_it_is_named(make_board, start, tmp_path, script, says):
 
 
 @pytest.mark.slow
-def test_nudged_by_a_person(make_board, start, tmp_path):
+def test_spots_moved_by_a_person(make_board, start, tmp_path):
     """The person sees where the spot is, 20 µm well, and says how far it is off the mark."""
     board, out = make_board(sensor=("--geometry", "4")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "--nudge", "--spots-max", "9", "--out", out, "--json")
+    command = start(board, "calibrate", "board", "--manual", "--spots-max", "9", "--out", out, "--json")
     truth, random = GroundTruthGeometry.sample(4, CONFIG), np.random.default_rng(0)
     for line in command.process.stderr:
         mark = re.match(r"pixel \d+, (\S+) (\S+) mm", line)
@@ -176,7 +176,7 @@ def test_nudged_by_a_person(make_board, start, tmp_path):
 
 
 def test_nobody_answers(board, start, tmp_path):
-    command = start(board, "calibrate", "--nudge", "--out", tmp_path / "field.toml")
+    command = start(board, "calibrate", "board", "--manual", "--out", tmp_path / "field.toml")
     command.process.stdin.close()
     command.process.stdin = None
     status, _, errors = command.ended()
@@ -186,7 +186,7 @@ def test_nobody_answers(board, start, tmp_path):
 
 
 def test_without_a_sensor_it_asks_for_one(board, start, tmp_path):
-    status, _, errors = start(board, "calibrate", "--out", tmp_path / "field.toml").ended()
+    status, _, errors = start(board, "calibrate", "board", "--out", tmp_path / "field.toml").ended()
     assert status == 2
     assert "sensor.port: got None" in errors
     assert errors.count("\n") == 1

@@ -1,4 +1,4 @@
-"""`serve --field` and `serve --pixels-map`: light lands at the codes that field and map say, by the board's own log."""
+"""`serve --field` and `serve --pixel-map`: light lands at the codes that field and map say, by the board's own log."""
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def test_a_frame_lands_where_the_field_and_the_map_lead_it(tmp_path, mapped):
     known = PixelMap(gain, gain * 0.01, *offset_m.copy(), *np.full((2, count), 1e-6), state, "surroundings")
     write_pixel_map(map_path, known, CONFIG, {})
 
-    pulses, answer = shown(tmp_path, "--field", path, *(("--pixels-map", map_path) if mapped else ()))
+    pulses, answer = shown(tmp_path, "--field", path, *(("--pixel-map", map_path) if mapped else ()))
     order = answer["pulses"]["pixel"]
     assert sorted(order) == [pixel for pixel in PIXELS if not known.dead[pixel]]
     places_m = np.array([LAYOUT.x_m, LAYOUT.y_m])[:, order]

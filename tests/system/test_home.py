@@ -41,7 +41,7 @@ def test_in_the_dark(make_board, start):
 
 def test_with_a_spot_and_no_position_outputs(make_board, start):
     board = make_board(sensor=("--no-readback", "--false-share", "0.1"))
-    status, out, errors = start(board, "home", "--spot", "5").ended()
+    status, out, errors = start(board, "home", "--spot-power-mw", "5").ended()
     assert status == 0, errors
     assert "no position outputs: not checked" in out
     assert "seen by spot" in out
@@ -67,10 +67,15 @@ def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
             *("stick_x", (), "home: travel x: mirror x, sent 0.1636 rad from end to end,: got does not move"),
             marks=pytest.mark.slow,
         ),
-        ("stick_y", ("--spot", "5"), "home: travel y: mirror y, sent 0.1636 rad from end to end,: got does not move"),
+        (
+            "stick_y",
+            ("--spot-power-mw", "5"),
+            "home: travel y: mirror y, sent 0.1636 rad from end to end,: got does not move",
+        ),
         pytest.param("invert_readback", (), "rad, inverted, expected 0.16364 ±", marks=pytest.mark.slow),
         pytest.param(
-            *("blind_sensor", ("--spot", "5"), "got no spot, expected a spot: is it covered"), marks=pytest.mark.slow
+            *("blind_sensor", ("--spot-power-mw", "5"), "got no spot, expected a spot: is it covered"),
+            marks=pytest.mark.slow,
         ),
     ],
 )
@@ -103,7 +108,7 @@ def armed(board):
 )
 def test_ended_from_outside(make_board, start, number):
     board = make_board(sensor=())
-    command = start(board, "home", "--spot", "5")
+    command = start(board, "home", "--spot-power-mw", "5")
     armed(board)
     command.process.send_signal(number)
     ended_us = board.events()[-1]["t_us"]
@@ -124,7 +129,7 @@ def test_ended_from_outside(make_board, start, number):
 )
 def test_what_happens_midway(make_board, start, script, says):
     board = make_board(sensor=(), script=script)
-    status, _, errors = start(board, "home", "--spot", "5").ended()
+    status, _, errors = start(board, "home", "--spot-power-mw", "5").ended()
     assert status == 1
     assert says in errors
     assert_dark(board, ("DISARMED", "FAULT"))

@@ -1,1 +1,1 @@
-"""`optodrive calibrate`: one module per subcommand."""
+"""The command group `optodrive calibrate`, with one module per subcommand."""

@@ -1,4 +1,4 @@
-"""`optodrive calibrate --pictures`: a camera saw a grid in the display's plane, and the beam on it."""
+"""`optodrive calibrate camera`: measure spots in pictures of a grid and of the beam, then fit a field."""
 
 from pathlib import Path
 from statistics import median
@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.calibrate.board import CalibrationResult
+from optodrive.cli.calibrate.field_report import FieldCalibration, FieldOutOption, ReportOption, write_calibration
+from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.core.errors import InputError
 from optodrive.core.units import m_to_um
 
@@ -14,15 +15,27 @@ if TYPE_CHECKING:
     from optodrive.core.types.arrays import BoolArray
     from optodrive.lab.calibration.camera.measure import CameraMeasurement
 
-PicturesOption = Annotated[
-    Path | None,
-    typer.Option("--pictures", metavar="FOLDER", help="By camera: a grid and the spots, as pictures.toml says."),
-]
-LISTED_MAX = 6
+NAMES_LISTED_MAX = 6
 
 
-def calibrate_by_camera(folder: Path, config: str | None) -> CalibrationResult:
-    """Measure the spots in pictures, keep them as FOLDER/spots.csv, a file that --spots takes, and fit a field."""
+def camera(
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Pictures of a grid and of the spots, described by pictures.toml.")
+    ],
+    out: FieldOutOption = None,
+    report: ReportOption = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Measure spots in pictures from a camera, and fit the field to them."""
+    write_calibration(calibrate_by_camera(folder, config), out, report, json)
+
+
+def calibrate_by_camera(folder: Path, config: str | None) -> FieldCalibration:
+    """Measure the spots, write them to FOLDER/spots.csv (input of `calibrate field`), and fit a field.
+
+    Raises InputError for a folder, a picture or spots that cannot be used.
+    """
     from optodrive.device.config import load_config
     from optodrive.lab.calibration.camera.folder import SPOTS_FILE
     from optodrive.lab.calibration.camera.measure import measure_folder
@@ -32,54 +45,57 @@ def calibrate_by_camera(folder: Path, config: str | None) -> CalibrationResult:
     from optodrive.lab.calibration.spots import write_spots
 
     if not folder.is_dir():
-        raise InputError("--pictures", str(folder), "a folder with pictures.toml")
+        raise InputError("FOLDER", str(folder), "a folder with pictures.toml")
     prior = FieldPrior.from_config(load_config(config))
     measured, path = measure_folder(folder), folder / SPOTS_FILE
     write_spots(path, measured.spots)
     check_spots(str(path), measured.spots, prior)
     fit = fit_field(measured.spots, prior)
     check_fit(str(path), fit)
-    outliers = [name for name, out in zip(measured.names, fit.outlier, strict=True) if out]
-    return CalibrationResult(fit, path, build_stats(measured, outliers, path), format_stats(measured, outliers, path))
+    outliers = [name for name, is_outlier in zip(measured.names, fit.outlier, strict=True) if is_outlier]
+    return FieldCalibration(
+        fit, path, build_camera_stats(measured, outliers, path), format_camera_stats(measured, outliers, path)
+    )
 
 
-def build_stats(measured: "CameraMeasurement", outliers: list[str], path: Path) -> dict[str, object]:
-    """What the camera adds, for --json."""
+def build_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots_file: Path) -> dict[str, object]:
+    """Build the statistics that the camera adds to those of the fit, for --json."""
     return {
-        "spots_file": str(path),
+        "spots_file": str(spots_file),
         "outlier_pictures": outliers,
         "outside_pictures": _select_names(measured, measured.is_outside),
         "saturated_pictures": _select_names(measured, measured.is_saturated),
         "grid_pictures": measured.view_count,
         "pixel_um": round(m_to_um(measured.pixel_scale_m), 3),
         "corners_rms_px": round(measured.plane.residual_px, 4),
-        "spot_sigma_um": [round(m_to_um(each), 3) for each in measured.sigma_m.tolist()],
+        "spot_sigma_um": [round(m_to_um(sigma_m), 3) for sigma_m in measured.sigma_m.tolist()],
     }
 
 
-def format_stats(measured: "CameraMeasurement", outliers: list[str], path: Path) -> tuple[str, ...]:
-    """The same in words."""
-    sigma_um = sorted(m_to_um(each) for each in measured.sigma_m.tolist())
-    report = [
-        f"camera           {m_to_um(measured.pixel_scale_m):.0f} µm a pixel; corners of the grid "
-        f"{measured.plane.residual_px:.2f} px off on an axis, from {measured.view_count} of its pictures",
-        f"centres          sure to {median(sigma_um):.1f} µm on an axis, {sigma_um[-1]:.1f} µm at worst",
+def format_camera_stats(measured: "CameraMeasurement", outliers: list[str], spots_file: Path) -> tuple[str, ...]:
+    """Format the statistics of the camera as text lines."""
+    sigma_um = sorted(m_to_um(sigma_m) for sigma_m in measured.sigma_m.tolist())
+    lines = [
+        f"camera           {m_to_um(measured.pixel_scale_m):.0f} µm per pixel; grid corners "
+        f"{measured.plane.residual_px:.2f} px rms per axis, from {measured.view_count} pictures",
+        f"centroids        sigma {median(sigma_um):.1f} µm per axis, {sigma_um[-1]:.1f} µm max",
     ]
-    for name, which in (
-        ("false pictures", outliers),
-        ("saturated", _select_names(measured, measured.is_saturated)),
-        ("warning", _select_names(measured, measured.is_outside)),
-    ):
-        if which:
-            outside = " outside the grid: the camera is only guessed there" if name == "warning" else ""
-            report.append(f"{name:<17}{_join_names(which)}{outside}")
-    return (*report, f"spots kept       {path}")
+    saturated, outside = (_select_names(measured, mask) for mask in (measured.is_saturated, measured.is_outside))
+    if outliers:
+        lines.append(f"outlier pictures {_join_names(outliers)}")
+    if saturated:
+        lines.append(f"saturated        {_join_names(saturated)}")
+    if outside:
+        lines.append(
+            f"warning          {_join_names(outside)} outside the grid: the camera model is extrapolated there"
+        )
+    return (*lines, f"spots written    {spots_file}")
 
 
 def _select_names(measured: "CameraMeasurement", mask: "BoolArray") -> list[str]:
-    return [name for name, chosen in zip(measured.names, mask, strict=True) if chosen]
+    return [name for name, is_selected in zip(measured.names, mask, strict=True) if is_selected]
 
 
 def _join_names(names: list[str]) -> str:
-    more = f" and {len(names) - LISTED_MAX} more" if len(names) > LISTED_MAX else ""
-    return ", ".join(names[:LISTED_MAX]) + more
+    omitted = len(names) - NAMES_LISTED_MAX
+    return ", ".join(names[:NAMES_LISTED_MAX]) + (f" and {omitted} more" if omitted > 0 else "")

@@ -1,14 +1,22 @@
-"""`optodrive calibrate --mirrors`: measured steps of the mirrors to their servos."""
+"""`optodrive calibrate servo`: identify the galvo servos from a recording of mirror steps."""
 
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Annotated
 
-from optodrive.cli.options import print_json
+import typer
+
+from optodrive.cli.options import ConfigOption, JsonOption, print_json
 from optodrive.core.errors import InputError
 
 
-def calibrate_servo(recording: Path, out: Path | None, config: str | None, json: bool) -> None:
-    """Identify both servos, write mirrors.toml where asked, and say what was found and against what is configured."""
+def servo(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording of steps of both mirrors.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="mirrors.toml", help="Write the servos.")] = None,
+    config: ConfigOption = None,
+    json: JsonOption = False,
+) -> None:
+    """Identify both mirror servos from a recording of steps, and compare them with the configuration."""
     if find_spec("scipy") is None:
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
     from optodrive.device.config import load_config
@@ -18,19 +26,19 @@ def calibrate_servo(recording: Path, out: Path | None, config: str | None, json:
     from optodrive.lab.servo_identification.report import build_report, format_report_lines, write_mirrors
     from optodrive.lab.servo_identification.step_trace import extract_trace
 
-    # What the configuration itself states, so that a file of mirrors that is no good keeps no one from a new one.
+    # Servos measured before are not loaded: an invalid mirrors.toml must not prevent a new identification.
     loaded, source = load_config(config, measured_servo=False), str(recording)
     measurement = read_recording(recording)
     x_trace, y_trace = (extract_trace(source, measurement, axis) for axis in range(2))
-    slew = loaded.scanner.slew_rad_per_s
-    servos = identify(source, x_trace, slew), identify(source, y_trace, slew)
-    stats = build_report(servos, find_common_servo(servos, loaded), loaded)
+    slew_rad_per_s = loaded.scanner.slew_rad_per_s
+    servos = identify(source, x_trace, slew_rad_per_s), identify(source, y_trace, slew_rad_per_s)
+    report = build_report(servos, find_common_servo(servos, loaded), loaded)
     if out is not None:
-        write_mirrors(out, stats, source)
+        write_mirrors(out, report, source)
     if json:
-        print_json(stats | ({} if out is None else {"mirrors": str(out)}))
+        print_json(report | ({} if out is None else {"mirrors": str(out)}))
         return
-    for line in format_report_lines(stats):
+    for line in format_report_lines(report):
         print(line)
     if out is not None:
         print(f"written          {out}")

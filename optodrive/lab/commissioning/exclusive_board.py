@@ -272,7 +272,7 @@ def max_spot_power_w(config: Config) -> float:
     return min(SPOT_POWER_MAX_W, SPOT_SHARE_MAX * config.laser.max_power_w)
 
 
-def check_spot_power(config: Config, power_w: float, option: str = "--spot") -> None:
+def check_spot_power(config: Config, power_w: float, option: str = "--spot-power-mw") -> None:
     """InputError, naming the option, for a power that no spot may have."""
     max_w = max_spot_power_w(config)
     if not 0.0 < power_w <= max_w:

@@ -11,7 +11,7 @@ RESET_REMEDIES = {
     "power-up": "its supply was switched off or unplugged; check plug and supply",
     "reset": "its reset was pressed, or the debugger or USB reset it; arm again when that is over",
     "brown-out": "its supply sagged; give board and laser a stronger supply, or separate ones",
-    "watchdog": "its firmware hung; update the firmware, and keep the recording of the link (serve --record)",
+    "watchdog": "its firmware hung; update the firmware, and keep the capture of the link (serve --capture)",
 }
 NOISE_REMEDY = "check cable, plugs and grounding, keep the cable from the laser's and mirrors' drivers"
 

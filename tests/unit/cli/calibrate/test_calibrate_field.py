@@ -1,4 +1,4 @@
-"""`optodrive calibrate --spots` and `optodrive field`, as run from a shell."""
+"""`optodrive calibrate field` and `optodrive field`, run as commands."""
 
 import json
 
@@ -26,13 +26,13 @@ def folder(tmp_path_factory):
     """With spots.csv and the field.toml made from it."""
     at = tmp_path_factory.mktemp("calibrated")
     write_spots(at / "spots.csv", SPOTS)
-    assert run(["calibrate", "--spots", f"{at}/spots.csv", "--out", f"{at}/field.toml"]) == 0
+    assert run(["calibrate", "field", f"{at}/spots.csv", "--out", f"{at}/field.toml"]) == 0
     return at
 
 
 def test_it_says_what_is_left_how_sure_it_is_and_which_spots_are_false(folder, capsys):
     assert IS_OUTLIER.any()
-    assert run(["calibrate", "--spots", f"{folder}/spots.csv", "--json"]) == 0
+    assert run(["calibrate", "field", f"{folder}/spots.csv", "--json"]) == 0
     figures = json.loads(capsys.readouterr().out)
     assert figures["outlier_rows"] == np.flatnonzero(IS_OUTLIER).tolist()
     assert 12 < figures["residual_rms_um"] < 16
@@ -42,7 +42,7 @@ def test_it_says_what_is_left_how_sure_it_is_and_which_spots_are_false(folder, c
 
 
 def test_in_words_the_false_ones_are_named_by_their_line(folder, capsys):
-    assert run(["calibrate", "--spots", f"{folder}/spots.csv"]) == 0
+    assert run(["calibrate", "field", f"{folder}/spots.csv"]) == 0
     told = capsys.readouterr().out
     lines = (folder / "spots.csv").read_text().splitlines()
     named = [int(word) for word in told.splitlines()[1].replace(",", " ").split()[2:]]
@@ -53,7 +53,7 @@ def test_in_words_the_false_ones_are_named_by_their_line(folder, capsys):
 
 
 def test_the_report_stands_alone(folder):
-    arguments = ["calibrate", "--spots", f"{folder}/spots.csv", "--report", f"{folder}/report.html"]
+    arguments = ["calibrate", "field", f"{folder}/spots.csv", "--report", f"{folder}/report.html"]
     assert run(arguments) == 0
     html = (folder / "report.html").read_text()
     assert html.count("<svg") == 2
@@ -136,7 +136,7 @@ WRONG = {
 def test_wrong_spots_end_with_one_line_and_status_2(tmp_path, capsys, case):
     options, spoil, named = WRONG[case]
     write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(spoil(SPOTS.to_table())))
-    arguments = ["calibrate", "--spots", f"{tmp_path}/spots.csv", "--out", f"{tmp_path}/field.toml", *options]
+    arguments = ["calibrate", "field", f"{tmp_path}/spots.csv", "--out", f"{tmp_path}/field.toml", *options]
     assert run(arguments) == 2
     captured = capsys.readouterr()
     assert named in captured.err

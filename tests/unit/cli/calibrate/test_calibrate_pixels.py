@@ -50,7 +50,7 @@ def test_heights_as_asked_once_the_pixels_are_known(capsys, tmp_path, display, s
 
 
 def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
-    told = run_json(capsys, "calibrate", "--pixels-sweep", tmp_path / "sweep", "--config", "display-437", "--json")
+    told = run_json(capsys, "calibrate", "pixels", "--sweep", tmp_path / "sweep", "--config", "display-437", "--json")
     assert len(told["aims"]) == 9
     assert all(aim["pulse_width_s"] * aim["power_w"] <= 0.0126 for aim in told["aims"])
     assert all(aim["power_w"] < 0.05 for aim in told["aims"] if (aim["x_m"], aim["y_m"]) != (0, 0))
@@ -64,7 +64,7 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
     name = told["aims"][1]["name"]
     played = tmp_path / "sweep" / name
     plan = run_json(
-        capsys, "plan", f"{played}.json", "--pixels-map", f"{played}.pixels.toml", "--config", "display-437", "--json"
+        capsys, "plan", f"{played}.json", "--pixel-map", f"{played}.pixels.toml", "--config", "display-437", "--json"
     )
     assert plan["trimmed"]["pulses"] == 0
     assert plan["feasibility"]["fits"]
@@ -72,38 +72,38 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
 
 def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):
     (middle,) = record_sweep(capsys, tmp_path, "display-16", 11, aims=("middle",))
-    assert run(["calibrate", "--config", "display-16", "--pixels", str(middle)]) == 0
+    assert run(["calibrate", "pixels", "--config", "display-16", str(middle)]) == 0
     told = capsys.readouterr().out
     dead = GroundTruthPixels.sample(11, load_config("display-16")).dead.tolist()
     assert f"dead             1: {dead[0]}\n" in told
     assert "offset x" in told
-    assert "aims on both sides" in told
+    assert "aims across both edges" in told
     for scale, says in ((1e3, "these look like millimetres"), (0.0, "a pixel that responds")):
         spoiled = tmp_path / f"x{scale:g}.h5"
         spoiled.write_bytes(middle.read_bytes())
         with h5py.File(spoiled, "r+") as file:
             for each in file["runs"].values():
                 each["displacement_m/value"][:] *= scale
-        assert run(["calibrate", "--config", "display-16", "--pixels", str(spoiled)]) == 2
+        assert run(["calibrate", "pixels", "--config", "display-16", str(spoiled)]) == 2
         errors = capsys.readouterr().err
         assert says in errors
         assert errors.count("\n") == 1
-    assert run(["calibrate", "--config", "display-1", "--pixels", str(middle)]) == 2
+    assert run(["calibrate", "pixels", "--config", "display-1", str(middle)]) == 2
     assert "a pixel of display-1, 0 to 0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--pixels", "a.h5", "--spots", "s.csv"], "--spots: got 's.csv', expected no such option beside --pixels"),
-        (["--pixels", "a.h5", "--pixels-sweep", "f"], "--pixels: got 'a.h5', expected no such option beside"),
-        (["a.h5"], "expected --pixels before recordings"),
-        (["--model", "m.toml"], "--model: got 'm.toml'"),
-        (["--pixels", "none.h5"], "none.h5: got nothing of this name"),
+        (["a.h5", "--sweep", "f"], "RECORDING: got 'a.h5', expected no such argument together with --sweep"),
+        (["--sweep", "f", "--out", "p.toml"], "--out: got 'p.toml', expected no such argument together with --sweep"),
+        (["--sweep", "f", "--model", "m.toml"], "--model: got 'm.toml'"),
+        ([], "RECORDING: got None, expected at least one recording of a sweep, or --sweep FOLDER"),
+        (["none.h5"], "none.h5: got nothing of this name"),
     ],
 )
-def test_options_that_do_not_go_together(capsys, arguments, says):
-    assert run(["calibrate", *arguments]) == 2
+def test_wrong_arguments_are_one_line(capsys, arguments, says):
+    assert run(["calibrate", "pixels", *arguments]) == 2
     errors = capsys.readouterr().err
     assert says in errors
     assert errors.count("\n") == 1

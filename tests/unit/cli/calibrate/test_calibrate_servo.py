@@ -1,4 +1,4 @@
-"""`optodrive calibrate --mirrors`, and planning by what it wrote."""
+"""`optodrive calibrate servo`, and plans that use its output."""
 
 import json
 import tomllib
@@ -23,7 +23,7 @@ def folder(tmp_path_factory):
     """With the recording r.h5 and mirrors.toml made from it."""
     at = tmp_path_factory.mktemp("mirrors")
     write_recording(at / "r.h5", recording(SERVOS, np.random.default_rng(20)))
-    assert run(["calibrate", "--mirrors", f"{at}/r.h5", "--out", f"{at}/mirrors.toml"]) == 0
+    assert run(["calibrate", "servo", f"{at}/r.h5", "--out", f"{at}/mirrors.toml"]) == 0
     return at
 
 
@@ -45,7 +45,7 @@ def test_the_file_says_both_axes_and_one_servo_for_them(folder):
 
 
 def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, capsys):
-    assert run(["calibrate", "--mirrors", f"{folder}/r.h5", "--json"]) == 0
+    assert run(["calibrate", "servo", f"{folder}/r.h5", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     config = load_config()
     for axis, (name, servo) in enumerate(zip("xy", SERVOS, strict=True)):
@@ -113,8 +113,3 @@ def test_a_wrong_file_of_mirrors_is_one_line(folder, capsys, old, new, words):
     said = capsys.readouterr().err
     assert words in said
     assert "wrong.toml" in said
-
-
-def test_spots_and_mirrors_are_not_asked_for_at_once(folder, capsys):
-    assert run(["calibrate", "--mirrors", f"{folder}/r.h5", "--spots", "spots.csv"]) == 2
-    assert "no such option beside --mirrors" in capsys.readouterr().err

@@ -1,0 +1,101 @@
+"""The output that `calibrate field`, `camera` and `board` share: field file, HTML report, text and JSON."""
+
+from dataclasses import dataclass
+from dataclasses import field as dataclass_field
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from optodrive.cli.options import print_json
+
+if TYPE_CHECKING:
+    from optodrive.lab.calibration.field_fit import FieldFit
+
+FieldOutOption = Annotated[Path | None, typer.Option("--out", metavar="field.toml", help="Write the calibrated field.")]
+ReportOption = Annotated[
+    Path | None, typer.Option("--report", metavar="report.html", help="Write an HTML report of the fit.")
+]
+OUTLIERS_LISTED_MAX = 12
+FIRST_DATA_LINE = 2
+"""Line number of row 0 in a file of spots."""
+
+
+@dataclass(frozen=True)
+class FieldCalibration:
+    """A fitted field, the file of its spots, and the statistics and report lines of the measurement, if any."""
+
+    fit: "FieldFit"
+    spots_file: Path
+    stats: dict[str, object] = dataclass_field(default_factory=dict)
+    report_lines: tuple[str, ...] = ()
+
+
+def write_calibration(calibration: FieldCalibration, out: Path | None, report: Path | None, json: bool) -> None:
+    """Write the field and the report where requested, and print the fit's statistics."""
+    from optodrive.lab.calibration.field_writer import write_field
+    from optodrive.lab.calibration.fit_summary import summarize_fit
+
+    source = str(calibration.spots_file)
+    stats = summarize_fit(calibration.fit) | calibration.stats
+    lines = [*format_fit(stats), *calibration.report_lines]
+    written = {name: path for name, path in (("field", out), ("report", report)) if path is not None}
+    if out is not None:
+        write_field(out, calibration.fit, source)
+    if report is not None:
+        _write_report(report, calibration.fit, source, lines)
+    if json:
+        print_json(stats | {name: str(path) for name, path in written.items()})
+        return
+    for line in lines:
+        print(line)
+    for path in written.values():
+        print(f"written          {path}")
+
+
+def format_fit(stats: dict[str, Any]) -> list[str]:
+    """Format the statistics of a fit as text lines."""
+    outlier_rows = stats["outlier_rows"]
+    lines = [f"spots            {stats['spots']}, {len(outlier_rows)} of them outliers"]
+    if outlier_rows:
+        listed = ", ".join(str(row + FIRST_DATA_LINE) for row in outlier_rows[:OUTLIERS_LISTED_MAX])
+        omitted = len(outlier_rows) - OUTLIERS_LISTED_MAX
+        more = f" and {omitted} more" if omitted > 0 else ""
+        lines.append(f"outliers         line{'s' if len(outlier_rows) > 1 else ''} {listed}{more}")
+    lines += [
+        f"residual         {stats['residual_rms_um']:.1f} µm rms, {stats['residual_max_um']:.1f} µm max",
+        f"noise            {stats['noise_um']:.1f} µm per axis; "
+        f"not explained by mirrors, lens and board {stats['surface_um']:.1f} µm",
+        f"sigma            {stats['sigma_rms_um']:.1f} µm per axis, {stats['sigma_max_um']:.1f} µm max; "
+        "by region, as seen from the front:",
+    ]
+    return lines + ["                 " + "".join(f"{value:8.1f}" for value in row) for row in stats["sigma_um"]]
+
+
+def _write_report(path: Path, fit: "FieldFit", source: str, lines: list[str]) -> None:
+    from optodrive.core.files import atomic_write
+    from optodrive.core.html_page import render_page, render_table
+    from optodrive.lab.calibration.fit_summary import draw_residuals, draw_sigma_map
+
+    geometry, width = fit.field.geometry._asdict(), fit.prior.sigma
+    rows = (
+        (escape(name), f"{value:.6g}", f"{sigma:.2g}")
+        for (name, value), sigma in zip(
+            geometry.items(), width * fit.covariance.diagonal()[: len(width)] ** 0.5, strict=True
+        )
+    )
+    body = [
+        f"<pre>{escape(chr(10).join(lines))}</pre>",
+        "<div class='grid'>",
+        f"<figure>{draw_residuals(fit)}<figcaption>Residual (measured minus fitted) by commanded position</figcaption>"
+        "</figure>",
+        f"<figure>{draw_sigma_map(fit)}<figcaption>Sigma of the beam position per axis</figcaption></figure>",
+        "</div>",
+        "<h2>Parameters</h2><p>Parameters are correlated: the field is better determined than its parameters.</p>",
+        render_table(("", "value", "sigma"), rows, frozenset({1, 2})),
+    ]
+    with atomic_write(path) as temporary:
+        temporary.write_text(
+            render_page(f"Calibration from {source}", "field", ["Calibrated field"], body), encoding="utf-8"
+        )

@@ -1,0 +1,17 @@
+"""The command group `optodrive calibrate field | camera | board | servo | pixels`."""
+
+import typer
+
+from optodrive.cli.calibrate.board import board
+from optodrive.cli.calibrate.camera import camera
+from optodrive.cli.calibrate.field import field
+from optodrive.cli.calibrate.pixels import pixels
+from optodrive.cli.calibrate.servo import servo
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands."""
+    group = typer.Typer(help="Calibrate the scan field, the galvo servos or the pixels.", no_args_is_help=True)
+    for command in (field, camera, board, servo, pixels):
+        group.command()(command)
+    app.add_typer(group, name="calibrate")

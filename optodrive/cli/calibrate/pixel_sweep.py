@@ -1,0 +1,74 @@
+"""Files of the sweep that `optodrive calibrate pixels` fits: pulses per aim, their pixel maps and instructions."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from optodrive.cli.options import load_run_config, print_json
+from optodrive.core.errors import InputError
+
+if TYPE_CHECKING:
+    from optodrive.lab.calibration.pixels.sweep import Aim
+
+PULSE_FIELDS = ("pulse_width_s", "power_w")
+README = "README.txt"
+
+
+def write_sweep(folder: Path, config: str | None, json: bool) -> None:
+    """Write, for each aim, its pulses and the pixel map that offsets the beam by it, and a README.
+
+    Raises InputError where a cell is too small for the offsets or the folder cannot be created.
+    """
+    from json import dumps
+
+    from optodrive.core.files import atomic_write
+    from optodrive.core.types.stimuli import FrameSequence
+    from optodrive.device.config import build_pixel_layout
+    from optodrive.device.pixel_map import PixelMap, max_aim_offset_m, remove_pixel_map, write_pixel_map
+    from optodrive.lab.calibration.pixels.sweep import build_sweep, compute_pulse, list_aims
+    from optodrive.planning.stimuli.sequence_file import sequence_to_json
+
+    loaded = remove_pixel_map(load_run_config(config, None))
+    offset_max_m, pixel_count = max_aim_offset_m(loaded), len(build_pixel_layout(loaded.display))
+    aims = list_aims(loaded)
+    for aim in aims:
+        if abs(aim.x_m) > offset_max_m[0] or abs(aim.y_m) > offset_max_m[1]:
+            offset_mm = max(abs(aim.x_m), abs(aim.y_m)) * 1e3
+            raise InputError(
+                "display.pitch_m", loaded.display.pitch_m, f"cells that contain the focus at {offset_mm:.2f} mm offset"
+            )
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError("--sweep", str(folder), f"a folder ({error.strerror})") from None
+    for aim in aims:
+        text = dumps(sequence_to_json(FrameSequence((), build_sweep(loaded, aim)))) + "\n"
+        with atomic_write(folder / f"{aim.name}.json") as temporary:
+            temporary.write_text(text, encoding="utf-8")
+        pixel_map = PixelMap.uniform(pixel_count, aim.x_m, aim.y_m)
+        write_pixel_map(folder / f"{aim.name}.pixels.toml", pixel_map, loaded, {"source": f"sweep, aim {aim.name}"})
+    with atomic_write(folder / README) as temporary:
+        temporary.write_text("\n".join(_format_instructions(aims, loaded.name)) + "\n", encoding="utf-8")
+    pulses = [dict(zip(PULSE_FIELDS, compute_pulse(loaded, aim), strict=True)) for aim in aims]
+    if json:
+        described = [aim._asdict() | pulse for aim, pulse in zip(aims, pulses, strict=True)]
+        print_json({"folder": str(folder), "aims": described, "pulses": pixel_count})
+        return
+    print(f"aims             {len(aims)}, one file per aim, {pixel_count} pulses per file")
+    for pulse, label in zip(pulses[:2], ("centre", "across edges"), strict=True):
+        print(f"{label:<17}{pulse['pulse_width_s'] * 1e3:g} ms at {pulse['power_w']:.3f} W")
+    print(f"written          {folder}; {README} lists what to play and what to record")
+
+
+def _format_instructions(aims: "list[Aim]", display_name: str) -> list[str]:
+    return [
+        f"Play each file on {display_name} with its pixel map. The display must be cold before each file:",
+        "",
+        *(f"    {aim.name}.json with --pixel-map {aim.name}.pixels.toml" for aim in aims),
+        "",
+        "Record one run per pixel: the pulses; displacement_m with the pixel, from 20 ms before the pixel's pulse to",
+        "100 ms after its end, at one sample per millisecond or faster; and the aim, as attributes of the run:",
+        "",
+        *(f"    {aim.name}: aim_x_m = {aim.x_m!r}, aim_y_m = {aim.y_m!r}" for aim in aims),
+        "",
+        "In all files but the first, part of the light misses the absorber: do not raise their power.",
+    ]
