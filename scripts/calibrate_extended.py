@@ -94,7 +94,7 @@ def measure_gains():
 def format_table(results):
     """Markdown: ratios by model; bold where the fact was shown to the fit."""
     lines = [
-        "| model | half shown | " + " | ".join(JUDGED_FACTS) + " | error unseen |",
+        "| model | fitted half | " + " | ".join(JUDGED_FACTS) + " | held-out error |",
         "| --- " * (len(JUDGED_FACTS) + 3) + "|",
     ]
     for name, row in results.items():
