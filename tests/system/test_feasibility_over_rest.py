@@ -95,13 +95,13 @@ def test_the_command_line_says_it_in_one_line(armed, tmp_path):
     path.write_text(json.dumps(LATE))
     late = run("plan", path).stdout.splitlines()[0]
     assert late.startswith("fits: no, frame late needs 0.2")
-    assert "nearest that fits: " in late
+    assert "nearest feasible: " in late
     figures = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
     assert figures["late"] == []
     assert figures["feasibility"]["height_factor"] < 1.0
     refused = run("plan", path, "--strict")
     assert refused.returncode == 1
-    assert "nearest that fits: " in refused.stderr
+    assert "nearest feasible: " in refused.stderr
     pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url).stdout
     assert "left out         late: pixels " in pushed
     simulated = run("simulate", path, "--pixels", "0").stdout

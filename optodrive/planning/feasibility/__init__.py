@@ -1,4 +1,4 @@
-"""Whether a sequence fits on one beam, who breaks it, and the nearest that fits; best effort on request."""
+"""Feasibility of a sequence on one beam: report, nearest feasible variants and best-effort plans."""
 
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.feasibility.report import (

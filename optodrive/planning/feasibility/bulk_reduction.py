@@ -1,4 +1,4 @@
-"""A long sequence thinned all at once: what is too much leaves every late frame, round by round; some comes back."""
+"""Reduction of a long sequence in bulk: drop the excess pixels of every late frame, then restore those that fit."""
 
 from collections.abc import Callable
 
@@ -10,13 +10,18 @@ from optodrive.planning.feasibility.sequence_edits import omit_pixels
 from optodrive.planning.planned_sequence import PlannedSequence
 
 PASSES_MAX = 12
+"""Planning passes after which the bulk reduction gives up."""
 
 OmittedPixels = dict[int, tuple[int, ...]]
-"""Pixels left out, by source."""
+"""Omitted pixels by source."""
 
 
 def reduce_in_bulk(search: OrderSearch, sequence: FrameSequence) -> tuple[OmittedPixels, Orders] | None:
-    """Pixels left out, and orders for the rest; None where it does not come to fit in a few rounds."""
+    """Reduce all frames pass by pass until the sequence fits.
+
+    Returns the omitted pixels and the visiting orders of the rest, or None if the sequence still does not fit after
+    PASSES_MAX passes.
+    """
     omitted: OmittedPixels = {}
     for _ in range(PASSES_MAX):
         prepared = search.plan(omit_pixels(sequence, omitted))
@@ -31,13 +36,13 @@ def reduce_in_bulk(search: OrderSearch, sequence: FrameSequence) -> tuple[Omitte
 
 
 def sort_pixels_by_height(frame: TactileFrame) -> tuple[int, ...]:
-    """The pixels a frame drives."""
+    """Return the driven pixels of a frame, the highest target first."""
     driven = np.flatnonzero(frame.target_m > 0)
     return tuple(driven[np.argsort(-frame.target_m[driven], kind="stable")].tolist())
 
 
 def _find_excess_pixels(prepared: PlannedSequence, on_progress: Callable[[], None]) -> OmittedPixels:
-    """What the frames of a plan that does not fit must lose at the least, as far as one plan shows it."""
+    """Return the pixels that the late frames of a plan must lose at least, as far as this plan shows it."""
     plan, previous_end_s = prepared.plan, 0.0
     excess: OmittedPixels = {}
     for timing in prepared.frames:
@@ -52,7 +57,7 @@ def _find_excess_pixels(prepared: PlannedSequence, on_progress: Callable[[], Non
                 break
             if pixel in cost_s and pixel not in omitted:
                 omitted.append(pixel)
-        # A frame that is late only because others were comes in time without them, or else in a later round.
+        # A frame delayed only by earlier frames is on time once those are reduced, or is reduced in a later pass.
         if timing.late_s > 0 and not omitted and not excess:
             omitted = list(sort_pixels_by_height(prepared.sequence.frames[timing.source])[:1])
         if omitted:
@@ -63,7 +68,7 @@ def _find_excess_pixels(prepared: PlannedSequence, on_progress: Callable[[], Non
 def _restore_pixels(
     search: OrderSearch, sequence: FrameSequence, omitted: OmittedPixels, best: Orders
 ) -> tuple[OmittedPixels, Orders]:
-    """Show again what fits after all, the lowest first, while plans may be tried."""
+    """Restore omitted pixels that fit after all, the lowest target first, until the search is exhausted."""
     for source, pixels in list(omitted.items()):
         for pixel in reversed(pixels):
             if search.is_exhausted:

@@ -1,6 +1,6 @@
-"""Whether a sequence fits, said before anything moves; and what is planned in its place where something else is wanted.
+"""Feasibility check: whether a sequence fits before it is shown, and the plan of a variant that fits.
 
-A sequence that fits costs its plan and nothing more.
+A feasible sequence costs one plan.
 """
 
 from dataclasses import dataclass, replace
@@ -27,19 +27,20 @@ from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.sequence_checks import first_unreachable, remove_dead_pixels
 
 PLANS_MAX = 1_000
-"""So many plans at most are tried for each of the nearest sets."""
+"""Plans tried at most per kind of nearest feasible variant."""
 PULSES_MAX = 30_000
+"""Pulses planned at most per kind of variant: about one second of computation."""
 PULSES_REQUESTED_MAX = 200_000
-"""And so many pulses, a second's work; for what was asked for by name some seconds'."""
+"""Pulses planned at most for the kind of variant that the caller requested: some seconds of computation."""
 TERMS_PLAN_FRACTION = 0.05
-"""With terms in the model a pulse takes so much longer to plan; this share of plans then."""
+"""Fraction of the plans tried when the model has planner terms, which make a pulse that much slower to plan."""
 PLANS_MIN = 12
-"""So many plans all the same for what was asked for by name, however long it is."""
+"""Plans tried at least for the kind of variant that the caller requested, regardless of the sequence's length."""
 
 
 @dataclass(frozen=True, eq=False)
 class _FeasibilityQuery:
-    """What was asked for, and what it is planned from. told: shows progress."""
+    """A sequence with the display, thermal state, budget and fit mode of its check."""
 
     display: DisplayModel
     sequence: FrameSequence
@@ -49,21 +50,24 @@ class _FeasibilityQuery:
     on_progress: Progress
 
     def new_search(self, plans_max: int) -> OrderSearch:
+        """Return a search that starts from the query's thermal state and budget."""
         return OrderSearch(self.display, self.heat, self.budget, lambda: self.on_progress(1.0), plans_max)
 
     def plan(
         self, policy: Policy = "trim", orders: Orders | None = None, replacement: FrameSequence | None = None
     ) -> PlannedSequence:
+        """Plan the sequence or its replacement under a policy, in the planner's order or in the given orders."""
         sequence = self.sequence if replacement is None else replacement
         return plan_sequence(
             self.display, sequence, self.heat, self.budget, policy, self.on_progress, visiting_orders=orders
         )
 
     def plan_fraction(self) -> float:
+        """Return the fraction of the plan limits that the model's computation time leaves."""
         return TERMS_PLAN_FRACTION if self.display.parameters.planner_terms else 1.0
 
     def compute_plans_max(self, is_requested: bool) -> int:
-        """How many plans may be tried for one of the nearest sets, by_name: the one that was asked for."""
+        """Compute the number of plans to try for one kind of variant; is_requested: the caller requested this kind."""
         pulses = PULSES_REQUESTED_MAX if is_requested else PULSES_MAX
         frames = sum(int((frame.target_m > 0).sum()) for frame in self.sequence.frames)
         count = frames + sum(len(train.pulse_starts_s()) for train in self.sequence.trains)
@@ -79,20 +83,24 @@ def check_feasibility(
     on_progress: Progress | None = None,
     fit: FitMode = "as_is",
 ) -> tuple[PlannedSequence, FeasibilityReport]:
-    """Plan a sequence as `prepare` does, or what of it fits, and say whether all of it does.
+    """Plan a sequence, or the part of it that fits, and report its feasibility.
 
-    Where the planner's order does not fit and there are few, all orders are tried, and one that fits is the plan.
-    "as_is": what does not fit goes by the policy; "even": lower by one factor; "priority": less of the less important.
-    Dead pixels are left out of frames first. Raises as `prepare`; RefusedError, with the admission, under policy
-    "refuse", and where nothing fits that is asked.
+    If the planner's order does not fit and the sequence has at most ORDERS_MAX orders, all orders are tried and the
+    first that fits is planned. If none fits, `fit` decides: "as_is" applies the policy to the whole sequence, "even"
+    scales all heights by one factor, "priority" omits the pixels and trains of lowest priority. Dead pixels are removed
+    from the frames beforehand.
+
+    Returns the plan and the report. Raises as `plan_sequence` does, and RefusedError with the report if the policy is
+    "refuse" or if no variant of the requested kind fits.
     """
     living, dead = remove_dead_pixels(display, sequence)
     query = _FeasibilityQuery(display, living, heat, budget, fit, on_progress or (lambda _share: None))
-    prepared, report = _check_query(query, policy)
-    return replace(prepared, dead_pixels=dead), report
+    planned, report = _check_query(query, policy)
+    return replace(planned, dead_pixels=dead), report
 
 
 def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSequence, FeasibilityReport]:
+    """Plan the query's sequence and report; plan a variant if the plan violates a limit."""
     unreachable = None if query.fit == "as_is" else first_unreachable(query.display, query.sequence)
     if unreachable is not None:
         return _plan_alternative(query, None, Violation("unreachable", unreachable[0], unreachable[1]), policy)
@@ -106,13 +114,13 @@ def _check_query(query: _FeasibilityQuery, policy: Policy) -> tuple[PlannedSeque
 def _plan_alternative(
     query: _FeasibilityQuery, plan: PlannedSequence | None, violation: Violation, policy: Policy
 ) -> tuple[PlannedSequence, FeasibilityReport]:
-    """What is planned of a sequence whose plan breaks; plan: None where a target is out of reach."""
+    """Plan a variant of a sequence whose plan violates a limit; plan is None if a target is unreachable."""
     search = query.new_search(int(query.plan_fraction() * ORDERS_MAX))
     orders, proof, lower_bound_s = _search_other_orders(search, query.sequence, violation)
     if orders is not None:
         ordered = query.plan(orders=orders)
-        report_found = build_feasible_report(ordered, proof, query.fit)
-        return ordered, replace(report_found, plans_tried=search.plans_tried, plans_tried_max=search.plans_max)
+        ordered_report = build_feasible_report(ordered, proof, query.fit)
+        return ordered, replace(ordered_report, plans_tried=search.plans_tried, plans_tried_max=search.plans_max)
     searches = [query.new_search(query.compute_plans_max(query.fit == fit)) for fit in ("priority", "even", None)]
     reduced, scaled, stretched = (
         reduce_sequence(searches[0], query.sequence),
@@ -123,12 +131,12 @@ def _plan_alternative(
         pixels=None if reduced is None else build_reduction(query.sequence, reduced[0], violation.source),
         height_factor=None if scaled is None else scaled[0],
         time_factor=None if stretched is None else stretched[0],
-        complete=not any(trials.is_exhausted for trials in searches),
+        complete=not any(each.is_exhausted for each in searches),
     )
     report = replace(
         build_infeasible_report(query.sequence, plan, violation, proof, lower_bound_s, nearest),
-        plans_tried=sum(trials.plans_tried for trials in (search, *searches)),
-        plans_tried_max=sum(trials.plans_max for trials in (search, *searches)),
+        plans_tried=sum(each.plans_tried for each in (search, *searches)),
+        plans_tried_max=sum(each.plans_max for each in (search, *searches)),
         fit=query.fit,
     )
     if query.fit == "as_is":
@@ -140,14 +148,14 @@ def _plan_alternative(
     if query.fit == "priority" and reduced is not None and nearest.pixels is not None:
         reduced_plan = query.plan("trim", reduced[1], omit_pixels(query.sequence, reduced[0]))
         return reduced_plan, replace(report, omitted=nearest.pixels.omitted)
-    refusal = "no height fits" if query.fit == "even" else "nothing of it fits"
+    refusal = "no height fits" if query.fit == "even" else "no part of it fits"
     raise _attach_report(RefusedError(f"{refusal}: {report.message}"), report)
 
 
 def _search_other_orders(
     search: OrderSearch, sequence: FrameSequence, violation: Violation
 ) -> tuple[Orders | None, Proof, float | None]:
-    """Other orders that fit, or how far it is proven that there are none, and the frame's least beam time, s."""
+    """Return orders that fit or None, the proof reached, and the lower bound of the frame's beam time in s if known."""
     impossible, lower_bound_s = search.prove_infeasible(sequence, violation)
     if impossible:
         return None, "bound", lower_bound_s
@@ -160,7 +168,7 @@ def _search_other_orders(
 def _apply_policy(
     query: _FeasibilityQuery, plan: PlannedSequence | None, report: FeasibilityReport, policy: Policy
 ) -> PlannedSequence:
-    """The plan as it is, or with its waits; raises under "refuse", and where waiting does not help."""
+    """Return the trimmed or delayed plan; raises under "refuse" and if no delay helps."""
     if plan is not None and policy == "trim":
         return plan
     try:
@@ -172,5 +180,6 @@ def _apply_policy(
 
 
 def _attach_report(error: RefusedError, report: FeasibilityReport) -> RefusedError:
+    """Return the error with the report attached."""
     error.feasibility = report.to_dict()
     return error

@@ -1,4 +1,4 @@
-"""What breaks a plan, and what would fit, in plain sentences."""
+"""One-line messages of the feasibility report: the first violation and the nearest feasible variants."""
 
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import m_to_um
@@ -9,32 +9,33 @@ from optodrive.planning.planned_sequence import PlannedSequence, describe_latene
 
 
 def name_source(sequence: FrameSequence, source: int) -> str:
-    """A frame's own name, or a train by its number."""
+    """Return the identifier of a frame, or the number of a train."""
     frames = sequence.frames
     return frames[source].frame_id if source < len(frames) else f"train {source - len(frames)}"
 
 
 def describe_violation(sequence: FrameSequence, plan: PlannedSequence | None, violation: Violation) -> str:
-    """What breaks a plan first, with its numbers; plan: None where a target is out of reach."""
+    """Describe the first violation with its numbers; plan is None if a target is unreachable."""
     frames, name = sequence.frames, name_source(sequence, violation.source)
     is_frame = violation.source < len(frames)
     subject = f"frame {name}" if is_frame else name
     if plan is None:
         target_um = m_to_um(float(frames[violation.source].target_m[violation.pixel]))
-        return f"{subject} asks {target_um:.1f} µm of pixel {violation.pixel}, more than the longest pulse reaches"
+        return f"{subject} requests {target_um:.1f} µm at pixel {violation.pixel}, more than the longest pulse reaches"
     if violation.reason != "deadline":
-        return f"{subject} asks more of pixel {violation.pixel} than the {PHRASES[violation.reason].rstrip(',')} allows"
+        cap = PHRASES[violation.reason].rstrip(",")
+        return f"{subject} requests more at pixel {violation.pixel} than the {cap} allows"
     if is_frame:
         return next(describe_lateness(timing) for timing in plan.frames if timing.source == violation.source)
     late_s = float((plan.plan.start_s - plan.plan.requested_start_s)[plan.plan.source == violation.source].max())
     return (
-        f"{subject} starts a pulse {late_s * 1e3:.2f} ms late, more than the one move to it takes: "
-        f"the moves between trains add up"
+        f"{subject} starts a pulse {late_s * 1e3:.2f} ms late, more than one settling time: "
+        f"the settling times between trains add up"
     )
 
 
 def describe_nearest(nearest: NearestFeasible, sequence: FrameSequence, source: int) -> str:
-    """The nearest sets in a few words; source: who breaks what was asked."""
+    """Describe the nearest feasible variants; source: the frame or train of the violation."""
     options = []
     if nearest.pixels is not None:
         options.append(_describe_reduction(nearest.pixels, sequence, source))
@@ -43,13 +44,14 @@ def describe_nearest(nearest: NearestFeasible, sequence: FrameSequence, source: 
     if nearest.time_factor is not None:
         options.append(f"times × {nearest.time_factor:g}")
     if options:
-        return "nearest that fits: " + ", or ".join(options)
-    return "nothing near it fits" if nearest.complete else "nothing near it was found to fit"
+        return "nearest feasible: " + ", or ".join(options)
+    return "no variant fits" if nearest.complete else "no variant was found to fit"
 
 
 def _describe_reduction(reduction: SequenceReduction, sequence: FrameSequence, source: int) -> str:
+    """Describe which pixels or trains a reduction keeps and how many other sources it reduces."""
     is_frame = source < len(sequence.frames)
-    is_source_omitted = any(left.source == source for left in reduction.omitted)
+    is_source_omitted = any(item.source == source for item in reduction.omitted)
     kept_text = (
         f"{reduction.kept} of {reduction.requested} pixels"
         if is_frame or not is_source_omitted

@@ -1,4 +1,4 @@
-"""The nearest sets that fit: with lower heights, at a slower rate, or with pixels left out. Each is really planned."""
+"""Nearest feasible variants with lower heights or longer times, each confirmed by a plan."""
 
 from math import ceil, sqrt
 
@@ -7,11 +7,16 @@ from optodrive.planning.feasibility.order_search import Orders, OrderSearch
 from optodrive.planning.feasibility.sequence_edits import scale_sequence, stretch_sequence
 
 TIME_FACTOR_MAX = 64.0
+"""Largest time factor tried."""
 TIME_FACTOR_STEP = 1.01
+"""Ratio of the bracket's ends at which the search for the time factor stops."""
 
 
 def find_height_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[float, Orders] | None:
-    """The largest factor on all heights and powers, in hundredths, by halving; and the orders it fits with."""
+    """Find the largest factor on all heights and powers that fits, by bisection in hundredths.
+
+    Returns the factor and the visiting orders, or None if no factor fits.
+    """
     best: tuple[float, Orders] | None = None
     low, high = 0, 100
     while high - low > 1:
@@ -25,7 +30,10 @@ def find_height_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[fl
 
 
 def find_time_factor(search: OrderSearch, sequence: FrameSequence) -> tuple[float, Orders] | None:
-    """The least factor on all times, to 1 %, by doubling and halving; and its orders. None beyond RATE_MAX."""
+    """Find the smallest factor on all times that fits, by doubling and bisection to within 1 %.
+
+    Returns the factor and the visiting orders, or None if no factor up to TIME_FACTOR_MAX fits.
+    """
     low, high = 1.0, 2.0
     orders = search.find_orders(stretch_sequence(sequence, high))
     while orders is None:

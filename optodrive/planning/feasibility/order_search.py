@@ -1,8 +1,8 @@
-"""Plans tried from one heat and budget, so many at most: by the planner's order, or by any order of a small sequence.
+"""Search for visiting orders that fit, from one thermal state and budget, with a limit on the number of plans.
 
-What is exact: every order of every frame's pixels is tried, each pulse as early as it may come, a train's pulse before
-any pulse that would make it late. What is not tried is waiting on purpose: the less heat is left, the longer a pulse,
-so that hardly ever pays; but the gas lags by some milliseconds, and within them it may.
+The exhaustive search covers every order of every frame's pixels with each pulse at its earliest start; a train's pulse
+precedes any pulse that would delay it. Deliberate waiting is not searched. It rarely helps, because a cooler pixel
+needs a longer pulse; within the few milliseconds of the gas lag it can.
 """
 
 from collections.abc import Callable, Mapping
@@ -30,23 +30,26 @@ from optodrive.planning.scheduler.scheduler import Scheduler
 from optodrive.planning.sequence_checks import first_unreachable
 
 ORDERS_MAX = 14_000
-"""A sequence with so many orders at most is small: three frames of four pixels have 13,824."""
+"""Orders up to which a sequence is searched exhaustively: three frames of four pixels have 13,824."""
 
 MICROSECOND_S = 1e-6
+"""Time step of the beam, s; a deadline is not rounded to it."""
 
 Orders = Mapping[int, IntArray]
-"""By source, the order in which a frame's driven pixels are visited."""
+"""Visiting order of a frame's driven pixels, by source."""
 
 
 class _PlanLimitError(Exception):
-    """So many plans were tried as may be."""
+    """The search has tried its maximum number of plans."""
 
 
 class OrderSearch:
-    """Tries plans. plans: how many so far; spent: whether one more was wanted than plans_max; tick: shows progress.
+    """Search for feasible plans with a limit on the number of plans.
 
-    What is found is given as orders by source, with which `prepare` makes the plan that was tried; the planner's own
-    where none is given.
+    plans_tried: plans so far; is_exhausted: a plan beyond plans_max was needed; on_progress: progress callback.
+
+    Results are visiting orders by source, from which `plan_sequence` makes the plan that was tried. An empty mapping
+    stands for the planner's own order.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class OrderSearch:
         self.on_progress = on_progress
 
     def find_orders(self, sequence: FrameSequence) -> Orders | None:
-        """Orders with which the sequence fits, the planner's own or others; None where none were found."""
+        """Return orders with which the sequence fits, the planner's own first, or None if none were found."""
         try:
             violation = self._try_orders(sequence)
             if violation is None:
@@ -82,7 +85,10 @@ class OrderSearch:
             return None
 
     def search_all_orders(self, sequence: FrameSequence) -> Orders | None:
-        """Orders with which a small sequence fits; None where there are none, unless spent."""
+        """Return the first of all orders with which a small sequence fits.
+
+        None proves that no order fits unless the search is exhausted.
+        """
         try:
             return self._search_depth_first(sequence)
         except _PlanLimitError:
@@ -90,7 +96,10 @@ class OrderSearch:
             return None
 
     def find_violation(self, sequence: FrameSequence) -> Violation | None:
-        """What breaks the plan by the planner's order; None where nothing does, or no more plans may be tried."""
+        """Return the first violation of the plan in the planner's order.
+
+        None means that the plan has no violation or that the search is exhausted.
+        """
         try:
             return self._try_orders(sequence)
         except _PlanLimitError:
@@ -98,7 +107,10 @@ class OrderSearch:
             return None
 
     def plan(self, sequence: FrameSequence) -> PlannedSequence | None:
-        """The plan by the planner's order, late and trimmed as it may be; None out of reach, or when spent."""
+        """Return the plan in the planner's order, late and trimmed where necessary.
+
+        None means that a target is unreachable, that a height train has no such cycle, or that the search is exhausted.
+        """
         if first_unreachable(self._display, sequence) is not None:
             return None
         if self.plans_tried >= self.plans_max:
@@ -109,26 +121,26 @@ class OrderSearch:
             return plan_sequence(
                 self._display, sequence, self._heat, self._budget, "trim", lambda _share: self.on_progress()
             )
-        except InputError:  # a train by height has no such cycle
+        except InputError:  # no steady cycle of a height train has this height and period
             return None
 
     def prove_infeasible(self, sequence: FrameSequence, violation: Violation) -> tuple[bool, float | None]:
-        """Whether no order can mend a breach, and the beam time that its frame takes at the least, s, if known."""
+        """Return whether no order removes a violation, and the lower bound of its frame's beam time in s if known."""
         if is_order_independent(violation, sequence):
             return True, None
         if violation.reason != "deadline":
             return False, None
         frame = sequence.frames[violation.source]
-        lead_s = self._display.scan_head.settling.lead_in_us * 1e-6
-        lower_bound_s = beam_lower_bound_s(self._display, sequence, self._heat, violation.source, lead_s)
-        # The beam counts from a whole microsecond, a deadline does not.
+        lead_in_s = self._display.scan_head.settling.lead_in_us * 1e-6
+        lower_bound_s = beam_lower_bound_s(self._display, sequence, self._heat, violation.source, lead_in_s)
+        # Pulses start on whole microseconds; a deadline need not lie on one.
         return (
             lower_bound_s is not None and lower_bound_s > frame.duration_s + MICROSECOND_S + TIME_TOLERANCE_S,
             lower_bound_s,
         )
 
     def _try_orders(self, sequence: FrameSequence, orders: Orders | None = None) -> Violation | None:
-        """What breaks the plan by these orders first; the planner's own where None."""
+        """Return the first violation of the plan in the given orders, or in the planner's own if None."""
         unreachable = first_unreachable(self._display, sequence) if orders is None else None
         if unreachable is not None:
             return Violation("unreachable", unreachable[0], unreachable[1])
@@ -136,18 +148,18 @@ class OrderSearch:
             raise _PlanLimitError
         self.plans_tried += 1
         try:
-            # Most orders end early for want of time, and the limiter takes four times as long to ask.
+            # Most orders miss a deadline early, and the limiter makes a plan four times as slow.
             return self._plan_until_violation(sequence, orders, through_limiter=False) or self._plan_until_violation(
                 sequence, orders, through_limiter=True
             )
-        except InputError:  # as scaled or stretched, a train by height has no such cycle
+        except InputError:  # no steady cycle of a scaled or stretched height train has this height and period
             source, train = next((k, t) for k, t in enumerate(sequence.trains) if isinstance(t, HeightTrain))
             return Violation("unreachable", len(sequence.frames) + source, train.pixel)
 
     def _plan_until_violation(
         self, sequence: FrameSequence, orders: Orders | None, through_limiter: bool
     ) -> Violation | None:
-        """Plan batch by batch up to the first violation, through the limiter or as if there were no caps."""
+        """Plan batch by batch up to the first violation, with or without the limiter."""
         scheduler = Scheduler(
             self._display.scan_head,
             sequence,
@@ -166,7 +178,7 @@ class OrderSearch:
         return next((violation for violation in violations if violation is not None), None)
 
     def _search_depth_first(self, sequence: FrameSequence) -> Orders | None:
-        """Orders one after the other, depth first: all that begin as one did up to where it broke are passed over."""
+        """Try orders depth first, skipping all orders that share the prefix in which a violation occurred."""
         driven = [np.flatnonzero(frame.target_m > 0) for frame in sequence.frames]
         ranks = [list(range(len(pixels))) for pixels in driven]
         while True:
@@ -181,21 +193,21 @@ class OrderSearch:
 
 
 def count_orders(sequence: FrameSequence) -> int:
-    """In how many orders the pixels of all frames can be visited; beyond counting where pixels come several times."""
+    """Return the number of visiting orders of all frames, or ORDERS_MAX + 1 if a frame is simultaneous."""
     if any(frame.simultaneous for frame in sequence.frames):
         return ORDERS_MAX + 1
     return prod(factorial(int(np.count_nonzero(frame.target_m > 0))) for frame in sequence.frames)
 
 
 def _locate_violation(violation: Violation, orders: Orders, ranks: list[list[int]]) -> tuple[int, int]:
-    """The frame and the place in its order up to which a breach is decided; for a train's pulse, the very last."""
+    """Return the frame and the place in its order that decide a violation; the last place for a train's pulse."""
     if violation.source < len(ranks):
         return violation.source, orders[violation.source].tolist().index(violation.pixel)
     return len(ranks) - 1, len(ranks[-1]) - 1 if ranks else 0
 
 
 def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
-    """To the next orders that differ up to this place of this frame, in place; False where there are no more."""
+    """Advance in place to the next orders that differ up to this place of this frame; False if there are none."""
     for later in ranks[source + 1 :]:
         later.sort()
     while source >= 0:
@@ -208,7 +220,7 @@ def _advance_orders(ranks: list[list[int]], source: int, place: int) -> bool:
 
 
 def _advance_permutation(rank: list[int], place: int) -> bool:
-    """The next permutation that differs up to a place, in place; False where there is none."""
+    """Advance in place to the next permutation that differs up to a place; False if there is none."""
     rank[place + 1 :] = sorted(rank[place + 1 :], reverse=True)
     for k in range(len(rank) - 2, -1, -1):
         if rank[k] < rank[k + 1]:

@@ -1,4 +1,4 @@
-"""Which pixels and trains are left out so that the rest fits: the more important stay, and of a frame the most."""
+"""Omission of pixels and trains by priority: sources of high priority stay, and of a reduced frame most pixels."""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations
@@ -9,16 +9,18 @@ from optodrive.planning.feasibility.order_search import Orders, OrderSearch
 from optodrive.planning.feasibility.sequence_edits import omit_pixels
 
 EXHAUSTIVE_PIXELS_MAX = 6
-"""In a frame of so many pixels at most every set is tried; of a larger one the tallest go first."""
+"""Pixels up to which every subset of a frame is tried; a larger frame loses its highest targets first."""
 PLANS_PER_SOURCE = 12
-"""Where there may be fewer plans, all frames are thinned at once, in rounds."""
+"""Plans per source below which all frames are reduced in bulk."""
 
 
 def reduce_sequence(search: OrderSearch, sequence: FrameSequence) -> tuple[OmittedPixels, Orders] | None:
-    """Pixels left out, by source, of a sequence that does not fit; and orders for the rest. None where nothing fits.
+    """Find pixels to omit so that an infeasible sequence fits.
 
-    Frames and trains are admitted in order of priority, the earlier first among equals; from what does not fit beside
-    those before it, a frame's pixels are left out, the fewest, and a train whole.
+    Frames and trains are accepted in order of priority, the earlier first among equals. A frame that does not fit
+    beside those accepted before loses as few pixels as possible; a train is omitted whole.
+
+    Returns the omitted pixels by source and the visiting orders of the rest, or None if no part fits.
     """
     sources = len(sequence.frames) + len(sequence.trains)
     priorities = {frame.priority for frame in sequence.frames} | {train.priority for train in sequence.trains}
@@ -30,7 +32,7 @@ def reduce_sequence(search: OrderSearch, sequence: FrameSequence) -> tuple[Omitt
 
 
 class _Reducer:
-    """One walk through frames and trains by priority."""
+    """One pass over frames and trains by priority."""
 
     def __init__(self, search: OrderSearch, sequence: FrameSequence) -> None:
         self._search = search
@@ -40,6 +42,7 @@ class _Reducer:
         self._orders: Orders | None = None
 
     def run(self) -> tuple[OmittedPixels, Orders] | None:
+        """Return the omitted pixels and the visiting orders of the rest, or None if no part fits."""
         remaining, whole_may_fit = sort_by_priority(self._sequence), False
         while remaining and not self._search.is_exhausted:
             accepted = self._accept_whole_sources(remaining, whole_may_fit)
@@ -53,6 +56,7 @@ class _Reducer:
         return (self._omitted, self._orders) if self._orders is not None and shows_anything else None
 
     def _try_omitted(self, omitted: OmittedPixels) -> bool:
+        """Return whether the sequence fits without these pixels, and keep the result if it does."""
         orders = self._search.find_orders(omit_pixels(self._sequence, omitted))
         if orders is None:
             return False
@@ -60,7 +64,7 @@ class _Reducer:
         return True
 
     def _accept_whole_sources(self, remaining: Sequence[int], whole_may_fit: bool) -> int:
-        """Admit as many of the rest as fit whole, by halving; how many."""
+        """Accept as many of the remaining sources as fit whole, by bisection, and return their number."""
         before = self._omitted
 
         def fits(count: int) -> bool:
@@ -76,12 +80,12 @@ class _Reducer:
         return low
 
     def _accept_reduced_frame(self, source: int) -> None:
-        """Admit a frame less the fewest pixels; leaves all out where nothing of it fits."""
+        """Accept a frame without the fewest pixels; omit all of it if no part fits."""
         if source >= len(self._sequence.frames):
             return
         pixels = self._source_pixels[source]
         if len(pixels) <= EXHAUSTIVE_PIXELS_MAX:
-            any(self._try_omitted(self._omitted | {source: left}) for left in _generate_omissions(pixels))
+            any(self._try_omitted(self._omitted | {source: omitted}) for omitted in _generate_omissions(pixels))
             return
         infeasible = self._find_infeasible_pixels(source, pixels)
         tallest = [pixel for pixel in pixels if pixel not in infeasible]
@@ -94,7 +98,7 @@ class _Reducer:
             low, high = (low, middle) if fits else (middle, high)
 
     def _find_infeasible_pixels(self, source: int, pixels: tuple[int, ...]) -> tuple[int, ...]:
-        """Those pixels of a frame that a cap or their reach does not allow, one after the other."""
+        """Return the pixels of a frame that violate a cap or are unreachable, found one by one."""
         infeasible: tuple[int, ...] = ()
         while True:
             violation = self._search.find_violation(omit_pixels(self._sequence, self._omitted | {source: infeasible}))
@@ -108,20 +112,20 @@ class _Reducer:
 
 
 def sort_by_priority(sequence: FrameSequence) -> list[int]:
-    """Sources of frames and trains, the most important first, the earlier first among equals."""
+    """Return the sources of frames and trains, the highest priority first, the earlier first among equals."""
     keys = [(-frame.priority, frame.show_at_s) for frame in sequence.frames]
     keys += [(-train.priority, train.start_s) for train in sequence.trains]
     return sorted(range(len(keys)), key=lambda source: keys[source])
 
 
 def _list_source_pixels(sequence: FrameSequence) -> OmittedPixels:
-    """What each source drives, the tallest first."""
+    """Return the driven pixels of every source, the highest target first."""
     pixels = {source: sort_pixels_by_height(frame) for source, frame in enumerate(sequence.frames)}
     first = len(sequence.frames)
     return pixels | {first + k: (train.pixel,) for k, train in enumerate(sequence.trains)}
 
 
 def _generate_omissions(pixels: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """All sets to leave out but none and everything: the smaller first, with the taller first."""
+    """Generate all proper non-empty subsets to omit, smaller subsets first, highest targets first."""
     for count in range(1, len(pixels)):
         yield from combinations(pixels, count)

@@ -1,15 +1,17 @@
-"""What is answered to whoever asks for a sequence: whether it fits, what breaks it, and what would fit."""
+"""Feasibility report: whether a sequence fits, its first violation and the nearest feasible variants."""
 
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 FitMode = Literal["as_is", "even", "priority"]
+"""Treatment of an infeasible sequence: unchanged, all heights scaled evenly, or pixels omitted by priority."""
 Proof = Literal["planned", "searched", "bound", "not found"]
+"""Evidence for a report's verdict; see FeasibilityReport."""
 
 
 @dataclass(frozen=True)
 class Omission:
-    """Pixels of a frame that are not shown, or a train, which is left out whole. source: as in the sequence."""
+    """Omitted pixels of a frame, or an omitted train; source: index as in the sequence."""
 
     name: str
     source: int
@@ -18,7 +20,10 @@ class Omission:
 
 @dataclass(frozen=True)
 class SequenceReduction:
-    """A set that fits with pixels left out; kept of asked: pixels of the frame that breaks it (1 for a train)."""
+    """A feasible variant with pixels omitted.
+
+    kept, requested: pixels of the frame of the violation (1 for a train); omitted: pixels and trains left out.
+    """
 
     kept: int
     requested: int
@@ -27,10 +32,12 @@ class SequenceReduction:
 
 @dataclass(frozen=True)
 class NearestFeasible:
-    """The nearest sets that fit, each planned; None where none was found.
+    """The nearest feasible variants, each confirmed by a plan; None for a kind without one.
 
-    height: largest factor on all targets and powers, in hundredths; rate: least factor on all times, within 1 %
-    complete: the bound on work cut none of these short
+    pixels: variant with pixels omitted
+    height_factor: largest factor on all targets and powers, in hundredths
+    time_factor: smallest factor on all times, within 1 %
+    complete: no search reached its limit of plans
     """
 
     pixels: SequenceReduction | None
@@ -41,16 +48,20 @@ class NearestFeasible:
 
 @dataclass(frozen=True)
 class FeasibilityReport:
-    """Whether a sequence fits as asked, and what was made of it.
+    """Whether a sequence fits as requested, and the variant that was planned.
 
-    proof: "planned" its plan fits, as the planner orders it; "searched" all orders were tried, or one was found that
-    fits and is played; "bound" no order can fit; "not found" none was found, which proves nothing
-    reason: "deadline", the name of a cap, or "unreachable"; name, pixel: of the first violation
-    beam_needed_s, beam_there_s: of that frame, from when it may be shown to its last pulse's end as planned and to its
-    deadline; of a train's pulse, from its nominal time; of the whole where it fits; None for what is out of reach
-    beam_least_s: what the frame takes in any order at the least, None where that is not known
-    plans, plans_max: how many were tried after the first, and the most that would have been
-    height, left_out: what was done to it to make it fit
+    proof: "planned": the planner's order fits; "searched": all orders were tried, or another order fits and is planned;
+    "bound": a lower bound excludes every order; "not found": the search ended without a proof
+    message: the verdict in one line
+    reason: "deadline", the name of a cap, or "unreachable"; name, pixel: frame or train and pixel of the first
+    violation
+    beam_required_s, beam_available_s: for a frame, from its earliest start to the planned end of its last pulse and to
+    its deadline; for a train's pulse, from its requested start; for a feasible sequence, of the whole; None if
+    unreachable
+    beam_lower_bound_s: lower bound of the frame's beam time over all orders, None if unknown
+    nearest: nearest feasible variants, None for a feasible sequence
+    plans_tried, plans_tried_max: plans after the first, and their limit
+    fit, height_factor, omitted: fit mode, and the changes that it made to the sequence
     """
 
     fits: bool
@@ -70,5 +81,5 @@ class FeasibilityReport:
     omitted: tuple[Omission, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """All of it, JSON-able."""
+        """Return the report as a JSON-serialisable dictionary."""
         return asdict(self)

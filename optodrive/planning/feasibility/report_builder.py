@@ -1,4 +1,4 @@
-"""The answer made up of what was found."""
+"""Build feasibility reports from plans, violations and variants."""
 
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.planning.feasibility.bulk_reduction import OmittedPixels
@@ -16,7 +16,7 @@ from optodrive.planning.planned_sequence import PlannedSequence
 
 
 def build_feasible_report(plan: PlannedSequence, proof: Proof, fit: FitMode) -> FeasibilityReport:
-    """The answer for a plan that fits."""
+    """Build the report of a plan that fits."""
     end_s = [timing.deadline_s for timing in plan.frames]
     if len(plan.plan):
         end_s.append(
@@ -29,7 +29,7 @@ def build_feasible_report(plan: PlannedSequence, proof: Proof, fit: FitMode) -> 
     return FeasibilityReport(
         fits=True,
         proof=proof,
-        message="all of it fits" if proof == "planned" else "all of it fits, in another order than the planner's own",
+        message="all of it fits" if proof == "planned" else "all of it fits, in another order than the planner's",
         beam_required_s=float(plan.plan.width_s.sum() + plan.plan.settling_s[1:].sum()),
         beam_available_s=max(0.0, max(end_s, default=0.0) - plan.lead_in_s),
         fit=fit,
@@ -44,7 +44,7 @@ def build_infeasible_report(
     lower_bound_s: float | None,
     nearest: NearestFeasible,
 ) -> FeasibilityReport:
-    """The answer for a sequence that does not fit; plan: None where a target is out of reach."""
+    """Build the report of a sequence that does not fit; plan is None if a target is unreachable."""
     required_s, available_s = (None, None) if plan is None else _beam_times_s(plan, violation)
     parts = [
         describe_violation(sequence, plan, violation),
@@ -52,7 +52,7 @@ def build_infeasible_report(
         describe_nearest(nearest, sequence, violation.source),
     ]
     if proof == "bound" and lower_bound_s is not None:
-        parts[1] = f"in any order it takes {lower_bound_s:.4f} s at the least"
+        parts[1] = f"in any order it takes at least {lower_bound_s:.4f} s"
     return FeasibilityReport(
         fits=False,
         proof=proof,
@@ -70,13 +70,13 @@ def build_infeasible_report(
 _PROOF_MESSAGES: dict[Proof, str] = {
     "planned": "",
     "searched": "no other order fits",
-    "bound": "no order mends that",
-    "not found": "no order that fits is known, which does not prove that there is none",
+    "bound": "no other order can fit",
+    "not found": "no order that fits was found, which does not prove that none exists",
 }
 
 
 def _beam_times_s(plan: PlannedSequence, violation: Violation) -> tuple[float, float]:
-    """Beam time needed and there of the frame that breaks, or of a train's pulse from its nominal time."""
+    """Return the required and the available beam time in s of the frame, or of the train's pulse, in violation."""
     for timing in plan.frames:
         if timing.source == violation.source:
             return timing.end_s - timing.show_at_s, timing.deadline_s - timing.show_at_s
@@ -89,7 +89,7 @@ def _beam_times_s(plan: PlannedSequence, violation: Violation) -> tuple[float, f
 
 
 def build_reduction(sequence: FrameSequence, omitted_pixels: OmittedPixels, source: int) -> SequenceReduction:
-    """What is left out of a sequence, and how much is kept of a source."""
+    """Describe the omitted pixels by name; source: the frame or train whose pixels are counted."""
 
     def count_requested(index: int) -> int:
         frames = sequence.frames

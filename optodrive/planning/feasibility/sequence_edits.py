@@ -1,4 +1,4 @@
-"""What may be changed of a sequence so that it fits: lower, slower, or fewer pixels."""
+"""Variants of a sequence: scaled heights, stretched times, omitted pixels."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace
@@ -9,7 +9,7 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 
 
 def scale_sequence(sequence: FrameSequence, factor: float) -> FrameSequence:
-    """All heights, and the powers of trains by pulse, times one factor."""
+    """Return the sequence with all heights, and the powers of pulse trains, multiplied by a factor."""
     return FrameSequence(
         tuple(replace(frame, target_m=frame.target_m * factor) for frame in sequence.frames),
         tuple(_scale_train(train, factor) for train in sequence.trains),
@@ -24,7 +24,7 @@ def _scale_train(train: Train, factor: float) -> Train:
 
 
 def stretch_sequence(sequence: FrameSequence, time_factor: float) -> FrameSequence:
-    """All times times one factor: frames, trains, and each train's pulses, whose widths stay."""
+    """Return the sequence with all times multiplied by a factor; the pulse widths of pulse trains stay."""
     return FrameSequence(
         tuple(
             replace(frame, show_at_s=frame.show_at_s * time_factor, duration_s=frame.duration_s * time_factor)
@@ -38,15 +38,15 @@ def _stretch_train(train: Train, time_factor: float) -> Train:
     start_s, duration_s = train.start_s * time_factor, train.duration_s * time_factor
     if isinstance(train, HeightTrain):
         return replace(train, start_s=start_s, duration_s=duration_s, period_s=train.period_s * time_factor)
-    # Start to start is stretched, not only the gap: so pulses of two trains never come to overlap.
+    # Stretch the period instead of the gap alone, so that the pulses of two trains do not overlap.
     gap_s = (train.pulse_width_s + train.gap_s) * time_factor - train.pulse_width_s
     return replace(train, start_s=start_s, duration_s=duration_s, gap_s=gap_s)
 
 
 def omit_pixels(sequence: FrameSequence, omitted: Mapping[int, Collection[int]]) -> FrameSequence:
-    """A sequence without some pixels of its frames and some of its trains.
+    """Return the sequence without some pixels of its frames and some of its trains.
 
-    left_out: pixels by source, the index of a frame, or of a train counted on from the frames; a train goes whole.
+    omitted: pixels by source; sources number the frames, then the trains. A train is omitted whole.
     """
     return FrameSequence(
         tuple(_omit_from_frame(frame, omitted.get(source, ())) for source, frame in enumerate(sequence.frames)),

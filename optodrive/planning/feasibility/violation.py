@@ -1,7 +1,8 @@
-"""What breaks a plan first, and what proves that no order of a frame's pulses could mend it.
+"""First violation of a plan, and the lower bound of a frame's beam time over all orders of its pulses.
 
-A train's pulse may come late by the move to it and no more: pulses that abut cannot do otherwise, but what adds up over
-several is a miss. No frame makes a train later than the train would be alone, so no order mends that.
+A train's pulse may be late by the settling time to its pixel and no more. Abutting pulses cannot start earlier, but
+lateness that accumulates over several pulses is a violation. No frame delays a train beyond its lateness alone, so
+such a violation does not depend on the order.
 """
 
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from optodrive.planning.planned_sequence import TIME_TOLERANCE_S
 from optodrive.planning.scheduler.scan_head import ScanHead
 
 SLOPE_INTERVAL_S = 1e-6
+"""Time difference from which the sign of the displacement's slope is computed, s."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,13 @@ class Violation:
     pixel: int
 
 
-def deadlines_s(sequence: FrameSequence, lead_s: float) -> FloatArray:
-    """When the last pulse of each frame must have ended, on the plan's time line: [frames]."""
-    return np.array([lead_s + frame.show_at_s + frame.duration_s for frame in sequence.frames])
+def deadlines_s(sequence: FrameSequence, lead_in_s: float) -> FloatArray:
+    """Return the deadline of each frame's last pulse on the plan's time axis, s, [frames]."""
+    return np.array([lead_in_s + frame.show_at_s + frame.duration_s for frame in sequence.frames])
 
 
 def find_first_violation(plan: PulsePlan, deadline_s: FloatArray) -> Violation | None:
-    """The first pulse of a plan, or of a piece of one, that is late or was trimmed. due_s: [frames] deadlines."""
+    """Return the first late or trimmed pulse of a plan or batch, or None; deadline_s: [frames]."""
     deadline_s = np.append(deadline_s, np.inf)
     is_frame = plan.source < len(deadline_s) - 1
     end_s = plan.start_s + plan.width_s
@@ -54,52 +56,52 @@ def find_first_violation(plan: PulsePlan, deadline_s: FloatArray) -> Violation |
 
 
 def is_order_independent(violation: Violation, sequence: FrameSequence) -> bool:
-    """Whether a breach is there whatever the order: out of reach, or a train that is late by itself."""
+    """Return whether a violation occurs in every order: an unreachable target or a late train."""
     return violation.reason == "unreachable" or (
         violation.reason == "deadline" and violation.source >= len(sequence.frames)
     )
 
 
 def beam_lower_bound_s(
-    display: DisplayModel, sequence: FrameSequence, heat: ThermalState, source: int, lead_s: float
+    display: DisplayModel, sequence: FrameSequence, heat: ThermalState, source: int, lead_in_s: float
 ) -> float | None:
-    """Beam time that a frame takes at the least between its show_at and its deadline, s; None where nobody knows.
+    """Return a lower bound of a frame's beam time between show_at and its deadline, s; None with planner terms.
 
-    Counted are trains' pulses that fall into that time whole, and the frame's pixels that nothing else in the sequence
-    lights before. Their heat is what there is now; where it falls, the pulse at show_at is the shortest there can be.
-    Each but one needs a move from the nearest it can come from. With terms in the model a pulse may get shorter
-    by waiting, and nothing is claimed.
+    The bound sums the trains' pulses that lie within that time, the pulses of the frame's pixels that no earlier frame
+    and no train drives, and the smallest settling time to all of these pixels but one. The thermal state of these
+    pixels is known; if their displacement falls, the pulse at show_at is the shortest possible. With planner terms a
+    pulse may become shorter by waiting, and no bound holds.
     """
     if display.parameters.planner_terms:
         return None
-    frame, machine = sequence.frames[source], display.scan_head
-    at_s = lead_s + round(frame.show_at_s * 1e6) * 1e-6
-    deadline_s = lead_s + frame.show_at_s + frame.duration_s
+    frame, scan_head = sequence.frames[source], display.scan_head
+    at_s = lead_in_s + round(frame.show_at_s * 1e6) * 1e-6
+    deadline_s = lead_in_s + frame.show_at_s + frame.duration_s
     is_driven_before = np.zeros(len(frame.target_m), dtype=bool)
     for earlier in sequence.frames[:source]:
         is_driven_before |= earlier.target_m > 0
-    # What a train by height needs is known only with the heat at each of its pulses.
-    trains = [t for t in sequence.trains if isinstance(t, PulseTrain) and lead_s + t.start_s < deadline_s]
+    # The pulse widths of a height train depend on the thermal state at each pulse and are unknown here.
+    trains = [t for t in sequence.trains if isinstance(t, PulseTrain) and lead_in_s + t.start_s < deadline_s]
     origins = np.array([train.pixel for train in sequence.trains], dtype=np.int64)
     is_driven_before[origins] = True
     driven = np.flatnonzero(frame.target_m > 0)
     fresh = _select_falling_pixels(heat, driven[~is_driven_before[driven]], at_s)
     width_s = {}
     for pixel in fresh.tolist():
-        pulse = heat.solve_pulse(pixel, at_s, float(frame.target_m[pixel]), machine.drive)
+        pulse = heat.solve_pulse(pixel, at_s, float(frame.target_m[pixel]), scan_head.drive)
         if pulse is not None:
-            width_s[pixel] = round(pulse[0] * machine.drive.period_s * 1e6) * 1e-6
-    settling_s = _min_settling_s(machine, np.array(list(width_s), dtype=np.int64), np.concatenate([driven, origins]))
+            width_s[pixel] = round(pulse[0] * scan_head.drive.period_s * 1e6) * 1e-6
+    settling_s = _min_settling_s(scan_head, np.array(list(width_s), dtype=np.int64), np.concatenate([driven, origins]))
     train_s = 0.0
     for train in trains:
-        starts_s = lead_s + train.pulse_starts_s()
-        inside = (starts_s >= at_s) & (starts_s + lead_s + train.pulse_width_s <= deadline_s)
+        starts_s = lead_in_s + train.pulse_starts_s()
+        inside = (starts_s >= at_s) & (starts_s + lead_in_s + train.pulse_width_s <= deadline_s)
         train_s += train.pulse_width_s * int(np.count_nonzero(inside))
     return sum(width_s.values()) + settling_s + train_s
 
 
 def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) -> IntArray:
-    """Those pixels whose displacement falls, or rests, when left dark at at_s: it does so from then on."""
+    """Return the pixels whose displacement does not rise after at_s with the gate off; it then keeps falling."""
     if not len(pixels):
         return pixels
     height_m = heat.simulate_traces(
@@ -109,16 +111,16 @@ def _select_falling_pixels(heat: ThermalState, pixels: IntArray, at_s: float) ->
     return falling
 
 
-def _min_settling_s(machine: ScanHead, pixels: IntArray, origins: IntArray) -> float:
-    """Moves to each pixel but one, each from where of the other `origins` it takes least; [k] and [m]."""
+def _min_settling_s(scan_head: ScanHead, pixels: IntArray, origins: IntArray) -> float:
+    """Return the sum of the smallest settling times to all pixels but one, s; pixels: [k], origins: [m]."""
     if not len(pixels):
         return 0.0
-    x_rad, y_rad = machine.field.angles_rad(machine.layout.x_m, machine.layout.y_m)
+    x_rad, y_rad = scan_head.field.angles_rad(scan_head.layout.x_m, scan_head.layout.y_m)
     settling_s = []
     for pixel in pixels:
-        # A train on the pixel itself would need no move; its pixels are not counted here.
+        # A train on the pixel itself would need no move; pixels of trains are excluded here.
         others = origins[origins != pixel]
         if len(others):
-            settling_us = machine.settling.min_settling_us(x_rad[others] - x_rad[pixel], y_rad[others] - y_rad[pixel])
+            settling_us = scan_head.settling.min_settling_us(x_rad[others] - x_rad[pixel], y_rad[others] - y_rad[pixel])
             settling_s.append(settling_us * 1e-6)
     return sum(settling_s) - max(settling_s, default=0.0)

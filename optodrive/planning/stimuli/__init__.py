@@ -1,1 +1,1 @@
-"""Where tactile content comes from: files, pictures, text, the paper's six experiments."""
+"""Sources of tactile content: sequence files, images, text, shapes and the paper's six experiments."""

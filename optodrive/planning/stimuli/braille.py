@@ -1,6 +1,6 @@
 """Text to uncontracted braille cells: Unified English Braille, grade 1.
 
-A cell is the set of its raised dots; dots 1 2 3 run down the left column, 4 5 6 down the right one.
+A cell is the set of its raised dots. Dots 1, 2, 3 run down the left column, 4, 5, 6 down the right one.
 """
 
 import unicodedata
@@ -20,7 +20,7 @@ CAPITAL_LETTER_INDICATOR = _parse_cells("6")
 CAPITAL_WORD_INDICATOR = _parse_cells("6 6")
 NUMERIC_INDICATOR = _parse_cells("3456")
 GRADE_1_INDICATOR = _parse_cells("56")
-"""Grade 1 indicator: before a small a…j that follows a number and would be read as a digit."""
+"""Precedes a lower-case a…j that follows a number and would otherwise be read as a digit."""
 
 _ALPHABET = _parse_cells(
     "1 12 14 145 15 124 1245 125 24 245 13 123 134 1345 135 1234 12345 1235 234 2345 136 1236 2456 1346 13456 1356"
@@ -50,13 +50,16 @@ PUNCTUATION = {
     "%": _parse_cells("46 356"),
     "&": _parse_cells("4 12346"),
 }
-"""An upright double quote, known too, opens at the start of a word and closes elsewhere."""
+"""Punctuation except the upright double quote, which opens at the start of a word and closes elsewhere."""
 
 _SUPPORTED_CHARACTERS = frozenset(ascii_letters) | DIGITS.keys() | PUNCTUATION.keys() | frozenset('" \t\r\n')
 
 
 def encode_lines(text: str, where: str) -> list[list[list[Cell]]]:
-    """Lines of words of cells; lines end at line breaks only. Raises InputError for a character without a cell."""
+    """Encode text as lines of words of cells; lines end at line breaks only.
+
+    Raises InputError (bad_text) for a character without a cell.
+    """
     for position, character in enumerate(text, start=1):
         if character not in _SUPPORTED_CHARACTERS:
             name = unicodedata.name(character, f"U+{ord(character):04X}")
@@ -66,7 +69,7 @@ def encode_lines(text: str, where: str) -> list[list[list[Cell]]]:
 
 
 def encode_word(word: str) -> list[Cell]:
-    """Cells of one word of known characters, with its number, capital and letter signs."""
+    """Encode one word of supported characters, with its number, capital and letter indicators."""
     cells: list[Cell] = []
     in_number = False
     for position, character in enumerate(word):
@@ -89,7 +92,7 @@ def encode_word(word: str) -> list[Cell]:
 
 
 def _select_letter_indicators(word: str, position: int, in_number: bool) -> tuple[Cell, ...]:
-    """The signs before a letter; one double sign stands for a whole run of capitals."""
+    """Return the indicators before a letter; one word indicator covers a whole run of capitals."""
     if word[position].islower():
         return GRADE_1_INDICATOR if in_number and word[position] in "abcdefghij" else ()
     start, end = position, position

@@ -1,7 +1,8 @@
-"""The paper's six perceptual experiments (Text S5) as pulse trains; docs/how-to/show-stimuli.md says what the paper leaves open.
+"""The paper's six perceptual experiments (Text S5) as pulse trains.
 
-A direction is as seen from above: right is +x, up is +y. `centre` None is the display's middle pixel. `where` names the
-caller in errors: every function raises InputError where the display has no pixel at a place that the stimulus needs.
+docs/how-to/show-stimuli.md lists what the paper leaves open. Directions are as seen from above: right is +x, up is +y.
+`centre` None is the display's middle pixel. `where` names the caller in errors. Every function raises InputError
+(does_not_fit) if the display lacks a pixel at a required place.
 """
 
 from collections.abc import Iterable
@@ -11,32 +12,34 @@ from optodrive.device.config import Config
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 DIRECTIONS = {"left": (0, -1), "right": (0, 1), "up": (1, 0), "down": (-1, 0)}
+"""Step (rows up, columns right) of each direction."""
 CLOCKWISE = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0))
-"""Eight places around a centre as (rows up, columns right), from the bottom left."""
+"""Eight places around a centre as (rows up, columns right), clockwise from the bottom left."""
 
 SPEEDS_S = {"16": 0.200, "32": 0.100, "64": 0.050}
-"""Speed in mm/s to the time of one pixel, s."""
+"""Time per pixel by speed in mm/s, s."""
 
 PULSE_AND_GAP_S = {"slow": 0.035, "fast": 0.010}
-"""Experiment 5: pulse width, and gap, s."""
+"""Pulse width, and equal gap, of the two kinds of stimulus in experiment 5, s."""
 
 FINGERS_UP_M = {2: 0.0, 3: 7.2e-3, 4: 3.6e-3, 5: -10.8e-3}
-"""Fingertips of a right hand against the index finger's, m; the paper gives no positions."""
+"""Position of the fingertips of a right hand relative to the index finger, m; the paper gives no positions."""
 
 FINGER_SPACING_M = 18e-3
+"""Lateral distance between neighbouring fingers, m."""
 
 
 def build_slot_train(
     pixel: int, start_s: float, slot_s: float, width_s: float, gap_s: float, power_w: float
 ) -> PulseTrain:
-    """Cyclic stimulation of a pixel for a slot of time; a pulse that would not end within the slot is left out."""
+    """Build a pixel's cyclic stimulation for a time slot, without a pulse that would end after the slot."""
     period_s = width_s + gap_s
     whole = max(1, int((slot_s + gap_s) / period_s + 1e-9))
     return PulseTrain(pixel, start_s, min(slot_s, whole * period_s), width_s, gap_s, power_w)
 
 
 def build_linear_motion(config: Config, where: str, direction: str, centre: int | None) -> FrameSequence:
-    """Experiment 1: three pixels in a row, 300 ms each at 20/60 ms; after a pause of 500 ms once more."""
+    """Build experiment 1: three pixels in a row, 300 ms each at 20/60 ms, repeated after a pause of 500 ms."""
     up, right = DIRECTIONS[direction]
     row = Lattice.from_config(config).pixels_around(
         centre, [(k * up, k * right) for k in (-1, 0, 1)], where, "a neighbour on either side"
@@ -49,7 +52,7 @@ def build_linear_motion(config: Config, where: str, direction: str, centre: int 
 
 
 def build_rotation(config: Config, where: str, direction: str, speed: str, centre: int | None) -> FrameSequence:
-    """Experiment 2: eight pixels around a centre from the bottom left, once round, at 25/71 ms."""
+    """Build experiment 2: eight pixels around a centre from the bottom left, one turn, at 25/71 ms."""
     places = CLOCKWISE if direction == "cw" else (CLOCKWISE[0], *reversed(CLOCKWISE[1:]))
     ring = Lattice.from_config(config).pixels_around(centre, places, where, "the eight pixels around it")
     slot_s, power_w = SPEEDS_S[speed], config.laser.max_power_w
@@ -59,7 +62,10 @@ def build_rotation(config: Config, where: str, direction: str, speed: str, centr
 
 
 def build_localisation(config: Config, where: str, target: int, centre: int | None) -> FrameSequence:
-    """Experiment 3: the centre for 500 ms at 25/25 ms, a pause of 750 ms, then one of 3 × 3, 1 at the top left."""
+    """Build experiment 3: a centre reference, then one of 3 × 3 places (target 1 is the top left).
+
+    Each is shown for 500 ms at 25/25 ms, with a pause of 750 ms between.
+    """
     places = [(1 - k // 3, k % 3 - 1) for k in range(9)]
     grid = Lattice.from_config(config).pixels_around(centre, places, where, "the eight pixels around it")
     power_w = config.laser.max_power_w
@@ -70,7 +76,7 @@ def build_localisation(config: Config, where: str, target: int, centre: int | No
 
 
 def build_intensity(config: Config, where: str, level: int, centre: int | None) -> FrameSequence:
-    """Experiment 4: one pixel for 1 s at 25/25 ms, level 1…9 from 0.5 to 2.5 W, no more than the laser has."""
+    """Build experiment 4: one pixel for 1 s at 25/25 ms, level 1…9 from 0.5 to 2.5 W, limited to the laser's power."""
     (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
     power_w = min(0.5 + 0.25 * (level - 1), config.laser.max_power_w)
     return _build_sequence([build_slot_train(pixel, 0.0, 1.0, 0.025, 0.025, power_w)])
@@ -79,7 +85,7 @@ def build_intensity(config: Config, where: str, level: int, centre: int | None) 
 def build_temporal_pattern(
     config: Config, where: str, oddball: int, kind: str, pause_s: float, centre: int | None
 ) -> FrameSequence:
-    """Experiment 5: three stimuli of 400 ms on one pixel, one of them (oddball, 1…3) of `kind`, slow or fast."""
+    """Build experiment 5: three stimuli of 400 ms on one pixel, one of them (oddball, 1…3) of `kind`, slow or fast."""
     (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
     other = "fast" if kind == "slow" else "slow"
     widths_s = [PULSE_AND_GAP_S[kind if k == oddball else other] for k in (1, 2, 3)]
@@ -90,7 +96,10 @@ def build_temporal_pattern(
 
 
 def build_two_fingers(config: Config, where: str, digits: str, centre: int | None) -> FrameSequence:
-    """Experiment 6: squares of four pixels under two fingers, 40 pulses of 15 ms, the fingers in turn, five rounds."""
+    """Build experiment 6: squares of four pixels under two fingers, the fingers alternating.
+
+    40 pulses of 15 ms in five rounds.
+    """
     pitch_m = config.display.pitch_m
     pair = [compute_finger_places(int(digit), pitch_m) for digit in digits.split("-")]
     turns = [place for both in zip(*pair, strict=True) for place in both]
@@ -111,7 +120,7 @@ def build_two_fingers(config: Config, where: str, digits: str, centre: int | Non
 
 
 def compute_finger_places(digit: int, pitch_m: float) -> list[tuple[int, int]]:
-    """Four places under a finger, clockwise from the top left, as (rows up, columns right) from the hand's centre."""
+    """Return four places under a finger as (rows up, columns right) from the hand's centre, clockwise from top left."""
     right = round(FINGER_SPACING_M / pitch_m * (digit - 3.5) - 0.5)
     up = round(FINGERS_UP_M[digit] / pitch_m)
     return [(up + 1, right), (up + 1, right + 1), (up, right + 1), (up, right)]

@@ -1,4 +1,4 @@
-"""Tactile frames from JSON: times in order, a height in µm for some pixels or for all."""
+"""Parse tactile frames from JSON: start times in order, a height in µm for some pixels or for all."""
 
 from collections.abc import Mapping
 
@@ -11,12 +11,13 @@ from optodrive.core.units import um_to_m
 from optodrive.planning.stimuli.json_values import require_number, require_object, require_priority, require_time
 
 ID_MAX = 100
+"""Largest length of a frame's identifier, characters."""
 OVERLAP_TOLERANCE_S = 1e-9
-"""Frames may share this much, the rounding of their times."""
+"""Overlap of two frames that the rounding of their times may cause, s."""
 
 
 def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[TactileFrame, ...]:
-    """The entries of `frames`; raises InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
+    """Parse the entries of `frames`; raises InputError (bad_time, bad_target, bad_priority, unknown_pixel, …)."""
     pixel_by_name = {str(pixel): pixel for pixel in range(pixel_count)}
     frames: list[TactileFrame] = []
     for k, entry in enumerate(entries):
@@ -30,7 +31,7 @@ def parse_frames(entries: list[object], where: str, pixel_count: int) -> tuple[T
 def _parse_frame(entry: object, where: str, position: int, pixel_by_name: dict[str, int]) -> TactileFrame:
     required = ("show_at_s", "duration_s", "target_um")
     table = require_object(entry, where, ("id", *required, "simultaneous", "priority"), required)
-    expected = "a time ≥ 0 in s (a frame in the past cannot be shown)"
+    expected = "a time ≥ 0 in s"
     show_at_s = require_time(table["show_at_s"], f"{where}.show_at_s", expected, "bad_time", positive=False)
     duration_s = require_time(table["duration_s"], f"{where}.duration_s", "a time > 0 in s", "bad_time", positive=True)
     frame_id = _parse_frame_id(table.get("id", f"frame-{position}"), f"{where}.id")
@@ -64,7 +65,10 @@ def _check_order(previous: TactileFrame, frame: TactileFrame, where: str, previo
 
 
 def parse_targets_m(value: object, where: str, pixel_by_name: dict[str, int]) -> FloatArray:
-    """Heights in µm, by pixel or a list of all, as metres [p]."""
+    """Parse heights in µm, by pixel or as a list of all, to metres [p].
+
+    Raises InputError (bad_target, unknown_pixel).
+    """
     if isinstance(value, dict):
         for key in value:
             if key not in pixel_by_name:
@@ -76,7 +80,7 @@ def parse_targets_m(value: object, where: str, pixel_by_name: dict[str, int]) ->
     if not isinstance(value, list):
         raise InputError(where, value, 'heights by pixel, {"17": 50}, or a list of all', code="bad_target")
     if len(value) != len(pixel_by_name):
-        expected = f"{len(pixel_by_name)} heights, one a pixel"
+        expected = f"{len(pixel_by_name)} heights, one per pixel"
         raise InputError(where, f"a list of {len(value)}", expected, code="bad_target")
     return _parse_heights_m(value, range(len(pixel_by_name)), where)
 
@@ -93,4 +97,4 @@ def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str
         place, expected = f"{where}.{pixel}", "a height ≥ 0 in µm"
         if require_number(value, place, expected, "bad_target") < 0:
             raise InputError(place, value, expected, code="bad_target")
-    raise AssertionError("a wrong height was seen and not found")
+    raise AssertionError("no invalid height found after validation failed")

@@ -1,4 +1,4 @@
-"""Pictures and animations as frames: brightness becomes height, averaged over the area of each lattice place."""
+"""Build frames from images and animations: brightness becomes height, averaged over the area of each lattice place."""
 
 import struct
 import warnings
@@ -23,22 +23,26 @@ if TYPE_CHECKING:
 
 FORMATS = ("PNG", "JPEG", "GIF")
 SOURCE_PIXELS_MAX = 16_000_000
+"""Largest number of pixels of an image file."""
 ANIMATION_PIXELS_MAX = 200_000_000
-"""Pixels of a picture, and of all pictures of an animation, before they are fitted."""
+"""Largest number of pixels of all images of an animation."""
 
 ANIMATION_FRAMES_MAX = 2_000
 FRAME_DURATION_MIN_S, FRAME_DURATION_MAX_S = 0.02, 60.0
 FRAME_DURATION_DEFAULT_S = 0.1
-"""Shown this long when the file says nothing."""
+"""Duration of an image for which the file states none, s."""
 
 BRIGHTNESS_MIN = 0.04
-"""Darker than this is not driven: it could not be felt, and each pulse costs beam time."""
+"""Smallest brightness that is driven: a lower one could not be felt, and each pulse costs beam time."""
 
 
 def build_image(
     config: Config, where: str, file: bytes, height_m: float, seconds: float, invert: bool
 ) -> FrameSequence:
-    """A picture (the first of several), white at height_m, kept up for `seconds`; raises InputError for no picture."""
+    """Build frames that show an image (the first of several) for `seconds`, white at height_m.
+
+    Raises InputError (bad_picture, too_many).
+    """
     lattice = Lattice.from_config(config)
     with _open_image(file, f"{where}: file") as image:
         target_m = height_m * compute_lattice_brightness(image, lattice, invert)
@@ -48,9 +52,10 @@ def build_image(
 def build_animation(
     config: Config, where: str, file: bytes, height_m: float, rate_hz: float | None, invert: bool
 ) -> FrameSequence:
-    """The pictures of an animated GIF or PNG in turn, each shown once; raises InputError for no picture.
+    """Build frames that show the images of an animated GIF or PNG once each.
 
-    Each lasts 1 / rate_hz; with None as long as the file says, at least 20 ms and the beam time that it needs.
+    An image lasts 1 / rate_hz. If rate_hz is None it lasts as long as the file states, at least 20 ms and its beam
+    time. Raises InputError (bad_picture, too_many).
     """
     beam, start_s = BeamTimeEstimator(config), 0.0
     frames: list[TactileFrame] = []
@@ -65,7 +70,7 @@ def build_animation(
 
 
 def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:
-    """Brightness 0…1 of each pixel [p]: the picture fitted whole into the lattice, centred, nothing around it."""
+    """Compute the brightness 0…1 of each pixel [p] from the whole image, fitted into the lattice and centred."""
     brightness = _compute_brightness(image, invert)
     rows, columns = lattice.index.shape
     height, width = brightness.shape
@@ -77,7 +82,10 @@ def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -
 
 
 def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArray[np.float32]:
-    """Share of each lattice place that each source pixel covers, [places, source]; scale: source pixels a place."""
+    """Compute the fraction of each place covered by each source pixel, [places, pixels].
+
+    scale: source pixels per place.
+    """
     low = pixel_count / 2 + (np.arange(place_count)[:, None] - place_count / 2) * scale
     pixel = np.arange(pixel_count)[None, :]
     covered = np.clip(np.minimum(low + scale, pixel + 1) - np.maximum(low, pixel), 0.0, None)
@@ -85,7 +93,7 @@ def _compute_overlap(place_count: int, pixel_count: int, scale: float) -> NDArra
 
 
 def _compute_brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
-    """Brightness 0…1, [rows from the top, columns]; what is transparent is dark, inverted or not."""
+    """Compute brightness 0…1, [rows from the top, columns]; transparency is dark, inverted or not."""
     from PIL import ImageOps
 
     image = ImageOps.exif_transpose(image)
@@ -99,7 +107,10 @@ def _compute_brightness(image: "Image", invert: bool) -> NDArray[np.float32]:
 
 
 def _duration_s(image: "Image") -> float:
-    """How long the file wants this picture shown, s; a PNG can carry text under the same name, which is not it."""
+    """Return the duration that the file states for this image, s.
+
+    A PNG may carry a text chunk of the same name, which is ignored.
+    """
     duration_ms = image.info.get("duration")
     if not isinstance(duration_ms, int | float) or not 0 < duration_ms < float("inf"):
         return FRAME_DURATION_DEFAULT_S
@@ -107,7 +118,7 @@ def _duration_s(image: "Image") -> float:
 
 
 def _select_positions(image: "Image", where: str) -> range:
-    """Which pictures of the file belong to the animation; raises InputError for too many."""
+    """Return the images of the file that belong to the animation; raises InputError (too_many)."""
     count = int(getattr(image, "n_frames", 1))
     if count > ANIMATION_FRAMES_MAX:
         raise InputError(where, f"{count} pictures", f"at most {ANIMATION_FRAMES_MAX}", code="too_many")
@@ -120,7 +131,7 @@ def _select_positions(image: "Image", where: str) -> range:
 
 @contextmanager
 def _open_image(file: bytes, where: str) -> Iterator["Image"]:
-    """A picture of a known format and a sane size; whatever fails while it is read becomes an InputError."""
+    """Open an image of a supported format and size; every error while reading becomes an InputError."""
     from PIL import Image, UnidentifiedImageError
 
     with warnings.catch_warnings():

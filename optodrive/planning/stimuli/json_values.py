@@ -1,4 +1,4 @@
-"""Checks on single values of decoded JSON; each refusal names the place, the value and what was expected."""
+"""Checks of single values of decoded JSON; each error names the place, the value and the expected value."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -7,13 +7,14 @@ from math import isfinite
 from optodrive.core.errors import InputError, suggest_nearest
 
 PRIORITY_MAX = 1_000_000
+"""Largest absolute priority."""
 
 TIME_MAX_S = 86_400.0
-"""No sequence reaches beyond a day; whole microseconds stay exact in a float."""
+"""Largest time in a sequence, s: one day, within which whole microseconds are exact in a float."""
 
 
 def decode_json(body: bytes | str, where: str) -> object:
-    """JSON text (UTF-8) as Python values; raises InputError (bad_json) for anything else and for repeated keys."""
+    """Decode JSON text (UTF-8); raises InputError (bad_json) for invalid JSON and for repeated keys."""
 
     def require_unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
         table = dict(pairs)
@@ -39,7 +40,10 @@ def decode_json(body: bytes | str, where: str) -> object:
 
 
 def require_object(value: object, where: str, known: Sequence[str], required: Sequence[str]) -> Mapping[str, object]:
-    """A JSON object with known keys only and all required ones; raises InputError (bad_json, unknown_key)."""
+    """Return a JSON object with known keys only and all required ones.
+
+    Raises InputError (bad_json, unknown_key, missing_key).
+    """
     if not isinstance(value, dict):
         raise InputError(where, value, "an object with " + ", ".join(known), code="bad_json")
     for key in value:
@@ -48,12 +52,12 @@ def require_object(value: object, where: str, known: Sequence[str], required: Se
             raise InputError(where, key, expected, code="unknown_key")
     for key in required:
         if key not in value:
-            raise InputError(f"{where}.{key}", None, "this key to be there", code="missing_key")
+            raise InputError(f"{where}.{key}", None, "this required key", code="missing_key")
     return value
 
 
 def require_list(value: object, where: str, length_max: int) -> list[object]:
-    """A JSON list of bounded length; raises InputError (bad_json, too_many)."""
+    """Return a JSON list of bounded length; raises InputError (bad_json, too_many)."""
     if not isinstance(value, list):
         raise InputError(where, value, "a list", code="bad_json")
     if len(value) > length_max:
@@ -62,7 +66,7 @@ def require_list(value: object, where: str, length_max: int) -> list[object]:
 
 
 def require_number(value: object, where: str, expected: str, code: str) -> float:
-    """A finite JSON number; true and "1" are none. Raises InputError."""
+    """Return a finite JSON number; booleans and strings are not numbers. Raises InputError."""
     if type(value) is float and isfinite(value):
         return value
     if type(value) is int and abs(value) < 2**1000:
@@ -71,14 +75,14 @@ def require_number(value: object, where: str, expected: str, code: str) -> float
 
 
 def require_priority(value: object, where: str) -> int:
-    """How important a frame or train is, a whole number; raises InputError (bad_priority)."""
+    """Return the priority of a frame or train, an integer; raises InputError (bad_priority)."""
     if type(value) is int and abs(value) <= PRIORITY_MAX:
         return value
     raise InputError(where, value, f"a whole number, -{PRIORITY_MAX}…{PRIORITY_MAX}", code="bad_priority")
 
 
 def require_time(value: object, where: str, expected: str, code: str, *, positive: bool) -> float:
-    """A time or duration, s, from 0 (or above it, if positive) to a day; raises InputError."""
+    """Return a time or duration in s, from 0 (or above 0 if positive) to one day; raises InputError."""
     time_s = require_number(value, where, expected, code)
     if time_s < 0 or (positive and time_s == 0) or time_s > TIME_MAX_S:
         bound = f" (at most {TIME_MAX_S:.0f} s)" if time_s > TIME_MAX_S else ""

@@ -1,4 +1,4 @@
-"""What a pattern is: a name, its parameters with kinds and bounds, and the function that builds its sequence."""
+"""Definition of a pattern: name, parameters with kinds and bounds, and the function that builds its sequence."""
 
 from base64 import b64decode
 from collections.abc import Callable, Mapping
@@ -11,17 +11,19 @@ from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config, build_pixel_layout
 
 ParameterKind = Literal["number", "integer", "choice", "pixel", "flag", "text", "file"]
+"""Kind of a pattern parameter, which selects its conversion."""
 ParameterValue = str | int | float | bytes | bool | None
 
 SI_SUFFIXES = {"_um": ("_m", 1e-6), "_mm": ("_m", 1e-3)}
-"""Ending of a parameter's name to the ending and factor under which its builder takes it."""
+"""Unit suffix of a parameter's name to the suffix and factor of its builder's argument in SI."""
 
 TEXT_MAX = 2_000
+"""Largest length of a text parameter, characters."""
 
 
 @dataclass(frozen=True)
 class PatternParameter:
-    """One parameter; least and most bound a number, required ones have no default."""
+    """One parameter of a pattern; min and max bound a number, a required parameter has no default."""
 
     name: str
     kind: ParameterKind
@@ -36,7 +38,7 @@ class PatternParameter:
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named stimulus; build(config, where, **parameters in SI), notes: what a player must know about it."""
+    """A named stimulus: build(config, where, **parameters in SI) builds it, notes state its particulars."""
 
     name: str
     summary: str
@@ -45,7 +47,10 @@ class Pattern:
     notes: str = ""
 
     def resolve_arguments(self, given: object, config: Config) -> dict[str, ParameterValue]:
-        """What the builder takes, from what the caller gave and the defaults; raises InputError."""
+        """Return the builder's arguments from the given parameters and the defaults.
+
+        Raises InputError (bad_parameter, unknown_parameter, missing_parameter, unknown_pixel).
+        """
         where = f"pattern {self.name}"
         if not isinstance(given, Mapping):
             raise InputError(where, given, "an object of its parameters", code="bad_parameter")
@@ -68,7 +73,7 @@ class Pattern:
 
 
 def convert_value(value: object, parameter: PatternParameter, where: str, config: Config) -> ParameterValue:
-    """A given value, or the text of one, as the parameter's kind; raises InputError (bad_parameter, unknown_pixel)."""
+    """Convert a value, or its text, to the parameter's kind; raises InputError (bad_parameter, unknown_pixel)."""
     match parameter.kind:
         case "number":
             return _convert_number(value, parameter, where)

@@ -1,4 +1,4 @@
-"""The registry of named patterns: what `play` and the patterns of the REST face offer."""
+"""Registry of the named patterns that `play` and the REST API offer."""
 
 from dataclasses import asdict
 from typing import Any
@@ -13,15 +13,13 @@ from optodrive.planning.stimuli.showcase import build_showcase
 from optodrive.planning.stimuli.text import build_text
 
 _CENTRE_PARAMETER = PatternParameter(
-    "centre", "pixel", None, "pixel at the stimulus' centre; the display's middle if not given"
+    "centre", "pixel", None, "pixel at the centre of the stimulus; the display's middle by default"
 )
-_SECONDS_PARAMETER = PatternParameter(
-    "seconds", "number", 1.0, "how long it is kept up, at least", "s", min=0.0, max=600.0
-)
-_FILE_PARAMETER = PatternParameter("file", "file", None, "the picture: PNG, JPEG or GIF", required=True)
-_INVERT_PARAMETER = PatternParameter("invert", "flag", False, "raise what is dark instead of what is bright")
+_SECONDS_PARAMETER = PatternParameter("seconds", "number", 1.0, "minimum duration", "s", min=0.0, max=600.0)
+_FILE_PARAMETER = PatternParameter("file", "file", None, "image file: PNG, JPEG or GIF", required=True)
+_INVERT_PARAMETER = PatternParameter("invert", "flag", False, "raise dark areas instead of bright ones")
 _DIRECTION_PARAMETER = PatternParameter(
-    "direction", "choice", "right", "where it moves, seen from above", choices=tuple(experiments.DIRECTIONS)
+    "direction", "choice", "right", "direction of motion, seen from above", choices=tuple(experiments.DIRECTIONS)
 )
 
 
@@ -45,7 +43,7 @@ def _choice_parameter(name: str, default: str, description: str, choices: tuple[
     return PatternParameter(name, "choice", default, description, choices=choices)
 
 
-_RADIUS_PARAMETER = _size_parameter("radius_mm", "of the ring; six tenths of the way to the border if not given")
+_RADIUS_PARAMETER = _size_parameter("radius_mm", "radius of the ring; 0.6 of the distance to the border by default")
 _DIGIT_PAIRS = ("2-3", "2-4", "2-5", "3-4", "3-5", "4-5")
 
 _PATTERN_LIST = (
@@ -54,7 +52,7 @@ _PATTERN_LIST = (
         "linear motion: three pixels in a row, twice",
         (_DIRECTION_PARAMETER, _CENTRE_PARAMETER),
         experiments.build_linear_motion,
-        "300 ms a pixel at 20 ms on, 60 ms off; 500 ms between the two passes.",
+        "300 ms per pixel at 20 ms on, 60 ms off; 500 ms between the two passes.",
     ),
     Pattern(
         "experiment-2",
@@ -62,39 +60,40 @@ _PATTERN_LIST = (
         (
             _choice_parameter("direction", "cw", "clockwise or counterclockwise, seen from above", ("cw", "ccw")),
             _choice_parameter(
-                "speed", "16", "mm/s as the paper counts it: 200, 100 or 50 ms a pixel", tuple(experiments.SPEEDS_S)
+                "speed", "16", "speed in mm/s as in the paper: 200, 100 or 50 ms per pixel", tuple(experiments.SPEEDS_S)
             ),
             _CENTRE_PARAMETER,
         ),
         experiments.build_rotation,
-        "25 ms on, 71 ms off, whole pulses only: two a pixel at 16 mm/s, one at 32 and 64. One turn is a choice.",
+        "25 ms on, 71 ms off, whole pulses only: two per pixel at 16 mm/s, one at 32 and 64. "
+        "The paper does not state the number of turns; one is shown.",
     ),
     Pattern(
         "experiment-3",
         "localisation: the centre as reference, then one of 3 × 3",
         (
-            _integer_parameter("target", 5, "place in the grid, counted by rows from the top left", 1, 9),
+            _integer_parameter("target", 5, "place in the grid, numbered by rows from the top left", 1, 9),
             _CENTRE_PARAMETER,
         ),
         experiments.build_localisation,
-        "500 ms each at 25 ms on, 25 ms off; 750 ms between. The numbering is a choice.",
+        "500 ms each at 25 ms on, 25 ms off; 750 ms between. The paper does not state the numbering.",
     ),
     Pattern(
         "experiment-4",
         "intensity: one pixel for a second, at one of nine powers",
-        (_integer_parameter("level", 5, "0.5 W to 2.5 W in steps of 0.25 W", 1, 9), _CENTRE_PARAMETER),
+        (_integer_parameter("level", 5, "power, 0.5 W to 2.5 W in steps of 0.25 W", 1, 9), _CENTRE_PARAMETER),
         experiments.build_intensity,
-        "25 ms on, 25 ms off. A level above the laser's maximum plays at it: level 9, 2.5 W, on a laser of 2.45 W.",
+        "25 ms on, 25 ms off. A level above the laser's maximum power plays at the maximum: level 9, 2.5 W, at 2.45 W.",
     ),
     Pattern(
         "experiment-5",
         "temporal pattern: three stimuli of 400 ms, one of them odd",
         (
-            _integer_parameter("oddball", 1, "which of the three is odd", 1, 3),
+            _integer_parameter("oddball", 1, "position of the odd stimulus", 1, 3),
             _choice_parameter(
-                "kind", "fast", "how the odd one is pulsed: slow 35/35 ms, fast 10/10 ms", ("slow", "fast")
+                "kind", "fast", "pulses of the odd stimulus: slow 35/35 ms, fast 10/10 ms", ("slow", "fast")
             ),
-            _time_parameter("pause_s", 0.5, "between stimuli; the paper does not say"),
+            _time_parameter("pause_s", 0.5, "pause between stimuli; not stated in the paper"),
             _CENTRE_PARAMETER,
         ),
         experiments.build_temporal_pattern,
@@ -102,17 +101,17 @@ _PATTERN_LIST = (
     Pattern(
         "experiment-6",
         "multi-point: squares of four pixels under two fingers at once",
-        (_choice_parameter("digits", "2-3", "which two fingers, 2 is the index", _DIGIT_PAIRS), _CENTRE_PARAMETER),
+        (_choice_parameter("digits", "2-3", "the two fingers; 2 is the index finger", _DIGIT_PAIRS), _CENTRE_PARAMETER),
         experiments.build_two_fingers,
-        "40 pulses of 15 ms, the two fingers in turn, 600 ms and the mirrors' moves. "
-        "Where the fingers lie and the order within a square are choices.",
+        "40 pulses of 15 ms, the two fingers alternating; 600 ms and the settling times. "
+        "The paper does not state the positions of the fingers or the order within a square.",
     ),
     Pattern("showcase", "a moving dot, a ring, braille, two pairs of fingers", (), build_showcase),
     Pattern(
         "pixel",
         "one pixel, up and down",
         (
-            PatternParameter("pixel", "pixel", None, "which; the middle if not given"),
+            PatternParameter("pixel", "pixel", None, "index of the pixel; the middle by default"),
             _height_parameter(100.0),
             _SECONDS_PARAMETER,
         ),
@@ -120,24 +119,24 @@ _PATTERN_LIST = (
     ),
     Pattern(
         "vibration",
-        "one pixel that vibrates at one height, each pulse planned with the heat that is there",
+        "one pixel that vibrates at one height, each pulse planned from the current thermal state",
         (
-            PatternParameter("pixel", "pixel", None, "which; the middle if not given"),
+            PatternParameter("pixel", "pixel", None, "index of the pixel; the middle by default"),
             _height_parameter(200.0, "height of every peak"),
             PatternParameter(
                 "peak_to_peak_um",
                 "number",
                 None,
-                "fall between peaks; that of the shortest pulses, which take least energy, if not given",
+                "fall between peaks; by default that of the shortest pulses, which need the least energy",
                 "µm",
                 min=0.1,
                 max=1000.0,
             ),
-            PatternParameter("rate_hz", "number", 25.0, "peaks a second", "Hz", min=0.1, max=200.0),
-            PatternParameter("seconds", "number", 1.0, "how long", "s", min=0.01, max=600.0),
+            PatternParameter("rate_hz", "number", 25.0, "peaks per second", "Hz", min=0.1, max=200.0),
+            PatternParameter("seconds", "number", 1.0, "duration", "s", min=0.01, max=600.0),
         ),
         shapes.build_vibration,
-        "What swing a rate and a height allow depends on the pixel; a refusal says which.",
+        "The peak-to-peak range for a rate and a height depends on the pixel; the error message states it.",
     ),
     Pattern("all", "every pixel", (_height_parameter(50.0), _SECONDS_PARAMETER), shapes.build_all_pixels),
     Pattern("checker", "every other pixel", (_height_parameter(50.0), _SECONDS_PARAMETER), shapes.build_checkerboard),
@@ -146,7 +145,7 @@ _PATTERN_LIST = (
         "square",
         "the outline of a square",
         (
-            _size_parameter("side_mm", "length of a side; six tenths of the display if not given"),
+            _size_parameter("side_mm", "length of a side; 0.6 of the display by default"),
             _height_parameter(100.0),
             _SECONDS_PARAMETER,
         ),
@@ -158,18 +157,18 @@ _PATTERN_LIST = (
         (
             _DIRECTION_PARAMETER,
             _height_parameter(50.0),
-            _time_parameter("step_s", 0.1, "time a pitch, or what the beam needs if longer"),
+            _time_parameter("step_s", 0.1, "time per pitch, or the beam time if longer"),
         ),
         shapes.build_moving_edge,
     ),
     Pattern(
         "dot",
-        "one pixel that runs round a ring, clockwise",
+        "one pixel that moves along a ring, clockwise",
         (
             _RADIUS_PARAMETER,
             _height_parameter(200.0),
-            _time_parameter("step_s", 0.06, "time a pixel, or what the beam needs if longer"),
-            _integer_parameter("turns", 1, "times round", 1, 100),
+            _time_parameter("step_s", 0.06, "time per pixel, or the beam time if longer"),
+            _integer_parameter("turns", 1, "number of turns", 1, 100),
         ),
         shapes.build_moving_dot,
     ),
@@ -177,9 +176,9 @@ _PATTERN_LIST = (
         "text",
         "text in braille, uncontracted English",
         (
-            PatternParameter("text", "text", None, "what to write", required=True),
+            PatternParameter("text", "text", None, "text to show", required=True),
             _height_parameter(150.0, "peak height of a dot"),
-            PatternParameter("seconds", "number", 2.0, "time a page, at least", "s", min=0.0, max=600.0),
+            PatternParameter("seconds", "number", 2.0, "minimum time per page", "s", min=0.0, max=600.0),
             _integer_parameter("dot_step", 1, "pitches between the dots of a cell", 1, 10),
             _integer_parameter("cell_gap", 1, "empty columns between cells", 0, 20),
             _integer_parameter("line_gap", 1, "empty rows between lines", 0, 20),
@@ -188,7 +187,7 @@ _PATTERN_LIST = (
     ),
     Pattern(
         "image",
-        "a picture, bright is high",
+        "an image, bright is high",
         (_FILE_PARAMETER, _height_parameter(50.0, "height of white"), _SECONDS_PARAMETER, _INVERT_PARAMETER),
         images.build_image,
     ),
@@ -202,7 +201,7 @@ _PATTERN_LIST = (
                 "rate_hz",
                 "number",
                 None,
-                "pictures a second; the file's own, or as fast as the beam allows, if not given",
+                "images per second; by default the file's durations, extended to the beam time",
                 "Hz",
                 min=0.01,
                 max=50.0,
@@ -217,7 +216,7 @@ PATTERNS: dict[str, Pattern] = {pattern.name: pattern for pattern in _PATTERN_LI
 
 
 def find_pattern(name: str) -> Pattern:
-    """A pattern by its name; raises InputError (unknown_pattern) with the nearest known one."""
+    """Return the pattern of a name; raises InputError (unknown_pattern) with the nearest known name."""
     if name not in PATTERNS:
         expected = f"a known pattern, {suggest_nearest(name[:60], list(PATTERNS))}"
         raise InputError("pattern", name, expected, code="unknown_pattern")
@@ -225,7 +224,7 @@ def find_pattern(name: str) -> Pattern:
 
 
 def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
-    """A pattern's sequence for a display; `given` maps parameters to values.
+    """Build a pattern's sequence for a display; `given` maps parameters to values.
 
     A value may be text, as from a command line; a file is its bytes, or these in base64.
 
@@ -238,7 +237,7 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
 
 
 def describe_patterns() -> list[dict[str, Any]]:
-    """Every pattern with its parameters, as JSON has it."""
+    """Return every pattern with its parameters, JSON-serialisable."""
     return [
         {
             "name": pattern.name,

@@ -1,4 +1,4 @@
-"""Places of the lattice to pixel indices: row and column from the bottom left, -1 where no pixel lies."""
+"""Lattice of a display: place (row, column from the bottom left) to pixel index."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -12,7 +12,10 @@ from optodrive.device.config import Config, PixelLayout, build_pixel_layout
 
 @dataclass(frozen=True, eq=False)
 class Lattice:
-    """A display's places. index: [rows, columns] pixel at a place, -1 where it is missing; layout: the inverse, [p]."""
+    """Places of a display's lattice.
+
+    index: [rows, columns] pixel at a place, -1 if there is none; layout: the inverse, [p].
+    """
 
     name: str
     index: IntArray
@@ -23,14 +26,14 @@ class Lattice:
 
     @classmethod
     def from_config(cls, config: Config) -> "Lattice":
-        """The lattice of a configured display."""
+        """Build the lattice of a configured display."""
         layout = build_pixel_layout(config.display)
         index = np.full((config.display.rows, config.display.columns), -1, dtype=np.int64)
         index[layout.row, layout.column] = np.arange(len(layout))
         return cls(config.name, index, layout)
 
     def pixel_at(self, row: int, column: int) -> int | None:
-        """The pixel of a place; None where there is none."""
+        """Return the pixel at a place, or None if there is none."""
         rows, columns = self.index.shape
         if not (0 <= row < rows and 0 <= column < columns):
             return None
@@ -38,16 +41,16 @@ class Lattice:
         return pixel if pixel >= 0 else None
 
     def middle_pixel(self) -> int:
-        """The pixel nearest to the display's middle; the lowest index among equals."""
+        """Return the pixel nearest to the display's middle, the lowest index among equals."""
         distance_m = np.round(np.hypot(self.layout.x_m, self.layout.y_m), 9)
         return int(np.argmin(distance_m))
 
     def pixels_around(
         self, centre: int | None, offsets: Iterable[tuple[int, int]], where: str, requirement: str
     ) -> list[int]:
-        """Pixels at (rows up, columns right) from a centre, None for the middle; raises InputError (does_not_fit).
+        """Return the pixels at offsets (rows up, columns right) from a centre; None is the middle pixel.
 
-        needs: what must lie around the centre, for the message.
+        requirement: what must surround the centre, for the message. Raises InputError (does_not_fit).
         """
         centre = self.middle_pixel() if centre is None else centre
         row, column = int(self.layout.row[centre]), int(self.layout.column[centre])

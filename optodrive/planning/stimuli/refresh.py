@@ -1,4 +1,4 @@
-"""How long the beam needs for a picture, and pictures shown for a while: a membrane stays up only while it is hit."""
+"""Beam time of a picture, and frames that refresh it: a membrane stays raised only while pulses repeat."""
 
 from math import ceil
 
@@ -15,17 +15,17 @@ from optodrive.physics.thermal_state import build_cold_state
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 REFRESH_HZ = 10.0
-"""A picture that stays is drawn again at most this often."""
+"""Largest rate at which a held picture is drawn again, Hz."""
 
 HEIGHT_STEP_RELATIVE = 0.01
-"""Where each pixel is asked for a height of its own, heights are told apart by so much, relative."""
+"""Relative step to which individual pixel targets are rounded, so that few distinct heights are solved."""
 
 BEAM_TIME_MARGIN = 1.05
-"""Beam time asked for over the estimate."""
+"""Factor by which the allotted beam time exceeds the estimate."""
 
 
 class BeamTimeEstimator:
-    """Estimates how long one beam needs to draw a picture from rest: pulses in whole PWM periods, and moves by rows."""
+    """Estimates the beam time of a picture from the cold state: pulses in whole PWM periods, moves row by row."""
 
     def __init__(self, config: Config) -> None:
         self.lattice = Lattice.from_config(config)
@@ -39,16 +39,19 @@ class BeamTimeEstimator:
         self._cold_heat = build_cold_state(remove_pixel_map(config), load_parameters(config.pixel_model.parameters))
 
     def min_pulse_s(self, target_m: float) -> float:
-        """Shortest pulse from rest that reaches a height, s; the longest there is for a height out of reach."""
+        """Return the shortest pulse from the cold state that reaches a height, s.
+
+        An unreachable height counts as the longest pulse.
+        """
         pulse = self._cold_heat.solve_pulse(0, 0.0, target_m, self._drive)
         return self._drive.period_s * (1 if pulse is None else pulse[0])
 
     def _settling_s(self, distance_m: float) -> float:
-        """From a move's command until the focus lies on the next absorber, s."""
+        """Return the settling time of a move between two absorbers, s."""
         return settling_s(self._servo, distance_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
 
     def beam_time_s(self, target_m: FloatArray) -> float:
-        """Beam time of a picture, s, with a little reserve, in whole milliseconds. target_m: [p]."""
+        """Return the beam time of a picture with its margin, in whole milliseconds, s; target_m: [p]."""
         driven = np.flatnonzero((target_m > 0) if self._lift is None else (target_m > 0) & (self._lift > 0))
         if not len(driven):
             return 0.0
@@ -60,15 +63,18 @@ class BeamTimeEstimator:
         distances_m = np.maximum(
             *(np.abs(np.diff(at_m[order], append=at_m[order[0]])) for at_m in (layout.x_m, layout.y_m))
         )
-        # A single pixel is still come to from somewhere: a pitch at least.
+        # A single pixel still needs a move of at least one pitch.
         distances_unique_m, counts = np.unique(np.maximum(distances_m, self._pitch_m).round(9), return_counts=True)
-        settling_s = sum(
-            self._settling_s(float(step_m)) * int(n) for step_m, n in zip(distances_unique_m, counts, strict=True)
+        moves_s = sum(
+            self._settling_s(float(each_m)) * int(n) for each_m, n in zip(distances_unique_m, counts, strict=True)
         )
-        return ceil(BEAM_TIME_MARGIN * (pulses_s + settling_s) * 1e3) / 1e3
+        return ceil(BEAM_TIME_MARGIN * (pulses_s + moves_s) * 1e3) / 1e3
 
     def _nominal_targets_m(self, target_m: FloatArray, driven: IntArray) -> FloatArray:
-        """What a nominal pixel would be asked for, so that one of the map stands as high, [driven]; in few steps."""
+        """Return targets of a nominal pixel whose pulses raise the mapped pixels to their own targets, m, [driven].
+
+        Targets are rounded up in steps of HEIGHT_STEP_RELATIVE.
+        """
         if self._lift is None:
             return target_m[driven]
         log_targets = np.log(target_m[driven] / self._lift[driven])
@@ -78,9 +84,9 @@ class BeamTimeEstimator:
 def hold_picture(
     estimator: BeamTimeEstimator, target_m: FloatArray, seconds: float, name: str, start_s: float = 0.0
 ) -> list[TactileFrame]:
-    """A picture kept up for at least `seconds`: drawn again and again, each time as long as the beam needs.
+    """Build frames that hold a picture for at least `seconds` by drawing it again and again.
 
-    target_m: [p]. The frames abut; the first starts at start_s.
+    target_m: [p]. Each frame lasts as long as the beam needs, the frames abut, and the first starts at start_s.
     """
     frame_s = max(estimator.beam_time_s(target_m), 1.0 / REFRESH_HZ)
     count = max(1, ceil(seconds / frame_s - 1e-9))
@@ -90,7 +96,7 @@ def hold_picture(
 def build_steps(
     estimator: BeamTimeEstimator, pictures: list[FloatArray], step_s: float, name: str
 ) -> list[TactileFrame]:
-    """Pictures one after the other, each shown once, for step_s or as long as the beam needs. pictures: of [p]."""
+    """Build frames that show pictures once each, for step_s or as long as the beam needs; pictures: each [p]."""
     frames: list[TactileFrame] = []
     start_s = 0.0
     for k, target_m in enumerate(pictures):
@@ -101,7 +107,7 @@ def build_steps(
 
 
 def sequence_end_s(sequence: FrameSequence) -> float:
-    """When the last frame, pulse, or cycle of a train by height ends, s; 0 for an empty sequence."""
+    """Return the end of the last frame, pulse, or cycle of a height train, s; 0 for an empty sequence."""
     frame_ends = [frame.show_at_s + frame.duration_s for frame in sequence.frames]
     train_ends = [
         float(train.pulse_starts_s()[-1]) + (train.period_s if isinstance(train, HeightTrain) else train.pulse_width_s)

@@ -1,4 +1,4 @@
-"""FRAMES.json, which is also the body of a plan request: decoded, checked whole, and written back."""
+"""Read, validate and write sequences: FRAMES.json, which is also the body of a plan request."""
 
 from pathlib import Path
 
@@ -13,15 +13,18 @@ from optodrive.planning.stimuli.json_values import decode_json, require_list, re
 from optodrive.planning.stimuli.train_json import check_trains, parse_train, train_to_json, validate_train
 
 FRAMES_MAX = 10_000
+"""Largest number of frames of a sequence."""
 TRAINS_MAX = 10_000
+"""Largest number of trains of a sequence."""
 TARGETS_MAX = 20_000_000
-"""Frames × pixels of a sequence: 160 MB of targets."""
+"""Largest number of frames × pixels of a sequence: 160 MB of targets."""
 
 FILE_MAX_BYTES = 64_000_000
+"""Largest size of a sequence file, bytes."""
 
 
 def load_sequence(path: str | Path, config: Config) -> FrameSequence:
-    """Read FRAMES.json; raises InputError as `parse_sequence`, or where the file cannot be read."""
+    """Read FRAMES.json; raises InputError as `parse_sequence`, or if the file cannot be read (no_file, too_many)."""
     try:
         with Path(path).open("rb") as file:
             body = file.read(FILE_MAX_BYTES + 1)
@@ -33,7 +36,7 @@ def load_sequence(path: str | Path, config: Config) -> FrameSequence:
 
 
 def parse_json(body: bytes | str, where: str) -> object:
-    """JSON text as Python values; raises InputError (bad_json) for what is no JSON, or nests too deep."""
+    """Decode JSON text; raises InputError (bad_json) for invalid JSON and for too deep nesting."""
     try:
         return decode_json(body, where)
     except RecursionError:
@@ -41,19 +44,19 @@ def parse_json(body: bytes | str, where: str) -> object:
 
 
 def parse_sequence(body: object, config: Config, where: str) -> FrameSequence:
-    """A sequence from JSON text, or from JSON already decoded, for a display; `where` names the source in errors.
+    """Parse a sequence for a display from JSON text or decoded JSON; `where` names the source in errors.
 
     Raises InputError with the place, and a code: bad_json, unknown_key, missing_key, unknown_pixel, bad_target,
     bad_time, bad_train, bad_priority, overlapping_trains, too_many.
     """
     try:
         return _parse_decoded(parse_json(body, where) if isinstance(body, bytes | str) else body, config, where)
-    except RecursionError:  # from showing a value that nests deeper than Python's stack
+    except RecursionError:  # the repr of a value that nests deeper than Python's stack
         raise InputError(where, "deeper nesting", "objects and lists at most 4 deep", code="bad_json") from None
 
 
 def validate_sequence(sequence: FrameSequence, where: str, config: Config) -> FrameSequence:
-    """A sequence made by a pattern, held to the same bounds as a file; raises InputError (too_many, bad_train, …)."""
+    """Return a pattern's sequence if it meets the bounds of a file; raises InputError (too_many, bad_train, …)."""
     frames_max = _compute_frames_max(len(build_pixel_layout(config.display)))
     if len(sequence.frames) > frames_max:
         raise InputError(f"{where}: frames", len(sequence.frames), f"at most {frames_max}", code="too_many")
@@ -67,7 +70,10 @@ def _compute_frames_max(pixel_count: int) -> int:
 
 
 def sequence_to_json(sequence: FrameSequence) -> dict[str, object]:
-    """A sequence as FRAMES.json has it; heights to 1e-9 µm, so that parsing gives the same numbers back."""
+    """Return a sequence in the form of FRAMES.json.
+
+    Heights are rounded to 1e-9 µm, so that parsing restores the numbers.
+    """
     return {
         "frames": [_frame_to_json(frame) for frame in sequence.frames],
         "trains": [train_to_json(train) | _priority_to_json(train) for train in sequence.trains],

@@ -1,4 +1,4 @@
-"""Shapes that stay and shapes that move, drawn as frames. Pictures are heights of all pixels, [p], m."""
+"""Static and moving shapes as frames. A picture holds the heights of all pixels, [p], m."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,11 +11,11 @@ from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, build_steps, hold_picture
 
 RING_RADIUS_FRACTION = 0.6
-"""Rings and squares reach this far from the middle, as a share of the way to the border, if not told."""
+"""Default radius of rings and half side of squares, as a fraction of the distance from the middle to the border."""
 
 
 def build_single_pixel(config: Config, where: str, pixel: int | None, height_m: float, seconds: float) -> FrameSequence:
-    """One pixel (None: the middle), drawn again and again."""
+    """Build one pixel (None: the middle), drawn again and again."""
     lattice = Lattice.from_config(config)
     chosen_pixel = lattice.middle_pixel() if pixel is None else pixel
     return _hold_mask(
@@ -32,26 +32,26 @@ def build_vibration(
     rate_hz: float,
     seconds: float,
 ) -> FrameSequence:
-    """One pixel (None: the middle) that swings below a height; peak_to_peak_m None: with as little energy as may be."""
+    """Build a height train on one pixel (None: the middle); peak_to_peak_m None: that of the shortest pulses."""
     chosen_pixel = Lattice.from_config(config).middle_pixel() if pixel is None else pixel
     return FrameSequence(trains=(HeightTrain(chosen_pixel, 0.0, seconds, 1.0 / rate_hz, height_m, peak_to_peak_m),))
 
 
 def build_all_pixels(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
-    """Every pixel at one height."""
+    """Build every pixel at one height."""
     return _hold_mask(
         config, np.ones(len(Lattice.from_config(config).layout), dtype=np.bool_), height_m, seconds, "all"
     )
 
 
 def build_checkerboard(config: Config, where: str, height_m: float, seconds: float) -> FrameSequence:
-    """Every other pixel, as on a chessboard."""
+    """Build every other pixel, as on a chessboard."""
     layout = Lattice.from_config(config).layout
     return _hold_mask(config, (layout.row + layout.column) % 2 == 0, height_m, seconds, "checker")
 
 
 def build_ring(config: Config, where: str, radius_m: float | None, height_m: float, seconds: float) -> FrameSequence:
-    """A ring about the display's middle, one pixel wide."""
+    """Build a ring about the display's middle, one pixel wide; raises InputError (does_not_fit)."""
     ring = np.isin(np.arange(len(Lattice.from_config(config).layout)), find_ring_pixels(config, where, radius_m))
     return _hold_mask(config, ring, height_m, seconds, "circle")
 
@@ -59,7 +59,7 @@ def build_ring(config: Config, where: str, radius_m: float | None, height_m: flo
 def build_square_outline(
     config: Config, where: str, side_m: float | None, height_m: float, seconds: float
 ) -> FrameSequence:
-    """The outline of a square about the display's middle, one pixel wide."""
+    """Build the outline of a square about the display's middle, one pixel wide; raises InputError (does_not_fit)."""
     layout = Lattice.from_config(config).layout
     half_m = _default_radius_m(config) if side_m is None else side_m / 2
     farthest_m = np.maximum(np.abs(layout.x_m), np.abs(layout.y_m))
@@ -70,7 +70,7 @@ def build_square_outline(
 
 
 def build_moving_edge(config: Config, where: str, direction: str, height_m: float, step_s: float) -> FrameSequence:
-    """A line of pixels across the display that moves to its other side, one pitch a step."""
+    """Build a line of pixels that moves across the display, one pitch per step."""
     layout = Lattice.from_config(config).layout
     line = layout.column if direction in ("left", "right") else layout.row
     places = np.arange(line.max() + 1)[:: -1 if direction in ("left", "down") else 1]
@@ -81,7 +81,7 @@ def build_moving_edge(config: Config, where: str, direction: str, height_m: floa
 def build_moving_dot(
     config: Config, where: str, radius_m: float | None, height_m: float, step_s: float, turns: int
 ) -> FrameSequence:
-    """One pixel at a time round a ring, clockwise from the left."""
+    """Build one pixel at a time along a ring, clockwise from the left; raises InputError (does_not_fit)."""
     layout = Lattice.from_config(config).layout
     ring = find_ring_pixels(config, where, radius_m)
     ring = ring[np.argsort(-np.arctan2(layout.y_m[ring], layout.x_m[ring]), kind="stable")]
@@ -90,7 +90,7 @@ def build_moving_dot(
 
 
 def find_ring_pixels(config: Config, where: str, radius_m: float | None) -> NDArray[np.int64]:
-    """Pixels of a ring about the middle (None: of the usual size), by index; raises InputError when it holds none."""
+    """Return the pixels of a ring about the middle by index (None: default radius); raises InputError."""
     layout = Lattice.from_config(config).layout
     radius_m = _default_radius_m(config) if radius_m is None else radius_m
     ring = np.flatnonzero(_is_within_half_pitch(np.hypot(layout.x_m, layout.y_m), radius_m, config.display.pitch_m))

@@ -1,4 +1,4 @@
-"""A short sequence that shows what the display can do."""
+"""A short sequence that demonstrates the display."""
 
 from dataclasses import replace
 
@@ -10,12 +10,13 @@ from optodrive.planning.stimuli.shapes import build_moving_dot, build_ring
 from optodrive.planning.stimuli.text import build_text
 
 PAUSE_S = 0.3
+"""Pause between two parts, s."""
 
 
 def build_showcase(config: Config, where: str) -> FrameSequence:
-    """A dot that runs round a ring, the ring, "hello" in braille, two pairs of fingers; about eight seconds.
+    """Build a dot along a ring, the ring, "hello" in braille, and two pairs of fingers; about eight seconds.
 
-    Raises InputError on a display too small for a hand.
+    Raises InputError (does_not_fit) on a display too small for a hand.
     """
     return concatenate_sequences(
         build_moving_dot(config, where, radius_m=None, height_m=200e-6, step_s=0.06, turns=1),
@@ -27,7 +28,7 @@ def build_showcase(config: Config, where: str) -> FrameSequence:
 
 
 def concatenate_sequences(*sequences: FrameSequence) -> FrameSequence:
-    """Sequences joined in time, with a pause between."""
+    """Concatenate sequences in time, with a pause between them."""
     concatenated, start_s = FrameSequence(), 0.0
     for sequence in sequences:
         concatenated = FrameSequence(

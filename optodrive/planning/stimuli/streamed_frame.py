@@ -1,4 +1,4 @@
-"""One frame of a running stream: from JSON text, or from a few bytes a pixel."""
+"""Parse one frame of a running stream, from JSON text or from two bytes per pixel."""
 
 import struct
 
@@ -13,17 +13,17 @@ from optodrive.planning.stimuli.json_values import decode_json, require_object
 MAGIC = b"ODF1"
 HEADER = struct.Struct("<4sI")
 HEIGHT_UNIT_M = 1e-7
-"""Binary heights are whole tenths of a micrometre."""
+"""Unit of binary heights, m."""
 FRAME_NUMBER_MAX = 0xFFFF_FFFF
 FRAME_DURATION_S = 3600.0
-"""A frame of a stream has no end of its own: it stays until the next, or until it has been drawn once."""
+"""Nominal duration of a streamed frame, s; the next frame, or one complete drawing, ends it earlier."""
 
 
 def parse_live_frame(message: str | bytes, expected_number: int, pixel_count: int) -> tuple[int, FrameSequence]:
-    """A frame's number and what to show; JSON without a number gets the expected one.
+    """Return a frame's number and its sequence; JSON without a number gets the expected one.
 
     Text: {"frame": 7, "target_um": …} with target_um as in FRAMES.json. Bytes, little-endian: "ODF1", u32 number,
-    then a u16 for each pixel, in 0.1 µm. Raises InputError (bad_json, bad_frame, bad_target, unknown_pixel, …).
+    then a u16 per pixel, in 0.1 µm. Raises InputError (bad_json, bad_frame, bad_target, unknown_pixel, …).
     """
     if isinstance(message, bytes):
         number, target_m = _parse_binary(message, pixel_count)
@@ -51,19 +51,19 @@ def _parse_text(message: str, expected_number: int, pixel_count: int) -> tuple[i
     number = table.get("frame", expected_number)
     if type(number) is not int or not 0 <= number <= FRAME_NUMBER_MAX:
         raise InputError("frame.frame", number, f"a whole number, 0…{FRAME_NUMBER_MAX}", code="bad_frame")
-    names = {str(pixel): pixel for pixel in range(pixel_count)}
-    return number, parse_targets_m(table["target_um"], "frame.target_um", names)
+    pixel_by_name = {str(pixel): pixel for pixel in range(pixel_count)}
+    return number, parse_targets_m(table["target_um"], "frame.target_um", pixel_by_name)
 
 
 def can_split(sequence: FrameSequence) -> bool:
-    """Whether a sequence is one frame whose pixels may stand up one after the other."""
+    """Return whether a sequence is one frame whose pixels may be raised one after the other."""
     return len(sequence.frames) == 1 and not sequence.trains and not sequence.frames[0].simultaneous
 
 
 def stale_pixels_first(sequence: FrameSequence, refreshed: BoolArray) -> FrameSequence:
-    """A stream's frame in two: first the pixels that this sweep over the display has not lit yet.
+    """Split a stream's frame in two: first the pixels not yet refreshed in this refresh cycle, then the others.
 
-    So every pixel has its turn however fast frames come. seen: [p], lit in this sweep.
+    Every pixel thus gets its turn at any frame rate. refreshed: [p], refreshed in this cycle.
     """
     (frame,) = sequence.frames
     parts = [np.where(part, frame.target_m, 0.0) for part in (~refreshed, refreshed)]

@@ -1,4 +1,4 @@
-"""Braille on the lattice: cells of 2 × 3 pixels, lines wrapped by words, pages one after the other."""
+"""Braille on the lattice: cells of 2 × 3 pixels, lines wrapped at words, one page after the other."""
 
 from dataclasses import dataclass
 from itertools import groupby
@@ -14,12 +14,12 @@ from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator, hold_picture, sequence_end_s
 
 DOT_OFFSETS = {1: (0, 0), 2: (1, 0), 3: (2, 0), 4: (0, 1), 5: (1, 1), 6: (2, 1)}
-"""Dot to (rows down, columns right) from the cell's top left, in dot steps."""
+"""Offset (rows down, columns right) of each dot from the cell's top left, in dot steps."""
 
 
 @dataclass(frozen=True)
 class Spacing:
-    """In lattice places: between dots of a cell, empty columns between cells, empty rows between lines."""
+    """Spacing in lattice places: between dots of a cell, empty columns between cells, empty rows between lines."""
 
     dot_step: int
     cell_gap: int
@@ -27,12 +27,12 @@ class Spacing:
 
     @property
     def cell_size(self) -> tuple[int, int]:
-        """Rows and columns that a cell covers."""
+        """Rows and columns of a cell."""
         return 2 * self.dot_step + 1, self.dot_step + 1
 
 
 CellSlot = dict[int, int]
-"""Where a cell can be shown: dot to pixel."""
+"""Place of a cell on the lattice: dot to pixel."""
 
 
 def build_text(
@@ -45,7 +45,10 @@ def build_text(
     cell_gap: int = 1,
     line_gap: int = 1,
 ) -> FrameSequence:
-    """Text in braille from the top left, `seconds` a page (or as long as the beam needs); raises InputError."""
+    """Build text in braille from the top left, each page for `seconds` or as long as the beam needs.
+
+    Raises InputError (bad_text, does_not_fit).
+    """
     lines = encode_lines(text, f"{where}: text")
     if not any(lines):
         raise InputError(f"{where}: text", text, "at least one character to show", code="bad_text")
@@ -68,7 +71,7 @@ def build_text(
 
 
 def find_line_slots(lattice: Lattice, spacing: Spacing) -> list[list[CellSlot]]:
-    """Lines of cells that fit, top first: of each line the longest run of cells with all six pixels present."""
+    """Find the lines of cells that fit, top first: per line the longest run of cells with all six pixels present."""
     rows, columns = lattice.index.shape
     cell_rows, cell_columns = spacing.cell_size
     step_rows, step_columns = cell_rows + spacing.line_gap, cell_columns + spacing.cell_gap
@@ -98,7 +101,7 @@ def _find_cell_slot(lattice: Lattice, from_top: int, from_left: int, dot_step: i
 
 
 def wrap_words(lines: list[list[list[Cell]]], widths: list[int]) -> list[list[Cell]]:
-    """Words into rows of cells, row k at most widths[k mod n] long; a word longer than its row is cut."""
+    """Wrap words into rows of cells, row k at most widths[k mod n] long; a word longer than its row is split."""
     rows: list[list[Cell]] = []
     for words in lines:
         rows.append([])

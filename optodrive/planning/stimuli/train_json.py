@@ -1,4 +1,4 @@
-"""Trains, by pulse and by height: from JSON, and what must hold for them on one beam, whoever made them."""
+"""Parse pulse trains and height trains from JSON, and validate them for one beam."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,21 +15,22 @@ from optodrive.planning.stimuli.json_values import require_number, require_objec
 PULSE_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "pulse_width_s", "gap_s", "power_w")
 HEIGHT_TRAIN_KEYS = ("pixel", "start_s", "duration_s", "period_s", "target_um", "peak_to_peak_um")
 HEIGHT_ONLY_KEYS = frozenset(HEIGHT_TRAIN_KEYS) - frozenset(PULSE_TRAIN_KEYS)
-"""One of these makes an entry a train by height."""
+"""Keys that only a height train has."""
 PULSES_MAX = 2_000_000
+"""Largest number of pulses of all trains."""
 HEIGHT_PULSES_MAX = 100_000
-"""Pulses of trains by height are planned one by one, each with the heat that the limiter left."""
+"""Largest number of pulses of all height trains, which are planned one by one with the limiter's thermal state."""
 OVERLAP_TOLERANCE_S = 1e-9
-"""Pulses may share this much, the rounding of their times."""
+"""Overlap of two pulses that the rounding of their times may cause, s."""
 
 PWM_TOLERANCE_PERIODS = 0.01
-"""How far from a whole number of PWM periods a width may be written, in periods; it is played as the whole number."""
+"""Largest deviation of a width from whole PWM periods, in periods; the width is rounded to whole periods."""
 
 
 def parse_train(value: object, where: str, config: Config, pixel_count: int) -> Train:
-    """One entry of `trains`, by pulse or by height as its keys say.
+    """Parse one entry of `trains` as a pulse train or a height train, by its keys.
 
-    Raises InputError (bad_train, bad_time, bad_priority, unknown_pixel, unknown_key, missing_key).
+    Raises InputError (bad_train, bad_time, bad_target, bad_priority, unknown_pixel, unknown_key, missing_key).
     """
     if isinstance(value, dict) and not HEIGHT_ONLY_KEYS.isdisjoint(value):
         return _parse_height_train(value, where, config, pixel_count)
@@ -82,7 +83,7 @@ def _validate_height_train(train: HeightTrain, where: str, config: Config) -> He
 
 
 def validate_train(train: Train, where: str, config: Config) -> Train:
-    """The train as it is played, a width at the whole number of PWM periods; raises InputError (bad_train, …)."""
+    """Return the train with its width rounded to whole PWM periods; raises InputError (bad_train, bad_target)."""
     if isinstance(train, HeightTrain):
         return _validate_height_train(train, where, config)
     return _validate_pulse_train(train, where, config)
@@ -106,15 +107,15 @@ def _validate_pulse_train(train: PulseTrain, where: str, config: Config) -> Puls
 
 
 def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
-    """Refuse more pulses than are planned at once, and pulses of two trains at the same time: there is one beam.
+    """Check the number of pulses and that no two pulses overlap, since there is one beam.
 
-    Raises InputError (too_many, overlapping_trains); pulses that abut are fine. A pulse by height, whose width is not
-    known yet, counts as one PWM period; the scheduler sees to the mirrors' moves.
+    Abutting pulses are allowed. A height train's pulse, of unknown width, counts as one PWM period; the scheduler
+    accounts for settling times. Raises InputError (too_many, overlapping_trains).
     """
     counts = [count_pulses(train) for train in trains]
     by_height = sum(n for train, n in zip(trains, counts, strict=True) if isinstance(train, HeightTrain))
     if by_height > HEIGHT_PULSES_MAX:
-        expected = f"at most {HEIGHT_PULSES_MAX} pulses in all trains by height"
+        expected = f"at most {HEIGHT_PULSES_MAX} pulses in all height trains"
         raise InputError(where, by_height, expected, code="too_many")
     if sum(counts) > PULSES_MAX:
         raise InputError(where, sum(counts), f"at most {PULSES_MAX} pulses in all trains", code="too_many")
@@ -125,27 +126,27 @@ def check_trains(trains: Sequence[Train], where: str, config: Config) -> None:
     width_s = [1 / config.laser.pwm_hz if isinstance(train, HeightTrain) else train.pulse_width_s for train in trains]
     end_s = start_s + np.array(width_s)[owner]
     order = np.argsort(start_s, kind="stable")
-    # Sorted by start, two pulses overlap somewhere only if two neighbours do.
+    # Of pulses sorted by start, some two overlap only if two neighbours do.
     clash = np.flatnonzero(start_s[order][1:] < end_s[order][:-1] - OVERLAP_TOLERANCE_S)
     if len(clash):
         first, second = (int(pulse) for pulse in order[clash[0] : clash[0] + 2])
         raise InputError(
             f"{where}[{owner[second]}]",
             round(float(start_s[second]), 9),
-            f"a pulse after {end_s[first]:.9g} s: until then the one beam is on for {where.rpartition(' ')[2]}"
+            f"a pulse after {end_s[first]:.9g} s: until then the beam is in use by {where.rpartition(' ')[2]}"
             f"[{owner[first]}], from {start_s[first]:.9g} s",
             code="overlapping_trains",
         )
 
 
 def count_pulses(train: Train) -> int:
-    """Pulses of a train, without making them: those that start before its end."""
+    """Return the number of pulses of a train: those that start before its end."""
     period_s = train.period_s if isinstance(train, HeightTrain) else train.pulse_width_s + train.gap_s
     return max(1, ceil(train.duration_s / period_s - 1e-9))
 
 
 def train_to_json(train: Train) -> dict[str, object]:
-    """A train as FRAMES.json has it; heights to 1e-9 µm."""
+    """Return a train in the form of FRAMES.json; heights are rounded to 1e-9 µm."""
     if isinstance(train, PulseTrain):
         return {key: getattr(train, key) for key in PULSE_TRAIN_KEYS}
     entry: dict[str, object] = {key: getattr(train, key) for key in HEIGHT_TRAIN_KEYS[:4]}

@@ -65,7 +65,7 @@ def test_a_late_frame_is_named_with_what_it_needs_and_what_fits():
     assert nearest.complete
     assert nearest.pixels.kept + len(nearest.pixels.omitted[0].pixels) == nearest.pixels.requested == 40
     assert nearest.time_factor == pytest.approx(admission.beam_required_s / 0.1, rel=0.02)
-    for word in ("needs", "at the least", f"{nearest.pixels.kept} of 40 pixels", f"× {nearest.height_factor:g}"):
+    for word in ("needs", "takes at least", f"{nearest.pixels.kept} of 40 pixels", f"× {nearest.height_factor:g}"):
         assert word in admission.message
     assert json.loads(json.dumps(admission.to_dict()))["nearest"]["time_factor"] == nearest.time_factor
 
@@ -133,7 +133,7 @@ def test_a_cap_is_named_as_what_breaks_it():
 
 
 def test_refuse_carries_the_admission():
-    with pytest.raises(RefusedError, match="nearest that fits") as late:
+    with pytest.raises(RefusedError, match="nearest feasible") as late:
         check(LATE_FRAME, policy="refuse")
     assert late.value.code == "refused"
     assert late.value.feasibility["name"] == "f"
@@ -173,7 +173,7 @@ def test_out_of_reach_is_refused_as_it_is_and_mended_on_request():
     prepared, fewer = check(build_frame([3, 4], [1000, 100]), fit="priority")
     assert [(item.name, item.pixels) for item in fewer.omitted] == [("f", (3,))]
     assert prepared.plan.pixel.tolist() == [4]
-    with pytest.raises(RefusedError, match="nothing of it fits"):
+    with pytest.raises(RefusedError, match="no part of it fits"):
         check(build_frame([3], 1000), fit="priority")
 
 

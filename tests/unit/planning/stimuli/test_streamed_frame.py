@@ -40,7 +40,7 @@ def test_a_frame_without_a_number_gets_the_next_one():
         ('{"frame": -1, "target_um": {}}', "frame.frame: got -1"),
         ('{"frame": true, "target_um": {}}', "frame.frame: got True"),
         ('{"target_um": {"3": 5}}', "frame.target_um: got '3', expected a pixel, 0…2"),
-        ('{"target_um": [1, 2]}', "expected 3 heights, one a pixel"),
+        ('{"target_um": [1, 2]}', "expected 3 heights, one per pixel"),
     ],
 )
 def test_bad_frames_are_refused_in_one_line(message, says):

@@ -126,7 +126,7 @@ def test_pulses_of_two_trains_at_once_are_refused():
     code, message = refusal({}, {"pixel": 18, "start_s": 0.03}, {"pixel": 19, "start_s": 0.165})
     assert code == "overlapping_trains"
     assert message == (
-        "frames.json: trains[2]: got 0.165, expected a pulse after 0.18 s: until then the one beam is on for "
+        "frames.json: trains[2]: got 0.165, expected a pulse after 0.18 s: until then the beam is in use by "
         "trains[0], from 0.16 s"
     )
 
@@ -177,7 +177,7 @@ def test_a_hundred_thousand_pulses_are_checked_quickly():
     assert time.process_time() - start_s < 0.5
     assert sum(map(count_pulses, many)) == 100_000
     late = replace(train, pixel=9, start_s=49.9996, duration_s=0.001)
-    with pytest.raises(InputError, match="one beam"):
+    with pytest.raises(InputError, match="the beam is in use"):
         check_trains([*many, late], "trains", CONFIG)
 
 
