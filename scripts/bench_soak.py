@@ -65,7 +65,7 @@ def build_requirements(baud):
     scanner = config.scanner.model_copy(
         update={"bandwidth_hz": 1e5, "slew_rad_per_s": 1000.0, "delay_s": 1e-6},
     )
-    limits = config.limits.model_copy(update={"pulse_rest_min_s": 1e-4})
+    limits = config.limits.model_copy(update={"pulse_gap_min_s": 1e-4})
     board = config.board.model_copy(update={"baud": baud, "lease_s": 1.0})
     return BoardRequirements.from_config(
         config.model_copy(update={"scanner": scanner, "limits": limits, "board": board})
