@@ -197,9 +197,9 @@ def measure_hour_rows(name, make_heat, columns, make_slope):
     """One simulator against the clock, and a general integrator on the first pulses of the same list."""
     first = [column[:INTEGRATED_PULSES] for column in columns]
     reference = make_heat()
-    reference.pulses(*first)
+    reference.apply_pulses(*first)
     heat = make_heat()
-    kernel_s, _ = measure_once_s(lambda: heat.pulses(*columns))
+    kernel_s, _ = measure_once_s(lambda: heat.apply_pulses(*columns))
     rises_k = np.concatenate(read_rises_at_end(reference, first))
     solver_s, state = measure_once_s(lambda: integrate_pulses(make_slope, len(rises_k), first))
     kernel_ms, solver_ms = 1e3 * kernel_s / len(columns[0]), 1e3 * solver_s / INTEGRATED_PULSES
@@ -219,7 +219,7 @@ def read_rises_at_end(heat, columns):
     end_s = float(columns[1][-1] + columns[2][-1])
     if isinstance(heat, CoupledDisplay):
         return heat.rises_k(end_s)
-    per_pixel = [heat.rises(pixel, end_s) for pixel in range(len(heat.pixels))]
+    per_pixel = [heat.rises_k(pixel, end_s) for pixel in range(len(heat.pixels))]
     return tuple(np.array(per_pixel).T)
 
 

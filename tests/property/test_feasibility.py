@@ -75,7 +75,7 @@ class ExhaustiveSearch:
         start = max(due, free + move)
         if start > due + move:
             return None
-        heat.pulse(pixel, start * 1e-6, width * 1e-6, power_w)
+        heat.apply_pulse(pixel, start * 1e-6, width * 1e-6, power_w)
         return start + width, update_position(stand, pixel, start), done + 1
 
     def frame(self, index, free, stand, done, heat):
@@ -100,7 +100,7 @@ class ExhaustiveSearch:
         frame = self.frames[index]
         while True:
             start = max(LEAD_US + round(frame.show_at_s * 1e6), free + settling_us(stand, free, pixel))
-            pulse = heat.pulse_for_peak(pixel, start * 1e-6, float(frame.target_m[pixel]), MACHINE.drive)
+            pulse = heat.solve_pulse(pixel, start * 1e-6, float(frame.target_m[pixel]), MACHINE.drive)
             if pulse is None:
                 return self.pixels(index, left - {pixel}, free, stand, done, heat)
             end = start + round(pulse[0] * MACHINE.drive.period_s * 1e6)
@@ -115,7 +115,7 @@ class ExhaustiveSearch:
             free, stand, done = placed
         if end > LEAD_US + (frame.show_at_s + frame.duration_s) * 1e6 + SLACK_US:
             return False
-        heat.pulse(pixel, start * 1e-6, (end - start) * 1e-6, pulse[1] * MACHINE.drive.max_power_w)
+        heat.apply_pulse(pixel, start * 1e-6, (end - start) * 1e-6, pulse[1] * MACHINE.drive.max_power_w)
         return self.pixels(index, left - {pixel}, end, update_position(stand, pixel, start), done, heat)
 
 

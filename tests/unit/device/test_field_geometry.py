@@ -39,7 +39,7 @@ def test_closed_forms_agree_with_rays_traced_by_other_code():
     ).T
     assert np.allclose(build_board_axes(SAME), axes, atol=1e-15)
     table = {name: getattr(TRUTH, name) for name in TRUTH.__dataclass_fields__}
-    traced = GroundTruthGeometry(**(table | {"board_axes": axes, "wave_m": np.zeros_like(TRUTH.wave_m)}))
+    traced = GroundTruthGeometry(**(table | {"display_axes": axes, "wave_m": np.zeros_like(TRUTH.wave_m)}))
     x_code, y_code = np.random.default_rng(0).uniform(2000, 63000, (2, 500))
     scale = PRIOR.rad_per_code
     closed = beam_position_m(SAME, (x_code - 32768) * scale, (y_code - 32768) * scale)

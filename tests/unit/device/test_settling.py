@@ -69,7 +69,7 @@ def test_times_rise_and_no_detour_is_quicker(moves):
             assert times_us[far] <= ways_us.min()
     for calm, hasty in zip(moves.after_long_dwell, moves.after_short_dwell, strict=True):
         assert np.all(np.array(hasty) >= np.array(calm))
-    assert moves.lead_us >= moves.after_short_dwell[0][-1]
+    assert moves.lead_in_us >= moves.after_short_dwell[0][-1]
 
 
 def test_without_care_a_detour_would_be_quicker():

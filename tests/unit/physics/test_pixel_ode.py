@@ -180,7 +180,7 @@ def test_what_only_scales_or_shifts():
     shown_k = seen({"sensor_scale": {"gain": 1.05, "offset": 2.0}})[0]
     assert shown_k == pytest.approx(1.05 * rise_k + 2.0)
     drift = {"ambient_drift": {"offset": 0.5, "ramp": 1.0, "bend": 2.0, "rate": 3.0}}
-    shown_k = seen(drift, session=0.5)[0]
+    shown_k = seen(drift, session_time=0.5)[0]
     assert shown_k == pytest.approx(rise_k + 0.5 + 0.5 + 2.0 * (1.5 * 0.25 - 0.5) + 3.0 * T_S)
     missed = seen({"beam_misalignment": {"share": 0.2, "pixel": 0.0, "resistance": 1e-9, "time": 0.5}})
     for ours, theirs in zip(missed, (rise_k, height_m, force_n), strict=True):

@@ -45,12 +45,12 @@ def test_nominal_pixels_are_where_each_says_it_is(after_s):
 def test_a_look_changes_nothing_and_a_time_before_an_event_counts_as_the_event(make):
     heat, untouched = lit(make()), lit(make())
     first = heat.state_at(0.12)
-    heat.at(3.0)
-    again = heat.at(0.12)
+    heat.state_at(3.0)
+    again = heat.state_at(0.12)
     assert np.allclose(first.displacement_m, again.displacement_m, rtol=1e-4, atol=1e-10)
-    assert heat.at(-1.0).absorber_k[9] == pytest.approx(heat.at(0.095).absorber_k[9])
+    assert heat.state_at(-1.0).absorber_k[9] == pytest.approx(heat.state_at(0.095).absorber_k[9])
     more = (np.array([3]), np.array([0.2]), np.array([4e-3]), np.array([2.0]))
-    assert heat.pulses(*more).displacement_m == pytest.approx(untouched.pulses(*more).displacement_m)
+    assert heat.apply_pulses(*more).displacement_m == pytest.approx(untouched.apply_pulses(*more).displacement_m)
 
 
 def test_stepped_pixels_looked_at_again_and_again_are_where_one_long_look_has_them():
