@@ -26,11 +26,13 @@ from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import load_parameters
-from optodrive.physics.wall_coupling import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import limit, shift_state, verify
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.scheduler import Scheduler
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
+from reference.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
 
 RUNS = 7
 
@@ -287,7 +289,6 @@ HIDDEN_TERMS = (
 
 def bench_display():
     """A recording of 100 pixels, 15 runs each, diagnosed pixel by pixel on two worker processes. One run."""
-    sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
     from display_lab import display_lab
     from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel

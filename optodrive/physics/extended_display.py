@@ -33,7 +33,6 @@ from optodrive.physics.term import AMBIENT_K, CONTEXT_SIZE, DOSE, FULL_W, ILLUMI
 from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
 
-MISALIGNED, CROSSTALK = "beam_misalignment", "neighbour_crosstalk"
 BATCH = 128
 """Pulses or pixels between two ticks: a tenth of a second on a slow machine."""
 
@@ -55,8 +54,9 @@ class ExtendedThermalState:
     ) -> None:
         self.pixels = pixels
         self._values, self._active = values, ActiveTerms.from_values(values)
-        self._neighbours = neighbours.indices if CROSSTALK in values else np.zeros((len(pixels), 0), dtype=np.int64)
-        self._neighbours = np.ascontiguousarray(self._neighbours)
+        is_coupled = any(discover_terms()[key].couples_neighbours for key in values)
+        indices = neighbours.indices if is_coupled else np.zeros((len(pixels), 0), dtype=np.int64)
+        self._neighbours = np.ascontiguousarray(indices)
         self._columns = np.stack([getattr(pixels, name) for name in Pixel._fields], axis=1)
         self._context = np.zeros(CONTEXT_SIZE)
         self._context[FULL_W], self._context[AMBIENT_K], self._context[DOSE] = full_w, ambient_k, 1.0
@@ -140,10 +140,10 @@ class ExtendedThermalState:
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
         """The largest displacement that one pulse can reach from rest, [p]."""
-        alone = -1.0 if MISALIGNED not in self._values else self._values[MISALIGNED]["pixel"]
-        kinds = [(pixel, index == alone) for index, pixel in enumerate(self.pixels.elements)]
+        affected = {discover_terms()[key].affected_pixel(values) for key, values in self._values.items()}
+        kinds = [(pixel, index if index in affected else None) for index, pixel in enumerate(self.pixels.elements)]
         width_s = drive.max_periods * drive.period_s
-        reach: dict[tuple[Pixel, bool], float] = {}
+        reach: dict[tuple[Pixel, int | None], float] = {}
         for index, kind in enumerate(kinds):
             if kind not in reach:
                 fresh = self.copy_shifted(0.0)
@@ -187,7 +187,7 @@ class ExtendedThermalState:
         if self._states.any():
             raise ValueError("a display with terms is traced from rest only")
         # What lifts the membrane does not act back on the gas: without it the membrane shows the gas's own rise.
-        bare = {key: own for key, own in self._values.items() if discover_terms()[key].kernels.membrane_drive is None}
+        bare = {key: own for key, own in self._values.items() if not discover_terms()[key].moves_membrane}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
         columns = []
         for index in pixels:

@@ -162,7 +162,7 @@ def load_parameters(name: str | Path) -> ParameterSet:
             raise InputError(
                 f"{path}: planner_terms", key, f"a term of this set, {suggest_nearest(key, [*parameters.terms])}"
             )
-        if not discover_terms()[key].is_pixel_term:
+        if not discover_terms()[key].in_pixel:
             raise InputError(f"{path}: planner_terms", key, "a term that heights can be planned with")
     return parameters
 

@@ -25,6 +25,7 @@ from optodrive.physics.term import (
     GAS,
     ILLUMINATED_PIXEL,
     IS_TARGET,
+    MEMBRANE_DRIVE_K,
     NEIGHBOUR,
     POWER_W,
     SENSOR,
@@ -55,6 +56,8 @@ MAX_STEP_S = 6e-3
     rates,
     membrane_drive,
     force_drive,
+    displacement,
+    force,
     sensor_reading,
     sensor_lag,
 ) = CHAINS
@@ -101,14 +104,13 @@ class ActiveTerms(NamedTuple):
     def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
         """From term → parameter → SI value; terms without kernels have no effect here."""
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
-        rows = [ABSORBER, GAS, *([WALL] if "wall_heating" in values else []), NEIGHBOUR]
+        rows = [ABSORBER, GAS, NEIGHBOUR]
         for key, own in values.items():
-            row = TERM_ROW[key]
+            row, term = TERM_ROW[key], discover_terms()[key]
             on[row] = 1
-            v[row, : len(own)] = [own[item.name] for item in TERMS[row].parameters]
-            rows += range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(TERMS[row].followers))
-        quick = any(discover_terms()[key].is_fast for key in values)
-        return cls(on, v, np.array(rows), quick)
+            v[row, : len(own)] = [own[item.name] for item in term.parameters]
+            rows += [*term.states, *range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))]
+        return cls(on, v, np.array(rows), any(discover_terms()[key].is_fast for key in values))
 
 
 def simulate_signals(
@@ -243,8 +245,10 @@ def output_signal(pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArra
     if signal == 0:
         return float(sensor_reading(active.on, active.values, y, c, y[SENSOR]))
     if signal == 1:
-        return float(pixel.kappa_m_per_k * membrane_drive(active.on, active.values, y, c, y[GAS]))
-    return float(pixel.phi_n_per_k * force_drive(active.on, active.values, y, c, y[GAS]))
+        c[MEMBRANE_DRIVE_K] = membrane_drive(active.on, active.values, y, c, y[GAS])
+        return float(displacement(active.on, active.values, y, c, pixel.kappa_m_per_k * c[MEMBRANE_DRIVE_K]))
+    force_n = pixel.phi_n_per_k * force_drive(active.on, active.values, y, c, y[GAS])
+    return float(force(active.on, active.values, y, c, force_n))
 
 
 @kernel

@@ -1,59 +1,53 @@
-"""What a term may add to the nominal pixel: hooks that every file of `optodrive.physics.terms` fills as it needs.
+"""Terms: physical effects that extend the nominal pixel, and everything that the package asks of one.
 
-Heat sits in nodes (the absorber, walls) and flows between them and to ambient. Gas and touch surface follow heat but
-carry none in this uncoupled form: the absorber loses nothing to them.
+Each module of `optodrive.physics.terms` defines one term: its parameters, its kernels in the compiled pixel, the heat
+that it may add to the limiter's bound, and the hypotheses by which a diagnosis searches for it. No other module names
+a term that it does not implement itself.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from itertools import product
 from typing import NamedTuple
 
-import numpy as np
-
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.neighbours import Neighbours
+from optodrive.device.servo import Servo
+from optodrive.physics.hypothesis import FreeParameter, Hypothesis, RecordingScope, TermParameter
 
 TermValues = Mapping[str, float]
-"""A term's parameters, SI, by name."""
-
+"""A term's parameters by name, SI."""
 
 ABSORBER, GAS, WALL, NEIGHBOUR, SENSOR, FIRST_FOLLOWER = range(6)
-"""Rows of a single pixel's states in kernels: its own three, the absorber beside it, what a thermometer that lags
-shows, then each term's followers."""
-(
-    POWER_W,
-    FULL_W,
-    SINCE_EDGE_S,
-    DOSE,
-    ILLUMINATED_PIXEL,
-    AMBIENT_K,
-    BRIDGE_FLOW_W,
-    FAR_END_K,
-    TIME_S,
-    SESSION_TIME,
-    IS_TARGET,
-) = range(11)
-"""What kernels are told beside the states.
+"""Rows of one pixel's state vector, all in K above ambient.
 
-Commanded and full power, time since the gate opened, dose so far as a share of the recording's, the index of the pixel
-that is lit, ambient, the bridge's heat flow, its far end's rise, time in the run, and in the session from −1 to 1, and
-whether the light is on this very pixel.
+The pixel's absorber, gas and wall, the absorber of an illuminated neighbour, and the reading of a lagging thermometer;
+the followers of each term come after them.
 """
-CONTEXT_SIZE = 11
+
+POWER_W, FULL_W, SINCE_EDGE_S, DOSE, ILLUMINATED_PIXEL, AMBIENT_K, BRIDGE_FLOW_W, FAR_END_K = range(8)
+TIME_S, SESSION_TIME, IS_TARGET, MEMBRANE_DRIVE_K = range(8, 12)
+"""Entries of the context vector that kernels receive beside the states.
+
+Commanded power and full power; time since the last gate edge; dose so far over the recording's largest; index of the
+illuminated pixel; ambient temperature; heat flow through the bridge and temperature rise of its far end; time in the
+run, and in the session from −1 to 1; 1 if the light falls on this very pixel, else 0; gas rise that drives the
+membrane.
+"""
+CONTEXT_SIZE = 12
 
 Modifier = Callable[[FloatArray, FloatArray, int, FloatArray, float], float]
 RateWriter = Callable[[FloatArray, FloatArray, int, FloatArray, FloatArray], None]
 
 
 class Kernels(NamedTuple):
-    """A term in the compiled single pixel.
+    """A term's part in the compiled pixel, one function per hook; None leaves the pixel as it is.
 
-    Each takes (v, y, s, c, x), v the term's parameters in order, y the states, s the row of its first follower, c the
-    context, x the value without the term; and returns it with the term.
+    Each function takes (v, y, s, c, x): v the term's parameters in order, y the states, s the row of the term's first
+    follower, c the context, x the value without the term. It returns the value with the term; `rates` writes to x.
 
-    light: W on the absorber; capacity: J/K; bridge: K/W; leaving: W from the absorber to the room; wall: rise of the
-    bridge's far end, K; rates: writes to x, dy/dt; lifts, pushes: the gas's rise that lifts the membrane, that pushes
-    a finger, K; reads: the rise that the thermometer shows, K; lag: the thermometer's, s
+    optical_power: W on the absorber; heat_capacity: J/K of the absorber; bridge_resistance: K/W; heat_loss: W from the
+    absorber to ambient; wall_rise: rise of the bridge's far end, K; rates: dy/dt; membrane_drive, force_drive: gas rise
+    that lifts the membrane and that pushes against a finger, K; displacement: m; force: N; sensor_reading: rise that
+    the thermometer shows, K; sensor_lag: time constant of the thermometer, s
     """
 
     optical_power: Modifier | None = None
@@ -64,36 +58,18 @@ class Kernels(NamedTuple):
     rates: RateWriter | None = None
     membrane_drive: Modifier | None = None
     force_drive: Modifier | None = None
+    displacement: Modifier | None = None
+    force: Modifier | None = None
     sensor_reading: Modifier | None = None
     sensor_lag: Modifier | None = None
 
 
-@dataclass(frozen=True)
-class TermParameter:
-    """A parameter of a term: its unit, where a fit begins, the plausible range, and where the range comes from."""
-
-    name: str
-    unit: str
-    default: float
-    low: float
-    high: float
-    source: str
-
-
-class StateView(NamedTuple):
-    """What a term sees: rises above ambient by the names of states, each [p]; ambient; the lattice."""
-
-    rise_k: Mapping[str, FloatArray]
-    ambient_k: float
-    neighbours: Neighbours | None
-
-    def wall_k(self) -> FloatArray:
-        """Walls' rise, zero where no term warms them: [p]."""
-        return self.rise_k.get("wall_k", np.zeros_like(self.rise_k["absorber_k"]))
-
-
 class OperatingEnvelope(NamedTuple):
-    """The most there is: one absorber's rise; all absorbers' rises together, one beam's, K; the laser's power, W."""
+    """Largest values that a display can reach.
+
+    absorber_k: rise of one absorber; summed_absorbers_k: sum of all absorbers' rises under one beam; full_w: power of
+    the laser.
+    """
 
     absorber_k: float
     summed_absorbers_k: float
@@ -101,9 +77,9 @@ class OperatingEnvelope(NamedTuple):
 
 
 class HeatGainBound(NamedTuple):
-    """The most a term adds to what warms.
+    """Upper bound on the heat that a term adds.
 
-    Factors on the power absorbed and on the heat capacity of a hot absorber; and what warms everything otherwise, K.
+    Factors on the absorbed power and on the heat capacity of a hot absorber, and an additional rise of everything, K.
     """
 
     power_factor: float = 1.0
@@ -114,74 +90,77 @@ class HeatGainBound(NamedTuple):
 NO_HEAT_GAIN = HeatGainBound()
 
 
-@dataclass
-class HeatFlows:
-    """Heat on its way, W, each [p]: into a node, by its name; and to ambient for good."""
+class SignalDelays(NamedTuple):
+    """Delay of each recorded signal behind the pixel, s."""
 
-    into_w: dict[str, FloatArray] = field(default_factory=dict)
-    lost_w: FloatArray | float = 0.0
-
-    def add_flow(self, source: str | None, target: str | None, power_w: FloatArray) -> None:
-        """Let heat flow from a node to another; None is ambient, at either end."""
-        for node, gained_w in ((source, -power_w), (target, power_w)):
-            if node is None:
-                self.lost_w = self.lost_w + gained_w
-            else:
-                self.into_w[node] = self.into_w.get(node, 0.0) + gained_w
+    temperature: float = 0.0
+    displacement: float = 0.0
+    force: float = 0.0
+    mirrors: float = 0.0
 
 
 class Term:
-    """One effect. Hooks that a term does not fill leave the model as it is.
+    """One physical effect. A term overrides what differs from the defaults, which leave the model unchanged.
 
-    key: its name in files; needs: keys of terms it builds on
-    heat_nodes: states that store heat, and the parameter that is their capacity; followers: states that store none
-    kernels: the same for one compiled pixel; suspect: where in measured data it shows, for causes of a discrepancy;
-    by_run: whether repeats of one drive differ, by what came before or by the room;
-    quick: whether it moves within a gas time constant; never_warmer: nothing that can burn gets warmer by it; for
-    other terms `warming` says by how much at most
+    Identity: key, the term's name in files; label, a clause that completes "The nominal model is wrong because …".
+    Physics: requires, keys of terms that it builds on; states, shared rows of the state vector that only it moves;
+    followers, names of its own state rows; kernels; in_pixel, False for a term that only the limiter's bound accounts
+    for; couples_neighbours, whether light on one pixel heats the pixels around it; is_fast, whether it acts within a
+    gas time constant; cannot_add_heat, whether it never makes anything hotter, see also `bound_heat_gain`.
+    Diagnosis: signature, where the effect shows in recorded data, empty if it is no possible cause of a discrepancy;
+    subsystems, the kinds of recording that can show it; varies_between_runs, whether repeats of one drive differ by it;
+    is_linear and fit_every_start as in `Hypothesis`; detection_limit, replaces the computed smallest visible effect.
     """
 
     key: str
+    label: str = ""
     parameters: tuple[TermParameter, ...] = ()
     requires: tuple[str, ...] = ()
-    heat_nodes: Mapping[str, str] = {}
+    states: tuple[int, ...] = ()
     followers: tuple[str, ...] = ()
     kernels: Kernels = Kernels()
-    signature: str = ""
-    varies_between_runs: bool = False
+    in_pixel: bool = True
+    couples_neighbours: bool = False
     is_fast: bool = False
     cannot_add_heat: bool = False
+    signature: str = ""
+    subsystems: tuple[str, ...] = ("pixels",)
+    varies_between_runs: bool = False
+    is_linear: bool = False
+    fit_every_start: bool = False
+    detection_limit: str = ""
 
     @property
-    def is_display_term(self) -> bool:
-        """Whether the term acts in the model of a whole display, not in the compiled single pixel alone."""
-        hooks = ("bridge_k_per_w", "add_flows", "rates_k_per_s", "displacement_m", "force_n")
-        return any(getattr(type(self), name) is not getattr(Term, name) for name in hooks)
-
-    @property
-    def is_pixel_term(self) -> bool:
-        """Whether nothing of the term is lost in the compiled single pixel."""
-        return any(self.kernels) or not self.is_display_term
+    def moves_membrane(self) -> bool:
+        """Whether the term changes the displacement that a given gas rise causes."""
+        return self.kernels.membrane_drive is not None or self.kernels.displacement is not None
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
-        """What a bound on heat must add for the term; None where it cannot say, and the limiter refuses the term."""
+        """Return an upper bound on the heat that the term adds, or None if there is none and the limiter refuses it."""
         return NO_HEAT_GAIN if self.cannot_add_heat else None
 
-    def bridge_k_per_w(self, values: TermValues, view: StateView, r_k_per_w: FloatArray) -> FloatArray:
-        """The bridge's resistance, given what it would be without the term: [p]."""
-        return r_k_per_w
+    def affected_pixel(self, values: TermValues) -> int | None:
+        """Return the index of the only pixel that the term affects, or None if it affects all."""
+        return None
 
-    def add_flows(self, values: TermValues, view: StateView, flows: HeatFlows) -> None:
-        """Add heat flows between nodes and to ambient."""
+    def signal_delays(self, values: TermValues) -> SignalDelays:
+        """Return the delays that the term gives to the recorded signals."""
+        return SignalDelays()
 
-    def rates_k_per_s(self, values: TermValues, view: StateView) -> dict[str, FloatArray]:
-        """How fast the term's followers move: name → [p]."""
-        return {}
+    def servo(self, values: TermValues) -> Servo | None:
+        """Return the servo that the mirrors follow under the term, or None if it does not concern them."""
+        return None
 
-    def displacement_m(self, values: TermValues, view: StateView, displacement_m: FloatArray) -> FloatArray:
-        """The membrane's displacement, given what it would be without the term: [p]."""
-        return displacement_m
+    def free(self, *names: str) -> FreeParameter:
+        """Return the number to be fitted that these parameters share."""
+        return FreeParameter(self.key, names, next(item for item in self.parameters if item.name == names[0]))
 
-    def force_n(self, values: TermValues, view: StateView, force_n: FloatArray) -> FloatArray:
-        """Blocked force, given what it would be without the term: [p]."""
-        return force_n
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return the hypotheses on the term that such a recording can show.
+
+        By default one, with every parameter free and every combination of the parameters' starts.
+        """
+        grid = {item.name: item.starts or (item.default,) for item in self.parameters}
+        starts = tuple(dict(zip(grid, values, strict=True)) for values in product(*grid.values()))
+        free = tuple(self.free(name) for name in grid)
+        return [Hypothesis(self.key, self.key, starts, free, self.is_linear, self.fit_every_start)]

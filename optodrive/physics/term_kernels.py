@@ -18,9 +18,6 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.physics.term import FIRST_FOLLOWER, Kernels, Term
 from optodrive.physics.terms import discover_terms
 
-MAX_PARAMETERS = 4
-"""Room for so many parameters a term."""
-
 HookChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, float], float]
 RateChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, FloatArray], None]
 
@@ -36,12 +33,15 @@ class HookChains(NamedTuple):
     rates: RateChain
     membrane_drive: HookChain
     force_drive: HookChain
+    displacement: HookChain
+    force: HookChain
     sensor_reading: HookChain
     sensor_lag: HookChain
 
 
 TERMS: tuple[Term, ...] = tuple(discover_terms()[key] for key in sorted(discover_terms()))
 """Every term, in the order of `on` and `v`."""
+MAX_PARAMETERS = max(len(term.parameters) for term in TERMS)
 TERM_ROW = {term.key: row for row, term in enumerate(TERMS)}
 STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))

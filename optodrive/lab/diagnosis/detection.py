@@ -15,10 +15,10 @@ from scipy.stats import f as fisher
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, Dataset
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
-from optodrive.lab.diagnosis.hypotheses import Hypothesis
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, project_out, solve
 from optodrive.lab.diagnosis.omnibus_test import compute_omnibus
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
+from optodrive.physics.hypothesis import Hypothesis
 
 DRAWS = 4000
 NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000

@@ -24,7 +24,7 @@ from optodrive.lab.diagnosis.detection import Score, count_noise_degrees
 from optodrive.lab.diagnosis.discrepancy_basis import compute_covariance
 from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, ModelFit, fit
 from optodrive.lab.diagnosis.held_out_gain import compute_held_out_gain, split_runs
-from optodrive.lab.diagnosis.hypotheses import FreeParameter, Hypothesis, build_hypotheses
+from optodrive.lab.diagnosis.hypotheses import build_hypotheses
 from optodrive.lab.diagnosis.model_selection import (
     BIC_INDISTINGUISHABLE,
     MAX_INTRA_PULSE_POWER_EXCESS,
@@ -39,6 +39,8 @@ from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, predict
+from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.terms import discover_terms
 
 DETECTABLE_RATIO = 30.0
 """Likelihood ratio of an effect that is detected nine times in ten."""
@@ -80,7 +82,7 @@ def diagnose(
         candidates = build_hypotheses(part)
         if subsystems:
             # All signals share one clock, determined by the pixels; a late mirror then is a lag of the mirror.
-            candidates = [item for item in candidates if item.key != "clock_offset"]
+            candidates = [item for item in candidates if len(discover_terms()[item.key].subsystems) == 1]
         subsystems.append(
             _diagnose_subsystem(
                 part, candidates, seed, prior, epsilon, timing_s, _find_clock_offset_s(subsystems), on_progress
@@ -186,9 +188,11 @@ def _diagnose_subsystem(
 def _find_clock_offset_s(subsystems: list[_SubsystemFit]) -> float:
     """Return the identified common offset of all clocks, s, or 0."""
     for subsystem in subsystems:
-        clock = subsystem.final.point.terms.get("clock_offset")
-        if "clock_offset" in subsystem.verdict.causes and clock is not None and clock["mirrors"] != 0.0:
-            return clock["mirrors"]
+        terms = subsystem.final.point.terms
+        for key in subsystem.verdict.causes:
+            delay_s = discover_terms()[key].signal_delays(terms[key]).mirrors if key in terms else 0.0
+            if delay_s != 0.0:
+                return delay_s
     return 0.0
 
 
@@ -254,8 +258,9 @@ def _judge_candidates(verdict: Verdict, gains: dict[str, float]) -> tuple[Candid
 
 def _describe_detection_limit(score: Score) -> str:
     """Return the smallest detectable size as text."""
-    if score.hypothesis.key == "mirror_lag":
-        return "mirror lag of more than subsystem a sample"
+    stated_limit = discover_terms()[score.hypothesis.key].detection_limit
+    if stated_limit:
+        return stated_limit
     free = score.hypothesis.free[-1 if score.hypothesis.is_linear else 0]
     start = score.start.get(free.names[0], 0.0) or 1.0
     if score.start_ratio <= 0.0 or score.independent_fraction < MIN_INDEPENDENT_FRACTION:
@@ -332,12 +337,8 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
     out = []
     for free in final.free:
         value = final.point.terms[free.key][free.names[0]]
-        if _is_shape_parameter(free):
+        if free.parameter.is_shape:
             continue
         if value >= 0.999 * free.parameter.high or (free.parameter.low > 0 and value <= 1.001 * free.parameter.low):
             out.append(f"{free.label} is at the limit of its plausible range, {value:g} {free.parameter.unit}.")
     return out
-
-
-def _is_shape_parameter(free: FreeParameter) -> bool:
-    return free.names[0] in ("spread", "order", "delay_share", "damping", "slew", "delay")

@@ -12,9 +12,9 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
-from optodrive.lab.diagnosis.hypotheses import Hypothesis
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.physics.hypothesis import Hypothesis
 
 MIN_POWER_FRACTION = 0.02
 """Lower limit of the relative power in the modulation by its inverse."""

@@ -5,7 +5,8 @@ from itertools import pairwise
 from typing import Any
 
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelAnswer, PixelGroup, PixelSpread
-from optodrive.lab.diagnosis.narrative import CAUSE_PHRASES, build_answer, build_narrative, format_quantity
+from optodrive.lab.diagnosis.narrative import build_answer, build_narrative, format_quantity
+from optodrive.physics.terms import discover_terms
 
 MAX_ERRORS = 6
 """Maximum number of errors listed individually."""
@@ -63,7 +64,7 @@ def build_headline(answer: DisplayAnswer) -> str:
 
 def describe_group(group: PixelGroup) -> str:
     """Return the causes of a group as text with their keys."""
-    named = [f"{CAUSE_PHRASES.get(key, key)} ({key})" for key in group.causes]
+    named = [f"{discover_terms()[key].label} ({key})" for key in group.causes]
     if group.verdict == "none":
         return "no error found"
     if group.verdict == "cause":

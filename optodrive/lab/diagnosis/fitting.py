@@ -7,10 +7,10 @@ import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import Dataset
-from optodrive.lab.diagnosis.hypotheses import FreeParameter
 from optodrive.lab.diagnosis.noise_model import NoiseModel
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, predict
+from optodrive.physics.hypothesis import FreeParameter
 
 BASE_LOG_STEP = 1e-3
 BASE_LOG_SPAN = 1.8

@@ -8,9 +8,9 @@ import numpy as np
 from optodrive.lab.diagnosis.detection import Detection, Score, detect
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jitter_sensitivity, fit
-from optodrive.lab.diagnosis.hypotheses import FreeParameter, Hypothesis
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
+from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 
 FAMILY_ALPHA = 0.001
 """Significance level of the family of tests: keeps false alarms below 1 % although the noise model is an estimate."""

@@ -7,26 +7,6 @@ from typing import Any
 from optodrive.core.types.discrepancy import CandidateCause, Discrepancy, Estimate
 from optodrive.physics.terms import discover_terms
 
-CAUSE_PHRASES = {
-    "bridge_conductivity": "the bridges conduct worse when hot",
-    "heat_capacity": "the absorber stores more heat when hot",
-    "radiation": "the hot absorber radiates",
-    "wall_heating": "the wall at the bridges' far end warms",
-    "neighbour_crosstalk": "pixels warm the pixels beside them",
-    "laser_turn_on": "the laser takes time to reach its power",
-    "laser_droop": "the laser's power falls while it is on",
-    "power_nonlinearity": "the laser's power is not proportional to what is commanded",
-    "sensor_lag": "the thermometer is slow",
-    "sensor_scale": "the thermometer's scale is off",
-    "membrane_creep": "the membrane creeps",
-    "membrane_stiffening": "the membrane stiffens as it rises",
-    "gas_leak": "gas leaks out of the warm cell",
-    "absorber_ageing": "the absorber absorbs less with the light it has had",
-    "beam_misalignment": "on one pixel part of the beam misses the absorber",
-    "ambient_drift": "the room's temperature is not what was stated",
-    "clock_offset": "an instrument's clock is offset",
-    "mirror_lag": "the mirrors follow late",
-}
 UNIT_PREFIXES = ((1e-6, 1e6, "µ"), (1e-3, 1e3, "m"), (1.0, 1.0, ""))
 UNPREFIXED_UNITS = ("", "1", "1/K", "1/s", "m^2", "Hz", "K", "K/W")
 MAX_RULED_OUT = 6
@@ -52,7 +32,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
     lines = [_build_headline(discrepancy), ""]
     if discrepancy.causes and discrepancy.verdict != "none":
         lines += [
-            f"- {CAUSE_PHRASES.get(key, key)} ({key}); visible in {discover_terms()[key].signature}."
+            f"- {discover_terms()[key].label} ({key}); visible in {discover_terms()[key].signature}."
             for key in discrepancy.causes
         ]
         lines += [
@@ -90,7 +70,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
 
 
 def _build_headline(discrepancy: Discrepancy) -> str:
-    names = [CAUSE_PHRASES.get(key, key) for key in discrepancy.causes]
+    names = [discover_terms()[key].label for key in discrepancy.causes]
     if discrepancy.verdict == "none":
         return "No error found: the refitted nominal model agrees with this recording within its noise."
     if discrepancy.verdict == "cause":

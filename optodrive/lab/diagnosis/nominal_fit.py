@@ -9,6 +9,7 @@ from optodrive.lab.diagnosis.fitting import BaseParameterPrior, FitProblem, Mode
 from optodrive.lab.diagnosis.noise_model import ColouredNoise, NoiseModel, estimate_noise_model
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import ParameterPoint
+from optodrive.physics.terms.clock_offset import TERM as CLOCK_OFFSET
 
 DEFAULT_EPSILON = 0.66
 BROAD_PRIOR = BaseParameterPrior(
@@ -31,8 +32,8 @@ def fit_nominal(
     min_timing_sigma_s: lower limit of the timing jitter, from other signals; clock_offset_s: known offset of all clocks
     """
     crude_noise = _estimate_crude_noise(data)
-    clocks = ("temperature", "displacement", "force", "mirrors")
-    fixed_terms = {"clock_offset": dict.fromkeys(clocks, clock_offset_s)} if clock_offset_s else {}
+    clocks = [item.name for item in CLOCK_OFFSET.parameters]
+    fixed_terms = {CLOCK_OFFSET.key: dict.fromkeys(clocks, clock_offset_s)} if clock_offset_s else {}
     problem = FitProblem(data, crude_noise, prior, epsilon)
     trials = [
         fit(problem, ParameterPoint((float(np.log(r)), *prior.mean[1:]), fixed_terms), iterations=3)

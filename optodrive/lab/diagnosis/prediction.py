@@ -6,11 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.device.servo import Servo, simulate_servo
+from optodrive.device.servo import simulate_servo
 from optodrive.lab.diagnosis.dataset import MIRROR_KINDS, PIXEL_KINDS, Dataset
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, simulate_signals
-from optodrive.physics.term import TermValues
+from optodrive.physics.term import SignalDelays, TermValues
 from optodrive.physics.terms import discover_terms
 
 BASE_PARAMETERS = ("R", "C", "tau_g", "kappa", "phi")
@@ -37,14 +37,12 @@ def predict(
     """Predict all samples [m]; power_factor scales all optical power, delay_s delays all signals."""
     out = np.zeros(len(data.value))
     pixel = point.pixel(epsilon * power_factor)
-    clock = point.terms.get("clock_offset", {})
-    lag = point.terms.get("sensor_lag", {})
-    delays_s = [delay_s + clock.get(name, 0.0) for name in ("temperature", "displacement", "force", "mirrors")]
-    delays_s[0] += lag.get("time", 0.0) * lag.get("delay_share", 0.0)
-    active = ActiveTerms.from_values(
-        {key: values for key, values in point.terms.items() if key not in ("clock_offset", "mirror_lag")}
-    )
-    if any(discover_terms()[key].varies_between_runs for key in point.terms):
+    terms = [(discover_terms()[key], values) for key, values in point.terms.items()]
+    signal_delays = [term.signal_delays(values) for term, values in terms]
+    signal_count = len(SignalDelays._fields)
+    delays_s = [delay_s + sum(delays[signal] for delays in signal_delays) for signal in range(signal_count)]
+    active = ActiveTerms.from_values(point.terms)
+    if any(term.varies_between_runs for term, _ in terms):
         for experiment, numbers in data.experiments:
             signals = simulate_signals(experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
             for kind in PIXEL_KINDS:
@@ -55,7 +53,7 @@ def predict(
             signals = simulate_signals(item.experiment, pixel, active, (delays_s[0], delays_s[1], delays_s[2]))
             for kind, number, rows in item.block_rows:
                 out[data.blocks[number].part] = signals[kind][rows]
-    servo = Servo(**point.terms["mirror_lag"]) if "mirror_lag" in point.terms else None
+    servo = next((servo for term, values in terms if (servo := term.servo(values)) is not None), None)
     for block in data.blocks:
         commands = data.runs[block.run].commands
         if block.kind in MIRROR_KINDS and commands is not None:

@@ -22,9 +22,7 @@ from optodrive.lab.validation.stimulus_heat import (
 from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel
-from optodrive.physics.term import StateView
-from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
-from optodrive.physics.terms.gas_membrane import TERM as MEMBRANE
+from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA, equilibrium_height_m
 
 CauseValues = Mapping[str, float]
 """Causes at work and the number of each."""
@@ -55,8 +53,8 @@ GAS_GRID_K = np.linspace(0.0, 1500.0, 6001)
 @cache
 def _membrane_table_m() -> FloatArray:
     """Height of the stretched membrane at GAS_K; only share × rise matters, so one table serves every share."""
-    values = {"share": GAS_FRACTION, "volume": load_paper_facts()["V_pixel"].value}
-    return MEMBRANE.displacement_m(values, StateView({"gas_k": GAS_GRID_K}, AMBIENT_K, None), GAS_GRID_K)
+    volume_m3 = load_paper_facts()["V_pixel"].value
+    return np.array([equilibrium_height_m(gas_k / AMBIENT_K, volume_m3) for gas_k in GAS_GRID_K])
 
 
 @dataclass(frozen=True)

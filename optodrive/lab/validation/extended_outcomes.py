@@ -1,6 +1,6 @@
-"""The paper's outcomes by the model of a parameter set with terms: what `paper.py` has in closed form, simulated.
+"""The paper's outcomes by simulation of a parameter set with its terms.
 
-Every stimulus is a column of one run: pixels side by side, each with its own bridge and its own light.
+`paper_outcomes` has the same outcomes in closed form, for sets without terms.
 """
 
 from dataclasses import dataclass
@@ -12,10 +12,8 @@ import numpy as np
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.units import ZERO_CELSIUS_K
 from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, GAS_J_PER_K, LONG_PULSE_S
-from optodrive.physics.numpy_model import Drive, Model
 from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
-from optodrive.physics.parameters import ParameterSet, PixelArray
-from optodrive.physics.pixel import Pixel
+from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
 
@@ -29,7 +27,7 @@ STEADY_PERIODS = 24
 
 @dataclass(frozen=True)
 class _Stimulus:
-    """Light on one pixel: on_s, off_s, so many times."""
+    """A train of equal pulses on one pixel."""
 
     width_mm: float
     on_s: float
@@ -37,25 +35,14 @@ class _Stimulus:
     off_s: float = 0.0
     repeats: int = 1
 
-    def power_at_w(self, time_s: float) -> float:
-        """Incident power just after a time."""
-        period_s = self.on_s + self.off_s
-        count = int((time_s + 1e-9) / period_s)
-        return self.power_w if count < self.repeats and time_s + 1e-9 - count * period_s < self.on_s else 0.0
-
     def pulses(self) -> FloatArray:
-        """[n, 4] start_s, width_s, power_w, pixel 0."""
+        """Return the pulses, [n, 4] start_s, width_s, power_w, pixel 0."""
         period_s = self.on_s + self.off_s
         return np.array([[k * period_s, self.on_s, self.power_w, 0.0] for k in range(self.repeats)])
 
-    def edges_s(self) -> list[float]:
-        """When the light changes."""
-        period_s = self.on_s + self.off_s
-        return [k * period_s + edge_s for k in range(self.repeats) for edge_s in (0.0, self.on_s)]
-
 
 class _Responses(NamedTuple):
-    """What the columns of a run do: [m, columns]."""
+    """Responses to several stimuli: [m, stimuli]."""
 
     absorber_k: FloatArray
     displacement_m: FloatArray
@@ -71,26 +58,19 @@ def simulate_outcomes(parameters: ParameterSet) -> dict[str, float]:
     )
 
 
-def _simulate(
-    parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray, steps: int | None = None
-) -> _Responses:
-    """By the terms that heights are planned with, where the set names them; else by all of its terms."""
-    pixels = [parameters.build_pixel(stimulus.width_mm * 1e-3) for stimulus in stimuli]
-    if parameters.planner_terms:
-        active = ActiveTerms.from_values({key: parameters.term_values(key) for key in parameters.planner_terms})
-        responses = [
-            simulate_signals(
-                PixelExperiment(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0), pixel, active
-            )
-            for stimulus, pixel in zip(stimuli, pixels, strict=True)
-        ]
-        return _Responses(*(np.stack(signal, axis=1) for signal in zip(*responses, strict=True)))
-    columns = (np.array([getattr(pixel, name) for pixel in pixels]) for name in Pixel._fields)
-    model = Model.from_parameters(parameters, PixelArray(*columns), AMBIENT_K)
-    edges_s = sorted({round(edge_s, 9) for stimulus in stimuli for edge_s in stimulus.edges_s()})
-    drives = [Drive(at_s, np.array([stimulus.power_at_w(at_s) for stimulus in stimuli])) for at_s in edges_s]
-    trace = model.trace(drives, t_s) if steps is None else model.trace(drives, t_s, steps)
-    return _Responses(trace.rise_k["absorber_k"], trace.displacement_m, trace.force_n)
+def _simulate(parameters: ParameterSet, stimuli: list[_Stimulus], t_s: FloatArray) -> _Responses:
+    """Simulate with the set's planner terms, or with all of its terms if it names none for planning."""
+    keys = parameters.planner_terms or parameters.terms
+    active = ActiveTerms.from_values({key: parameters.term_values(key) for key in keys})
+    responses = [
+        simulate_signals(
+            PixelExperiment(stimulus.pulses(), 0, AMBIENT_K, (t_s, t_s, t_s), dose_before=1.0),
+            parameters.build_pixel(stimulus.width_mm * 1e-3),
+            active,
+        )
+        for stimulus in stimuli
+    ]
+    return _Responses(*(np.stack(signal, axis=1) for signal in zip(*responses, strict=True)))
 
 
 def _simulate_pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
@@ -159,8 +139,8 @@ def _simulate_train_outcomes(parameters: ParameterSet) -> dict[str, float]:
 
 
 def _simulate_repeatability_m(parameters: ParameterSet) -> float:
-    """Peaks of four pulses 5 s apart: what is left by then moves slowly, so a coarse step is enough for its size."""
+    """Return the spread of the peaks of four equal pulses 5 s apart, m."""
     train = _Stimulus(0.40, LONG_PULSE_S, off_s=4.95, repeats=4)
     around_s = [k * 5.0 + LONG_PULSE_S + np.arange(1, 41) * 2.5e-4 for k in range(4)]
-    heights_m = _simulate(parameters, [train], np.concatenate(around_s), steps=2).displacement_m
+    heights_m = _simulate(parameters, [train], np.concatenate(around_s)).displacement_m
     return float(np.ptp(heights_m.reshape(4, -1).max(axis=1)))

@@ -1,7 +1,8 @@
-"""On one pixel part of the beam misses the absorber and warms its wall instead."""
+"""Beam misalignment: on one pixel, part of the beam misses the absorber and heats its wall instead."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
 from optodrive.physics.term import (
     ILLUMINATED_PIXEL,
     IS_TARGET,
@@ -10,34 +11,34 @@ from optodrive.physics.term import (
     Kernels,
     OperatingEnvelope,
     Term,
-    TermParameter,
     TermValues,
 )
 
 
 @kernel
 def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """1 − share on that pixel."""
+    """Scale the power by 1 − share on the misaligned pixel."""
     return float(x * (1.0 - v[0]) if c[ILLUMINATED_PIXEL] == v[1] else x)
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
-    """The wall warms towards resistance × what misses, while the light is on this pixel."""
+    """Heat the wall towards resistance · missing power while the misaligned pixel is illuminated."""
     missing_w = v[0] * c[POWER_W] if c[ILLUMINATED_PIXEL] == v[1] and c[IS_TARGET] > 0.0 else 0.0
     x[s] = (v[2] * missing_w - y[s]) / v[3]
 
 
 @kernel
 def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Rise of the bridge's far end, K."""
+    """Add the wall's rise, K, to that of the bridge's far end."""
     return float(x + y[s])
 
 
 class BeamMisalignment(Term):
-    """P (1 − share) on one pixel; the rest warms its wall."""
+    """P (1 − share) on one pixel; the rest heats its wall: time · dm/dt = resistance · share · P − m."""
 
     key = "beam_misalignment"
+    label = "on one pixel part of the beam misses the absorber"
     parameters = (
         TermParameter("share", "1", 0.1, 0.0, 0.5, "missing the absorber, 2 to 30 %"),
         TermParameter("pixel", "1", 0.0, 0.0, 1e6, "the pixel's index"),
@@ -49,8 +50,22 @@ class BeamMisalignment(Term):
     signature = "several pixels beside each other"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """The wall under what misses at full power for ever."""
+        """Return the wall's steady rise under continuous full power as a rise of everything."""
         return HeatGainBound(uniform_rise_k=values["resistance"] * values["share"] * envelope.full_w)
+
+    def affected_pixel(self, values: TermValues) -> int | None:
+        """Return the index of the misaligned pixel."""
+        return int(values["pixel"])
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one hypothesis per measured and illuminated pixel, if there is a second one to compare it with."""
+        free = tuple(self.free(name) for name in ("share", "resistance", "time"))
+        start = {item.name: item.default for item in self.parameters}
+        return [
+            Hypothesis(self.key, f"{self.key} of pixel {pixel}", (start | {"pixel": float(pixel)},), free)
+            for pixel in scope.pixels
+            if pixel in scope.illuminated and len(scope.pixels) > 1
+        ]
 
 
 TERM = BeamMisalignment()

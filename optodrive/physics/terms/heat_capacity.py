@@ -1,20 +1,22 @@
-"""Graphite stores more heat when hot: its c_p rises 0.71 to 1.12 J/(g K) from 300 to 450 K."""
+"""Heat capacity: graphite stores more heat when hot; its c_p rises 0.71 to 1.12 J/(g K) from 300 to 450 K."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import ABSORBER, HeatGainBound, Kernels, OperatingEnvelope, Term, TermParameter, TermValues
+from optodrive.physics.hypothesis import TermParameter
+from optodrive.physics.term import ABSORBER, HeatGainBound, Kernels, OperatingEnvelope, Term, TermValues
 
 
 @kernel
 def heat_capacity(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """C = C₀ (1 + slope θ), J/K."""
+    """Scale the absorber's heat capacity by 1 + slope · θ."""
     return float(x * (1.0 + v[0] * y[ABSORBER]))
 
 
 class HeatCapacity(Term):
-    """C = C₀ (1 + slope θ), J/K."""
+    """C = C₀ (1 + slope · θ), J/K."""
 
     key = "heat_capacity"
+    label = "the absorber stores more heat when hot"
     parameters = (
         TermParameter(
             "slope",
@@ -29,7 +31,7 @@ class HeatCapacity(Term):
     signature = "initial slopes at several powers, plateaus unchanged"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Never less capacity than C₀; the most at the hottest."""
+        """Return the capacity of the hottest absorber over C₀; the capacity is never below C₀."""
         return HeatGainBound(capacity_factor=1.0 + values["slope"] * envelope.absorber_k)
 
 

@@ -1,37 +1,44 @@
-"""The wall rises with the absorbers beside it."""
+"""Neighbour crosstalk: the wall warms with the absorbers beside it."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import NEIGHBOUR, HeatGainBound, Kernels, OperatingEnvelope, Term, TermParameter, TermValues
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
+from optodrive.physics.term import NEIGHBOUR, HeatGainBound, Kernels, OperatingEnvelope, Term, TermValues
 
 
 @kernel
 def rates(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: FloatArray) -> None:
-    """The share arrives after a lag."""
+    """Let the wall follow a share of the neighbour's rise with a first-order lag."""
     x[s] = (v[0] * y[NEIGHBOUR] - y[s]) / v[1]
 
 
 @kernel
 def wall_rise(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Rise of the bridge's far end, K."""
+    """Add the wall's rise, K, to that of the bridge's far end."""
     return float(x + y[s])
 
 
 class NeighbourCrosstalk(Term):
-    """The share arrives after a lag."""
+    """lag · dn/dt = share · θ_neighbour − n, with n the rise of the bridge's far end."""
 
     key = "neighbour_crosstalk"
+    label = "pixels warm the pixels beside them"
     parameters = (
         TermParameter("share", "1", 0.02, 0.0, 0.15, "a wall's rise over its neighbour's rise, 0.002 to 0.1"),
-        TermParameter("lag", "s", 0.02, 2.5e-3, 1.0, "conduction through one cell's wall"),
+        TermParameter("lag", "s", 0.02, 2.5e-3, 1.0, "conduction through one cell's wall", starts=(0.003, 0.03, 0.2)),
     )
     followers = ("crosstalk_k",)
     kernels = Kernels(rates=rates, wall_rise=wall_rise)
+    couples_neighbours = True
     signature = "runs in which only a neighbour is lit"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """All the heat that one beam leaves on a display, beside this very pixel."""
+        """Return a rise of everything as if all heat of the display were beside every pixel."""
         return HeatGainBound(uniform_rise_k=values["share"] * envelope.summed_absorbers_k)
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return the default hypothesis if the recording has pulses beside a measured pixel."""
+        return super().build_hypotheses(scope) if scope.has_neighbour_pulses else []
 
 
 TERM = NeighbourCrosstalk()

@@ -1,22 +1,16 @@
-"""Power is not proportional to what is commanded: a threshold, or a curve."""
+"""Power nonlinearity: the laser's power is not proportional to its command, by a threshold or a curve."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import (
-    FULL_W,
-    POWER_W,
-    HeatGainBound,
-    Kernels,
-    OperatingEnvelope,
-    Term,
-    TermParameter,
-    TermValues,
-)
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
+from optodrive.physics.term import FULL_W, POWER_W, HeatGainBound, Kernels, OperatingEnvelope, Term, TermValues
+
+START = 0.1
 
 
 @kernel
 def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Full power kept: (p − threshold) / (1 − threshold), then p (1 + curvature (1 − p))."""
+    """Apply the threshold, then the curve, to the relative power; full power stays full power."""
     if x <= 0.0:
         return x
     share, threshold = c[POWER_W] / c[FULL_W], v[0] / c[FULL_W]
@@ -25,9 +19,10 @@ def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float)
 
 
 class PowerNonlinearity(Term):
-    """Full power kept: (p − threshold) / (1 − threshold), then p (1 + curvature (1 − p))."""
+    """q (1 + curvature · (1 − q)) with q = (p − threshold) / (1 − threshold), all relative to full power."""
 
     key = "power_nonlinearity"
+    label = "the laser's power is not proportional to what is commanded"
     parameters = (
         TermParameter("threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command"),
         TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept"),
@@ -36,8 +31,23 @@ class PowerNonlinearity(Term):
     signature = "a ladder of powers, shapes unchanged"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """A threshold takes away; a curve gives the more, the weaker the light."""
+        """Return the curve's largest gain, which it reaches at low power; a threshold only reduces power."""
         return HeatGainBound(power_factor=1.0 + max(0.0, values["curvature"]))
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return one hypothesis per parameter if the recording has several powers; the curve alone is linear."""
+        zero = {item.name: 0.0 for item in self.parameters}
+        return [
+            Hypothesis(
+                self.key,
+                f"{self.key}: {name}",
+                (zero | {name: START},),
+                (self.free(name),),
+                is_linear=name == "curvature",
+            )
+            for name in zero
+            if scope.power_levels > 1
+        ]
 
 
 TERM = PowerNonlinearity()

@@ -1,8 +1,9 @@
-"""The hot absorber radiates to the room."""
+"""Radiation: the hot absorber radiates to the room."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import ABSORBER, AMBIENT_K, Kernels, Term, TermParameter
+from optodrive.physics.hypothesis import TermParameter
+from optodrive.physics.term import ABSORBER, AMBIENT_K, Kernels, Term
 
 STEFAN_BOLTZMANN = 5.670374e-8
 """W/(m² K⁴)."""
@@ -10,15 +11,16 @@ STEFAN_BOLTZMANN = 5.670374e-8
 
 @kernel
 def heat_loss(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """εA σ (T⁴ − T₀⁴), W, on top of x."""
+    """Add the radiated power, W."""
     warm_k = c[AMBIENT_K] + y[ABSORBER]
     return float(x + v[0] * STEFAN_BOLTZMANN * (warm_k**4 - c[AMBIENT_K] ** 4))
 
 
 class Radiation(Term):
-    """εA σ (T⁴ − T₀⁴), W, on top of x."""
+    """εA σ (T⁴ − T₀⁴), W, from the absorber to ambient."""
 
     key = "radiation"
+    label = "the hot absorber radiates"
     parameters = (
         TermParameter(
             "emitting_area",

@@ -1,28 +1,45 @@
-"""The thermometer follows late."""
+"""Sensor lag: the thermometer follows the absorber with a lag and a delay."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import Kernels, Term, TermParameter
+from optodrive.physics.hypothesis import TermParameter
+from optodrive.physics.term import Kernels, SignalDelays, Term, TermValues
 
 
 @kernel
 def sensor_lag(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """First order, s."""
+    """Add the thermometer's time constant, s."""
     return float(x + v[0])
 
 
 class SensorLag(Term):
-    """time · dT/dt = T_true − T, all of it later by delay_share × time (by `late_s` of what is observed)."""
+    """time · dT/dt = T_true − T, delayed as a whole by delay_share · time."""
 
     key = "sensor_lag"
+    label = "the thermometer is slow"
     parameters = (
-        TermParameter("time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector"),
-        TermParameter("delay_share", "1", 0.0, 0.0, 1.0, "a delay beside it; 0.73 for an exposure's moving mean"),
+        TermParameter(
+            "time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector", starts=(1e-4, 5e-4, 2e-3)
+        ),
+        TermParameter(
+            "delay_share",
+            "1",
+            0.0,
+            0.0,
+            1.0,
+            "a delay beside it; 0.73 for an exposure's moving mean",
+            starts=(0.0, 0.7),
+            is_shape=True,
+        ),
     )
     kernels = Kernels(sensor_lag=sensor_lag)
     is_fast = True
     cannot_add_heat = True
     signature = "edges of temperature against edges of displacement"
+
+    def signal_delays(self, values: TermValues) -> SignalDelays:
+        """Return the thermometer's delay."""
+        return SignalDelays(temperature=values["time"] * values["delay_share"])
 
 
 TERM = SensorLag()

@@ -1,20 +1,22 @@
-"""The thermometer's gain is off."""
+"""Sensor scale: the thermometer's gain is wrong."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.term import Kernels, Term, TermParameter
+from optodrive.physics.hypothesis import Hypothesis, RecordingScope, TermParameter
+from optodrive.physics.term import Kernels, Term
 
 
 @kernel
 def sensor_reading(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
-    """Gain on the rise, and an offset."""
+    """Apply the gain to the rise and add the offset, K."""
     return float(v[0] * x + v[1])
 
 
 class SensorScale(Term):
-    """Gain on the absolute temperature."""
+    """gain · θ + offset in place of the rise θ above ambient."""
 
     key = "sensor_scale"
+    label = "the thermometer's scale is off"
     parameters = (
         TermParameter("gain", "1", 1.03, 0.85, 1.15, "emissivity taken wrongly by 10 %"),
         TermParameter("offset", "K", 0.0, -20.0, 20.0, "what it shows at ambient"),
@@ -22,6 +24,11 @@ class SensorScale(Term):
     kernels = Kernels(sensor_reading=sensor_reading)
     cannot_add_heat = True
     signature = "only a reference temperature"
+
+    def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
+        """Return the offset alone: a gain acts as R, C and κ together, and no data tells it from them."""
+        start = {"gain": 1.0, "offset": 1.0}
+        return [Hypothesis(self.key, f"{self.key}: offset", (start,), (self.free("offset"),), is_linear=True)]
 
 
 TERM = SensorScale()

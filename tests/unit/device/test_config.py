@@ -53,7 +53,12 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
         ('transport = "simulated"', 'transport = "usb"', "board", "needs vendor_id and product_id"),
         ('transport = "simulated"', 'transport = "usb"\nvendor_id = 0x12345', "board.vendor_id", "65535"),
         ('transport = "simulated"', 'transport = "helios"', "contradict", "half_range_codes 32767 must be 2047"),
-        ("damping = 0.7", "damping = 0.7\nhalf_range_codes = 2047", "contradict", "half_range_codes 2047 must be 32767"),
+        (
+            "damping = 0.7",
+            "damping = 0.7\nhalf_range_codes = 2047",
+            "contradict",
+            "_codes 2047 must be 32767",
+        ),
         ("baud = 1_000_000", "points_per_s = 60_000", "board.points_per_s", "50000"),
         ("absorber_max_c = 400.0", "absorber_max_c = nan", "absorber_max_c", "finite"),
         ("pulse_width_max_s = 0.050", "pulse_width_max_s = 0.070", "pulse_width_max_s", "0.065535"),

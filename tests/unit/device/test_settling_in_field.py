@@ -43,7 +43,9 @@ MOVES = {name: SettlingTable.from_config(config, Askew()) for name, config in CA
 def needed_us(config, axis, way_rad):
     """What a calm move needs in this field, µs."""
     tolerance_rad = tolerance_ratio(Askew(), LAYOUT, config) * config.tolerance_rad[axis]
-    room_rad = (1.0 - LONG_DWELL_SHARE) * (tolerance_rad - 0.5 * config.scanner.rad_per_code) - config.scanner.rad_per_code
+    room_rad = (1.0 - LONG_DWELL_SHARE) * (
+        tolerance_rad - 0.5 * config.scanner.rad_per_code
+    ) - config.scanner.rad_per_code
     return 1e6 * settling_s(build_servo(config.scanner), way_rad, room_rad)
 
 

@@ -15,7 +15,6 @@ from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.discrepancy_basis import compute_discrepancy_basis
 from optodrive.lab.diagnosis.fitting import ModelFit, compute_jitter_sensitivity, fit
 from optodrive.lab.diagnosis.held_out_gain import split_runs
-from optodrive.lab.diagnosis.hypotheses import FreeParameter
 from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
 from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.noise_model import ColouredNoise
@@ -23,6 +22,7 @@ from optodrive.lab.diagnosis.nominal_fit import fit_nominal
 from optodrive.lab.diagnosis.omnibus_test import OmnibusStatistic, compute_omnibus
 from optodrive.lab.diagnosis.prediction import ParameterPoint, predict
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.terms import discover_terms
 
 CLOCKS = ("temperature", "displacement", "force", "mirrors")
 TEMPERATURE = "absorber_temperature_K"
@@ -154,7 +154,7 @@ def test_a_lag_at_the_end_of_its_range_is_no_rival_of_a_late_clock():
 
     def candidate(terms, *names):
         point, key = ParameterPoint(base.point.base, terms), next(iter(terms))
-        free = tuple(FreeParameter(key, (name,)) for name in names)
+        free = tuple(discover_terms()[key].free(name) for name in names)
         fitted = ModelFit(point, free, 0.0, base.covariance, base.gram, predict(problem.data, point))
         return model_selection.RefittedCandidate((), fitted, 0.0)
 
@@ -181,7 +181,7 @@ def rivals_of(runs, near, far):
     fits = []
     for terms in (near, far):
         point, key = ParameterPoint(base.point.base, terms), next(iter(terms))
-        free = tuple(FreeParameter(key, (name,)) for name in terms[key])
+        free = tuple(discover_terms()[key].free(name) for name in terms[key])
         fits.append(fit(problem, point, free, iterations=1))
     return propose_experiment(problem, *fits, ("the one", "the other"))
 
