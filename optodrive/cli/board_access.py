@@ -1,4 +1,4 @@
-"""What `home` and `calibrate` hold: the configured board, its sensor, and signals that end both as Ctrl-C does."""
+"""Exclusive access to the configured board and its spot sensor, for `home` and `calibrate board`."""
 
 import signal
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ SENSOR_BAUD = 115_200
 
 
 class BoardAccess(NamedTuple):
-    """A board, not yet connected, and what sees the spot, None without a sensor."""
+    """A board that is not yet connected, and the reader of its spot sensor, None without a sensor."""
 
     board: "ExclusiveBoard"
     spot_reader: "SpotReader | None"
@@ -24,7 +24,11 @@ class BoardAccess(NamedTuple):
 
 @contextmanager
 def open_board(config: str | None) -> Iterator[BoardAccess]:
-    """The configured board and sensor; told to abort and closed whatever happens within."""
+    """Open the configured board and sensor; on exit, send ABORT and close both.
+
+    SIGTERM and SIGHUP end the block like Ctrl-C. Raises InputError for a configuration that cannot be used, and
+    LinkError where a port cannot be opened.
+    """
     from optodrive.core.clock import MonotonicClock
     from optodrive.device.config import DEFAULT_CONFIG, load_config
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
@@ -35,7 +39,7 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     from optodrive.planning.display_model import DisplayModel
 
     loaded = load_config(config)
-    # Aimed by nominal numbers: a field that is no good any more must not keep anyone from measuring a new one.
+    # The nominal scan field is used: an invalid field.toml must not prevent a new calibration.
     loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     board, clock = loaded.board, MonotonicClock()
@@ -51,10 +55,10 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
             yield BoardAccess(exclusive_board, spot_reader)
         except LinkError as error:
             if "cannot be opened" in str(error):
-                raise LinkError(f"{error} `optodrive serve` does as long as it runs: end it first") from None
+                raise LinkError(f"{error} A running `optodrive serve` holds the port: stop it first") from None
             raise
         finally:
             for signal_number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-                signal.signal(signal_number, signal.SIG_IGN)  # on the way out nothing comes between board and ABORT
+                signal.signal(signal_number, signal.SIG_IGN)  # no signal may interrupt the ABORT
             if spot_reader is not None:
                 spot_reader.close()

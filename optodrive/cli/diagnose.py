@@ -1,4 +1,4 @@
-"""`optodrive diagnose`: what a recording says of the model."""
+"""`optodrive diagnose`: find the errors of the model in a recording."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING…", help="HDF5 files or CSV folders.")]
 STDOUT = "-"
 DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
-"""Where nobody says which bridge was measured: model.toml then holds for displays of that width only by R and C."""
+"""Assumed where the recording states no width; R and C in model.toml then hold for displays of this width only."""
 
 
 def register(app: typer.Typer) -> None:
@@ -31,7 +31,7 @@ def register(app: typer.Typer) -> None:
 
 @dataclass(frozen=True)
 class _DiagnosisOutput:
-    """An answer in all its forms; model: None where there is none to write."""
+    """A diagnosis as JSON document, text, HTML and TOML; model_toml is None without a model to write."""
 
     document: dict[str, Any]
     narrative: list[str]
@@ -46,19 +46,24 @@ def diagnose(
     ] = None,
     json: Annotated[
         str | None,
-        typer.Option("--json", metavar="FILE", help="Write the answer as JSON; - for stdout and nothing else there."),
+        typer.Option(
+            "--json", metavar="FILE", help="Write the diagnosis as JSON; - writes it, and nothing else, to stdout."
+        ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Of the draws behind p values and intervals.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the sampling for p values and intervals.")] = 0,
     config: ConfigOption = None,
     workers: Annotated[
         int | None,
-        typer.Option("--workers", min=1, help="Processes for a recording of many pixels; all cores without it."),
+        typer.Option("--workers", min=1, help="Processes for a recording of many pixels; default: all cores."),
     ] = None,
     dask: Annotated[
-        str | None, typer.Option("--dask", metavar="ADDRESS", help="A Dask scheduler for many pixels: tcp://host:8786.")
+        str | None,
+        typer.Option(
+            "--dask", metavar="ADDRESS", help="Dask scheduler for a recording of many pixels: tcp://host:8786."
+        ),
     ] = None,
 ) -> None:
-    """Name what the simulation gets wrong in measured data, and what mending it gains."""
+    """Name the errors of the model in measured data, and the gain from correcting them."""
     _require_scipy()
     from optodrive.device.config import load_config
     from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
@@ -66,7 +71,7 @@ def diagnose(
 
     _check_output_paths(json, out)
     if dask is not None and workers is not None:
-        raise InputError("--workers", workers, "no such option beside --dask: a cluster has its own workers")
+        raise InputError("--workers", workers, "no such option together with --dask: a cluster has its own workers")
     settings = None if config is None else load_config(config)
     runs = DisplayRuns.open(recordings)
     title = ", ".join(path.name for path in recordings)
@@ -78,7 +83,7 @@ def diagnose(
 
 
 def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Config | None") -> _DiagnosisOutput:
-    """One pixel, or a few as one set of numbers."""
+    """Diagnose one pixel, or a few pixels with common parameters."""
     from optodrive.lab.diagnosis.diagnose import diagnose as study
     from optodrive.lab.diagnosis.model_file import build_model_toml
     from optodrive.lab.diagnosis.narrative import build_answer, build_narrative
@@ -97,7 +102,7 @@ def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Co
 def _diagnose_per_pixel(
     runs: "DisplayRuns", title: str, seed: int, config: "Config | None", dask: str | None, workers: int | None
 ) -> _DiagnosisOutput:
-    """Many pixels, each for itself."""
+    """Diagnose many pixels independently."""
     from optodrive.cli.diagnose_display import diagnose_display
     from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative
     from optodrive.lab.diagnosis.display_report import build_display_report
@@ -120,7 +125,7 @@ def _diagnose_per_pixel(
 
 
 def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) -> None:
-    """Files, each whole, then words."""
+    """Write the requested files atomically, then print the narrative or the JSON document."""
     if json is not None and json != STDOUT:
         _write_text(Path(json), _dump_json(output.document))
     if out is not None:
@@ -129,7 +134,7 @@ def _write_output(output: _DiagnosisOutput, out: Path | None, json: str | None) 
         _write_text(out / "diagnosis.json", _dump_json(output.document))
         if output.model_toml is not None:
             _write_text(out / "model.toml", output.model_toml)
-        else:  # one of an earlier answer would be taken for this one's
+        else:  # a model.toml of an earlier diagnosis would be mistaken for this one's
             (out / "model.toml").unlink(missing_ok=True)
     if json == STDOUT:
         print_json(output.document)
@@ -148,9 +153,9 @@ def _require_scipy() -> None:
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:
-    """Answers go beside recordings, never over one."""
+    """Reject outputs that would overwrite a recording or a file."""
     if json is not None and json != STDOUT and (Path(json).suffix in (".h5", ".hdf5") or Path(json).is_dir()):
-        raise InputError("--json", json, "a file for the answer, or - for stdout")
+        raise InputError("--json", json, "a file other than a recording, or - for stdout")
     if out is not None and out.exists() and not out.is_dir():
         raise InputError("--out", str(out), "a folder")
 
@@ -182,7 +187,7 @@ def _write_text(path: Path, text: str) -> None:
 
 @contextmanager
 def _report_progress() -> "Iterator[Callable[[str], None]]":
-    """What is being done, on stderr where that is a terminal."""
+    """Show the current step on stderr where it is a terminal."""
     import sys
 
     if not sys.stderr.isatty():

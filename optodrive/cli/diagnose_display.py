@@ -1,4 +1,4 @@
-"""`optodrive diagnose` of many pixels: tasks go out, answers come in, a bar counts them."""
+"""`optodrive diagnose` for many pixels: distribute the pixels over processes and show the progress."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -15,13 +15,16 @@ if TYPE_CHECKING:
     from optodrive.lab.recording import DisplayRuns
 
 PROGRESS_LINES = 10
-"""Of progress, where stderr is no terminal."""
+"""Number of progress lines where stderr is no terminal."""
 
 
 def diagnose_display(
     runs: "DisplayRuns", seed: int, config: "Config | None", dask: str | None, workers: int | None
 ) -> "DisplayAnswer":
-    """Every pixel for itself, on local processes or a cluster; InputError where not one has an answer."""
+    """Diagnose every pixel independently, on local processes or a cluster.
+
+    Raises InputError where the diagnosis fails for every pixel.
+    """
     from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import (
         DisplayAnswer,
@@ -59,7 +62,7 @@ def diagnose_display(
 
 @contextmanager
 def _report_progress(pixels: int) -> Iterator[Callable[[int], None]]:
-    """A bar that counts pixels on stderr, or a few lines where that is no terminal."""
+    """Show a bar of diagnosed pixels on stderr, or a few lines where it is no terminal."""
     if not sys.stderr.isatty():
         steps = {pixels * (step + 1) // PROGRESS_LINES for step in range(PROGRESS_LINES)}
 

@@ -1,4 +1,4 @@
-"""`optodrive doctor`: everything that can be checked before a display is driven."""
+"""`optodrive doctor`: check the computer, the port and the board before a display is driven."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,7 +19,7 @@ def register(app: typer.Typer) -> None:
 
 
 def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Check computer, port and board beforehand; nothing is armed. Exit 1 where there is a problem."""
+    """Check computer, port and board without arming; exit status 1 where there is a problem."""
     findings = examine(config)
     problems = sum(finding.status == "problem" for finding in findings)
     warnings = sum(finding.status == "warning" for finding in findings)
@@ -37,7 +37,7 @@ def doctor(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 
 def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
-    """All findings in order; root: the folder that stands for /."""
+    """Return all findings in order; `root` replaces / in tests."""
     from optodrive.cli import doctor_host as host
     from optodrive.cli.doctor_board import check_board
     from optodrive.cli.doctor_finding import report_problem
@@ -53,7 +53,7 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     except InputError as error:
         return [
             *findings,
-            report_problem("configuration", str(error), "correct it; `optodrive config check` tells more"),
+            report_problem("configuration", str(error), "correct it; `optodrive config check` checks it again"),
         ]
     findings += [host.check_clock(clock, loaded.board.lease_s), host.check_governor(root)]
     findings += [*host.check_disk(), host.check_kernels()]

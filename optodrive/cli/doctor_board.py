@@ -1,4 +1,4 @@
-"""What the doctor asks the board itself: a handshake and nothing more; it is never armed."""
+"""Checks of the board by a handshake; the board is never armed."""
 
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock
@@ -20,7 +20,7 @@ UNSAFE_REASONS = {
 
 
 def check_board(config: Config, clock: Clock) -> list[Finding]:
-    """Greet the board, hold its limits against the configuration's, measure the round trip, and leave it DISARMED."""
+    """Connect to the board, compare its limits with the configuration, measure the round trip, and stay DISARMED."""
     board = config.board
     session = BoardSession(find_transport_factory(board)(), clock, BoardRequirements.from_config(config))
     try:
@@ -37,13 +37,15 @@ def check_board(config: Config, clock: Clock) -> list[Finding]:
 def _check_identity(session: BoardSession, config: Config) -> list[Finding]:
     board = session.board
     observation = f"uid {board.uid}, firmware {board.firmware >> 16}.{board.firmware & 0xFFFF}, {board.state}"
-    limits = report_ok("limits", "the board's own allow what the configuration asks for")
+    limits = report_ok("limits", "the board's limits allow the configuration")
     if board.fault:
         return [report_warning("board", f"{observation} {board.fault}", get_fault_hint(board.fault)), limits]
     if not config.board.uid:
         return [
             report_warning(
-                "board", f"{observation}; any board would do", f'to be sure of it: board.uid = "{board.uid}"'
+                "board",
+                f"{observation}; the configuration accepts any board",
+                f'to accept this board only: board.uid = "{board.uid}"',
             ),
             limits,
         ]
@@ -54,7 +56,7 @@ def _check_inputs(session: BoardSession) -> Finding:
     input_states = {name: bool(session.board.inputs >> bit & 1) for bit, name in enumerate(INPUTS)}
     unsafe = [UNSAFE_REASONS[name] for name in INPUTS if input_states[name] != SAFE_INPUTS[name]]
     if unsafe:
-        return report_warning("inputs", "; ".join(unsafe), "the board will not arm before that is put right")
+        return report_warning("inputs", "; ".join(unsafe), "the board refuses to arm until this is corrected")
     return report_ok("inputs", "enclosure closed, key on, emergency stop released")
 
 
@@ -63,6 +65,6 @@ def _check_round_trip(session: BoardSession) -> Finding:
     observation = f"round trip {trip_ms:.2f} ms"
     if trip_ms > ROUND_TRIP_WARNING_S * 1e3:
         return report_warning(
-            "link", observation, "slow: see latency above, and use a port of its own rather than a hub"
+            "link", observation, "slow: see latency above, and connect the board directly rather than through a hub"
         )
     return report_ok("link", observation)

@@ -1,4 +1,4 @@
-"""One line of the doctor's: what was looked at, how it is, what was seen, what to do."""
+"""Findings of `optodrive doctor`."""
 
 from typing import Literal, NamedTuple
 
@@ -6,7 +6,7 @@ FindingStatus = Literal["ok", "warning", "problem"]
 
 
 class Finding(NamedTuple):
-    """remedy: what to do, '' where nothing is to be done."""
+    """One check: its name, status, observation, and the remedy ('' where none is needed)."""
 
     check: str
     status: FindingStatus
@@ -15,15 +15,15 @@ class Finding(NamedTuple):
 
 
 def report_ok(check: str, observation: str) -> Finding:
-    """All is well."""
+    """Return a finding without a problem."""
     return Finding(check, "ok", observation)
 
 
 def report_warning(check: str, observation: str, remedy: str) -> Finding:
-    """It works, but may not always."""
+    """Return a finding of a condition that can cause a failure."""
     return Finding(check, "warning", observation, remedy)
 
 
 def report_problem(check: str, observation: str, remedy: str) -> Finding:
-    """It will not work."""
+    """Return a finding of a condition that prevents operation."""
     return Finding(check, "problem", observation, remedy)

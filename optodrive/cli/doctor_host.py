@@ -1,4 +1,4 @@
-"""What the doctor looks at on the computer itself: Python, packages, clock, processor, disk, compiled kernels."""
+"""Checks of the computer: Python, packages, clock, processor, disk, compiled kernels."""
 
 import re
 import shutil
@@ -22,7 +22,7 @@ DISK_FULL_BYTES = 50_000_000
 
 
 def check_python() -> Finding:
-    """The interpreter."""
+    """Check the version of Python."""
     observation = sys.version.split()[0]
     if sys.version_info < MIN_PYTHON:
         return report_problem("python", observation, "use Python 3.11 or newer")
@@ -30,15 +30,19 @@ def check_python() -> Finding:
 
 
 def check_packages(name: str = "optodrive") -> list[Finding]:
-    """What the package needs, as its own metadata says."""
+    """Check the installed packages against the metadata of `name`."""
     try:
         requirements = [text for text in metadata.requires(name) or [] if "extra ==" not in text]
     except metadata.PackageNotFoundError:
-        return [report_warning("packages", f"{name} runs from its sources, not installed", "install it: pip install .")]
+        return [
+            report_warning(
+                "packages", f"{name} is not installed, it runs from its sources", "install it: pip install ."
+            )
+        ]
     violations = [violation for text in requirements if (violation := _check_requirement(text))]
     if violations:
         return [report_problem("packages", text, "install the package again: pip install .") for text in violations]
-    return [report_ok("packages", f"all {len(requirements)} there")]
+    return [report_ok("packages", f"all {len(requirements)} installed")]
 
 
 def _check_requirement(requirement: str) -> str | None:
@@ -60,41 +64,43 @@ def _parse_version(version: str) -> list[int]:
 
 
 def check_clock(clock: Clock, lease_s: float) -> Finding:
-    """Whether the clock is fine enough, and the computer wakes in time: naps of 1 ms over a second."""
+    """Check the resolution of the monotonic clock, and the overshoot of 1 ms sleeps over one second."""
     resolution_s = time.get_clock_info("monotonic").resolution
     overshoot_s, end_s = 0.0, clock.now_s() + OBSERVATION_S
     while (before_s := clock.now_s()) < end_s:
         clock.sleep(SLEEP_S)
         overshoot_s = max(overshoot_s, clock.now_s() - before_s - SLEEP_S)
-    observation = (
-        f"resolution {resolution_s * 1e9:.0f} ns; a nap of 1 ms took at most {overshoot_s * 1e3:.2f} ms longer"
-    )
+    observation = f"resolution {resolution_s * 1e9:.0f} ns; a 1 ms sleep overshot by max {overshoot_s * 1e3:.2f} ms"
     if resolution_s > CLOCK_RESOLUTION_MAX_S:
         return report_problem(
-            "clock", observation, "the monotonic clock is too coarse: choose another clock source of the kernel's"
+            "clock", observation, "the monotonic clock is too coarse: select another clock source in the kernel"
         )
     if overshoot_s > lease_s / 2:
         return report_problem(
-            "clock", observation, f"half the lease of {lease_s:g} s and more: end other work on this computer"
+            "clock", observation, f"more than half the lease of {lease_s:g} s: end other programs on this computer"
         )
     if overshoot_s > OVERSHOOT_WARNING_S:
         return report_warning(
-            "clock", observation, "the computer is busy or saves power: end other work, or set it to performance"
+            "clock",
+            observation,
+            "the computer is busy or saves power: end other programs, or select the performance governor",
         )
     return report_ok("clock", observation)
 
 
 def check_governor(root: Path = ROOT) -> Finding:
-    """How the processor chooses its frequency."""
+    """Check the frequency governor of the processor."""
     folders = join_root(root, "/sys/devices/system/cpu").glob("cpu[0-9]*/cpufreq")
     governors = {_read_word(folder / "scaling_governor") for folder in folders} - {""}
     if not governors:
-        return report_ok("processor", "its frequency is not this system's to choose")
+        return report_ok("processor", "this system does not control its frequency")
     observation = "governor " + ", ".join(sorted(governors))
     if governors == {"performance"}:
         return report_ok("processor", observation)
     if "powersave" in governors:
-        return report_warning("processor", observation, "wakes late: sudo cpupower frequency-set -g performance")
+        return report_warning(
+            "processor", observation, "causes late wake-ups: sudo cpupower frequency-set -g performance"
+        )
     return report_ok("processor", observation)
 
 
@@ -106,28 +112,28 @@ def _read_word(path: Path) -> str:
 
 
 def check_disk() -> list[Finding]:
-    """Room here, and where temporary files go (the simulated board's log)."""
+    """Check the free space of the working folder and of the folder for temporary files (the simulated board's log)."""
     folders = dict.fromkeys((Path.cwd(), Path(tempfile.gettempdir())))
     return [check_free_space(folder, shutil.disk_usage(folder).free) for folder in folders]
 
 
 def check_free_space(folder: Path, free_bytes: int) -> Finding:
-    """Whether logs and recordings of a link fit; an hour of 100 pulses a second is some 30 MB of recording."""
+    """Check the space for logs and link captures; one hour at 100 pulses/s is a capture of about 30 MB."""
     observation = f"{free_bytes / 1e9:.1f} GB free in {folder}"
     if free_bytes < DISK_FULL_BYTES:
-        return report_problem("disk", observation, "make room: logs and recordings stop when the disk is full")
+        return report_problem("disk", observation, "free space: logs and recordings stop when the disk is full")
     if free_bytes < DISK_LOW_BYTES:
-        return report_warning("disk", observation, "make room, or record elsewhere")
+        return report_warning("disk", observation, "free space, or record to another disk")
     return report_ok("disk", observation)
 
 
 def check_kernels() -> Finding:
-    """Whether machine code is there already."""
+    """Check whether compiled kernels are cached."""
     from optodrive.core.kernels import CACHED, is_cold
 
     if not CACHED:
         return report_warning(
-            "kernels", "machine code cannot be kept", "make ~/.cache/optodrive writable, or set NUMBA_CACHE_DIR"
+            "kernels", "compiled kernels cannot be cached", "make ~/.cache/optodrive writable, or set NUMBA_CACHE_DIR"
         )
     if is_cold():
         return report_warning(

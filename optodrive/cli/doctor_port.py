@@ -1,4 +1,4 @@
-"""What the doctor looks at of the configured serial port, without opening it."""
+"""Checks of the configured serial port, without opening it."""
 
 import grp
 import os
@@ -22,19 +22,19 @@ IGNORE_PROPERTIES = ("E:ID_MM_DEVICE_IGNORE=1", "E:ID_MM_PORT_IGNORE=1")
 
 
 def check_port(board: BoardSection, root: Path = ROOT) -> tuple[list[Finding], bool]:
-    """Findings, and whether the board may be asked: the port is there, ours to open, and nobody holds it."""
+    """Return the findings, and whether the board can be contacted: the port exists, may be opened and is not in use."""
     if board.transport == "simulated":
         return [report_ok("port", "none: the board is simulated")], True
     port = board.port
     try:
         exists = join_root(root, port).exists()
     except PermissionError:
-        remedy = "name the port in /dev in board.port, or give this user the right to look there"
-        return [report_problem("permission", f"this user may not look for {port}", remedy)], False
+        remedy = "name a port in /dev in board.port, or give this user access to that folder"
+        return [report_problem("permission", f"this user has no access to the folder of {port}", remedy)], False
     if not exists:
-        available = ", ".join(list_serial_ports(root)) or "no serial port at all"
-        remedy = "plug the board in, or name its port in board.port"
-        return [report_problem("port", f"{port} does not exist; there is {available}", remedy)], False
+        available = ", ".join(list_serial_ports(root)) or "no serial port"
+        remedy = "connect the board, or name its port in board.port"
+        return [report_problem("port", f"{port} does not exist; found: {available}", remedy)], False
     permission, holder = _check_permission(port, root), _check_holders(port, root)
     findings = [report_ok("port", f"{port} exists"), permission, holder]
     findings += [_check_name(port, root), _check_latency(port, root), _check_modem_manager(port, root)]
@@ -59,9 +59,9 @@ def _check_holders(port: str, root: Path) -> Finding:
         return report_ok("holder", "no other program has it open")
     names = "; ".join(map(str, port_holders))
     if any(holder.command == MODEM_MANAGER for holder in port_holders):
-        return report_problem("holder", f"held by {names}", "tell ModemManager to ignore it, see below")
-    remedy = "if that is the daemon, `optodrive status` tells of the board; else end it"
-    return report_warning("holder", f"held by {names}: the board is left alone", remedy)
+        return report_problem("holder", f"held by {names}", "configure ModemManager to ignore it, see below")
+    remedy = "if this is the daemon, `optodrive status` reports the board; otherwise end it"
+    return report_warning("holder", f"held by {names}: the board is not contacted", remedy)
 
 
 def _check_name(port: str, root: Path) -> Finding:
@@ -74,7 +74,9 @@ def _check_name(port: str, root: Path) -> Finding:
             remedy = f'board.port = "/dev/serial/by-id/{link.name}"'
             return report_warning("name", f"{port} may be another device's name after the next start", remedy)
     return report_warning(
-        "name", f"{port} may be another device's name after the next start", "no by-id link: name it by udev"
+        "name",
+        f"{port} may be another device's name after the next start",
+        "no by-id link: give it a name with a udev rule",
     )
 
 
@@ -84,10 +86,10 @@ def _check_latency(port: str, root: Path) -> Finding:
     try:
         latency_ms = int(path.read_text())
     except (OSError, ValueError):
-        return report_ok("latency", "no FTDI converter, nothing to set")
+        return report_ok("latency", "no FTDI converter")
     if latency_ms > LATENCY_MAX_MS:
         rule = f'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{{latency_timer}}="1" in {UDEV_RULES}'
-        return report_warning("latency", f"the FTDI converter holds bytes back for {latency_ms} ms", rule)
+        return report_warning("latency", f"the FTDI converter delays bytes by {latency_ms} ms", rule)
     return report_ok("latency", f"{latency_ms} ms")
 
 
@@ -100,11 +102,11 @@ def _check_modem_manager(port: str, root: Path) -> Finding:
     if not running:
         return report_ok("modem manager", "does not run")
     if not device.startswith(("/dev/ttyACM", "/dev/ttyUSB")):
-        return report_ok("modem manager", "does not look at this kind of port")
+        return report_ok("modem manager", "does not probe this kind of port")
     if _is_ignored(device, root):
         return report_ok("modem manager", "runs, and ignores this port")
     rule = f'SUBSYSTEM=="tty", ATTRS{{idVendor}}=="…", ENV{{ID_MM_DEVICE_IGNORE}}="1" in {UDEV_RULES}'
-    return report_warning("modem manager", "runs, and writes to new ports to see whether they are modems", rule)
+    return report_warning("modem manager", "runs, and probes new ports for modems by writing to them", rule)
 
 
 def _is_ignored(device: str, root: Path) -> bool:

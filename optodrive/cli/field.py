@@ -1,4 +1,4 @@
-"""`optodrive field`: display metres to DAC codes by a calibrated field, and back; grids of corrections."""
+"""`optodrive field`: convert display positions to DAC codes and back, and fields to correction grids and back."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -27,22 +27,25 @@ def field(
         typer.Option("--calibration", metavar="field.toml", help="Calibrated field, an output of `calibrate`."),
     ] = None,
     points: Annotated[
-        Path | None, typer.Option("--points", metavar="points.csv", help="x_m,y_m; with --inverse x_code,y_code.")
+        Path | None,
+        typer.Option("--points", metavar="points.csv", help="Input: x_m,y_m; with --inverse x_code,y_code."),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", metavar="codes.csv", help="Where to write; of --import the field.toml.")
+        Path | None, typer.Option("--out", metavar="codes.csv", help="Output; with --import the field.toml.")
     ] = None,
-    inverse: Annotated[bool, typer.Option("--inverse", help="Codes to metres.")] = False,
+    inverse: Annotated[bool, typer.Option("--inverse", help="Convert codes to metres.")] = False,
     export_path: Annotated[
-        Path | None, typer.Option("--export", metavar="grid.cor", help="Write the field as a grid, LMC1COR_1.0.")
+        Path | None,
+        typer.Option("--export", metavar="grid.cor", help="Write the field as a correction grid, LMC1COR_1.0."),
     ] = None,
     import_path: Annotated[
-        Path | None, typer.Option("--import", metavar="grid.cor", help="Make a field.toml from a grid, LMC1COR_1.0.")
+        Path | None,
+        typer.Option("--import", metavar="grid.cor", help="Convert a correction grid, LMC1COR_1.0, to field.toml."),
     ] = None,
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Convert display metres to DAC codes and back, or a field to a grid of corrections and back."""
+    """Convert display metres to DAC codes and back, or a field to a correction grid and back."""
     if import_path is not None:
         result = _import(import_path, _require_option("--out", out), config)
     else:
@@ -61,7 +64,7 @@ def field(
         print(f"written          {result['out']}" + (f", {result['points']} points" if "points" in result else ""))
         if result.get("outside"):
             print(
-                f"outside          {result['outside']} points lie where nothing was calibrated: nothing is claimed there"
+                f"outside          {result['outside']} points lie outside the calibrated region, where sigma is unknown"
             )
 
 
@@ -87,7 +90,7 @@ def _convert(calibrated_field: "CalibratedField", points: Path, out: Path, inver
         if len(unreachable):
             row = int(unreachable[0])
             raise InputError(
-                f"{points}: row {row + 2}", f"{table[row, 0]:g}, {table[row, 1]:g} m", "a place that a code leads to"
+                f"{points}: row {row + 2}", f"{table[row, 0]:g}, {table[row, 1]:g} m", "a position that a code reaches"
             )
         write_columns(out, CODE_COLUMNS, converted, (CODE_FORMAT,) * 2)
     sigma_m = calibrated_field.sigma_m(codes[:, 0], codes[:, 1])
@@ -129,7 +132,7 @@ def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
 
     calibrated_field = fit_correction_grid(grid, FieldPrior.from_config(load_config(config)))
     metadata: dict[str, str | float | int] = {
-        "source": strip_toml_specials(f"{grid}, a grid: how sure it is it does not say")
+        "source": strip_toml_specials(f"{grid}, a correction grid without uncertainties")
     }
     with atomic_write(out) as temporary:
         temporary.write_text(format_field(calibrated_field, metadata), encoding="utf-8")

@@ -1,4 +1,4 @@
-"""`optodrive home`: the mirrors to their middle, and everything a beam needs looked at before there is one."""
+"""`optodrive home`: centre the mirrors and check the board's inputs and outputs before any light is emitted."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,7 +27,7 @@ def home(
     ] = False,
     json: JsonOption = False,
 ) -> None:
-    """Bring the mirrors to their middle, look at travel, position outputs, interlock, key, stop, indicator."""
+    """Centre the mirrors; check travel, position outputs, interlock, key, emergency stop and indicator."""
     from optodrive.cli.board_access import open_board
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.homing import Homing
@@ -51,5 +51,5 @@ def home(
         raise
     finally:
         if json:
-            steps = [{"step": step.step, "ok": True, "says": step.message, **step.details} for step in results]
+            steps = [{"step": step.step, "ok": True, "message": step.message, **step.details} for step in results]
             print_json({"home": not failure, "steps": steps, "failure": failure or None})

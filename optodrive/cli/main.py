@@ -1,4 +1,4 @@
-"""The command line: one line an error, exit status 0 done, 1 failed, 2 bad input."""
+"""The command line: one line per error; exit status 0 done, 1 failed, 2 bad input."""
 
 import os
 import sys
@@ -28,7 +28,7 @@ from optodrive.core.errors import OptodriveError
 
 EXIT_INTERRUPTED = 130
 UsageError: Any = typer.BadParameter.__bases__[0]
-"""The base of every complaint about arguments; typer brings its own copy of click, or uses click's."""
+"""Base class of errors about arguments; typer contains its own copy of click or uses the installed one."""
 
 app = typer.Typer(
     name="optodrive",
@@ -60,17 +60,17 @@ for module in (
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit with its status."""
-    # No command calls BLAS; its threads alone would cost a tenth of a second to start.
+    # No command needs a multithreaded BLAS; starting its threads takes 0.1 s.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     sys.exit(run(sys.argv[1:] if arguments is None else arguments))
 
 
 def run(arguments: list[str]) -> int:
-    """Run the command line; every error it knows becomes one line on stderr and an exit status."""
+    """Run the command line and return its exit status; print a known error as one line on stderr."""
     try:
         status = app(args=arguments, prog_name="optodrive", standalone_mode=False)
         sys.stdout.flush()
-        if status == EXIT_INTERRUPTED:  # some versions of typer turn a Ctrl-C into a status
+        if status == EXIT_INTERRUPTED:  # some versions of typer convert Ctrl-C to a status
             raise KeyboardInterrupt
         return status if isinstance(status, int) else 0
     except OptodriveError as error:
@@ -81,14 +81,14 @@ def run(arguments: list[str]) -> int:
         return EXIT_INTERRUPTED
     except UsageError as error:
         message = " ".join(error.format_message().split())
-        if message:  # without arguments there is none: help was shown instead
+        if message:  # empty without arguments: typer has printed the help
             print(f"optodrive: {message}", file=sys.stderr)
         return 2
     except OSError as error:
-        # What is still buffered cannot be written either; without this the interpreter would complain at its end.
+        # Buffered output cannot be written either; redirecting it prevents a second error at interpreter exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         if isinstance(error, BrokenPipeError):
-            return 0  # the reader has gone: nobody is left to tell
+            return 0  # the reader of stdout has exited
         print(f"optodrive: {error}", file=sys.stderr)
         return 1
 

@@ -1,4 +1,4 @@
-"""`optodrive recording convert | show | merge`."""
+"""`optodrive recording convert | show | merge`: convert, inspect and merge recordings."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,13 +11,13 @@ if TYPE_CHECKING:
     from optodrive.core.types.measurements import Measurement
 
 TABLE_WIDTH_MAX = 500
-"""The table is as wide as what it says, but no wider than this."""
+"""Maximum width of the table, which otherwise fits its content, in characters."""
 RecordingArgument = Annotated[Path, typer.Argument(metavar="RECORDING", help="An HDF5 file, or a folder of CSV files.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(help="Look into measured data, or turn one form of it into the other.", no_args_is_help=True)
+    group = typer.Typer(help="Inspect recordings, convert them, or merge them with a session.", no_args_is_help=True)
     group.command("convert")(convert)
     group.command("show")(show)
     group.command("merge")(merge)
@@ -26,10 +26,12 @@ def register(app: typer.Typer) -> None:
 
 def convert(
     source: Annotated[Path, typer.Argument(metavar="IN", help="An HDF5 file, or a folder of CSV files.")],
-    target: Annotated[Path, typer.Argument(metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a new folder.")],
+    target: Annotated[
+        Path, typer.Argument(metavar="OUT", help="HDF5 if the name ends in .h5 or .hdf5, otherwise a new folder.")
+    ],
     json: JsonOption = False,
 ) -> None:
-    """Turn an HDF5 recording into a folder of CSV files, or the other way; every number stays exactly what it was."""
+    """Convert an HDF5 recording to a folder of CSV files or back, without loss of precision."""
     from optodrive.lab.recording import convert_recording
 
     measurement = convert_recording(source, target)
@@ -44,10 +46,12 @@ def convert(
 
 def show(
     recording: RecordingArgument,
-    out: Annotated[Path | None, typer.Option("--out", metavar="picture.png", help="Draw every signal.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="picture.png", help="Draw every signal in a picture.")
+    ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check a recording whole, and show what each run holds."""
+    """Validate a recording, and list the signals of each run."""
     from optodrive.lab.recording import read_recording
     from optodrive.lab.recording.summary import build_summary
 
@@ -65,15 +69,17 @@ def show(
 
 
 def merge(
-    session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="As `serve --record-session` writes it.")],
+    session: Annotated[Path, typer.Argument(metavar="SESSION.h5", help="Output of `serve --record-session`.")],
     measured: Annotated[Path, typer.Argument(metavar="MEASURED", help="A recording of the same runs, without pulses.")],
-    out: Annotated[Path, typer.Option("--out", metavar="OUT", help="HDF5 if it ends in .h5 or .hdf5, else a folder.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="OUT", help="HDF5 if the name ends in .h5 or .hdf5, otherwise a folder.")
+    ],
     time_offset_s: Annotated[
         float, typer.Option("--time-offset", metavar="SECONDS", help="Added to every measured time.")
     ] = 0.0,
     json: JsonOption = False,
 ) -> None:
-    """Join a session's pulses, as executed, with what was measured meanwhile: a recording for `diagnose`."""
+    """Merge the executed pulses of a session with signals measured meanwhile into a recording for `diagnose`."""
     from optodrive.lab.recording import write_recording
     from optodrive.lab.recording.merge import merge_session
 

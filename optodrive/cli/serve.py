@@ -1,4 +1,4 @@
-"""`optodrive serve`: the daemon."""
+"""`optodrive serve`: run the daemon."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -31,7 +31,7 @@ def serve(
     mirrors: MirrorsOption = None,
     pixel_map: PixelMapOption = None,
     port: Annotated[
-        int | None, typer.Option("--port", min=0, max=65535, help="TCP port, instead of the configured.")
+        int | None, typer.Option("--port", min=0, max=65535, help="TCP port instead of the configured one.")
     ] = None,
     capture: Annotated[
         Path | None,
@@ -39,10 +39,10 @@ def serve(
     ] = None,
     record_session: Annotated[
         Path | None,
-        typer.Option("--record-session", metavar="FILE.h5", help="Note what is asked, planned and executed."),
+        typer.Option("--record-session", metavar="FILE.h5", help="Record requests, plans and executed pulses."),
     ] = None,
 ) -> None:
-    """Run the daemon: the engine that drives the board, and REST."""
+    """Run the daemon: the engine that drives the board, the REST API and the live page."""
     from optodrive.daemon.server import run
 
     def load() -> "Config":

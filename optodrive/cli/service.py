@@ -1,4 +1,4 @@
-"""`optodrive service install | remove | show`: the daemon as a service. Writes files, starts nothing."""
+"""`optodrive service install | remove | show`: manage the files of the systemd service; nothing is started."""
 
 import sys
 from pathlib import Path
@@ -9,13 +9,13 @@ import typer
 from optodrive.cli.options import ConfigOption, JsonOption, print_json
 
 RootOption = Annotated[
-    Path, typer.Option("--root", metavar="DIR", help="Below this folder instead of /, for packages and tests.")
+    Path, typer.Option("--root", metavar="DIR", help="Install below this folder instead of /, for packages and tests.")
 ]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(help="The daemon as a systemd service; nothing here starts it.", no_args_is_help=True)
+    group = typer.Typer(help="Manage the files of the systemd service; no command starts it.", no_args_is_help=True)
     for command in (install, remove, show):
         group.command()(command)
     app.add_typer(group, name="service")
@@ -25,63 +25,62 @@ def install(
     config: ConfigOption = None,
     root: RootOption = Path("/"),
     program: Annotated[
-        Path | None, typer.Option("--program", metavar="PATH", help="The optodrive that is started, if not this one.")
+        Path | None,
+        typer.Option("--program", metavar="PATH", help="The optodrive executable to start; default: this one."),
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Write unit, user, udev rules and configuration; what somebody edited is never overwritten."""
+    """Write unit, user, udev rules and configuration; edited files are never overwritten."""
     from optodrive.cli.service_files import CONFIG_PATH, DEVICE_LINK, Installation, build_service_files
 
     installation = Installation(root)
     installed_config = installation.resolve(CONFIG_PATH)
-    # Installed again, for an upgrade: the configuration that is there goes on.
+    # An upgrade keeps the installed configuration.
     source = installed_config if config is None and installed_config.exists() else config
     loaded, files = build_service_files(source, program or Path(sys.executable).with_name("optodrive"))
     actions = installation.install(files)
     if json:
-        print_json({"files": [{"path": str(path), "done": what} for path, what in actions]})
+        print_json({"files": [{"path": str(path), "action": action} for path, action in actions]})
         return
     _print_files(actions)
     if loaded.board.vendor_id is None and loaded.board.transport == "serial":
-        print(
-            f"no udev rules: give [board] vendor_id and product_id for {DEVICE_LINK} and for ModemManager to leave it alone"
-        )
+        print(f"no udev rules: set [board] vendor_id and product_id to get {DEVICE_LINK} and keep ModemManager away")
     elif loaded.board.transport == "serial" and loaded.board.port != DEVICE_LINK:
-        print(f"[board] port is {loaded.board.port}; {DEVICE_LINK} is the name that stays")
-    print(f"next, as root, once {CONFIG_PATH} is as it should be:")
+        print(f"[board] port is {loaded.board.port}; {DEVICE_LINK} is its persistent name")
+    print(f"next, as root, once {CONFIG_PATH} is correct:")
     for line in (
         "systemd-sysusers optodrive.conf",
         "udevadm control --reload && udevadm trigger --subsystem-match=tty --subsystem-match=usb",
         "systemctl daemon-reload && systemctl enable --now optodrive",
     ):
         print(f"    {line}")
-    print("The laser stays off: the daemon arms nothing, `optodrive arm` does.")
+    print("The laser stays off: only `optodrive arm` arms the board, the daemon never does.")
 
 
 def remove(root: RootOption = Path("/"), json: JsonOption = False) -> None:
-    """Remove what install wrote and nobody edited."""
+    """Remove the installed files, except edited ones."""
     from optodrive.cli.service_files import Installation
 
     actions = Installation(root).remove()
     if json:
-        print_json({"files": [{"path": str(path), "done": what} for path, what in actions]})
+        print_json({"files": [{"path": str(path), "action": action} for path, action in actions]})
         return
     _print_files(actions)
     if not actions:
         print("nothing is installed")
     else:
-        print("stop it first if it runs: systemctl disable --now optodrive; then systemctl daemon-reload")
-        print("left: /var/lib/optodrive (tokens, audit file), the user optodrive")
+        print("stop the service if it is running: systemctl disable --now optodrive; then systemctl daemon-reload")
+        print("kept: /var/lib/optodrive (tokens, audit file), the user optodrive")
 
 
 def show(root: RootOption = Path("/"), json: JsonOption = False) -> None:
-    """Show which files are installed, and which of them were edited."""
+    """List the installed files, and whether they were edited."""
     from optodrive.cli.service_files import Installation
 
     installation = Installation(root)
     statuses = [(path, str(installation.file_status(path))) for path in installation.installed_files()]
     if json:
-        print_json({"files": [{"path": str(path), "standing": standing} for path, standing in statuses]})
+        print_json({"files": [{"path": str(path), "status": status} for path, status in statuses]})
         return
     _print_files(statuses)
     if not statuses:

@@ -1,4 +1,4 @@
-"""The files of the service: what is in them, where they lie, and which of them somebody has edited."""
+"""The files of the systemd service: content, paths, and detection of edits."""
 
 import json
 import re
@@ -20,14 +20,14 @@ RULES_PATH = Path("/etc/udev/rules.d/60-optodrive.rules")
 MANIFEST_PATH = Path("/etc/optodrive/installed.json")
 FORMAT, VERSION = "optodrive-service", 1
 DEVICE_LINK = "/dev/optodrive-board"
-HIDDEN_FOLDERS = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - what the unit does not see
+HIDDEN_FOLDERS = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - folders that the unit cannot access
 DAEMON_PATHS = {
     "socket": "/run/optodrive/optodrive.sock",
     "tokens": "/var/lib/optodrive/tokens.toml",
     "audit": "/var/lib/optodrive/audit.jsonl",
 }
 USB_UNIT_LINES = """DeviceAllow=char-usb_device rw
-# libusb learns of devices over netlink.
+# libusb detects devices over netlink.
 RestrictAddressFamilies=AF_NETLINK
 """
 FileStatus = Literal["missing", "as installed", "edited"]
@@ -35,7 +35,7 @@ FileStatus = Literal["missing", "as installed", "edited"]
 
 @dataclass(frozen=True)
 class ServiceFile:
-    """A file of the service. path: from the root; kept: an edited one is left as it is and is no obstacle."""
+    """A file of the service: absolute path, text, and whether an edited file is kept instead of being an obstacle."""
 
     path: Path
     text: str
@@ -43,7 +43,10 @@ class ServiceFile:
 
 
 def build_service_files(source: str | Path | None, program: Path) -> tuple[Config, list[ServiceFile]]:
-    """The configuration, and every file that an installation has; InputError or RefusedError for what cannot be."""
+    """Build the configuration and every file of an installation.
+
+    Raises InputError for values that cannot be used, and RefusedError for a program that the service cannot access.
+    """
     config, text = _load_configuration(source)
     files = [
         ServiceFile(UNIT_PATH, _render_unit(config, program)),
@@ -56,7 +59,7 @@ def build_service_files(source: str | Path | None, program: Path) -> tuple[Confi
 
 
 def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
-    load_config(source)  # says what is wrong by the name that was given
+    load_config(source)  # reports errors under the given name
     path = Path(DEFAULT_CONFIG if source is None else source)
     text = (path if path.exists() else locate_shipped(f"{path}.toml")).read_text("utf-8")
     if not re.search(r"^\s*\[daemon\]", text, re.MULTILINE):
@@ -73,7 +76,7 @@ def _render_unit(config: Config, program: Path) -> str:
     hidden = next((folder for folder in HIDDEN_FOLDERS if program.is_relative_to(folder)), None)
     if hidden is not None:
         raise RefusedError(
-            f"the service sees nothing below {hidden}, and {program} lies there; install optodrive where all may read "
+            f"the service has no access to {hidden}, the folder of {program}; install optodrive where all may read "
             "it (python3 -m venv /opt/optodrive), and run its `optodrive service install`, or name it with --program"
         )
     text = locate_shipped("systemd", "optodrive.service").read_text("utf-8").replace("@PROGRAM@", str(program))
@@ -93,31 +96,31 @@ def _render_rules(config: Config) -> str:
 
 
 class Installation:
-    """The files below a root, and what is remembered of what was put there."""
+    """The installed files below a root, and the digests of their installed content."""
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._digests = self._load_digests()
 
     def resolve(self, path: Path) -> Path:
-        """Where a file of the service lies below the root."""
+        """Return the path of a file of the service below the root."""
         return self._root / path.relative_to("/")
 
     def file_status(self, path: Path) -> FileStatus:
-        """How a file stands: as it was put there, edited since (or put there by others), or not there."""
+        """Return whether a file is missing, as installed, or edited (or created by others)."""
         target = self.resolve(path)
         if not target.exists() and not target.is_symlink():
             return "missing"
         return "as installed" if _compute_digest(_read_text(target)) == self._digests.get(str(path)) else "edited"
 
     def installed_files(self) -> Iterator[Path]:
-        """The files that were put there."""
+        """Yield the paths of the installed files."""
         return (Path(path) for path in sorted(self._digests))
 
     def install(self, files: list[ServiceFile]) -> list[tuple[Path, str]]:
-        """Write what is not there yet or has changed; each file and what was done.
+        """Write missing and changed files, and return each path with the action taken.
 
-        RefusedError, before anything is written, where that would overwrite what somebody edited.
+        Raises RefusedError, before writing anything, where an edited file would be overwritten.
         """
         edited = [file for file in files if self.file_status(file.path) == "edited"]
         obstacles = [
@@ -125,8 +128,8 @@ class Installation:
         ]
         if obstacles:
             raise RefusedError(
-                f"{', '.join(obstacles)}: edited, or not put there by `optodrive service install`; nothing was "
-                "written. Move it away, and keep changes to the unit in a drop-in (systemctl edit optodrive)"
+                f"{', '.join(obstacles)}: edited, or not written by `optodrive service install`; nothing was "
+                "written. Move it away, and put changes to the unit into a drop-in (systemctl edit optodrive)"
             )
         actions = [(file.path, self._install_file(file, file in edited)) for file in files]
         self._save_digests()
@@ -134,10 +137,10 @@ class Installation:
 
     def _install_file(self, file: ServiceFile, edited: bool) -> str:
         if edited and file.preserve_edits:
-            return "edited, left as it is"
+            return "edited, kept"
         self._digests[str(file.path)] = _compute_digest(file.text)
         if self._is_current(file):
-            return "there already"
+            return "unchanged"
         target = self.resolve(file.path)
         action = "replaced" if target.exists() else "written"
         _make_folder(target.parent)
@@ -146,19 +149,19 @@ class Installation:
         return action
 
     def remove(self) -> list[tuple[Path, str]]:
-        """Remove what was put there and is as it was; each file and what was done."""
+        """Remove the installed files that were not edited, and return each path with the action taken."""
         actions = []
         for path in list(self.installed_files()):
             status = self.file_status(path)
             if status == "edited":
-                actions.append((path, "edited, left as it is"))
+                actions.append((path, "edited, kept"))
                 continue
             try:
                 self.resolve(path).unlink(missing_ok=True)
             except OSError as error:
-                raise InputError(str(self.resolve(path)), error.strerror, "a file that may be removed") from None
+                raise InputError(str(self.resolve(path)), error.strerror, "a file that can be removed") from None
             del self._digests[str(path)]
-            actions.append((path, "removed" if status == "as installed" else "was not there"))
+            actions.append((path, "removed" if status == "as installed" else "was missing"))
         self._save_digests()
         return actions
 
@@ -205,4 +208,6 @@ def _make_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(str(folder), error.strerror, "a folder that may be made (as root, or with --root)") from None
+        raise InputError(
+            str(folder), error.strerror, "a folder that can be created (as root, or with --root)"
+        ) from None

@@ -1,4 +1,4 @@
-"""`optodrive validate`."""
+"""`optodrive validate`: compare the models with the facts of the paper."""
 
 from pathlib import Path
 from typing import Annotated
@@ -19,16 +19,17 @@ def validate(
     diagnose: Annotated[
         bool,
         typer.Option(
-            "--diagnose", help="Name what Text S1 gets wrong in the paper's numbers, and what mending it gains."
+            "--diagnose",
+            help="Name the errors of Text S1 in the paper's measurements, and the gain from correcting them.",
         ),
     ] = False,
     model: Annotated[
-        Path | None, typer.Option("--model", metavar="model.toml", help="Hold this parameter set beside the others.")
+        Path | None, typer.Option("--model", metavar="model.toml", help="Compare this parameter set too.")
     ] = None,
 ) -> None:
-    """Hold the models against every fact of the paper they can speak to."""
+    """Compare the models with every fact of the paper that they predict."""
     if diagnose and model is not None:
-        raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose begins from Text S1")
+        raise InputError("--model", str(model), "--diagnose or --model, not both: --diagnose starts from Text S1")
     if diagnose:
         from optodrive.cli.validate_diagnose import diagnose_paper_facts as tell
 

@@ -1,4 +1,4 @@
-"""`optodrive validate --diagnose`: the paper's facts as a recording, and what Text S1 gets wrong in them."""
+"""`optodrive validate --diagnose`: diagnose the model of Text S1 with the facts of the paper as data."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,11 +11,11 @@ if TYPE_CHECKING:
 
 LITERAL_SET = "paper_s1_literal"
 MIN_TABLE_WIDTH = 110
-"""Narrower terminals wrap lines rather than lose digits."""
+"""Narrower terminals wrap lines instead of truncating digits, in characters."""
 
 
 def diagnose_paper_facts(json: bool = False) -> None:
-    """Print the story, or one JSON object."""
+    """Print the narrative, or one JSON object."""
     from optodrive.lab.validation.narrative import build_study_answer
     from optodrive.lab.validation.study import run_study
     from optodrive.physics.paper_facts import load_paper_facts
@@ -49,7 +49,7 @@ def _print_narrative(study_result: "StudyResult") -> None:
             console.print(line, highlight=False, markup=False)
 
     print_lines(describe_findings(study_result))
-    table = Table(title="Predicted without having been seen: causes chosen and fitted anew, model over measured")
+    table = Table(title="Predictions of held-out facts: causes selected and fitted without them, model over measured")
     for heading in HEADINGS:
         table.add_column(heading, justify="right" if heading == "off by" else "left")
     for row in build_rows(study_result):
@@ -61,7 +61,7 @@ def _print_narrative(study_result: "StudyResult") -> None:
 
 @contextmanager
 def _report_progress() -> Iterator[Callable[[str], None]]:
-    """What is being done, on stderr where that is a terminal."""
+    """Show the current step on stderr where it is a terminal."""
     from rich.console import Console
 
     console = Console(stderr=True)

@@ -1,4 +1,4 @@
-"""The paper's facts against the parameter sets: rows, a table on the terminal, JSON."""
+"""Comparison of the paper's facts with the parameter sets: rows, terminal table, JSON."""
 
 from dataclasses import asdict, dataclass
 from math import isfinite
@@ -20,25 +20,26 @@ from optodrive.physics.paper_facts import PaperFact, load_paper_facts
 from optodrive.physics.parameters import load_parameters
 
 NOTABLE_ERROR = 0.15
-"""Misses of the calibrated set beyond this share get a word."""
+"""Relative error of the calibrated set above which a remark is shown."""
 
 DISPLAY_UNITS = {"m": (1e6, "µm"), "N": (1e3, "mN"), "J": (1e3, "mJ"), "J/K": (1e6, "µJ/K"), "m K/W": (1e3, "mm K/W")}
-"""Display scale and unit of SI units whose numbers would be awkward."""
+"""Display scale and unit by SI unit."""
 
 
 Role = Literal["input", "fitted", "predicted"]
 HEADINGS = ("fact", "measured", "literal", "ratio", "calibrated", "ratio", "role", "extended", "ratio", "role")
 USER_HEADINGS = ("model", "ratio")
 MIN_TABLE_WIDTH, USER_WIDTH = 130, 18
-"""Narrower terminals wrap lines rather than lose digits."""
+"""Narrower terminals wrap lines instead of truncating digits, in characters."""
 
 
 @dataclass(frozen=True)
 class ValidationRow:
-    """One fact beside the models, SI; ratios are model over measured, None for a bound; model: the user's own, if any.
+    """One fact and its value in each model, SI; `model` is the user's parameter set, None without one.
 
-    role, extended_role: whether that set was fitted on it, predicts it, or took it from the paper; remark: what there
-    is to say of the calibrated set, '' unless it misses.
+    Ratios are model over measured, None for a bound. `role` and `extended_role`: the calibrated or extended set was
+    fitted on the fact, predicts it, or takes it as input. `remark` comments on an error of the calibrated set above
+    NOTABLE_ERROR, '' otherwise.
     """
 
     fact: PaperFact
@@ -56,7 +57,10 @@ class ValidationRow:
 
 
 def build_validation_rows(user_file: Path | None = None) -> list[ValidationRow]:
-    """Every fact that a parameter set can speak to, in the order of the facts. own: a parameter file to hold beside."""
+    """Build a row for every fact that the parameter sets predict, in the order of the facts.
+
+    `user_file` is a further parameter set to compare. Raises InputError for a file that cannot be used.
+    """
     literal, calibrated = load_parameters("paper_s1_literal"), load_parameters("calibrated")
     extended_outcomes = simulate_outcomes(load_parameters("extended"))
     user_parameters = None if user_file is None else load_parameters(user_file)
@@ -95,7 +99,7 @@ def _find_role(name: str, fitted_facts: set[str]) -> Role:
 
 
 def print_validation(json: bool = False, model: Path | None = None) -> None:
-    """Print the table, or one JSON object. model: a parameter file to hold beside the shipped sets."""
+    """Print the table, or one JSON object; `model` is a further parameter set to compare."""
     rows = build_validation_rows(model)
     if json:
         from optodrive.cli.options import print_json
@@ -106,10 +110,10 @@ def print_validation(json: bool = False, model: Path | None = None) -> None:
 
 
 def build_document(rows: list[ValidationRow]) -> dict[str, Any]:
-    """The rows as plain data in SI units; a number that is not finite becomes null."""
+    """Return the rows as JSON data in SI units; numbers that are not finite become null."""
     facts = [asdict(row.fact) | _to_plain(row) for row in rows]
     fitted = {"fitted_on": dict(FITTED_ON), "extended_fitted_on": dict(EXTENDED_FITTED_ON)}
-    return {"facts": facts, "silent": dict(NOT_MODELLED)} | fitted
+    return {"facts": facts, "not_modelled": dict(NOT_MODELLED)} | fitted
 
 
 def _to_plain(row: ValidationRow) -> dict[str, Any]:
@@ -118,7 +122,7 @@ def _to_plain(row: ValidationRow) -> dict[str, Any]:
 
 
 def format_cells(row: ValidationRow) -> list[str]:
-    """A row as text under HEADINGS, in readable units."""
+    """Format a row as cells under HEADINGS, in display units."""
     scale, unit = DISPLAY_UNITS.get(row.fact.unit, (1.0, row.fact.unit))
     measured = ("< " if row.fact.relation == "<" else "") + f"{row.fact.value * scale:.4g}"
     if row.fact.uncertainty is not None:
@@ -146,7 +150,7 @@ def _print_table(rows: list[ValidationRow]) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    table = Table(title="The paper's facts, and what the parameter sets make of them")
+    table = Table(title="Facts of the paper and their values in the parameter sets")
     has_user_model = rows[0].model is not None
     for heading in HEADINGS + (USER_HEADINGS if has_user_model else ()):
         table.add_column(heading, justify="left" if heading in ("fact", "role") else "right", no_wrap=True)
@@ -154,10 +158,10 @@ def _print_table(rows: list[ValidationRow]) -> None:
         table.add_row(*format_cells(row), style="bold" if row.remark else None)
     console = Console(width=max(Console().width, MIN_TABLE_WIDTH + (USER_WIDTH if has_user_model else 0)))
     console.print(table)
-    console.print(f"Calibrated, off by more than {100 * NOTABLE_ERROR:.0f} %:")
+    console.print(f"Errors of the calibrated set above {100 * NOTABLE_ERROR:.0f} %:")
     for row in rows:
         if row.remark:
             console.print(f"  {row.fact.id}: {row.remark}", highlight=False, soft_wrap=True)
     console.print(
-        f"No parameter set speaks to the other {len(NOT_MODELLED)} facts; docs/explanation/validation.md says why."
+        f"No parameter set predicts the other {len(NOT_MODELLED)} facts; docs/explanation/validation.md says why."
     )

@@ -1,4 +1,4 @@
-"""`optodrive wire dump | replay`: look into a recorded session, or do it once more."""
+"""`optodrive wire dump | replay`: list or replay a link capture."""
 
 import json as json_module
 import sys
@@ -15,21 +15,21 @@ if TYPE_CHECKING:
     from optodrive.link.transport.link_capture import LinkCapture
 
 LISTED_MAX = 8
-"""A column longer than this is only counted on a line for people; --json lists it whole."""
+"""Elements of a column shown in text; --json lists all."""
 INVALID_SHOWN_BYTES = 32
 CaptureArgument = Annotated[Path, typer.Argument(metavar="FILE", help="Output of `optodrive serve --capture`.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    group = typer.Typer(help="Look into what passed on the link to a board, or replay it.", no_args_is_help=True)
+    group = typer.Typer(help="List or replay a capture of the link to a board.", no_args_is_help=True)
     group.command("dump")(dump)
     group.command("replay")(replay)
     app.add_typer(group, name="wire")
 
 
 def dump(file: CaptureArgument, json: JsonOption = False) -> None:
-    """List every message with its time, and totals; with --json one object a line, the totals last."""
+    """List every message with its time, then totals; with --json one object per line."""
     from optodrive.link.protocol.transcript import Transcript
     from optodrive.link.transport.link_capture import CLOSED, OPENED, TO_BOARD, LinkCapture
 
@@ -44,7 +44,7 @@ def dump(file: CaptureArgument, json: JsonOption = False) -> None:
         for line in transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data):
             print_document(_build_document(line, capture))
     totals = {**transcript.totals.to_dict(), "ignored_bytes": capture.ignored_bytes}
-    print_document({"totals": {"began_unix_s": capture.unix_s, **totals}})
+    print_document({"totals": {"start_unix_s": capture.unix_s, **totals}})
 
 
 def _build_document(line: "TranscriptEntry", capture: "LinkCapture") -> dict[str, Any]:
@@ -52,10 +52,10 @@ def _build_document(line: "TranscriptEntry", capture: "LinkCapture") -> dict[str
 
     document: dict[str, Any] = {"t_s": line.host_s - capture.host_s, "to": "board" if line.to_board else "host"}
     if line.message is None or line.frame is None:
-        return {**document, "bad": line.error, "bytes": len(line.raw), "hex": line.raw.hex()}
+        return {**document, "error": line.error, "bytes": len(line.raw), "hex": line.raw.hex()}
     document |= {"message": line.message.NAME, "session": line.frame.session}
     if line.message.SEQUENCED and line.to_board:
-        document |= {"seq": line.frame.seq, "again": line.retransmitted}
+        document |= {"seq": line.frame.seq, "retransmitted": line.retransmitted}
     return {**document, "fields": describe(line.message)}
 
 
@@ -74,13 +74,13 @@ def _print_line(document: dict[str, Any]) -> None:
         print(f"{at} -- link {document['link']}")
         return
     arrow = "->" if document["to"] == "board" else "<-"
-    if "bad" in document:
+    if "error" in document:
         shown = document["hex"][: 2 * INVALID_SHOWN_BYTES]
         more = "…" if len(shown) < len(document["hex"]) else ""
-        print(f"{at} {arrow} BAD {document['bad']}, {document['bytes']} bytes: {shown}{more}")
+        print(f"{at} {arrow} INVALID {document['error']}, {document['bytes']} bytes: {shown}{more}")
         return
     seq = f" #{document['seq']}" if "seq" in document else ""
-    retransmitted = " again" if document.get("again") else ""
+    retransmitted = " retransmitted" if document.get("retransmitted") else ""
     fields = " ".join(f"{name}={_shorten(value)}" for name, value in document["fields"].items())
     print(f"{at} {arrow} {document['message']}{seq}{retransmitted} {fields}".rstrip())
 
@@ -98,20 +98,24 @@ def replay(
     file: CaptureArgument,
     board: Annotated[str, typer.Option("--board", metavar="PORT", help="A serial port, or `simulated`.")],
     seed: Annotated[
-        int | None, typer.Option("--seed", help="The seed the recorded simulated board had; only so it arms again.")
+        int | None,
+        typer.Option("--seed", help="Seed of the captured simulated board; with another seed it does not arm."),
     ] = None,
     limits: Annotated[
-        Path | None, typer.Option("--limits", metavar="FILE", help="The simulated board's own limits, TOML.")
+        Path | None, typer.Option("--limits", metavar="FILE", help="Limits of the simulated board, TOML.")
     ] = None,
-    baud: Annotated[int, typer.Option("--baud", min=300, help="Of the serial port.")] = 1_000_000,
+    baud: Annotated[int, typer.Option("--baud", min=300, help="Baud rate of the serial port.")] = 1_000_000,
     json: JsonOption = False,
 ) -> None:
-    """Send the host's bytes at their times to a board; exit 1 where it does otherwise. A real board is never armed."""
+    """Send the captured bytes of the host to a board at their times; exit status 1 where its behaviour differs.
+
+    A real board is never armed.
+    """
     from optodrive.core.errors import InputError
     from optodrive.link.session.replay import compare_traces
 
     if board != "simulated" and (seed is not None or limits is not None):
-        raise InputError("--board", board, "simulated, for --seed and --limits are the simulated board's")
+        raise InputError("--board", board, "simulated: --seed and --limits apply to the simulated board only")
     result = _run_replay(file, board, seed, limits, baud)
     verdict = compare_traces(result.recorded, result.replayed)
     if json:
@@ -150,14 +154,14 @@ def _print_verdict(verdict: dict[str, Any], result: "Replay") -> None:
     print(f"states           {states['recorded']} recorded, {states['replayed']} replayed")
     if states["first_difference"] is not None:
         at = states["first_difference"]
-        was, now = (_format_state(account.states, at) for account in (result.recorded, result.replayed))
-        print(f"first difference state {at + 1}: recorded {was}, replayed {now}")
+        recorded, replayed = (_format_state(account.states, at) for account in (result.recorded, result.replayed))
+        print(f"first difference state {at + 1}: recorded {recorded}, replayed {replayed}")
     counts = ", ".join(f"{executed[name]} {name}" for name in ("recorded", "replayed", "missing", "changed", "moved"))
     print(f"points executed  {counts}, by {executed['largest_move_ticks']} ticks at most")
 
 
 def _format_state(states: list[tuple[str, str, str]], at: int) -> str:
     if at >= len(states):
-        return "nothing more"
+        return "no further state"
     state, fault, reason = states[at]
     return f"{state}{f' {fault}' if fault else ''} ({reason})"

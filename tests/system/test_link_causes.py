@@ -159,16 +159,16 @@ def doctor(config):
 def test_the_doctor_leaves_a_running_daemon_alone_and_greets_a_free_board(board, daemon):
     plan = play(daemon, 4.0)
     findings = doctor(daemon.config)
-    assert findings["holder"]["grade"] == "warning"
-    assert f"process {daemon.process.pid}" in findings["holder"]["seen"]
+    assert findings["holder"]["status"] == "warning"
+    assert f"process {daemon.process.pid}" in findings["holder"]["observation"]
     assert "board" not in findings
     assert daemon.finished(plan)["status"] == "done"
     assert daemon.board_state() == "ARMED"
     daemon.stop()
     armings = len([event for event in board.of("state") if event["state"] == "ARMING"])
     findings = doctor(daemon.config)
-    assert findings["holder"]["grade"] == "ok"
-    assert "DISARMED" in findings["board"]["seen"]
+    assert findings["holder"]["status"] == "ok"
+    assert "DISARMED" in findings["board"]["observation"]
     assert len([event for event in board.of("state") if event["state"] == "ARMING"]) == armings
     assert not board.of("fault")
 

@@ -1,4 +1,4 @@
-"""`optodrive diagnose` as people call it: words, files, JSON, wrong input."""
+"""`optodrive diagnose`, run as a command: text, files, JSON and wrong input."""
 
 import json
 
@@ -21,11 +21,11 @@ def recording(tmp_path_factory):
     return path
 
 
-def test_the_story_and_three_files(recording, tmp_path, capsys):
+def test_the_narrative_and_three_files(recording, tmp_path, capsys):
     out = tmp_path / "answer"
     assert run(["diagnose", str(recording), "--out", str(out)]) == 0
-    told = capsys.readouterr().out
-    assert told.startswith("The nominal model is wrong because the laser's power falls while it is on.")
+    output = capsys.readouterr().out
+    assert output.startswith("The nominal model is wrong because the laser's power falls while it is on.")
     assert sorted(path.name for path in out.iterdir()) == ["diagnosis.json", "model.toml", "report.html"]
     assert json.loads((out / "diagnosis.json").read_text())["causes"] == ["laser_droop"]
     assert "<svg" in (out / "report.html").read_text()

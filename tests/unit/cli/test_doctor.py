@@ -1,4 +1,4 @@
-"""The doctor: each check on a small tree of files that stands for the system, or on the real thing."""
+"""`optodrive doctor`: each check on a file tree that replaces the system, or on the real system."""
 
 import json
 import os
@@ -21,7 +21,7 @@ from optodrive.device.config import BoardSection, load_config, locate_shipped
 
 @pytest.fixture
 def tmp_path():
-    """A folder that nobody else closes: pytest's own are for its user alone."""
+    """A folder that other users can read; the folders of pytest are private to its user."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder).chmod(0o755)
         yield Path(folder)
@@ -32,7 +32,7 @@ SERIAL = BoardSection(transport="serial", port="/dev/ttyACM0")
 
 @pytest.fixture
 def tree(tmp_path):
-    """A system with one board at /dev/ttyACM0 and nothing wrong but its name."""
+    """A system with one board at /dev/ttyACM0 and no defect but the port's name."""
     for folder in ("dev/serial/by-id", "proc/77/fd", "sys/class/tty/ttyACM0/device", "run/udev/data"):
         (tmp_path / folder).mkdir(parents=True)
     (tmp_path / "dev/ttyACM0").touch()
@@ -92,10 +92,10 @@ def test_modem_manager_is_a_warning_unless_told_to_ignore_the_port(tree):
     assert find_finding(port_findings(tree)[0], "modem manager").status == "ok"
 
 
-@pytest.mark.parametrize(("text", "grade"), [("16\n", "warning"), ("1\n", "ok"), ("?", "ok")])
-def test_the_latency_timer_of_an_ftdi_converter(tree, text, grade):
+@pytest.mark.parametrize(("text", "status"), [("16\n", "warning"), ("1\n", "ok"), ("?", "ok")])
+def test_the_latency_timer_of_an_ftdi_converter(tree, text, status):
     (tree / "sys/class/tty/ttyACM0/device/latency_timer").write_text(text)
-    assert find_finding(port_findings(tree)[0], "latency").status == grade
+    assert find_finding(port_findings(tree)[0], "latency").status == status
 
 
 def test_missing_permission_for_real(tree):
@@ -131,7 +131,7 @@ def test_a_pty_held_by_another_process_for_real(tmp_path):
 
 
 class SlowClock(ManualClock):
-    """A clock whose naps take longer by so much."""
+    """A clock whose sleeps overshoot by `delay_s`."""
 
     def __init__(self, delay_s):
         super().__init__()
@@ -141,28 +141,28 @@ class SlowClock(ManualClock):
         super().sleep(duration_s + self.delay_s)
 
 
-@pytest.mark.parametrize(("late_s", "grade"), [(0.0, "ok"), (0.009, "ok"), (0.011, "warning"), (0.06, "problem")])
-def test_a_computer_that_wakes_late(late_s, grade):
+@pytest.mark.parametrize(("late_s", "status"), [(0.0, "ok"), (0.009, "ok"), (0.011, "warning"), (0.06, "problem")])
+def test_a_computer_that_wakes_late(late_s, status):
     finding = host.check_clock(SlowClock(late_s), lease_s=0.1)
-    assert finding.status == grade
+    assert finding.status == status
     assert f"{late_s * 1e3:.2f} ms" in finding.observation
 
 
 @pytest.mark.parametrize(
-    ("governors", "grade"),
+    ("governors", "status"),
     [((), "ok"), (("performance",) * 2, "ok"), (("performance", "powersave"), "warning"), (("schedutil",), "ok")],
 )
-def test_the_processor_s_governor(tmp_path, governors, grade):
+def test_the_processor_s_governor(tmp_path, governors, status):
     for k, governor in enumerate(governors):
         folder = tmp_path / f"sys/devices/system/cpu/cpu{k}/cpufreq"
         folder.mkdir(parents=True)
         (folder / "scaling_governor").write_text(governor + "\n")
-    assert host.check_governor(tmp_path).status == grade
+    assert host.check_governor(tmp_path).status == status
 
 
-@pytest.mark.parametrize(("free_bytes", "grade"), [(5e9, "ok"), (5e8, "warning"), (1e7, "problem")])
-def test_the_disk_s_room(free_bytes, grade):
-    assert host.check_free_space(Path("/var"), int(free_bytes)).status == grade
+@pytest.mark.parametrize(("free_bytes", "status"), [(5e9, "ok"), (5e8, "warning"), (1e7, "problem")])
+def test_the_disk_s_room(free_bytes, status):
+    assert host.check_free_space(Path("/var"), int(free_bytes)).status == status
 
 
 def test_packages_missing_or_too_old_are_named():
@@ -175,12 +175,12 @@ def test_packages_missing_or_too_old_are_named():
 
 
 @pytest.mark.parametrize(
-    ("cached", "cold", "grade"), [(True, False, "ok"), (True, True, "warning"), (False, True, "warning")]
+    ("cached", "cold", "status"), [(True, False, "ok"), (True, True, "warning"), (False, True, "warning")]
 )
-def test_the_compiled_kernels(monkeypatch, cached, cold, grade):
+def test_the_compiled_kernels(monkeypatch, cached, cold, status):
     monkeypatch.setattr("optodrive.core.kernels.CACHED", cached)
     monkeypatch.setattr("optodrive.core.kernels.is_cold", lambda: cold)
-    assert host.check_kernels().status == grade
+    assert host.check_kernels().status == status
 
 
 # --- the board, and all of it ---------------------------------------------------------------------------------------
@@ -208,13 +208,13 @@ def test_another_board_than_the_configured_one_is_a_problem():
 
 
 def test_the_command_exits_0_without_a_problem_and_1_with_one(tmp_path, capsys, monkeypatch):
-    # Whether this computer wakes in time is not what is tested here.
-    monkeypatch.setattr(host, "check_clock", lambda clock, lease_s: report_ok("clock", "left out"))
+    # The result of the clock check depends on the load of this computer.
+    monkeypatch.setattr(host, "check_clock", lambda clock, lease_s: report_ok("clock", "skipped"))
     assert run(["doctor", "--config", "display-16", "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["ok"]
     assert document["problems"] == 0
-    assert {finding["grade"] for finding in document["findings"]} <= {"ok", "warning"}
+    assert {finding["status"] for finding in document["findings"]} <= {"ok", "warning"}
     text = locate_shipped("display-16.toml").read_text()
     path = tmp_path / "config.toml"
     path.write_text(text.replace('transport = "simulated"', f'transport = "serial"\nport = "{tmp_path}/tty"'))

@@ -1,3 +1,5 @@
+"""`optodrive service install | remove | show` below a temporary root."""
+
 import json
 
 import pytest
@@ -12,12 +14,12 @@ USB_BOARD = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x
 
 @pytest.fixture
 def install(tmp_path, capsys):
-    def go(*arguments, command="install", status=0):
+    def run_service(*arguments, command="install", status=0):
         program = ["--program", PROGRAM] if command == "install" and "--program" not in arguments else []
         assert run(["service", command, "--root", str(tmp_path / "root"), *program, *map(str, arguments)]) == status
         return capsys.readouterr()
 
-    return go
+    return run_service
 
 
 @pytest.fixture
@@ -33,7 +35,7 @@ def board_config(folder, board):
 
 
 def test_what_is_written_is_in_order(install, at):
-    said = install().out
+    output = install().out
     assert all(at(path).is_file() for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH, MANIFEST_PATH))
     assert f"ExecStart={PROGRAM} serve --config {CONFIG_PATH}\n" in at(UNIT_PATH).read_text()
     assert "@" not in at(UNIT_PATH).read_text().replace("~@", "").replace("=@", "").replace(" @", "")
@@ -44,8 +46,8 @@ def test_what_is_written_is_in_order(install, at):
         "/var/lib/optodrive/audit.jsonl",
     )
     assert daemon.host == "127.0.0.1"
-    assert "enable --now" in said
-    assert "arms nothing" in said
+    assert "enable --now" in output
+    assert "only `optodrive arm` arms" in output
 
 
 def test_once_more_changes_nothing(install, at):
@@ -53,7 +55,7 @@ def test_once_more_changes_nothing(install, at):
     before = {
         path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH)
     }
-    assert install().out.count("there already") == 3
+    assert install().out.count("unchanged") == 3
     assert before == {
         path: (at(path).read_text(), at(path).stat().st_mtime_ns) for path in (UNIT_PATH, USERS_PATH, CONFIG_PATH)
     }
@@ -63,9 +65,9 @@ def test_an_edited_unit_is_not_overwritten_and_nothing_else_is(install, at):
     install()
     at(UNIT_PATH).write_text("[Service]\nNice=0\n")
     at(USERS_PATH).unlink()
-    said = install("--program", "/opt/other/optodrive", status=1).err
-    assert said.count("\n") == 1
-    assert str(at(UNIT_PATH)) in said
+    output = install("--program", "/opt/other/optodrive", status=1).err
+    assert output.count("\n") == 1
+    assert str(at(UNIT_PATH)) in output
     assert at(UNIT_PATH).read_text() == "[Service]\nNice=0\n"
     assert not at(USERS_PATH).exists()
 
@@ -84,16 +86,16 @@ def test_an_upgrade_replaces_what_was_not_edited_and_keeps_the_configuration(ins
     assert "/opt/new/optodrive" in at(UNIT_PATH).read_text()
     assert load_config(at(CONFIG_PATH)).name == "display-16"
     at(CONFIG_PATH).write_text(at(CONFIG_PATH).read_text().replace("ambient_c = 20.0", "ambient_c = 25.0"))
-    said = install("--program", "/opt/newer/optodrive").out
-    assert f"{CONFIG_PATH}: edited, left as it is" in said
+    output = install("--program", "/opt/newer/optodrive").out
+    assert f"{CONFIG_PATH}: edited, kept" in output
     assert load_config(at(CONFIG_PATH)).ambient_c == 25.0
 
 
 def test_remove_leaves_what_was_edited(install, at):
     install()
     at(CONFIG_PATH).write_text(at(CONFIG_PATH).read_text() + "# mine\n")
-    said = install(command="remove").out
-    assert f"{CONFIG_PATH}: edited, left as it is" in said
+    output = install(command="remove").out
+    assert f"{CONFIG_PATH}: edited, kept" in output
     assert not at(UNIT_PATH).exists()
     assert at(CONFIG_PATH).exists()
     at(CONFIG_PATH).unlink()
@@ -108,7 +110,7 @@ def test_show(install, at):
     at(UNIT_PATH).write_text("")
     at(USERS_PATH).unlink()
     shown = json.loads(install("--json", command="show").out)["files"]
-    assert {item["path"]: item["standing"] for item in shown} == {
+    assert {item["path"]: item["status"] for item in shown} == {
         str(UNIT_PATH): "edited",
         str(USERS_PATH): "missing",
         str(CONFIG_PATH): "as installed",
@@ -135,8 +137,8 @@ def test_rules_name_the_board(install, at, tmp_path):
 @pytest.mark.parametrize("serial", ['x", RUN+="/bin/sh', "a b", "ü", "a$b"])
 def test_a_serial_number_that_is_more_than_one_is_refused(install, at, tmp_path, serial):
     quoted = json.dumps(serial, ensure_ascii=False)
-    said = install("--config", board_config(tmp_path, f"{USB_BOARD}serial_number = {quoted}\n"), status=2).err
-    assert "board.serial_number" in said
+    output = install("--config", board_config(tmp_path, f"{USB_BOARD}serial_number = {quoted}\n"), status=2).err
+    assert "board.serial_number" in output
     assert not at(UNIT_PATH).exists()
 
 
@@ -159,5 +161,5 @@ def test_only_a_board_on_usb_gets_usb_devices(install, at, tmp_path):
 
 def test_a_root_that_may_not_be_written_is_one_line(install, tmp_path):
     (tmp_path / "root").write_text("a file")
-    said = install(status=2).err
-    assert said.count("\n") == 1
+    output = install(status=2).err
+    assert output.count("\n") == 1

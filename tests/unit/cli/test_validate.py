@@ -1,4 +1,4 @@
-"""`optodrive validate`, as a process and as rows."""
+"""`optodrive validate`, run as a process, and the rows of its table."""
 
 import json
 import subprocess
@@ -59,7 +59,7 @@ def test_json_is_one_object_in_si_units():
     assert facts["z_tp8_w040"]["uncertainty"] == pytest.approx(2.3e-6)
     assert facts["N_50um"]["calibrated_ratio"] == pytest.approx(ROWS["N_50um"].calibrated_ratio)
     assert facts["z_repeat_w040"]["calibrated_ratio"] is None
-    assert document["silent"] == NOT_MODELLED
+    assert document["not_modelled"] == NOT_MODELLED
     assert document["fitted_on"] == FITTED_ON
     assert document["extended_fitted_on"] == EXTENDED_FITTED_ON
     for name in EXTENDED_FITTED_ON.values():
@@ -69,7 +69,7 @@ def test_json_is_one_object_in_si_units():
 
 def test_it_loads_nothing_heavy():
     check = (
-        "import sys; import optodrive.cli.validation_table as v; v.validate(True);"
+        "import sys; import optodrive.cli.validation_table as v; v.print_validation(True);"
         " assert 'scipy.optimize' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", check], check=True, capture_output=True, timeout=30)
@@ -84,7 +84,7 @@ def test_a_model_of_ones_own_stands_beside_the_others(tmp_path):
     )
     rows = {row.fact.id: row for row in build_validation_rows(path)}
     assert rows["R_w020"].model == rows["R_w020"].calibrated
-    # The light comes 2 ms late: a 50 ms pulse hardly knows; one that lifts 50 µm takes 2 ms longer.
+    # The light rises 2 ms late: a 50 ms pulse is hardly affected; a pulse to 50 µm takes about 2 ms longer.
     assert rows["z_peak_w020"].model == pytest.approx(rows["z_peak_w020"].calibrated, rel=0.03)
     width_s = 1.0 / rows["N_50um"].model - 1.0 / rows["N_50um"].calibrated
     assert width_s == pytest.approx(1.6e-3, abs=0.4e-3)

@@ -1,3 +1,5 @@
+"""`optodrive wire dump | replay` on a small link capture."""
+
 import json
 
 import pytest
@@ -9,7 +11,7 @@ from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO
 
 
 def encode_message(message, seq=0):
-    return encode_frame(Frame(message.TYPE, seq, 5, message.body()))
+    return encode_frame(Frame(message.TYPE, seq, 5, message.encode_body()))
 
 
 DATA = m.Data(0, m.POINT.pack(1, 2, 3, 4, 32768) * 20)
@@ -25,8 +27,8 @@ ENTRIES = [
 
 
 @pytest.fixture
-def tape(tmp_path):
-    writer = LinkCaptureWriter(tmp_path / "tape", 10.0, pytest.fail)
+def capture(tmp_path):
+    writer = LinkCaptureWriter(tmp_path / "capture", 10.0, pytest.fail)
     for entry in ENTRIES:
         writer.record(entry)
     writer.close()
@@ -35,16 +37,16 @@ def tape(tmp_path):
     return str(writer.path)
 
 
-def test_dump_in_words(tape, capsys):
-    assert run(["wire", "dump", tape]) == 0
+def test_dump_as_text(capture, capsys):
+    assert run(["wire", "dump", capture]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[:2] == ["    0.000000 -- link opened", "    0.100000 -> CLOCK host_t=00000009"]
     assert lines[2].startswith("    0.100000 -> DATA #0 first_index=0 points=20 x_code=[1,1,1,1,1,1,1,1,…]")
     assert lines[3:5] == [
         "    0.200000 <- CLOCK_REPLY host_t=00000009 tick=77",
-        "    0.200000 <- BAD no COBS frame, 9 bytes: 056e6f206672616d65",
+        "    0.200000 <- INVALID no COBS frame, 9 bytes: 056e6f206672616d65",
     ]
-    assert "-> DATA #0 again" in lines[5]
+    assert "-> DATA #0 retransmitted" in lines[5]
     assert lines[6] == "    2.300000 <- NAK next_seq=1 reason=SEQUENCE"
     totals = dict(line.rsplit(maxsplit=1) for line in lines[9:])
     assert totals["retransmissions"] == totals["naks"] == totals["bad frames from board"] == "1"
@@ -54,26 +56,26 @@ def test_dump_in_words(tape, capsys):
     assert totals["board silence s"] == "2.1"
 
 
-def test_dump_as_json_lists_every_point(tape, capsys):
-    assert run(["wire", "dump", tape, "--json"]) == 0
+def test_dump_as_json_lists_every_point(capture, capsys):
+    assert run(["wire", "dump", capture, "--json"]) == 0
     *lines, last = map(json.loads, capsys.readouterr().out.splitlines())
     assert [line.get("message") for line in lines] == [None, "CLOCK", "DATA", "CLOCK_REPLY", None, "DATA", "NAK", None]
     assert lines[2]["fields"]["on_us"] == [4] * 20
-    assert [line["again"] for line in lines if "again" in line] == [False, True]
+    assert [line["retransmitted"] for line in lines if "retransmitted" in line] == [False, True]
     assert last["totals"]["frames_to_board"] == 3
-    assert last["totals"]["began_unix_s"] > 1e9
+    assert last["totals"]["start_unix_s"] > 1e9
 
 
-def test_bad_input_is_one_line(tape, tmp_path, capsys):
+def test_bad_input_is_one_line(capture, tmp_path, capsys):
     assert run(["wire", "dump", str(tmp_path / "none")]) == 2
-    assert run(["wire", "replay", tape, "--board", "/dev/none", "--seed", "1"]) == 2
-    assert run(["wire", "replay", tape, "--board", "/dev/none"]) == 2
+    assert run(["wire", "replay", capture, "--board", "/dev/none", "--seed", "1"]) == 2
+    assert run(["wire", "replay", capture, "--board", "/dev/none"]) == 2
     errors = capsys.readouterr().err.splitlines()
     assert len(errors) == 3
     assert "simulated" in errors[1]
     assert "serial port that exists" in errors[2]
 
 
-def test_replay_tells_where_a_board_differs(tape, capsys):
-    assert run(["wire", "replay", tape, "--board", "simulated"]) == 0, "nothing was told, nothing differs"
+def test_replay_reports_where_a_board_differs(capture, capsys):
+    assert run(["wire", "replay", capture, "--board", "simulated"]) == 0, "no state was captured, none differs"
     assert capsys.readouterr().out.startswith("same\n")

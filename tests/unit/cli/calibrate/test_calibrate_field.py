@@ -148,7 +148,7 @@ def test_wrong_spots_end_with_one_line_and_status_2(tmp_path, capsys, case):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("x_m,y_m\n0.01,0\n0.2,0\n", "row 3: got '0.2, 0 m', expected a place that a code leads to"),
+        ("x_m,y_m\n0.01,0\n0.2,0\n", "row 3: got '0.2, 0 m', expected a position that a code reaches"),
         ("x_code,y_code\n1,2\n", "first line"),
         ("x_m,y_m\n0.01,0,0\n", "row 2"),
         ("x_m,y_m\n0.01,inf\n", "row 2: y_m: got inf"),
@@ -166,7 +166,7 @@ def test_places_where_nothing_was_calibrated_are_counted(folder, capsys):
     (folder / "far.csv").write_text("x_m,y_m\n0.0,0.0\n0.06,0.0\n")
     arguments = ["field", "--calibration", f"{folder}/field.toml", "--points", f"{folder}/far.csv"]
     assert run([*arguments, "--out", f"{folder}/far-codes.csv"]) == 0
-    assert "1 points lie where nothing was calibrated" in capsys.readouterr().out
+    assert "1 points lie outside the calibrated region" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("command", ["plan", "simulate"])
