@@ -1,10 +1,13 @@
-"""The cache of machine code: what invalidates it, and what happens where the folder is not writable."""
+"""The cache of machine code: what invalidates it, and what happens if its folder is not writable."""
 
 import os
 import subprocess
 import sys
+from types import ModuleType
 
 import pytest
+
+from optodrive.core.kernels import code_stamp
 
 IS_COLD = (
     "import optodrive.planning.limiter.pulse_application, optodrive.core.kernels as c;"
@@ -13,100 +16,118 @@ IS_COLD = (
 OTHER = """
 from typing import NamedTuple
 
-from optodrive.core.kernels import kernel
-
 FACTOR = 2.0
+TABLE = (1.0, 2.0)
+
+
+class Inner(NamedTuple):
+    third: float
 
 
 class Pair(NamedTuple):
     first: float
     second: float
+    inner: Inner
 
 
-@kernel
 def scale(x: float) -> float:
-    return FACTOR * x
+    return FACTOR * x + TABLE[0]
 """
 KERNEL = '''
-import other
-from optodrive.core.kernels import kernel
-from other import Pair, scale
+from {other} import Pair, scale
 
 
-@kernel
 def total(pair: Pair) -> float:
     """Return the sum."""
     return scale(pair.first) + later(pair.second)
 
 
-@kernel
-def later(x: float) -> float:
-    return x + 1.0
-
-
-print(total(Pair(2.0, 5.0)), sum(total.stats.cache_hits.values()))
+def later(x: float, offset: float = 0.0) -> float:
+    return x + 1.0 + offset
 '''
 
 
-def print_state(folder):
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder)}
-    command = [sys.executable, "-c", IS_COLD]
+def stamp(other=OTHER, kernel=KERNEL):
+    """Stamp of `total` in two modules made of these sources."""
+    for name, source in (("kernel_other", other), ("kernel_main", kernel.replace("{other}", "kernel_other"))):
+        sys.modules[name] = ModuleType(name)
+        exec(source, vars(sys.modules[name]))
+    return code_stamp(sys.modules["kernel_main"].total)
+
+
+def test_comments_and_docstrings_keep_the_stamp():
+    commented = KERNEL.replace("Return the sum.", "Return the sum of both.").replace("from {", "# why\nfrom {")
+    assert stamp(f"# a comment\n{OTHER}", commented) == stamp()
+
+
+@pytest.mark.parametrize(
+    ("other", "kernel"),
+    [
+        (OTHER.replace("FACTOR = 2.0", "FACTOR = 3.0"), KERNEL),
+        (OTHER.replace("(1.0, 2.0)", "(1.5, 2.0)"), KERNEL),
+        (OTHER.replace("FACTOR * x", "FACTOR * x + 1.0"), KERNEL),
+        (OTHER.replace("first: float\n    second: float", "second: float\n    first: float"), KERNEL),
+        (OTHER.replace("third", "fourth"), KERNEL),
+        (OTHER, KERNEL.replace("x + 1.0", "x + 2.0")),
+        (OTHER, KERNEL.replace("offset: float = 0.0", "offset: float = 0.5")),
+        (OTHER, KERNEL.replace("later(pair.second)", "pair.second")),
+    ],
+    ids=[
+        "constant of another module",
+        "constant in a tuple",
+        "callee of another module",
+        "order of fields",
+        "nested named tuple",
+        "callee defined later",
+        "default of a callee",
+        "own code",
+    ],
+)
+def test_everything_that_a_kernel_refers_to_changes_its_stamp(other, kernel):
+    assert stamp(other, kernel) != stamp()
+
+
+def test_a_constant_read_through_a_module_of_the_package_changes_the_stamp(monkeypatch):
+    kernel = "from optodrive.core import units\n\n\ndef total(x: float) -> float:\n    return units.FACTOR * x\n"
+    monkeypatch.setattr("optodrive.core.units.FACTOR", 1.0, raising=False)
+    before = stamp(kernel=kernel)
+    monkeypatch.setattr("optodrive.core.units.FACTOR", 2.0, raising=False)
+    assert stamp(kernel=kernel) != before
+
+
+RUN = """
+import sys
+sys.path.insert(0, {folder!r})
+from optodrive.core import kernels
+import main
+total = kernels.kernel(main.total)
+print(total(3.0), sum(total.stats.cache_hits.values()))
+"""
+
+
+def run_python(code, folder):
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder), "PYTHONDONTWRITEBYTECODE": "1"}
+    command = [sys.executable, "-c", code]
     return subprocess.run(
         command, env=environment, capture_output=True, text=True, check=True, timeout=60
     ).stdout.split()
 
 
+def test_machine_code_is_loaded_until_the_kernel_changes(tmp_path):
+    source = tmp_path / "main.py"
+    code = RUN.format(folder=str(tmp_path))
+    source.write_text("def total(x: float) -> float:\n    return 2.0 * x\n")
+    assert run_python(code, tmp_path / "cache") == ["6.0", "0"]
+    source.write_text('def total(x: float) -> float:\n    """Comment."""\n    return 2.0 * x\n')
+    assert run_python(code, tmp_path / "cache") == ["6.0", "1"]
+    source.write_text("def total(x: float) -> float:\n    return 5.0 * x\n")
+    assert run_python(code, tmp_path / "cache") == ["15.0", "0"]
+
+
 def test_an_empty_folder_is_cold(tmp_path):
-    assert print_state(tmp_path) == ["True", "True", str(tmp_path)]
+    assert run_python(IS_COLD, tmp_path) == ["True", "True", str(tmp_path)]
 
 
 def test_without_a_writable_folder_nothing_is_cached():
-    is_cold, cached, _ = print_state("/proc/self/nowhere")
+    is_cold, cached, _ = run_python(IS_COLD, "/proc/self/nowhere")
     assert (is_cold, cached) == ("True", "False")
-
-
-def run_kernel(folder, other, kernel):
-    """Value of the kernel, and the number of its signatures that came from the cache."""
-    (folder / "other.py").write_text(other)
-    (folder / "main.py").write_text(kernel)
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, str(folder / "main.py")]
-    value, hits = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True, timeout=60
-    ).stdout.split()
-    return float(value), int(hits)
-
-
-@pytest.fixture
-def folder(tmp_path):
-    assert run_kernel(tmp_path, OTHER, KERNEL) == (10.0, 0)
-    assert run_kernel(tmp_path, OTHER, KERNEL) == (10.0, 1)
-    return tmp_path
-
-
-def test_comments_and_docstrings_keep_the_machine_code(folder):
-    commented = KERNEL.replace("Return the sum.", "Return the sum of both.").replace(
-        "import other", "# why\nimport other"
-    )
-    assert run_kernel(folder, f"# a comment\n{OTHER}", commented) == (10.0, 1)
-
-
-@pytest.mark.parametrize(
-    ("other", "kernel", "value"),
-    [
-        (OTHER.replace("2.0", "3.0"), KERNEL, 12.0),
-        (OTHER.replace("FACTOR * x", "FACTOR * x + 1.0"), KERNEL, 11.0),
-        (OTHER.replace("first: float\n    second: float", "second: float\n    first: float"), KERNEL, 13.0),
-        (OTHER, KERNEL.replace("x + 1.0", "x + 2.0"), 11.0),
-        (OTHER, KERNEL.replace("later(pair.second)", "pair.second"), 9.0),
-    ],
-    ids=["constant of another file", "callee of another file", "order of fields", "later callee", "own code"],
-)
-def test_whatever_the_kernel_refers_to_invalidates_it(folder, other, kernel, value):
-    assert run_kernel(folder, other, kernel) == (value, 0)
-
-
-def test_a_constant_read_through_a_module_invalidates_the_kernel(folder):
-    kernel = KERNEL.replace("scale(pair.first)", "other.FACTOR * pair.first")
-    assert run_kernel(folder, OTHER, kernel) == (10.0, 0)
-    assert run_kernel(folder, OTHER, kernel) == (10.0, 1)
