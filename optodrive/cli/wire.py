@@ -122,7 +122,7 @@ def replay(
         print_json(verdict)
     else:
         _print_verdict(verdict, result)
-    if not verdict["same"]:
+    if not verdict["identical"]:
         raise typer.Exit(1)
 
 
@@ -150,14 +150,14 @@ def _run_replay(file: Path, board: str, seed: int | None, limits: Path | None, b
 
 def _print_verdict(verdict: dict[str, Any], result: "Replay") -> None:
     states, executed = verdict["states"], verdict["executed"]
-    print("same" if verdict["same"] else "not the same")
+    print("identical" if verdict["identical"] else "different")
     print(f"states           {states['recorded']} recorded, {states['replayed']} replayed")
     if states["first_difference"] is not None:
         at = states["first_difference"]
         recorded, replayed = (_format_state(account.states, at) for account in (result.recorded, result.replayed))
         print(f"first difference state {at + 1}: recorded {recorded}, replayed {replayed}")
-    counts = ", ".join(f"{executed[name]} {name}" for name in ("recorded", "replayed", "missing", "changed", "moved"))
-    print(f"points executed  {counts}, by {executed['largest_move_ticks']} ticks at most")
+    counts = ", ".join(f"{executed[name]} {name}" for name in ("recorded", "replayed", "missing", "changed", "shifted"))
+    print(f"points executed  {counts}, by {executed['largest_shift_ticks']} ticks at most")
 
 
 def _format_state(states: list[tuple[str, str, str]], at: int) -> str:

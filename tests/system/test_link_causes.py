@@ -43,7 +43,7 @@ def test_a_board_whose_process_is_killed_is_gone_and_a_timing_error_was_known_be
     plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
     wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
     board.process.kill()
-    cause = told(daemon, "is gone")
+    cause = told(daemon, "is missing")
     assert str(board.port) in cause
     failed = daemon.finished(plan)
     assert failed["status"] == "failed"
@@ -57,7 +57,7 @@ def test_a_pty_that_closes_and_a_board_that_was_reset(make_board, make_daemon):
     board = make_board(script=script)
     daemon = make_daemon(board)
     plan = play(daemon, 30.0)
-    told(daemon, "is there again: replugged")
+    told(daemon, "is available again: replugged")
     # When the plan failed the port was either gone for a moment, or there again already.
     assert f"likely cause: {board.port}" in daemon.finished(plan)["error"]
     wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link")
@@ -82,7 +82,7 @@ def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_
     daemon.process.send_signal(signal.SIGSTOP)
     wait_for(lambda: board.of("fault"), "the lease to lapse")
     daemon.process.send_signal(signal.SIGCONT)
-    cause = told(daemon, "this computer stood still")
+    cause = told(daemon, "this computer stalled")
     failed = daemon.finished(plan)
     assert cause in failed["error"]
     assert "FAULT (LINK: this computer" in failed["error"]
@@ -122,7 +122,7 @@ def replay(*arguments):
     run = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert run.returncode in (0, 1), run.stderr
     verdict = json.loads(run.stdout)
-    assert run.returncode == (not verdict["same"])
+    assert run.returncode == (not verdict["identical"])
     return verdict
 
 
@@ -137,12 +137,12 @@ def test_a_recorded_session_is_replayed_into_a_simulated_board_and_does_not_arm_
     daemon.stop()
     own = ("--limits", tmp_path / "first" / "board--limits.toml")
     verdict = replay(tape, "--board", "simulated", "--seed", "7", *own)
-    assert verdict["same"], verdict
+    assert verdict["identical"], verdict
     assert verdict["executed"]["recorded"] >= 15
-    assert not replay(tape, "--board", "simulated", *own)["same"]
+    assert not replay(tape, "--board", "simulated", *own)["identical"]
     board = seeded(tmp_path / "second")
     verdict = replay(tape, "--board", str(board.port))
-    assert not verdict["same"]
+    assert not verdict["identical"]
     assert verdict["executed"]["replayed"] == 0
     assert "ARMED" not in [event["state"] for event in board.of("state")]
     assert not board.of("gate")

@@ -1,1 +1,1 @@
-"""The host's session with a board: handshake, arming, credits, lease, clock, faults."""
+"""Host session with a board: handshake, arming, flow control, lease, clock and faults."""

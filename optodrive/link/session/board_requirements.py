@@ -1,4 +1,4 @@
-"""What a configuration asks of a board: limits it is told to tighten to, and what it must be able to do."""
+"""Requirements of a configuration on a board: the limits it must tighten to and the capabilities it must have."""
 
 from dataclasses import dataclass
 from math import ceil
@@ -16,18 +16,21 @@ from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScal
 PROTOCOL_MAJOR = 1
 TICK_HZ = 1_000_000
 CAP_MARGIN = 1.05
-"""The board's caps lie this much above the limiter's: it is the second fence, not the first."""
+"""Ratio of the board's caps to the limiter's. The board is the second line of defence behind the limiter."""
 FIELD_MARGIN_CODES = 64
 FRAME_BYTES = 254
 MAX_IN_FLIGHT_S = 0.01
-"""Bytes on their way to the board never take longer than this, so that an ABORT is soon heard, and a lost frame costs
-few others that must be sent again behind it; the protocol allows twice as much."""
+"""Maximum transmission time of the bytes in flight. It bounds the delay of an ABORT and the cost of a retransmission.
+The protocol permits twice this time."""
 BITS_PER_BYTE = 10
 
 
 @dataclass(frozen=True)
 class BoardRequirements:
-    """Derived once from a configuration. margin_codes: so far beyond the outermost pixels the board is let go."""
+    """Requirements of one configuration.
+
+    margin_codes: DAC codes by which the permitted range extends beyond the outermost pixels
+    """
 
     config: Config
     scale: WireScale
@@ -35,7 +38,7 @@ class BoardRequirements:
 
     @classmethod
     def from_config(cls, config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> "BoardRequirements":
-        """Derive them; codes span the scanner's whole range."""
+        """Derive the requirements. The DAC codes span the whole range of the scanner."""
         scale = WireScale(
             rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
             full_power_w=config.laser.max_power_w,
@@ -45,21 +48,21 @@ class BoardRequirements:
 
     @property
     def lease_s(self) -> float:
-        """How long the board stays lit without hearing from the host, s."""
+        """Time for which the board may emit without a renewal by the host, s."""
         return self.config.board.lease_s
 
     @property
     def max_in_flight_bytes(self) -> int:
-        """Most bytes that may be unacknowledged on the link."""
+        """Maximum number of unacknowledged bytes on the link."""
         return max(2 * FRAME_BYTES, int(self.config.board.baud / BITS_PER_BYTE * MAX_IN_FLIGHT_S))
 
     @property
     def rto_s(self) -> float:
-        """When a frame without an answer is sent again, s: what is in flight must have had time to pass twice."""
+        """Retransmission timeout, s. It exceeds twice the transmission time of the bytes in flight."""
         return RTO_S + 2 * self.max_in_flight_bytes * BITS_PER_BYTE / self.config.board.baud
 
     def build_limits(self) -> m.Limits:
-        """The limits this host asks the board to tighten to."""
+        """Return the limits that the host requests."""
         limits, layout = self.config.limits, build_aim_layout(self.config)
         settle_us, settle_ns_per_code = self._compute_settling()
         angles_rad = load_scan_field(self.config).angles_rad(layout.x_m, layout.y_m)
@@ -82,31 +85,32 @@ class BoardRequirements:
         )
 
     def _compute_settling(self) -> tuple[int, int]:
-        """settle_us and settle_ns_per_code: the slew, and as much as never comes above the plan's own time of a move.
+        """Return settle_us and settle_ns_per_code, a line that nowhere exceeds the planned settling time.
 
-        Times jump where a longer move begins to overshoot; a steeper line would have to lie lower for the short ones.
+        Its slope is the slew rate. The planned time jumps where longer moves start to overshoot, so a steeper line
+        would have to start lower for short moves.
         """
         settling_table = build_settling_table(self.config)
         ns_per_code = int(self.scale.rad_per_code / self.config.scanner.slew_rad_per_s * 1e9)
         pitches = np.arange(1, len(settling_table.after_long_dwell[0]))
-        # A move may come out a code longer than planned.
+        # Quantisation may lengthen a move by one code.
         codes = np.floor(pitches * settling_table.pitch_rad / self.scale.rad_per_code).astype(np.int64) + 2
         times_us = np.minimum(*(np.array(table)[pitches] for table in settling_table.after_long_dwell))
         return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code
 
     def check_board(self, peer: m.HelloReply) -> None:
-        """Refuse a board that cannot do what the configuration plans with; InputError names key and value."""
+        """Raise InputError with key and value if the board cannot execute plans of this configuration."""
         config = self.config
         if peer.major != PROTOCOL_MAJOR:
             raise InputError("board protocol", f"{peer.major}.{peer.minor}", f"major version {PROTOCOL_MAJOR}", "board")
         if config.board.uid and peer.uid.hex() != config.board.uid.lower():
-            raise InputError("board.uid", peer.uid.hex(), f"{config.board.uid}, the board configured", "board")
+            raise InputError("board.uid", peer.uid.hex(), f"{config.board.uid}, the configured board", "board")
         if peer.tick_hz != TICK_HZ:
             raise InputError("board tick_hz", peer.tick_hz, f"{TICK_HZ}", "board")
         limits, requested = peer.limits, self.build_limits()
-        slower = "a slower servo: the board itself keeps the gate closed"
+        slower = "a slower servo: the board keeps the gate closed"
         if limits.settle_us > requested.settle_us:
-            expected = f"{slower} for {limits.settle_us} µs a move, the plan for {requested.settle_us} µs"
+            expected = f"{slower} for {limits.settle_us} µs per move, the plan for {requested.settle_us} µs"
             raise InputError("scanner.bandwidth_hz", config.scanner.bandwidth_hz, expected, "board")
         if limits.settle_ns_per_code > requested.settle_ns_per_code:
             expected = (
@@ -119,7 +123,7 @@ class BoardRequirements:
         if abs(limits.full_power_uw - requested.full_power_uw) > 0.01 * requested.full_power_uw:
             board_w = limits.full_power_uw * 1e-6
             raise InputError(
-                "laser.max_power_w", config.laser.max_power_w, f"{board_w:g}, what the board was set to", "board"
+                "laser.max_power_w", config.laser.max_power_w, f"{board_w:g}, the setting of the board", "board"
             )
         if limits.spot_uj < config.limits.pulse_energy_max_j * 1e6:
             max_j = limits.spot_uj * 1e-6

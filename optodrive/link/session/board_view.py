@@ -1,4 +1,4 @@
-"""What the host last heard of the board."""
+"""Latest state of the board as reported to the host."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -8,7 +8,7 @@ from optodrive.link.session.fault_hints import get_fault_hint
 
 @dataclass
 class BoardView:
-    """What the host last heard of the board."""
+    """Latest state of the board as reported to the host."""
 
     state: str = "UNKNOWN"
     fault: str = ""
@@ -26,5 +26,5 @@ class BoardView:
     firmware: int = 0
 
     def to_dict(self) -> dict[str, Any]:
-        """As REST answers it, with the fault's likely cause in plain words."""
+        """Return the fields of the REST response, with a hint on the fault's likely cause."""
         return {**asdict(self), "fault": self.fault or None, "hint": get_fault_hint(self.fault)}

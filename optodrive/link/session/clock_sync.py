@@ -1,34 +1,34 @@
-"""Board time on the host's clock: each exchange brackets a tick, the narrowest bracket of the last few counts."""
+"""Clock synchronisation: every exchange brackets a board tick, and the narrowest recent bracket is used."""
 
 SAMPLES_MAX = 16
 DRIFT_MAX = 2e-4
-"""Two crystals disagree by less than this; a bracket widens by it as it ages."""
+"""Maximum relative drift of two crystals. A bracket widens at this rate with age."""
 
 
 class ClockSync:
-    """Maps host seconds to board seconds (ticks over tick_hz); one thread adds, any may ask."""
+    """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read."""
 
     def __init__(self) -> None:
-        # Replaced, never changed: another thread may be walking through the samples.
+        # An immutable tuple, because another thread may be reading it.
         self._samples: tuple[tuple[float, float, float], ...] = ()
 
     def add(self, request_s: float, reply_s: float, board_s: float) -> None:
-        """Note an exchange: asked at sent_s, answered at received_s, the board read board_s in between."""
+        """Add an exchange: request at request_s, reply at reply_s, board clock board_s in between."""
         sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
         self._samples = (*self._samples[1 - SAMPLES_MAX :], sample)
 
     @property
     def is_synchronised(self) -> bool:
-        """Whether there was an exchange yet."""
+        """Whether at least one exchange has completed."""
         return bool(self._samples)
 
     @property
     def round_trip_s(self) -> float | None:
-        """The shortest round trip among the samples, s."""
+        """Shortest round trip of the recent samples, s, None without any."""
         return min((sample[0] for sample in self._samples), default=None)
 
     def board_s(self, host_s: float) -> float:
-        """The board's time at host_s, s; 0 before any exchange."""
+        """Return the board time at host time host_s, s, or 0 before the first exchange."""
         samples = self._samples
         if not samples:
             return 0.0

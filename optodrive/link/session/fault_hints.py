@@ -1,13 +1,13 @@
-"""What a board's fault means and what to do, in plain words."""
+"""Explanation of and remedy for each board fault."""
 
 FAULT_HINTS = {
-    "LINK": "the board heard no lease in time: the host stalled, or bytes were lost on the way",
-    "RANGE": "a point lay outside the field: the scanner's range in the configuration does not match the board's",
-    "ON_TIME": "a point, or several on one spot, kept the gate on longer than the board allows",
-    "DUTY": "a point asked for more duty than the board allows",
-    "MEAN_POWER": "the mean power of the last second passed the board's cap",
-    "SPOT": "one spot was given more energy than the board allows",
-    "UNDERRUN": "the queue ran empty three times in ten seconds: the host or the link is too slow",
+    "LINK": "the lease expired: the host stalled, or bytes were lost on the link",
+    "RANGE": "a point lay outside the field: the configured scanner range does not match the board's",
+    "ON_TIME": "one point, or several on one spot, kept the gate on longer than the board permits",
+    "DUTY": "a point requested more duty than the board permits",
+    "MEAN_POWER": "the mean power of the last second exceeded the board's cap",
+    "SPOT": "one spot received more energy than the board permits",
+    "UNDERRUN": "the queue ran empty three times within ten seconds: the host or the link is too slow",
     "INTERLOCK": "the interlock opened: close the enclosure, then acknowledge with disarm",
     "KEY": "the key was turned off: turn it on, then acknowledge with disarm",
     "ESTOP": "the emergency stop was pressed: release it, then acknowledge with disarm",
@@ -15,7 +15,7 @@ FAULT_HINTS = {
 
 
 def get_fault_hint(fault: str | None) -> str:
-    """A sentence on a fault's likely cause; says so where none is known."""
+    """Return the likely cause of a fault in one sentence, '' without a fault."""
     if not fault:
         return ""
-    return FAULT_HINTS.get(fault, "no likely cause is known; look at the board's log")
+    return FAULT_HINTS.get(fault, "no likely cause is known; see the board's log")

@@ -1,4 +1,4 @@
-"""Why a link went, or a lease lapsed: the likeliest cause in one plain sentence, with what to do."""
+"""Most likely cause of a lost link or an expired lease, in one sentence with a remedy."""
 
 from dataclasses import dataclass
 
@@ -6,22 +6,24 @@ from optodrive.link.protocol.describe import describe_reset_cause
 from optodrive.link.transport.port_state import PortState
 
 STALL_LEASE_FRACTION = 0.8
-"""The lease is renewed at a fifth of its length: a stall of the rest lets it lapse."""
+"""Stall, as a fraction of the lease, that lets it expire. The host renews it after a fifth of its length."""
 RESET_REMEDIES = {
-    "power-up": "its supply was switched off or unplugged; check plug and supply",
-    "reset": "its reset was pressed, or the debugger or USB reset it; arm again when that is over",
-    "brown-out": "its supply sagged; give board and laser a stronger supply, or separate ones",
-    "watchdog": "its firmware hung; update the firmware, and keep the capture of the link (serve --capture)",
+    "power-up": "its supply was switched off or unplugged; check the plug and the supply",
+    "reset": "a button, a debugger or USB reset it; arm it again afterwards",
+    "brown-out": "its supply voltage dropped; use a stronger supply, or separate ones for board and laser",
+    "watchdog": "its firmware hung; update it, and keep a capture of the link (serve --capture)",
 }
-NOISE_REMEDY = "check cable, plugs and grounding, keep the cable from the laser's and mirrors' drivers"
+NOISE_REMEDY = "check cable, plugs and grounding, keep the cable away from the drivers of laser and mirrors"
 
 
 @dataclass(frozen=True)
 class LinkEvidence:
-    """What is known when a link fails; counts and stall of the last seconds only.
+    """Evidence at the failure of a link. Counts and stall cover the last seconds only.
 
-    bad_here, bad_at_board: frames that arrived damaged; stall_s: the longest gap between turns of the host's loop
-    silent: nothing came for long, rather than an error of the port; planner_stuck: the lease was withheld
+    silent: whether the board stopped answering, rather than the port reporting an error
+    stall_s: longest time between two iterations of the host's loop
+    host_bad_frames, board_bad_frames: frames received damaged
+    planner_stalled: whether the lease was withheld because the planner made no progress
     """
 
     port: str
@@ -37,24 +39,23 @@ class LinkEvidence:
 
 
 def diagnose_port(port: str, state: PortState) -> str | None:
-    """A cause that the port alone tells; None where it is there and free."""
+    """Return a cause evident from the port alone, None if it is available."""
     if state.status == "missing":
-        others = (
-            f"; {', '.join(state.other_ports)} there instead, perhaps the same board: " if state.other_ports else "; "
-        )
+        others = ", ".join(state.other_ports)
+        found = f"; found {others} instead, possibly the same board: " if others else "; "
         return (
-            f"{port} is gone: unplugged, without power, or come back under another name{others}"
-            "check the plug, and name the port by /dev/serial/by-id"
+            f"{port} is missing: unplugged, without power, or reconnected under another name{found}"
+            "check the plug, and configure the port by its /dev/serial/by-id name"
         )
     if state.status == "denied":
-        return f"{port} may not be opened by this user: join its group (often dialout) and log in again"
+        return f"this user may not open {port}: join its group (often dialout) and log in again"
     if state.status == "in_use":
-        return f"{port} is held by {'; '.join(map(str, state.holders))}: end that program"
+        return f"{port} is in use by {'; '.join(map(str, state.holders))}: end that program"
     return None
 
 
 def diagnose_link_loss(evidence: LinkEvidence) -> str:
-    """Why the link was lost."""
+    """Return the likely cause of a lost link."""
     port_message = diagnose_port(evidence.port, evidence.port_state)
     if port_message is not None:
         return port_message
@@ -64,21 +65,21 @@ def diagnose_link_loss(evidence: LinkEvidence) -> str:
         _diagnose_host_stall(evidence)
         or _diagnose_corruption(evidence)
         or (
-            f"nothing comes from the board though {evidence.port} is open and nothing arrived damaged: "
-            "it hangs, restarts, has no power, or cannot read what reaches it; look at supply, lamps and cable"
+            f"the board does not answer although {evidence.port} is open and no frame arrived damaged: it hangs, "
+            "restarts, has no power, or receives only damaged frames; check its supply, indicators and cable"
         )
     )
 
 
 def diagnose_lease_expiry(evidence: LinkEvidence) -> str:
-    """Why the board heard no lease in time while the link stood."""
+    """Return the likely cause of an expired lease while the link was up."""
     return (
         _diagnose_host_stall(evidence)
         or _diagnose_planner_stall(evidence)
         or _diagnose_corruption(evidence)
         or (
-            "the host kept its time and nothing arrived damaged: bytes were held up on the way; "
-            "use a port of its own rather than a hub, and run `optodrive doctor`"
+            "the host was on time and no frame arrived damaged: bytes were delayed on the link; "
+            "use a dedicated port instead of a hub, and run `optodrive doctor`"
         )
     )
 
@@ -87,7 +88,7 @@ def _diagnose_host_stall(evidence: LinkEvidence) -> str | None:
     if evidence.stall_s < STALL_LEASE_FRACTION * evidence.lease_s:
         return None
     return (
-        f"this computer stood still for {evidence.stall_s * 1e3:.0f} ms, the lease is {evidence.lease_s * 1e3:.0f} ms: "
+        f"this computer stalled for {evidence.stall_s * 1e3:.0f} ms, the lease is {evidence.lease_s * 1e3:.0f} ms: "
         "suspended, swapping or overloaded; end other work on it, and run `optodrive doctor`"
     )
 
@@ -95,36 +96,38 @@ def _diagnose_host_stall(evidence: LinkEvidence) -> str | None:
 def _diagnose_planner_stall(evidence: LinkEvidence) -> str | None:
     if not evidence.planner_stalled:
         return None
-    return "the planner made no progress and the lease was withheld: send smaller plans, or look at the last one"
+    return "the planner made no progress and the lease was withheld: submit smaller plans, or check the last one"
 
 
 def _diagnose_corruption(evidence: LinkEvidence) -> str | None:
     bad_frames = evidence.host_bad_frames + evidence.board_bad_frames
     if bad_frames:
         return (
-            f"bytes arrive damaged ({evidence.host_bad_frames} bad frames here, {evidence.board_bad_frames} at the board "
-            f"in the last seconds): {NOISE_REMEDY}, and compare board.baud"
+            f"bytes arrive damaged ({evidence.host_bad_frames} bad frames at the host, "
+            f"{evidence.board_bad_frames} at the board in the last seconds): {NOISE_REMEDY}, and check board.baud"
         )
     if evidence.naks or evidence.retransmitted:
         return (
-            f"bytes are lost on the way ({evidence.retransmitted} frames sent again, {evidence.naks} refused): "
-            "a hub or a converter cannot keep up; use a port of its own, or a lower board.baud"
+            f"bytes are lost on the link ({evidence.retransmitted} frames retransmitted, {evidence.naks} refused): "
+            "a hub or a converter is too slow; use a dedicated port, or a lower board.baud"
         )
     return None
 
 
 def describe_replug(port: str) -> str:
-    """A port that failed and can be opened again, on a board that did not restart."""
-    return f"{port} went away and is there again: replugged, or a hub's fault; check the plug, the cable and the hub"
+    """Return the cause for a port that failed and opened again while the board did not restart."""
+    return (
+        f"{port} was missing and is available again: replugged, or a hub failed; check the plug, the cable and the hub"
+    )
 
 
 def describe_receive_errors(board_bad_frames: int) -> str:
-    """What a board says that fell silent, did not restart, and counted damaged frames meanwhile."""
-    return f"what was sent reached the board damaged ({board_bad_frames} bad frames there): {NOISE_REMEDY}"
+    """Return the cause for a board that did not answer, did not restart and counted damaged frames meanwhile."""
+    return f"bytes reached the board damaged ({board_bad_frames} bad frames there): {NOISE_REMEDY}"
 
 
 def describe_restart(cause_code: int, uptime_s: float) -> str:
-    """What a board says that was started anew while the link was down."""
+    """Return the cause for a board that restarted while the link was down."""
     cause_text = describe_reset_cause(cause_code)
-    remedy = RESET_REMEDIES.get(cause_text, "look at its log")
+    remedy = RESET_REMEDIES.get(cause_text, "see its log")
     return f"the board restarted {uptime_s:.1f} s before it answered again ({cause_text}): {remedy}"

@@ -1,4 +1,4 @@
-"""Watches a link and the loop that serves it, and says what likely went wrong when something did."""
+"""Monitor of a link and its service loop that determines the likely cause of a failure."""
 
 from collections import deque
 from typing import NamedTuple
@@ -15,12 +15,12 @@ from optodrive.link.session.likely_cause import (
 from optodrive.link.transport.port_state import PortState, read_port_state
 
 EVIDENCE_WINDOW_S = 5.0
-"""What happened longer ago explains nothing."""
+"""Only events of this last period count as evidence."""
 SAMPLE_INTERVAL_S = 0.5
 
 
 class LinkErrorCounts(NamedTuple):
-    """Counters of the link since it was opened."""
+    """Error counts of a link since it was opened."""
 
     host_bad_frames: int = 0
     board_bad_frames: int = 0
@@ -29,14 +29,14 @@ class LinkErrorCounts(NamedTuple):
 
 
 class LinkCause(NamedTuple):
-    """A sentence, and when what it explains was noticed, host time in s."""
+    """Likely cause in one sentence, and the host time at which the failure was noticed, s."""
 
     message: str
     noticed_s: float
 
 
 class LinkWatch:
-    """One link's; the loop that owns the session calls it, any thread may read `cause` and `longest_gap_s`."""
+    """Monitor of one link. The session's loop calls it. Any thread may read `cause` and `longest_stall_s`."""
 
     def __init__(self, port: str, lease_s: float) -> None:
         self.cause: LinkCause | None = None
@@ -54,12 +54,12 @@ class LinkWatch:
         self._port_missing = False
 
     def on_opened(self) -> None:
-        """The counters begin anew, and connecting was no turn of the loop."""
+        """Reset the counters after the link was opened. The time for connecting is no stall."""
         self._samples.clear()
         self._counts, self._last_loop_s, self._fault = LinkErrorCounts(), None, ""
 
     def on_loop(self, now_s: float, may_renew_lease: bool, counts: LinkErrorCounts) -> None:
-        """The loop is about to serve the link. lease: whether it may renew the lease."""
+        """Record one loop iteration. may_renew_lease: whether the planner permits a renewal."""
         self._record_stall(now_s)
         self._last_loop_s = now_s
         if not may_renew_lease:
@@ -79,10 +79,10 @@ class LinkWatch:
             self._stall_s, self._stall_at_s = stall_s, now_s
 
     def on_status(self, fault: str, now_s: float, counts: LinkErrorCounts) -> None:
-        """The board told its fault, '' where it has none."""
-        # A board that was found in this fault has it from another time, of which nothing is known here.
+        """Record the board's fault, '' for none, and explain an expired lease."""
+        # A fault that was present before the first iteration is from an unobserved time.
         if fault == "LINK" and self._fault != fault and self._last_loop_s is not None:
-            self._record_stall(now_s)  # it may have stood still within this very turn, waiting for these bytes
+            self._record_stall(now_s)  # the stall may lie within this iteration
             self._counts = counts
             self.cause = LinkCause(
                 diagnose_lease_expiry(self._collect_evidence(now_s, PortState("available"), silent=False)), now_s
@@ -90,7 +90,11 @@ class LinkWatch:
         self._fault = fault
 
     def on_lost(self, now_s: float, last_received_s: float, silent: bool) -> LinkCause:
-        """The link was given up; why, likely. heard_s: when the board was last heard; silent: that was why."""
+        """Return the likely cause of a lost link.
+
+        last_received_s: time of the last message from the board
+        silent: whether the link was closed because the board did not answer
+        """
         self._last_received_s = last_received_s
         self._board_bad_frames = self._counts.board_bad_frames if silent else None
         state = read_port_state(self._port)
@@ -99,7 +103,7 @@ class LinkWatch:
         return self.cause
 
     def on_reconnect_failed(self, now_s: float) -> None:
-        """The link could not be opened again: the port may tell why."""
+        """Update the cause from the port's state after a failed attempt to reconnect."""
         state = read_port_state(self._port)
         self._port_missing = self._port_missing or state.status == "missing"
         message = diagnose_port(self._port, state)
@@ -107,7 +111,10 @@ class LinkWatch:
             self.cause = LinkCause(message, now_s)
 
     def on_reconnected(self, now_s: float, reset_code: int, uptime_s: float, counts: LinkErrorCounts) -> None:
-        """The link is open again; a board younger than the last word heard of it has restarted."""
+        """Update the cause after the link was reopened.
+
+        The board has restarted if its uptime is shorter than the time since its last message.
+        """
         if self._last_received_s is not None and uptime_s < now_s - self._last_received_s:
             self.cause = LinkCause(describe_restart(reset_code, uptime_s), now_s)
         elif self._board_bad_frames is not None and counts.board_bad_frames > self._board_bad_frames:

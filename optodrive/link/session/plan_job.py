@@ -1,4 +1,4 @@
-"""One plan on its way through the board: what was sent, what came back as executed."""
+"""Job: the points of one plan, how many were sent, and what the board reported as executed."""
 
 from math import inf
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from optodrive.link.protocol.quantisation import WirePoints
 
 
 class ReportedPulses(NamedTuple):
-    """Pulses as executed, all [n]: row of the plan, tick of gate on, ticks of gate on, duty in 1/65535."""
+    """Executed pulses, all [n]: plan row, tick of gate on, gate-on time in ticks, duty in 1/65535."""
 
     row: IntArray
     on_tick: IntArray
@@ -21,9 +21,12 @@ class ReportedPulses(NamedTuple):
 
 
 class PlanJob:
-    """Points of one plan. start_tick: the board tick of the plan's zero; indices count over the session.
+    """Points of one plan on their way through the board.
 
-    ahead_ticks: points leave no longer before they begin; left_tick: when the first one did.
+    first_index, next_to_send: point indices, which count over the session
+    start_tick: board tick of the plan's zero
+    send_ahead_ticks: maximum time from sending a point to its start
+    first_sent_tick: board tick at which the first point was sent
     """
 
     def __init__(
@@ -47,36 +50,36 @@ class PlanJob:
 
     @property
     def end_index(self) -> int:
-        """The index after the last point."""
+        """Index after the last point."""
         return self.first_index + self._count
 
     def end_tick_after(self, count: int) -> int:
-        """When the first `count` points are done, if nothing is late."""
+        """Return the scheduled end tick of the first `count` points."""
         return int(self._end_tick[count - 1]) if count else self.start_tick
 
     def delay(self, ticks: int) -> None:
-        """What came before it was late: its zero lies so much later."""
+        """Shift the plan's zero because an earlier job was late."""
         self.start_tick += ticks
         self._end_tick += ticks
 
     @property
     def is_fully_sent(self) -> bool:
-        """Whether nothing of it is left to send."""
+        """Whether all points were sent."""
         return self.next_to_send == self.end_index
 
     def count_sendable(self, now_tick: float) -> int:
-        """How many points may leave now."""
+        """Return the number of points that may be sent now."""
         position = self.next_to_send - self.first_index
         if self._send_ahead_ticks == inf:
             return self._count - position
-        # A point begins where the one before it ends.
+        # A point starts at the end of its predecessor.
         due_count = (
             int(np.searchsorted(self._end_tick[: self._count], now_tick + self._send_ahead_ticks, side="right")) + 1
         )
         return max(0, min(due_count, self._count) - position)
 
     def take_payload(self, count: int, now_tick: float) -> bytes:
-        """The bytes of the next points, which thereby count as sent."""
+        """Return the bytes of the next points and mark them as sent."""
         if self.first_sent_tick is None:
             self.first_sent_tick = now_tick
         position = self.next_to_send - self.first_index
@@ -84,14 +87,14 @@ class PlanJob:
         return self._points.encode_payload(position, count)
 
     def truncate(self, kept_points: int) -> bool:
-        """End after `keep` points; False, and unchanged, where more were sent."""
+        """Truncate the job to `kept_points` points. Return False, unchanged, if more were sent."""
         if self.first_index + kept_points < self.next_to_send:
             return False
         self._count = min(kept_points, self._count)
         return True
 
     def record_executed(self, message: Executed) -> None:
-        """Take over what the board reports; reports of other jobs and repeated ones change nothing."""
+        """Record the board's report. Reports of other jobs and repeated reports have no effect."""
         first = message.first_index - self.first_index
         for offset, (on_tick, on_ticks, duty) in enumerate(message.records):
             position = first + offset
@@ -104,41 +107,41 @@ class PlanJob:
 
     @property
     def first_unreported(self) -> int | None:
-        """The first index not yet reported, None when all are."""
+        """First index not yet reported, None if all are."""
         return None if self._reported_count == self._count else self.first_index + self._reported_count
 
     @property
     def sent_count(self) -> int:
-        """Pulses of the plan handed to the link so far."""
+        """Number of pulses sent so far."""
         return int(np.searchsorted(self._pulse_points, self.next_to_send - self.first_index))
 
     @property
     def executed_count(self) -> int:
-        """Pulses of the plan reported as executed, without a gap from the first."""
+        """Number of pulses reported as executed, without a gap from the first."""
         return int(np.searchsorted(self._pulse_points, self._reported_count))
 
     def list_executed_rows(self) -> IntArray:
-        """Rows of the plan reported as executed, in order."""
+        """Return the plan rows reported as executed, in order."""
         return self._row[self._pulse_points[self._on_tick[self._pulse_points] >= 0]]
 
     @property
     def pulse_count(self) -> int:
-        """Pulses of the plan among its points."""
+        """Number of pulses among the points."""
         return len(self._pulse_points)
 
     def read_reported(self, begin: int, end: int) -> ReportedPulses:
-        """What came back so far of the pulses begin to end, counted in order of its points; any thread may ask."""
+        """Return the reports so far of pulses begin to end, in order of the points. Any thread may call it."""
         pulse_points = self._pulse_points[begin:end]
         done = pulse_points[self._on_tick[pulse_points] >= 0]
         return ReportedPulses(self._row[done], self._on_tick[done], self._on_ticks[done], self._duty[done])
 
     @property
     def is_finished(self) -> bool:
-        """Whether every point was sent, and reported as executed."""
+        """Whether every point was sent and reported as executed."""
         return self.is_fully_sent and self.first_unreported is None
 
     def build_executed(self, plan: PulsePlan, full_power_w: float, tick_s: float) -> ExecutedPulses:
-        """What the board says it did, as pulses of the plan; complete: all of it, but for what was cut away."""
+        """Return the reported pulses of `plan`. They are complete if none is missing from the untruncated part."""
         done = self._pulse_points[self._on_tick[self._pulse_points] >= 0]
         row = self.list_executed_rows()
         on_tick, width_ticks = self._on_tick[done], self._on_ticks[done]

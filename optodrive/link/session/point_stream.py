@@ -1,6 +1,6 @@
-"""Points on their way to the board: jobs one after the other, the last of which another may still cut short and follow.
+"""Stream of points to the board: consecutive jobs, of which a newer one may truncate and follow the last.
 
-What has left is never taken back; what has not may give way to a newer plan, without a pause between them.
+Sent points are final. Points not yet sent may be replaced by a newer plan without a pause.
 """
 
 from collections import deque
@@ -16,7 +16,10 @@ WATERMARK_POINTS = 48
 
 
 class PointStream:
-    """Jobs in order; the board knows them as one, from START to END. Indices count over the session."""
+    """Jobs in order of execution.
+
+    The board treats consecutive jobs as one, from START to END. Point indices count over the session.
+    """
 
     def __init__(self) -> None:
         self._jobs: deque[PlanJob] = deque()
@@ -30,11 +33,14 @@ class PointStream:
         return bool(self._jobs)
 
     def reset_indices(self) -> None:
-        """A new session: the board counts from 0 again."""
+        """Restart the point indices at 0 for a new session."""
         self._next_index = self._sent_index = 0
 
     def begin(self, points: WirePoints, start_tick: int, send_ahead_ticks: float = inf) -> PlanJob:
-        """A job whose zero is at the board's start_tick. ahead_ticks: points leave no longer before they begin."""
+        """Start a job whose zero is board tick start_tick.
+
+        send_ahead_ticks: maximum time from sending a point to its start
+        """
         self._number += 1
         self._started = self._end_sent = False
         return self._append(points, start_tick, send_ahead_ticks)
@@ -42,9 +48,10 @@ class PointStream:
     def splice(
         self, points: WirePoints, kept_points: int, send_ahead_ticks: float, min_end_tick: float
     ) -> PlanJob | None:
-        """Cut the last job after `keep` points and go on with others at once.
+        """Truncate the last job to `kept_points` points and append others without a pause.
 
-        None where more has left already, or `keep` points end before soonest_tick and the board might run dry.
+        Return None if more points were sent, or if the kept points end before min_end_tick, where the board might run
+        out of points.
         """
         last = self._jobs[-1] if self._jobs else None
         if (
@@ -57,7 +64,7 @@ class PointStream:
         return self._append(points, last.end_tick_after(kept_points), send_ahead_ticks)
 
     def truncate(self, kept_points: int) -> bool:
-        """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
+        """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
         if not self._jobs or self._end_sent or not self._jobs[-1].truncate(kept_points):
             return False
         self._next_index = self._jobs[-1].end_index
@@ -70,17 +77,17 @@ class PointStream:
         return job
 
     def clear(self) -> None:
-        """Forget what has not left; the jobs themselves keep what is known of them."""
+        """Drop all points not yet sent, and all jobs. The job objects keep their reports."""
         self._next_index = self._sent_index
         self._jobs.clear()
 
     def record_executed(self, message: m.Executed) -> None:
-        """Take over what the board reports."""
+        """Record the board's report of executed points."""
         for job in self._jobs:
             job.record_executed(message)
 
     def send(self, link: HostConnection, done_index: int, queue_points: int, now_tick: float) -> None:
-        """Hand the link what may leave now: points as far as the board has room, START, END."""
+        """Send the points that are due and that the board has room for, START and END."""
         for job in self._jobs:
             while link.outstanding < link.window:
                 free_points = queue_points - (job.next_to_send - max(self._jobs[0].first_index, done_index))
@@ -103,7 +110,7 @@ class PointStream:
             self._started = True
 
     def request_missing_reports(self, link: HostConnection, done_index: int, now_s: float) -> None:
-        """Ask again for reports that were lost: the board has done more than it was heard to say."""
+        """Request lost reports again if the board has executed more points than it reported."""
         missing = next((job.first_unreported for job in self._jobs if job.first_unreported is not None), None)
         if missing is None or missing >= done_index or now_s - self._reports_requested_s < MISSING_REPORT_RETRY_S:
             return
@@ -111,6 +118,6 @@ class PointStream:
         link.send(m.GetExecuted(first_index=missing))
 
     def drop_finished(self, armed: bool) -> None:
-        """Drop jobs of which everything is known; the last one only when the board has ended it too."""
+        """Drop completely reported jobs, the last one only after the board has ended it."""
         while self._jobs and self._jobs[0].is_finished and (len(self._jobs) > 1 or (self._end_sent and armed)):
             self._jobs.popleft()

@@ -1,7 +1,7 @@
-"""A recorded session once more: the host's bytes at their times to a board, and whether it did the same.
+"""Replay of a captured session to a board, and comparison of the board's behaviour.
 
-Replaying never arms by itself: a challenge is answered with the recorded nonces, which no other challenge accepts. A
-board that makes the same nonces again (simulated, with the recorded one's seed) is the only one that arms.
+A replay cannot arm a real board: it answers a challenge with the captured nonces, which no new challenge accepts. Only
+a simulated board with the captured board's seed repeats its nonces and can be armed.
 """
 
 from collections.abc import Iterable
@@ -19,16 +19,17 @@ from optodrive.link.transport.link_capture import CLOSED, FROM_BOARD, OPENED, TO
 
 READ_MAX_S = 0.05
 SLEEP_BELOW_S = 0.999_999e-4
-"""What is left of a wait below this is slept: reading would take longer."""
+"""Remaining waits below this time are slept, because a read would take longer."""
 HELLO_TIMEOUT_S = 1.0
 DRAIN_S = 0.5
 
 
 @dataclass
 class BoardTrace:
-    """What a board told of itself. states: (state, fault, reason) in order.
+    """Reports of a board over a capture.
 
-    executed: (gate on in ticks, gate-on ticks, duty) by (session, counted from 1, and point index)
+    states: (state, fault, reason) in order
+    executed: (tick of gate on, gate-on ticks, duty) by (number of the session from 1, point index)
     """
 
     states: list[tuple[str, str, str]] = field(default_factory=list)
@@ -38,7 +39,7 @@ class BoardTrace:
     transcript: Transcript = field(default_factory=Transcript)
 
     def feed(self, entry: CaptureEntry) -> None:
-        """Take in what passed."""
+        """Add an entry of a capture."""
         if entry.kind in (OPENED, CLOSED):
             self.transcript.reset_link()
             return
@@ -56,7 +57,7 @@ class BoardTrace:
 
 
 def clock_shift_s(entries: Iterable[CaptureEntry]) -> float:
-    """The board's time less the host's when recorded, s, from CLOCK and its replies; 0 where that agrees with them."""
+    """Return the captured board time minus host time, s, from CLOCK and its replies, 0 if consistent with them."""
     low_s, high_s = -inf, inf
     transcript, request_s = Transcript(), dict[int, float]()
     for entry in entries:
@@ -70,7 +71,7 @@ def clock_shift_s(entries: Iterable[CaptureEntry]) -> float:
                 board_s = line.message.tick * 1e-6
                 sent_s = request_s.pop(line.message.host_t)
                 if board_s - sent_s < low_s or board_s - line.host_s > high_s:
-                    return _choose_shift_s(low_s, high_s)  # the board started anew: what came before counts
+                    return _choose_shift_s(low_s, high_s)  # the board restarted: use the first run
                 low_s, high_s = max(low_s, board_s - line.host_s), min(high_s, board_s - sent_s)
     return _choose_shift_s(low_s, high_s)
 
@@ -80,9 +81,10 @@ def _choose_shift_s(low_s: float, high_s: float) -> float:
 
 
 class Replay:
-    """Sends a recording to a board. shift_s: the clock's time less the recorded one.
+    """Replay of a capture to a board.
 
-    may_arm: send ARM_CONFIRM too; only for a simulated board
+    shift_s: present time minus captured time
+    may_arm: whether to send ARM_CONFIRM; only for a simulated board
     """
 
     def __init__(self, transport: Transport, clock: Clock, shift_s: float, may_arm: bool) -> None:
@@ -94,7 +96,7 @@ class Replay:
         self._open = False
 
     def run(self, entries: Iterable[CaptureEntry]) -> None:
-        """Do it all, to the end; LinkError where the link fails."""
+        """Replay all entries. Raise LinkError if the link fails."""
         try:
             for entry in entries:
                 self.recorded.feed(entry)
@@ -134,7 +136,7 @@ class Replay:
             self.replayed.feed(CaptureEntry(FROM_BOARD, self._clock.now_s(), data))
 
     def _translate_frames(self, data: bytes) -> bytes:
-        """The host's frames under the session this board gave; what is no frame of a host never leaves."""
+        """Return the host's frames with the session number of this board. Drop everything else."""
         out = []
         for frame in FrameDecoder().feed(data):
             kind = m.MESSAGES_BY_TYPE.get(frame.type)
@@ -150,12 +152,12 @@ class Replay:
         deadline_s = self._clock.now_s() + HELLO_TIMEOUT_S
         while self.replayed.sessions < self.recorded.sessions:
             if self._clock.now_s() > deadline_s:
-                raise LinkError(f"{self._transport.name}: the board does not answer the recorded HELLO")
+                raise LinkError(f"{self._transport.name}: the board does not answer the captured HELLO")
             self._receive(SLEEP_BELOW_S)
 
 
 def compare_traces(recorded: BoardTrace, replayed: BoardTrace) -> dict[str, Any]:
-    """Whether a board did what was recorded; what it did beyond the recording's end does not count against it."""
+    """Compare a replay with its capture. Reports beyond the end of the capture are ignored."""
     states = len(recorded.states)
     first = next(
         (at for at, pair in enumerate(zip(recorded.states, replayed.states, strict=False)) if pair[0] != pair[1]), None
@@ -167,14 +169,14 @@ def compare_traces(recorded: BoardTrace, replayed: BoardTrace) -> dict[str, Any]
     shifts = [now[0] - was[0] for was, now in pairs]
     missing = len(recorded.executed) - len(pairs)
     return {
-        "same": first is None and not missing and not changed and not any(shifts),
+        "identical": first is None and not missing and not changed and not any(shifts),
         "states": {"recorded": states, "replayed": len(replayed.states), "first_difference": first},
         "executed": {
             "recorded": len(recorded.executed),
             "replayed": len(replayed.executed),
             "missing": missing,
             "changed": changed,
-            "moved": sum(map(bool, shifts)),
-            "largest_move_ticks": max(shifts, key=abs, default=0),
+            "shifted": sum(map(bool, shifts)),
+            "largest_shift_ticks": max(shifts, key=abs, default=0),
         },
     }

@@ -1,7 +1,7 @@
-"""The host's session with one board: handshake, limits, clock, arming, lease, streaming, faults.
+"""Host session with one board: handshake, limits, clock, arming, lease, streaming and faults.
 
-Nothing here blocks but `connect`; `step` is called again and again by the loop that owns the session. Arming is never
-repeated by itself: a reconnect ends in DISARMED.
+Only `connect` blocks. The loop that owns the session calls `step` repeatedly. The session never arms on its own: after
+a reconnect the board is DISARMED.
 """
 
 import secrets
@@ -26,25 +26,26 @@ from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 
 LEASE_RENEWAL_FRACTION = 0.2
-"""The lease is renewed five times in its length."""
+"""Interval between renewals as a fraction of the lease."""
 HELLO_RETRY_S = 0.25
 CONNECT_TIMEOUT_S = 6.0
 STATUS_INTERVAL_S = 0.2
 CLOCK_INTERVAL_S = 1.0
 CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
-"""A board that answers nothing for this long counts as lost."""
+"""The link counts as lost after this time without a message from the board."""
 SPLICE_LEAD_S = 0.01
-"""Points that follow others must be on their way so long before those end."""
+"""Minimum time between a splice and the end of the points before it."""
 LEASE_AGE_BUCKETS_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
 LEASED_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
 class BoardSession:
-    """A session over a transport, with the requirements of a configuration.
+    """Session with a board over a transport.
 
-    faults: how often the board was seen to go into each; lease_ages: seconds since the last renewal, at each;
-    lease_slack_s: the least of the lease that was left then, None before the second renewal
+    faults: number of times that the board reported each fault
+    lease_ages: distribution of the time between lease renewals, s
+    lease_slack_s: minimum remaining lease at a renewal, None before the second renewal
     """
 
     def __init__(self, transport: Transport, clock: Clock, requirements: BoardRequirements) -> None:
@@ -69,38 +70,39 @@ class BoardSession:
         self.connected = False
         self.last_event_reason = ""
         self.abort_confirmed = False
-        """Whether the board has said that it took the last ABORT: dark, queue dropped, DISARMED."""
+        """Whether the board has confirmed the last ABORT: gate off, queue dropped, DISARMED."""
 
     @property
     def port(self) -> str:
-        """The transport's name."""
+        """Name of the transport."""
         return self._transport.name
 
     @property
     def scale(self) -> WireScale:
-        """How SI becomes codes on this board."""
+        """Scale factors between SI units and this board's integers."""
         return self._requirements.scale
 
     def board_s(self) -> float:
-        """The board's time now, s."""
+        """Return the present board time, s."""
         return self._clock_sync.board_s(self._clock.now_s())
 
     @property
     def is_ready(self) -> bool:
-        """Whether a job may begin now."""
+        """Whether a job may start now."""
         return self.board.state == "ARMED" and not self._points and self.is_acknowledged
 
     @property
     def is_acknowledged(self) -> bool:
-        """Whether the board has greeted and acknowledged everything that was sent."""
+        """Whether the board has answered HELLO and acknowledged everything sent."""
         return self._connection.peer is not None and self._connection.outstanding == 0
 
     # --- connecting ---------------------------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Open the link and shake hands; LinkError without an answer, InputError for a board that does not fit.
+        """Open the link and perform the handshake.
 
-        Until it has succeeded the clock known before goes on: heat is kept in its time.
+        Raise LinkError without an answer, InputError if the board does not meet the requirements. After a failure the
+        previous clock synchronisation stays valid, because thermal states refer to it.
         """
         previous_sync = self._clock_sync
         try:
@@ -123,22 +125,20 @@ class BoardSession:
             self._exchange(0.02)
             if self._clock.now_s() > deadline_s:
                 raise LinkError(
-                    f"{self.port} is open, but no board answers: is it powered, the right port, the right baud rate?"
+                    f"{self.port} is open, but no board answers: check its power, the port and the baud rate"
                 )
         while not (self.is_acknowledged and self._clock_sync.is_synchronised and self.board.state != "UNKNOWN"):
             self._request_clock()
             self._request_status()
             self._exchange(0.02)
             if self._clock.now_s() > deadline_s:
-                raise LinkError(
-                    f"{self.port}: the board greets, but does not answer further; {self._describe_errors()}"
-                )
+                raise LinkError(f"{self.port}: the board answers HELLO but nothing else; {self._describe_errors()}")
         for _ in range(CLOCK_INITIAL_SAMPLES):
             self._request_clock()
             self._exchange(0.005)
 
     def _send_hello(self) -> None:
-        """Begin a session: whatever the board did, it ends, and leads to DISARMED."""
+        """Begin a session. The board ends its previous activity and goes to DISARMED."""
         self._points.clear()
         self._hello_sent_s = self._clock.now_s()
         self._connection.send_hello(secrets.randbits(32))
@@ -154,7 +154,7 @@ class BoardSession:
         self._points.reset_indices()
         self._connection.send(
             self._requirements.build_limits(), at_front=True
-        )  # an order may wait for this session already
+        )  # before commands already queued for this session
         self._request_status()
 
     def _reset(self) -> None:
@@ -168,12 +168,12 @@ class BoardSession:
         self._watch.on_opened()
 
     def disconnect(self) -> None:
-        """Give the link up."""
+        """Close the link. It may be opened again."""
         self.connected = False
         self._transport.close()
 
     def on_lost(self, error: Exception) -> str:
-        """Give the link up after an error; the error, and why it likely came where the link itself failed."""
+        """Close the link after an error and return its message, with the likely cause of a link failure."""
         message = str(error)
         if isinstance(error, LinkError):
             now_s = self._clock.now_s()
@@ -185,23 +185,26 @@ class BoardSession:
         return message
 
     def close(self) -> None:
-        """Tell the board to abort, if it can still be told, and close the link for good."""
+        """Send ABORT if possible and close the link permanently."""
         if self.connected:
             self._send_abort()
         self.connected = False
         self._transport.release()
 
     def _send_abort(self) -> None:
-        with suppress(LinkError):  # the board's own lease ends it dark where it cannot be told
+        with suppress(LinkError):  # without ABORT the board turns the gate off when its lease expires
             self._connection.abort()
             self._transport.write(
                 self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
             )
 
-    # --- the loop's turn ----------------------------------------------------------------------------------------
+    # --- loop ---------------------------------------------------------------------------------------------------
 
     def step(self, wait_s: float, renew_lease: bool) -> None:
-        """Send what is due, wait at most wait_s for bytes, take them in. lease: whether the planner is alive."""
+        """Run one loop iteration: send what is due, wait at most wait_s for bytes and process them.
+
+        renew_lease: whether the planner is alive. Raise LinkError if the link failed or the board does not answer.
+        """
         now_s = self._clock.now_s()
         self._watch.on_loop(now_s, renew_lease, self._count_errors())
         if self.board.state not in LEASED_STATES:
@@ -217,7 +220,7 @@ class BoardSession:
         self._exchange(wait_s)
         if now_s - self._last_received_s > SILENCE_TIMEOUT_S:
             raise LinkError(
-                f"{self.port}: the board fell silent for {SILENCE_TIMEOUT_S:g} s; {self._describe_errors()}"
+                f"{self.port}: the board sent nothing for {SILENCE_TIMEOUT_S:g} s; {self._describe_errors()}"
             )
 
     def _renew_lease(self, now_s: float) -> None:
@@ -273,7 +276,7 @@ class BoardSession:
 
     def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
-        if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first is the cause, others follow from it
+        if reason not in m.NOT_CONSUMED and self._refusal is None:  # the first refusal causes the following ones
             self._refusal = reason
 
     def _on_status(self, message: m.Status, now_s: float) -> None:
@@ -315,14 +318,14 @@ class BoardSession:
             self._connection.send(m.ArmConfirm(board_nonce=message.board_nonce, host_nonce=message.host_nonce))
 
     def _on_executed(self, message: m.Executed, now_s: float) -> None:
-        # What is done makes room: a small queue would run dry before an ACK or a STATUS tells.
+        # A report frees queue space at once. With a small queue, waiting for ACK or STATUS would cause an underrun.
         self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
         self._points.record_executed(message)
 
-    # --- orders -------------------------------------------------------------------------------------------------
+    # --- commands -----------------------------------------------------------------------------------------------
 
     def arm(self) -> None:
-        """Ask the board to arm; it lights its indicator and is ARMED two seconds after the confirmation."""
+        """Request arming. The board shows its indicator and is ARMED two seconds after the confirmation."""
         if self.board.state != "DISARMED":
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
@@ -332,63 +335,69 @@ class BoardSession:
         self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
 
     def disarm(self) -> None:
-        """Disarm; from FAULT, acknowledge the fault."""
+        """Disarm the board, or acknowledge its fault in FAULT."""
         self._refusal = None
         self._points.clear()
         self._connection.send(m.ClearFault() if self.board.state == "FAULT" else m.Disarm())
 
     def abort(self) -> None:
-        """Gate off now, queue dropped, DISARMED; goes ahead of everything else that waits to be sent."""
+        """Turn the gate off, drop the queue and disarm, before all other queued messages."""
         self._refusal = None
         self.abort_confirmed = False
         self._connection.abort()
         self._send_hello()
 
     def flush(self) -> None:
-        """Drop what is queued; the board stays armed."""
+        """Turn the gate off and drop the queue. The board stays armed."""
         self._points.clear()
         self._connection.send(m.Flush())
 
     def pop_refusal(self) -> str | None:
-        """Why the board refused the last order, once."""
+        """Return and clear the reason for which the board refused the last command."""
         refusal, self._refusal = self._refusal, None
         return refusal
 
     # --- streaming ----------------------------------------------------------------------------------------------
 
     def begin(self, points: WirePoints, start_s: float, send_ahead_s: float = inf) -> PlanJob:
-        """Begin to stream a plan whose zero is at the board's time start_s, as Job says."""
+        """Start to stream a plan whose zero is board time start_s.
+
+        send_ahead_s: maximum time from sending a point to its start
+        """
         return self._points.begin(points, max(1, round(start_s / self.scale.tick_s)), send_ahead_s / self.scale.tick_s)
 
     def splice(self, points: WirePoints, kept_points: int, send_ahead_s: float) -> PlanJob | None:
-        """Cut the last job after `keep` points and go on without a pause; None where that is too late."""
+        """Truncate the last job to `kept_points` points and continue with `points` without a pause.
+
+        Return None if it is too late for that.
+        """
         tick_s = self.scale.tick_s
         return self._points.splice(
             points, kept_points, send_ahead_s / tick_s, (self.board_s() + SPLICE_LEAD_S) / tick_s
         )
 
     def truncate(self, kept_points: int) -> bool:
-        """Cut the last job after `keep` points; False, and unchanged, where more has left already."""
+        """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
         return self._points.truncate(kept_points)
 
     def _stream_points(self) -> None:
         if not self._points:
             return
-        if self.board.state not in ("DISARMED", "FAULT"):  # else it ended by itself: send no more, but hear the rest
+        if self.board.state not in ("DISARMED", "FAULT"):  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
         self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
         self._points.drop_finished(self.board.state == "ARMED")
 
-    # --- figures ------------------------------------------------------------------------------------------------
+    # --- statistics ---------------------------------------------------------------------------------------------
 
     @property
     def likely_cause(self) -> LinkCause | None:
-        """Why the link was lost last, or the lease lapsed, as far as can be told; None before that."""
+        """Likely cause of the last lost link or expired lease, None before the first."""
         return self._watch.cause
 
     def collect_link_stats(self) -> dict[str, Any]:
-        """Counters of the link, for people who wonder why it is slow or lost; any thread may ask."""
+        """Return the statistics of the link. Any thread may call it."""
         counts, round_trip_s, cause = self._count_errors(), self._clock_sync.round_trip_s, self._watch.cause
         return {
             "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
@@ -409,5 +418,5 @@ class BoardSession:
 
     def _describe_errors(self) -> str:
         counts = self._count_errors()
-        bad = f"{counts.host_bad_frames} bad frames here, {counts.board_bad_frames} at the board"
-        return f"{bad}, {counts.retransmitted} sent again"
+        bad = f"{counts.host_bad_frames} bad frames at the host, {counts.board_bad_frames} at the board"
+        return f"{bad}, {counts.retransmitted} retransmitted"

@@ -18,7 +18,10 @@ STALE_READS_MAX = 64
 
 
 class UsbBulk:
-    """First interface with a bulk endpoint in each direction, claimed exclusively. backend: of pyusb, None for libusb."""
+    """Transport that claims the first interface with a bulk endpoint in each direction.
+
+    backend: of pyusb, None for libusb
+    """
 
     def __init__(self, vendor_id: int, product_id: int, serial_number: str = "", backend: Any = None) -> None:
         self.name = f"usb {vendor_id:04x}:{product_id:04x}" + (f" {serial_number}" if serial_number else "")

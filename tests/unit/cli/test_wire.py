@@ -78,4 +78,4 @@ def test_bad_input_is_one_line(capture, tmp_path, capsys):
 
 def test_replay_reports_where_a_board_differs(capture, capsys):
     assert run(["wire", "replay", capture, "--board", "simulated"]) == 0, "no state was captured, none differs"
-    assert capsys.readouterr().out.startswith("same\n")
+    assert capsys.readouterr().out.startswith("identical\n")

@@ -67,7 +67,7 @@ def test_a_host_that_stood_still_is_told_so():
     rig.run(0.3)
     rig.clock.sleep(0.35)
     rig.until(lambda: rig.session.board.state == "FAULT")
-    assert "this computer stood still for 35" in cause(rig)
+    assert "this computer stalled for 35" in cause(rig)
     assert f"the lease is {LEASE_S * 1e3:.0f} ms" in cause(rig)
     assert rig.session.collect_link_stats()["longest_stall_ms"] == pytest.approx(350, abs=5)
 
@@ -85,7 +85,7 @@ def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
     rig.link.read = stopped
     rig.session.step(0.002, renew_lease=True)
     assert rig.session.board.fault == "LINK"
-    assert "this computer stood still for 35" in cause(rig)
+    assert "this computer stalled for 35" in cause(rig)
 
 
 def test_a_stall_of_long_ago_explains_nothing():
@@ -94,7 +94,7 @@ def test_a_stall_of_long_ago_explains_nothing():
     rig.run(EVIDENCE_WINDOW_S + 1.0)
     rig.arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
-    assert "stood still" not in cause(rig)
+    assert "stalled" not in cause(rig)
 
 
 def test_a_planner_that_hangs_is_told_so():
@@ -135,7 +135,7 @@ def test_damage_of_what_the_board_sends_is_told_at_once():
 def test_damage_of_what_the_board_hears_is_told_when_it_answers_again():
     rig = Damaged().connect()
     rig.faults.inject_fault("flip_bits", 0.3)
-    assert "cannot read what reaches it" in lost(rig)
+    assert "receives only damaged frames" in lost(rig)
     rig.faults.repair()
     rig.connect()
     assert "reached the board damaged" in cause(rig)
@@ -151,27 +151,27 @@ def test_a_board_that_hears_only_damage_lets_the_lease_lapse():
 
 def test_lost_frames_without_damage_are_told_as_lost_bytes():
     evidence = replace(QUIET, naks=3, retransmitted=9)
-    assert "bytes are lost on the way (9 frames sent again, 3 refused)" in diagnose_link_loss(evidence)
+    assert "bytes are lost on the link (9 frames retransmitted, 3 refused)" in diagnose_link_loss(evidence)
     assert diagnose_lease_expiry(evidence) == diagnose_link_loss(evidence)
-    assert "kept its time" in diagnose_lease_expiry(QUIET)
+    assert "was on time" in diagnose_lease_expiry(QUIET)
 
 
 def test_the_port_tells_first():
     missing = PortState("missing", other_ports=("/dev/ttyACM1",))
     evidence = replace(QUIET, port_state=missing, host_bad_frames=5, stall_s=9.0)
-    assert diagnose_link_loss(evidence).startswith("/dev/ttyACM0 is gone")
-    assert "/dev/ttyACM1 there instead" in diagnose_link_loss(evidence)
+    assert diagnose_link_loss(evidence).startswith("/dev/ttyACM0 is missing")
+    assert "found /dev/ttyACM1 instead" in diagnose_link_loss(evidence)
     assert "dialout" in diagnose_port("/dev/ttyACM0", PortState("denied"))
     in_use = PortState("in_use", (PortHolder(12, "ModemManager"),))
-    assert "held by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=in_use))
+    assert "in use by ModemManager, process 12" in diagnose_link_loss(replace(QUIET, port_state=in_use))
     assert diagnose_port("/dev/ttyACM0", PortState("available")) is None
-    assert "is there again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
+    assert "is available again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
 
 
 def test_a_stall_counts_from_where_it_costs_the_lease():
     enough_s = STALL_LEASE_FRACTION * LEASE_S
-    assert "stood still" in diagnose_lease_expiry(replace(QUIET, stall_s=enough_s))
-    assert "stood still" not in diagnose_lease_expiry(replace(QUIET, stall_s=0.99 * enough_s))
+    assert "stalled" in diagnose_lease_expiry(replace(QUIET, stall_s=enough_s))
+    assert "stalled" not in diagnose_lease_expiry(replace(QUIET, stall_s=0.99 * enough_s))
 
 
 def test_an_unknown_reset_cause_is_said_as_it_is():
@@ -184,7 +184,7 @@ def test_counters_of_an_earlier_link_do_not_count():
     watch.on_opened()
     watch.on_loop(2.0, True, LinkErrorCounts())
     watch.on_status("LINK", 2.01, LinkErrorCounts())
-    assert "kept its time" in watch.cause.message
+    assert "was on time" in watch.cause.message
     before = watch.cause
     watch.on_status("LINK", 2.2, LinkErrorCounts(host_bad_frames=9))
     assert watch.cause is before, "told once a fault"
@@ -220,12 +220,12 @@ def test_a_pty_that_is_taken_away_is_gone(tmp_path):
     os.close(master)
     assert not device.exists()
     watch.on_reconnect_failed(2.0)
-    assert watch.cause.message.startswith(f"{name} is gone")
+    assert watch.cause.message.startswith(f"{name} is missing")
     first = watch.cause
     watch.on_reconnect_failed(3.0)
     assert watch.cause is first
     watch.on_reconnected(4.0, 0, 100.0, LinkErrorCounts())
-    assert "is there again: replugged" in watch.cause.message
+    assert "is available again: replugged" in watch.cause.message
 
 
 def test_a_port_that_another_program_took_names_it(tmp_path):

@@ -71,7 +71,7 @@ def test_the_same_seed_gives_the_same_states_gate_edges_and_reports(recorded):
     replay, log = replayed(recorded.path, SEED)
     assert log == recorded.log
     verdict = compare_traces(replay.recorded, replay.replayed)
-    assert verdict["same"], verdict
+    assert verdict["identical"], verdict
     assert verdict["executed"]["recorded"] == len([e for e in recorded.log if e["event"] == "pulse"]) > 300
     assert verdict["states"]["recorded"] == verdict["states"]["replayed"]
     assert [state for state, _, _ in replay.recorded.states].count("ARMED") == 3
@@ -81,7 +81,7 @@ def test_another_seed_never_arms(recorded):
     replay, log = replayed(recorded.path, SEED + 1)
     assert stays_dark(log)
     verdict = compare_traces(replay.recorded, replay.replayed)
-    assert not verdict["same"]
+    assert not verdict["identical"]
     assert verdict["executed"]["missing"] == verdict["executed"]["recorded"]
     assert verdict["states"]["first_difference"] is not None
 
@@ -138,7 +138,7 @@ def test_the_board_that_began_at_another_time_is_replayed_on_its_own_clock(tmp_p
         MemoryLink(BoardCore(sink=log.append, seed=SEED), clock), clock, clock_shift_s(tape.read_entries()), True
     )
     replay.run(tape.read_entries())
-    assert compare_traces(replay.recorded, replay.replayed)["same"]
+    assert compare_traces(replay.recorded, replay.replayed)["identical"]
     edges = [[(e["t_us"], e["on"]) for e in events if e["event"] == "gate"] for events in (log, rig.log)]
     assert edges[0] == edges[1]
     assert len(edges[0]) == 100
@@ -156,7 +156,7 @@ def test_a_board_that_does_otherwise_is_found_out(recorded, what):
     else:
         replay.replayed.executed.popitem()
     verdict = compare_traces(replay.recorded, replay.replayed)
-    assert not verdict["same"]
+    assert not verdict["identical"]
     assert verdict["states"]["first_difference"] == (3 if what == "state" else None)
     assert (verdict["executed"]["changed"], verdict["executed"]["missing"]) == (what == "width", what == "missing")
 

@@ -134,7 +134,7 @@ def test_hello_is_repeated_until_the_board_hears():
 
 @pytest.mark.parametrize(
     ("kinds", "says"),
-    [(range(256), "is open, but no board answers"), ((0x90, 0x98, 0x83), "greets, but does not answer further")],
+    [(range(256), "is open, but no board answers"), ((0x90, 0x98, 0x83), "answers HELLO but nothing else")],
 )
 def test_no_answer_is_a_link_error_in_its_time(kinds, says):
     rig = Rig()
@@ -309,7 +309,7 @@ def test_without_proof_of_the_planner_the_board_ends_within_its_lease(rig):
 def test_silence_is_a_link_error_that_says_what_was_counted(rig):
     rig.link.cut = True
     began_s = rig.clock.now_s()
-    with pytest.raises(LinkError, match=r"fell silent for 2 s; 0 bad frames here"):
+    with pytest.raises(LinkError, match=r"sent nothing for 2 s; 0 bad frames at the host"):
         rig.run(10.0)
     assert SILENCE_TIMEOUT_S < rig.clock.now_s() - began_s < SILENCE_TIMEOUT_S + 0.1
 

@@ -13,7 +13,7 @@ STRINGS = {0: b"\x04\x03\x09\x04"}
 
 
 class UsbBridge(usb.backend.IBackend):
-    """Backend with one device per serial number. Interface 0 of each has no bulk endpoints, interface 1 is the core's."""
+    """Backend with one device per serial number. Interface 0 has no bulk endpoints, interface 1 is the core's."""
 
     def __init__(self, core, clock, serials=("A1",), ids=(0x1209, 0x0001), one_way=False):
         self.core, self.clock, self.serials, self.ids, self.one_way = core, clock, serials, ids, one_way
