@@ -12,7 +12,8 @@ from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import ParameterSet, PixelArray
 from optodrive.physics.term import NO_HEAT_GAIN, HeatGainBound, OperatingEnvelope, TermValues
 from optodrive.physics.terms import discover_terms
-from optodrive.planning.limiter.budget import Budget, Caps, GalvoModel
+from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.caps import CAPS, CapScale, CapValues
 from optodrive.planning.limiter.worst_case import (
     NominalThermalModel,
     NominalTouch,
@@ -30,28 +31,20 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
     limits, ambient_c = config.limits, config.ambient_c
     heat_gain = compute_heat_gain_bound(parameters, pixels, config)
     base_c = ambient_c + heat_gain.uniform_rise_k
-    for name, cap_c in (
-        ("absorber_max_c", limits.absorber_max_c),
-        ("wall_max_c", limits.wall_max_c),
-        ("touch_max_c", limits.touch_max_c),
-    ):
-        if cap_c <= base_c:
+    values = {}
+    for cap in CAPS:
+        setting = getattr(limits, cap.setting)
+        if cap.scale is CapScale.TEMPERATURE and setting <= base_c:
             raise InputError(
-                f"limits.{name}",
-                cap_c,
+                f"limits.{cap.setting}",
+                setting,
                 f"more than {base_c:.1f} °C, to which the terms of {parameters.name} may warm it",
             )
-    caps = Caps(
-        absorber_k=limits.absorber_max_c - base_c,
-        wall_k=limits.wall_max_c - base_c,
-        touch_k=limits.touch_max_c - base_c,
-        galvo_rad2_per_s4=limits.galvo_acceleration_rms_max_rad_per_s2**2,
-        pulse_energy_j=limits.pulse_energy_max_j,
-        pulse_width_s=limits.pulse_width_max_s,
+        values[cap.field] = cap.scale.to_value(setting, base_c)
+    caps = CapValues(
+        **values,
         pulse_gap_s=limits.pulse_gap_min_s,
-        pixel_mean_w=limits.pixel_mean_power_max_w,
         pixel_window_s=limits.pixel_mean_window_s,
-        display_mean_w=limits.display_mean_power_max_w,
         display_window_s=limits.display_mean_window_s,
         min_power_w=config.min_power_w,
     )

@@ -9,10 +9,10 @@ import numpy as np
 from optodrive.core.types.plans import EMPTY_PLAN, PulsePlan
 from optodrive.device.config import DisplaySection
 from optodrive.device.neighbours import Neighbours
-from optodrive.planning.limiter.budget import Caps
+from optodrive.planning.limiter.caps import CapValues
 from optodrive.planning.limiter.worst_case import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
 
-NO_CAPS = Caps(
+NO_CAPS = CapValues(
     absorber_k=1e6,
     wall_k=1e6,
     touch_k=1e6,

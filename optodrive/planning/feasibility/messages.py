@@ -4,7 +4,7 @@ from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import m_to_um
 from optodrive.planning.feasibility.report import NearestFeasible, SequenceReduction
 from optodrive.planning.feasibility.violation import Violation
-from optodrive.planning.limiter.limiter import PHRASES
+from optodrive.planning.limiter.caps import CAPS_BY_KEY
 from optodrive.planning.planned_sequence import PlannedSequence, describe_lateness
 
 
@@ -23,7 +23,7 @@ def describe_violation(sequence: FrameSequence, plan: PlannedSequence | None, vi
         target_um = m_to_um(float(frames[violation.source].target_m[violation.pixel]))
         return f"{subject} requests {target_um:.1f} µm at pixel {violation.pixel}, more than the longest pulse reaches"
     if violation.reason != "deadline":
-        cap = PHRASES[violation.reason].rstrip(",")
+        cap = CAPS_BY_KEY[violation.reason].message
         return f"{subject} requests more at pixel {violation.pixel} than the {cap} allows"
     if is_frame:
         return next(describe_lateness(timing) for timing in plan.frames if timing.source == violation.source)

@@ -6,27 +6,10 @@ Written apart from `optodrive.physics` on purpose: what checks the limiter must 
 from typing import NamedTuple
 
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.planning.limiter.caps import CapValues
 
-
-class Caps(NamedTuple):
-    """Caps that no accepted sequence passes; rises above ambient, infinite where nothing is declared.
-
-    galvo_rad2_per_s4: mean-square acceleration of either mirror; least_w: light that is weaker is none, as the board
-    knows no step so small; the rest as in the configuration's limits
-    """
-
-    absorber_k: float
-    wall_k: float
-    touch_k: float
-    galvo_rad2_per_s4: float
-    pulse_energy_j: float
-    pulse_width_s: float
-    pulse_gap_s: float
-    pixel_mean_w: float
-    pixel_window_s: float
-    display_mean_w: float
-    display_window_s: float
-    min_power_w: float
+TOLERANCE = 1e-9
+"""Relative excess that floating-point rounding may cause; a larger one is real."""
 
 
 class HeatBound(NamedTuple):
@@ -95,6 +78,6 @@ class GalvoModel(NamedTuple):
 class Budget(NamedTuple):
     """Everything a plan is held against."""
 
-    caps: Caps
+    caps: CapValues
     heat: HeatBound
     galvo: GalvoModel

@@ -15,18 +15,15 @@ from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedEr
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, PulsePlan
 from optodrive.planning.limiter.budget import Budget
+from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
+from optodrive.planning.limiter.galvo_moves import count_galvo_feasible
 from optodrive.planning.limiter.pulse_application import (
     COUNT_ONLY,
-    ORDER,
     STOP,
     TRIM,
-    WIDTH,
-    LimiterWorkspace,
-    PixelBudgets,
     apply_pulses,
-    count_galvo_feasible,
 )
-from optodrive.planning.limiter.workspace import close_workspace, open_workspace
+from optodrive.planning.limiter.workspace import LimiterWorkspace, PixelBudgets, close_workspace, open_workspace
 
 Policy = Literal["trim", "delay", "refuse"]
 
@@ -65,32 +62,6 @@ class TimedPulses(Protocol):
         """Mean incident power while on."""
 
 
-CAPS = (
-    "",
-    "absorber_temperature",
-    "pulse_width",
-    "pulse_energy",
-    "spot_energy",
-    "pixel_mean_power",
-    "display_mean_power",
-    "wall_temperature",
-    "touch_temperature",
-    "galvo_acceleration",
-    "order",
-)
-"""The reasons a plan names, by the kernels' numbers."""
-
-PHRASES = {
-    "absorber_temperature": "absorber temperature cap",
-    "pulse_width": "pulse width cap, counting pulses without a rest between them as one,",
-    "pulse_energy": "pulse energy cap",
-    "spot_energy": "energy that may stay in a pixel's bucket",
-    "pixel_mean_power": "pixel mean power cap",
-    "display_mean_power": "display mean power cap",
-    "wall_temperature": "wall temperature cap",
-    "touch_temperature": "touch surface temperature cap",
-    "galvo_acceleration": "galvo acceleration cap",
-}
 MAX_WAIT_S = 3600.0
 """What does not fit after an hour in the dark never does."""
 WAIT_RESOLUTION_S = 1e-3
@@ -152,14 +123,14 @@ def limit(
         plan.pixel, plan, 0.0, state, budget, TRIM if policy == "trim" else STOP
     )
     if applied < len(plan):
-        raise _build_refusal(plan, applied, float(power_w[applied]), CAPS[cause[applied]], state, budget)
+        raise _build_refusal(plan, applied, float(power_w[applied]), REASONS[cause[applied]], state, budget)
     columns = {item.name: getattr(plan, item.name) for item in fields(PulsePlan)}
     columns["power_w"] = power_w
     limited = LimitedPlan(
         **columns,
         energy_j=power_w * plan.width_s,
         trimmed_j=(plan.power_w - power_w) * plan.width_s,
-        reason=np.array(CAPS)[cause],
+        reason=np.array(REASONS)[cause],
         headroom_k=budget.caps.absorber_k - np.maximum(workspace.budgets.peak_k, state.rise_k),
     )
     return limited, close_workspace(workspace, budget)
@@ -245,7 +216,7 @@ def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetSta
     stop_row, allowed_w, cause, _ = _apply_plan(pixel, encoded, 0.0, state, exact, STOP)
     if stop_row < len(pixel):
         raise LocalProtocolError(
-            f"encoded pulse {order[stop_row]} on pixel {pixel[stop_row]} passes a cap ({CAPS[cause[stop_row]]}): "
+            f"encoded pulse {order[stop_row]} on pixel {pixel[stop_row]} passes a cap ({REASONS[cause[stop_row]]}): "
             f"{encoded.power_w[stop_row]:.4f} W, allowed {allowed_w[stop_row]:.4f} W"
         )
 
@@ -277,9 +248,9 @@ def _build_refusal(
     plan: PulsePlan, row: int, allowed_w: float, cap: str, state: BudgetState, budget: Budget
 ) -> RefusedError:
     pixel, start_s, width_s = int(plan.pixel[row]), float(plan.start_s[row]), float(plan.width_s[row])
-    if cap == CAPS[ORDER]:
+    if cap == REASONS[WRONG_ORDER]:
         return RefusedError(f"a pulse at {start_s:.6f} s starts before the budget's time {state.at_s:.6f} s")
-    if cap == CAPS[WIDTH] and width_s > budget.caps.pulse_width_s:
+    if cap == "pulse_width" and width_s > budget.caps.pulse_width_s:
         max_ms = budget.caps.pulse_width_s * 1e3
         return RefusedError(f"pulse {row} on pixel {pixel} is {width_s * 1e3:.3f} ms wide, the cap is {max_ms:.3f} ms")
     requested_j, allowed_j, delay_s = (
@@ -290,7 +261,7 @@ def _build_refusal(
     fits = f"the whole fits {delay_s:.3f} s later" if delay_s < inf else "the whole does not fit at any later time"
     return OverBudgetError(
         f"pulse {row} on pixel {pixel} at {start_s:.4f} s asks for {requested_j * 1e3:.2f} mJ, "
-        f"the {PHRASES[cap]} allows {allowed_j * 1e3:.2f} mJ; {fits}",
+        f"the {CAPS_BY_KEY[cap].message} allows {allowed_j * 1e3:.2f} mJ; {fits}",
         pixel=pixel,
         cap=cap,
         margin_j=float(requested_j - allowed_j),

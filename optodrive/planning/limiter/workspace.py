@@ -1,17 +1,46 @@
 """BudgetState, which is kept and never changes, to the ledger that a walk writes to, and back."""
 
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains
+from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append
 from optodrive.planning.limiter.heat_bound import ThermalNodes
-from optodrive.planning.limiter.pulse_application import LimiterWorkspace, PixelBudgets, replay_history
 
 T = TypeVar("T", bound=np.generic)
+
+
+class PixelBudgets(NamedTuple):
+    """What each pixel's own pulses leave, and the mirrors; arrays are written to.
+
+    bucket_j, on_s: [p] at the end of the pixel's last pulse; end_s: [1] end of the display's last pulse
+    peak_k: [p] largest bound on the absorber so far
+    mirror_rad: [2] where the mirrors stand; acceleration2, swing: [2], mirror_at_s: [1], see `mirrors.Motion`
+    """
+
+    bucket_j: FloatArray
+    merged_width_s: FloatArray
+    end_s: FloatArray
+    peak_k: FloatArray
+    mirror_rad: FloatArray
+    galvo_mean_square: FloatArray
+    galvo_ringing: FloatArray
+    mirror_at_s: FloatArray
+
+
+class LimiterWorkspace(NamedTuple):
+    """Everything that changes while a plan is walked through."""
+
+    nodes: ThermalNodes
+    budgets: PixelBudgets
+    history: PulseHistory
+    pixel_chains: WindowChains
+    display_chain: WindowChains
 
 
 def open_workspace(state: BudgetState, capacity: int) -> LimiterWorkspace:
@@ -49,7 +78,7 @@ def open_workspace(state: BudgetState, capacity: int) -> LimiterWorkspace:
     workspace = LimiterWorkspace(
         nodes, budgets, history, _build_chains(pixels, past + capacity), _build_chains(1, past + capacity)
     )
-    replay_history(workspace)
+    _replay_history(workspace)
     return workspace
 
 
@@ -94,3 +123,11 @@ def close_workspace(workspace: LimiterWorkspace, budget: Budget) -> BudgetState:
         recent_power_w=history.power_w[recent],
         recent_pixel=history.pixel[recent],
     )
+
+
+@kernel
+def _replay_history(workspace: LimiterWorkspace) -> None:
+    """Append the pulses of earlier plans to the chains."""
+    for row in range(workspace.history.n_valid[0]):
+        append(workspace.pixel_chains, workspace.history.pixel[row], workspace.history, row)
+        append(workspace.display_chain, 0, workspace.history, row)

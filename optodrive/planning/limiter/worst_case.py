@@ -11,7 +11,8 @@ import numpy as np
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.planning.limiter.budget import Caps, HeatBound
+from optodrive.planning.limiter.budget import HeatBound
+from optodrive.planning.limiter.caps import CapValues
 
 CHORDS = 8
 STEP_FRACTION = 0.07
@@ -90,7 +91,9 @@ def specht_ratio(ratio: float) -> float:
     return float((ratio - 1) * ratio ** (1 / (ratio - 1)) / (e * log(ratio)))
 
 
-def build_heat_bound(model: NominalThermalModel, uncertainty: Uncertainty, caps: Caps, power_max_w: float) -> HeatBound:
+def build_heat_bound(
+    model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues, power_max_w: float
+) -> HeatBound:
     """The upper corner; raises InputError where a wall or touch surface is too quick beside the absorber."""
     epsilon = model.epsilon * (1 + uncertainty.absorbed_power)
     r_high = model.r_k_per_w * (1 + uncertainty.bridge_resistance)
@@ -142,7 +145,7 @@ def build_heat_bound(model: NominalThermalModel, uncertainty: Uncertainty, caps:
 
 
 def _compute_loss_chords(
-    model: NominalThermalModel, uncertainty: Uncertainty, caps: Caps
+    model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues
 ) -> tuple[FloatArray, FloatArray]:
     """Chords of the loss u / R(u), times R₀, from 0 to the cap. The loss is concave, so they lie below it."""
     exponent = model.exponent + uncertainty.exponent if model.exponent > 0 else 0.0
@@ -275,7 +278,7 @@ class _LowerBound:
 def _build_lower_bound(
     model: NominalThermalModel,
     uncertainty: Uncertainty,
-    caps: Caps,
+    caps: CapValues,
     c_low: FloatArray,
     c_high: FloatArray,
     wall: _WallBound,

@@ -10,6 +10,7 @@ import pytest
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.core.types.plans import PulsePlan
 from optodrive.planning.limiter.budget import Budget, GalvoModel
+from optodrive.planning.limiter.caps import CAPS
 from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append, max_window_power_w
 from optodrive.planning.limiter.limiter import cold_state, commit_until, compute_wait_s, limit, shift_state, verify
 from optodrive.planning.limiter.worst_case import (
@@ -98,6 +99,10 @@ CASES = {
     "galvo_acceleration": (dict(galvo_rad2_per_s4=1e7), [(0, 0.0, 0.001, 1.0), (2, 0.002, 0.001, 1.0)]),
     "pulse_width": ({}, [(0, 0.0, 0.030, 1.0), (0, 0.0302, 0.030, 1.0)]),
 }
+
+
+def test_every_cap_has_a_case():
+    assert set(CASES) == {cap.key for cap in CAPS}
 
 
 @pytest.mark.parametrize("cause", CASES)

@@ -1,0 +1,165 @@
+"""What each cap allows a pulse, and how much of each cap is in use. Kernels."""
+
+from math import exp
+from typing import NamedTuple
+
+import numpy as np
+
+from optodrive.core.kernels import kernel
+from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.plans import BudgetState
+from optodrive.planning.limiter.budget import TOLERANCE, Budget
+from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS, WRONG_ORDER
+from optodrive.planning.limiter.energy_windows import max_window_power_w
+from optodrive.planning.limiter.galvo_load import mean_square_bound
+from optodrive.planning.limiter.galvo_moves import galvo_after_move, is_move
+from optodrive.planning.limiter.heat_bound import absorber_after_k, advance_pixel, exchange_wall_heat, wall_bound_k
+from optodrive.planning.limiter.slow_nodes import PulseRequest, slow_node_limits_w, wall_peak_k
+from optodrive.planning.limiter.workspace import LimiterWorkspace, open_workspace
+
+BISECTIONS = 32
+
+ABSORBER_TEMPERATURE = CAP_NUMBERS["absorber_temperature"]
+WALL_TEMPERATURE = CAP_NUMBERS["wall_temperature"]
+TOUCH_TEMPERATURE = CAP_NUMBERS["touch_temperature"]
+PULSE_ENERGY = CAP_NUMBERS["pulse_energy"]
+SPOT_ENERGY = CAP_NUMBERS["spot_energy"]
+PULSE_WIDTH = CAP_NUMBERS["pulse_width"]
+PIXEL_MEAN_POWER = CAP_NUMBERS["pixel_mean_power"]
+DISPLAY_MEAN_POWER = CAP_NUMBERS["display_mean_power"]
+GALVO_ACCELERATION = CAP_NUMBERS["galvo_acceleration"]
+
+
+class PixelStartState(NamedTuple):
+    """A pixel as a pulse begins: absorber over wall, and that at least, K; bucket, J; light without a rest, s."""
+
+    rise_k: float
+    lower_bound_k: float
+    bucket_j: float
+    merged_width_s: float
+
+
+@kernel
+def max_power_w(
+    budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, before: PixelStartState
+) -> tuple[float, int]:
+    """Largest power the caps allow a pulse, W, and the cap that binds; below zero for a pulse no power makes right."""
+    caps, width_s = budget.caps, request.width_s
+    if request.start_s < workspace.budgets.end_s[0] - TOLERANCE:
+        return -1.0, WRONG_ORDER
+    if width_s > caps.pulse_width_s * (1 + TOLERANCE):
+        return -1.0, PULSE_WIDTH
+    rise_k, lower_bound_k, bucket_j, merged_width_s = before
+    if merged_width_s + width_s > caps.pulse_width_s + TOLERANCE:
+        return 0.0, PULSE_WIDTH
+    if is_move(workspace.budgets, request):
+        galvo_state = galvo_after_move(budget, workspace.budgets, request)
+        mean_square = mean_square_bound(budget.galvo, galvo_state, request.start_s + width_s)
+        if mean_square > caps.galvo_rad2_per_s4 * (1 + TOLERANCE):
+            return 0.0, GALVO_ACCELERATION
+    max_w, binding = caps.pulse_energy_j / width_s, PULSE_ENERGY
+    spot_w = (caps.pulse_energy_j - bucket_j) / width_s
+    if spot_w < max_w:
+        max_w, binding = spot_w, SPOT_ENERGY
+    pixel_w = max_window_power_w(
+        workspace.pixel_chains,
+        request.pixel,
+        workspace.history,
+        request.start_s,
+        width_s,
+        caps.pixel_window_s,
+        caps.pixel_mean_w,
+    )
+    if pixel_w < max_w:
+        max_w, binding = pixel_w, PIXEL_MEAN_POWER
+    display_w = max_window_power_w(
+        workspace.display_chain,
+        0,
+        workspace.history,
+        request.start_s,
+        width_s,
+        caps.display_window_s,
+        caps.display_mean_w,
+    )
+    if display_w < max_w:
+        max_w, binding = display_w, DISPLAY_MEAN_POWER
+    wall_w, touch_w = slow_node_limits_w(budget, workspace.nodes, request, lower_bound_k)
+    if wall_w < max_w:
+        max_w, binding = wall_w, WALL_TEMPERATURE
+    if touch_w < max_w:
+        max_w, binding = touch_w, TOUCH_TEMPERATURE
+    absorber_w = _max_absorber_power_w(budget, workspace, request, rise_k, min(max_w, request.power_w))
+    if absorber_w < min(max_w, request.power_w):
+        max_w, binding = absorber_w, ABSORBER_TEMPERATURE
+    return max(0.0, max_w), binding
+
+
+@kernel
+def absorber_peak_k(
+    budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, rise_k: float, power_w: float
+) -> float:
+    """Bound on the absorber during a pulse, above ambient."""
+    own_k = max(rise_k, absorber_after_k(budget.heat, request.pixel, rise_k, power_w, request.width_s))
+    return own_k + budget.heat.absorber_wall_factor * wall_peak_k(budget, workspace.nodes, request, power_w)
+
+
+@kernel
+def _max_absorber_power_w(
+    budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, rise_k: float, requested_w: float
+) -> float:
+    """wanted_w where the absorber bears it, else the largest power that it bears, W."""
+    cap_k = budget.caps.absorber_k
+    if requested_w <= 0.0 or absorber_peak_k(budget, workspace, request, rise_k, requested_w) <= cap_k:
+        return requested_w
+    low_w, high_w = 0.0, requested_w
+    for _ in range(BISECTIONS):
+        middle_w = 0.5 * (low_w + high_w)
+        if absorber_peak_k(budget, workspace, request, rise_k, middle_w) <= cap_k:
+            low_w = middle_w
+        else:
+            high_w = middle_w
+    return low_w
+
+
+def compute_levels(state: BudgetState, budget: Budget, at_s: float) -> FloatArray:
+    """Return how much of each cap is in use at `at_s`, with the gate off since the state's own time.
+
+    Returns an array [caps + 1, p] by cap number, in units of `CapValues`; a cap of the whole display has the same level
+    in every pixel, and a cap that does not accumulate is 0.
+    """
+    caps, pixels = budget.caps, len(state.rise_k)
+    levels = np.zeros((len(CAPS) + 1, pixels))
+    at_s = max(at_s, state.at_s)
+    _fill_levels(budget, open_workspace(state, 0), at_s, levels)
+    pixel_j = np.bincount(state.recent_pixel, _compute_window_energy_j(state, at_s, caps.pixel_window_s), pixels)
+    levels[PIXEL_MEAN_POWER] = pixel_j / caps.pixel_window_s
+    display_j = float(_compute_window_energy_j(state, at_s, caps.display_window_s).sum())
+    levels[DISPLAY_MEAN_POWER] = display_j / caps.display_window_s
+    decay = exp(-max(0.0, at_s - state.mirror_at_s) / budget.galvo.averaging_s)
+    levels[GALVO_ACCELERATION] = float(state.galvo_mean_square.max()) * decay
+    return levels
+
+
+def _compute_window_energy_j(state: BudgetState, at_s: float, window_s: float) -> FloatArray:
+    """Return the energy of each recent pulse [r] within the window that ends at `at_s`, J."""
+    begin_s = np.maximum(state.recent_start_s, at_s - window_s)
+    end_s = np.minimum(state.recent_start_s + state.recent_width_s, at_s)
+    return np.asarray(np.clip(end_s - begin_s, 0.0, None) * state.recent_power_w, dtype=np.float64)
+
+
+@kernel
+def _fill_levels(budget: Budget, workspace: LimiterWorkspace, at_s: float, levels: FloatArray) -> None:
+    """Advance the workspace to `at_s` with the gate off, and fill in the levels that are kept per pixel."""
+    heat, nodes = budget.heat, workspace.nodes
+    exchange_wall_heat(heat, nodes, at_s, 0.0)
+    for pixel in range(levels.shape[1]):
+        advance_pixel(heat, nodes, pixel, at_s)
+        off_s = max(0.0, at_s - nodes.last_pulse_end_s[pixel])
+        wall_k = wall_bound_k(heat, nodes, pixel)
+        rise_k = absorber_after_k(heat, pixel, nodes.absorber_k[pixel], 0.0, off_s)
+        levels[ABSORBER_TEMPERATURE, pixel] = rise_k + heat.absorber_wall_factor * wall_k
+        levels[WALL_TEMPERATURE, pixel] = wall_k
+        levels[TOUCH_TEMPERATURE, pixel] = heat.touch_specht_ratio * max(
+            nodes.touch_k[pixel, 0], nodes.touch_k[pixel, 1]
+        )
+        levels[SPOT_ENERGY, pixel] = max(0.0, workspace.budgets.bucket_j[pixel] - off_s * budget.caps.pixel_mean_w)
