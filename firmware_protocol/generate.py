@@ -1,35 +1,54 @@
-"""Writes core/messages.h from messages.toml; run it as a script after the table has changed."""
+"""Generate core/messages.h and the page's board_states.js from messages.toml: run this after the table has changed."""
 
 import tomllib
 from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
+PAGE = HERE.parent / "optodrive" / "daemon" / "page"
 SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2, "bytes12": 12}
-ENUMERATIONS = {"state": "STATE", "fault": "FAULT", "nak_reason": "NAK", "reason": "REASON"}
+PREFIXES = {"state": "STATE", "fault": "FAULT", "nak_reason": "NAK", "reason": "REASON"}
 Table = dict[str, Any]
 
 
-def header(table: Table) -> str:
-    """The C header of the whole table: numbers, enumerations, layouts, limits, forms of bodies."""
+def build_header(table: Table) -> str:
+    """Return the C header of the whole table: numbers, enumerations, transitions, layouts and limits."""
     parts = [
-        "/* Generated from messages.toml by generate.py: do not edit. PROTOCOL.md says what the messages mean. */",
+        "/* Generated from messages.toml by generate.py: do not edit. PROTOCOL.md defines the messages. */",
         "#ifndef MESSAGES_H\n#define MESSAGES_H",
-        numbers(table),
-        *(enumeration(prefix, table["enumerations"][name]) for name, prefix in ENUMERATIONS.items()),
-        input_bits(table["enumerations"]["input_bit"]),
+        format_numbers(table),
+        *(format_enumeration(prefix, table["enumerations"][name]) for name, prefix in PREFIXES.items()),
+        format_state_groups(table["state_group"]),
+        format_transitions(table["transition"]),
+        format_input_bits(table["enumerations"]["input_bit"]),
         "\n".join(f"#define MESSAGE_{entry['name']} 0x{entry['id']:02x}" for entry in table["message"]),
-        "\n\n".join(layout(entry["name"].upper(), entry["fields"], table) for entry in table["message"]),
-        "\n\n".join(layout(name.upper(), fields, table) for name, fields in table["struct"].items()),
-        limits(table["struct"]["limits"]),
-        forms(table),
+        "\n\n".join(format_offsets(entry["name"].upper(), entry["fields"], table) for entry in table["message"]),
+        "\n\n".join(format_offsets(name.upper(), fields, table) for name, fields in table["struct"].items()),
+        format_limits(table["struct"]["limits"]),
+        format_layouts(table),
         "#endif",
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def numbers(table: Table) -> str:
-    """Protocol version, framing and timing as defines."""
+def build_page_module(table: Table) -> str:
+    """Return the JavaScript module of the board's states and groups of states."""
+    states = table["enumerations"]["state"]
+    lines = [
+        "// Generated from firmware_protocol/messages.toml by generate.py: do not edit.",
+        "",
+        "export const BoardState = Object.freeze({",
+        *(f'  {state}: "{state}",' for state in states),
+        "});",
+    ]
+    for name, members in table["state_group"].items():
+        listed = ", ".join(f"BoardState.{state}" for state in members)
+        lines += ["", f"export const {name.upper()}_STATES = Object.freeze([{listed}]);"]
+    return "\n".join(lines) + "\n"
+
+
+def format_numbers(table: Table) -> str:
+    """Return the protocol version, the framing and the timing as defines."""
     frame = table["frame"]
     values = {f"PROTOCOL_{name.upper()}": value for name, value in table["protocol"].items()}
     values |= {"RAW_MAX": frame["raw_max"], "RX_WINDOW": frame["window"], "SEQ_MODULUS": frame["seq_modulus"]}
@@ -40,39 +59,65 @@ def numbers(table: Table) -> str:
     return "\n".join(f"#define {name} {value}u" for name, value in values.items())
 
 
-def enumeration(prefix: str, words: list[str]) -> str:
-    """An enum, its count, and its names as the initialiser of an array of strings."""
-    lines = [f"    {prefix}_{(word or 'none').replace(' ', '_').upper()} = {k}," for k, word in enumerate(words)]
+def constant_name(prefix: str, word: str) -> str:
+    """Return the C constant of an enumeration's word."""
+    return f"{prefix}_{(word or 'none').replace(' ', '_').upper()}"
+
+
+def format_enumeration(prefix: str, words: list[str]) -> str:
+    """Return an enum, its count, and its names as the initialiser of an array of strings."""
+    lines = [f"    {constant_name(prefix, word)} = {k}," for k, word in enumerate(words)]
     names = ", ".join(f'"{word}"' for word in words)
     listed = "\n".join(lines)
     defines = f"#define {prefix}_COUNT {len(words)}u\n#define {prefix}_NAMES {{{names}}}"
     return f"enum {prefix.lower()} {{\n{listed}\n}};\n{defines}"
 
 
-def input_bits(words: list[str]) -> str:
-    """The inputs' bits and names."""
+def format_state_groups(groups: dict[str, list[str]]) -> str:
+    """Return each group of states as a mask with one bit per state."""
+    lines = []
+    for name, states in groups.items():
+        bits = " | ".join(f"1u << {constant_name('STATE', state)}" for state in states)
+        lines.append(f"#define STATES_{name.upper()} ({bits})")
+    return "\n".join(lines)
+
+
+def format_transitions(transitions: list[Table]) -> str:
+    """Return T(from, event, to) of each transition of the state machine; an event is the reason in EVENT."""
+    rows = [
+        f"    T({constant_name('STATE', state)}, {constant_name('REASON', entry['event'])},"
+        f" {constant_name('STATE', entry['to'])})"
+        for entry in transitions
+        for state in entry["from"]
+    ]
+    return "#define STATE_TRANSITIONS(T) \\\n" + " \\\n".join(rows)
+
+
+def format_input_bits(words: list[str]) -> str:
+    """Return the bits and names of the inputs."""
     lines = [f"#define INPUT_{word.upper()} {1 << k}u" for k, word in enumerate(words)]
     names = ", ".join(f'"{word}"' for word in words)
     return "\n".join([*lines, f"#define INPUT_COUNT {len(words)}u", f"#define INPUT_NAMES {{{names}}}"])
 
 
-def size(fields: list[Table], table: Table, repeats: bool) -> int:
-    """Bytes of fields; of a repeated last one nothing."""
-    counted = fields[:-1] if repeats else fields
-    return sum(SIZES.get(entry["type"]) or size(table["struct"][entry["type"]], table, False) for entry in counted)
+def count_bytes(fields: list[Table], table: Table, repeats: bool) -> int:
+    """Return the number of bytes of fields, without a repeated last one."""
+    fixed = fields[:-1] if repeats else fields
+    return sum(SIZES.get(entry["type"]) or count_bytes(table["struct"][entry["type"]], table, False) for entry in fixed)
 
 
-def layout(name: str, fields: list[Table], table: Table) -> str:
-    """NAME_FIELD_AT for each field and NAME_SIZE, without what is repeated."""
+def format_offsets(name: str, fields: list[Table], table: Table) -> str:
+    """Return NAME_FIELD_AT of each field and NAME_SIZE, without the repeated part."""
     repeats = any(entry.get("repeat") and entry["name"] == name for entry in table["message"])
     lines = [
-        f"#define {name}_{entry['name'].upper()}_AT {size(fields[:k], table, False)}u" for k, entry in enumerate(fields)
+        f"#define {name}_{entry['name'].upper()}_AT {count_bytes(fields[:k], table, False)}u"
+        for k, entry in enumerate(fields)
     ]
-    return "\n".join([*lines, f"#define {name}_SIZE {size(fields, table, repeats)}u"])
+    return "\n".join([*lines, f"#define {name}_SIZE {count_bytes(fields, table, repeats)}u"])
 
 
-def limits(fields: list[Table]) -> str:
-    """F(name, bits, offset, way) for each limit; way: LESS or MORE is tighter, or FIXED."""
+def format_limits(fields: list[Table]) -> str:
+    """Return F(name, bits, offset, direction) of each limit; direction: LESS or MORE is tighter, or FIXED."""
     lines, at = [], 0
     for entry in fields:
         lines.append(f"    F({entry['name']}, {8 * SIZES[entry['type']]}, {at}, {entry['tighter'].upper()})")
@@ -80,19 +125,19 @@ def limits(fields: list[Table]) -> str:
     return "#define LIMITS_FIELDS(F) \\\n" + " \\\n".join(lines)
 
 
-def forms(table: Table) -> str:
-    """What a frame of each type must be: F(type, from host, sequenced, body, item, most items, three enumerations)."""
+def format_layouts(table: Table) -> str:
+    """Return the layout of each message: direction, sequencing, size, repeated items and enumerated fields."""
     lines = [
-        "/* F(type, from_host, sequenced, body bytes, bytes an item, most items, offset and count of up to three",
-        "   enumerations in the body; count 0: none) */",
-        "#define MESSAGE_FORMS(F) \\",
+        "/* F(type, from_host, sequenced, bytes of the body, bytes per item, maximum number of items, then offset and",
+        "   count of up to three enumerations in the body; count 0: none) */",
+        "#define MESSAGE_LAYOUTS(F) \\",
     ]
     rows = []
     for entry in table["message"]:
         fields, repeat = entry["fields"], entry.get("repeat")
-        item = size(table["struct"][fields[-1]["type"]], table, False) if repeat else 0
+        item = count_bytes(table["struct"][fields[-1]["type"]], table, False) if repeat else 0
         named = [(k, field["enum"]) for k, field in enumerate(fields) if "enum" in field]
-        enums = [f"{size(fields[:k], table, False)}, {ENUMERATIONS[name]}_COUNT" for k, name in named]
+        enums = [f"{count_bytes(fields[:k], table, False)}, {PREFIXES[name]}_COUNT" for k, name in named]
         columns = [
             f"MESSAGE_{entry['name']}",
             str(int(entry["from"] == "host")),
@@ -108,5 +153,6 @@ def forms(table: Table) -> str:
 
 
 if __name__ == "__main__":
-    text = header(tomllib.loads((HERE / "messages.toml").read_text(encoding="utf-8")))
-    (HERE / "core" / "messages.h").write_text(text, encoding="utf-8")
+    messages = tomllib.loads((HERE / "messages.toml").read_text(encoding="utf-8"))
+    (HERE / "core" / "messages.h").write_text(build_header(messages), encoding="utf-8")
+    (PAGE / "board_states.js").write_text(build_page_module(messages), encoding="utf-8")

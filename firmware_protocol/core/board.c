@@ -56,7 +56,7 @@ static void do_due(struct board *b) {
         fail(b, FAULT_LINK);
     } else if (arming_due_us(b) <= b->now_us) {
         if (b->confirmed) {
-            set_state(b, STATE_ARMED, REASON_ARMED);
+            change_state(b, REASON_ARMED);
         } else {
             disarm(b, REASON_ARMING_TIMED_OUT);
         }
@@ -253,5 +253,5 @@ void board_init(struct board *b, const struct board_hal *hal, const struct board
     hal->mirrors(hal->context, b->x, b->y); /* a reset may have come upon them anywhere */
     b->inputs = hal->inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
     link_begin(&b->link, 0);
-    set_state(b, STATE_DISARMED, REASON_BOOT);
+    change_state(b, REASON_BOOT);
 }

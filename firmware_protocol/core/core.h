@@ -95,7 +95,8 @@ bool is_leased(uint8_t state);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
 void trace_gate(struct board *b, bool on, bool is_point, uint32_t what);
 void set_gate(struct board *b, bool on, uint16_t duty);
-void set_state(struct board *b, enum state state, enum reason reason);
+/* Changes to the state that the table has for this event. */
+void change_state(struct board *b, enum reason event);
 void disarm(struct board *b, enum reason reason);
 void fail(struct board *b, enum fault fault);
 void drop_queue(struct board *b);

@@ -15,7 +15,7 @@ struct form {
 
 #define FORM(type, host, sequenced, body, item, most, at0, n0, at1, n1, at2, n2) \
     {type, host, sequenced, body, item, most, {{at0, n0}, {at1, n1}, {at2, n2}}},
-static const struct form FORMS[] = {MESSAGE_FORMS(FORM)};
+static const struct form FORMS[] = {MESSAGE_LAYOUTS(FORM)};
 
 /* Decodes what stands between two zeros; false where it is no frame, which counts. */
 static bool frame_decode(struct receiver *r, struct frame *frame) {

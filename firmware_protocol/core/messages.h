@@ -1,4 +1,4 @@
-/* Generated from messages.toml by generate.py: do not edit. PROTOCOL.md says what the messages mean. */
+/* Generated from messages.toml by generate.py: do not edit. PROTOCOL.md defines the messages. */
 
 #ifndef MESSAGES_H
 #define MESSAGES_H
@@ -83,6 +83,48 @@ enum reason {
 };
 #define REASON_COUNT 17u
 #define REASON_NAMES {"", "boot", "hello", "arm requested", "armed", "start", "job done", "queue empty", "refilled", "hold too long", "disarm", "abort", "link lost", "arming timed out", "fault", "fault cleared", "flush"}
+
+#define STATES_LEASED (1u << STATE_ARMING | 1u << STATE_ARMED | 1u << STATE_RUNNING | 1u << STATE_HOLD)
+#define STATES_ARMED (1u << STATE_ARMED | 1u << STATE_RUNNING | 1u << STATE_HOLD)
+#define STATES_IDLE (1u << STATE_DISARMED | 1u << STATE_FAULT)
+
+#define STATE_TRANSITIONS(T) \
+    T(STATE_BOOT, REASON_BOOT, STATE_DISARMED) \
+    T(STATE_DISARMED, REASON_ARM_REQUESTED, STATE_ARMING) \
+    T(STATE_ARMING, REASON_ARMED, STATE_ARMED) \
+    T(STATE_ARMING, REASON_ARMING_TIMED_OUT, STATE_DISARMED) \
+    T(STATE_ARMED, REASON_START, STATE_RUNNING) \
+    T(STATE_RUNNING, REASON_JOB_DONE, STATE_ARMED) \
+    T(STATE_HOLD, REASON_JOB_DONE, STATE_ARMED) \
+    T(STATE_RUNNING, REASON_QUEUE_EMPTY, STATE_HOLD) \
+    T(STATE_HOLD, REASON_REFILLED, STATE_RUNNING) \
+    T(STATE_RUNNING, REASON_HOLD_TOO_LONG, STATE_DISARMED) \
+    T(STATE_HOLD, REASON_HOLD_TOO_LONG, STATE_DISARMED) \
+    T(STATE_RUNNING, REASON_FLUSH, STATE_ARMED) \
+    T(STATE_HOLD, REASON_FLUSH, STATE_ARMED) \
+    T(STATE_ARMING, REASON_DISARM, STATE_DISARMED) \
+    T(STATE_ARMED, REASON_DISARM, STATE_DISARMED) \
+    T(STATE_RUNNING, REASON_DISARM, STATE_DISARMED) \
+    T(STATE_HOLD, REASON_DISARM, STATE_DISARMED) \
+    T(STATE_ARMING, REASON_ABORT, STATE_DISARMED) \
+    T(STATE_ARMED, REASON_ABORT, STATE_DISARMED) \
+    T(STATE_RUNNING, REASON_ABORT, STATE_DISARMED) \
+    T(STATE_HOLD, REASON_ABORT, STATE_DISARMED) \
+    T(STATE_ARMING, REASON_HELLO, STATE_DISARMED) \
+    T(STATE_ARMED, REASON_HELLO, STATE_DISARMED) \
+    T(STATE_RUNNING, REASON_HELLO, STATE_DISARMED) \
+    T(STATE_HOLD, REASON_HELLO, STATE_DISARMED) \
+    T(STATE_ARMING, REASON_LINK_LOST, STATE_DISARMED) \
+    T(STATE_ARMED, REASON_LINK_LOST, STATE_DISARMED) \
+    T(STATE_RUNNING, REASON_LINK_LOST, STATE_DISARMED) \
+    T(STATE_HOLD, REASON_LINK_LOST, STATE_DISARMED) \
+    T(STATE_BOOT, REASON_FAULT, STATE_FAULT) \
+    T(STATE_DISARMED, REASON_FAULT, STATE_FAULT) \
+    T(STATE_ARMING, REASON_FAULT, STATE_FAULT) \
+    T(STATE_ARMED, REASON_FAULT, STATE_FAULT) \
+    T(STATE_RUNNING, REASON_FAULT, STATE_FAULT) \
+    T(STATE_HOLD, REASON_FAULT, STATE_FAULT) \
+    T(STATE_FAULT, REASON_FAULT_CLEARED, STATE_DISARMED)
 
 #define INPUT_INTERLOCK 1u
 #define INPUT_KEY 2u
@@ -264,9 +306,9 @@ enum reason {
     F(rest_us, 16, 30, MORE) \
     F(lease_ms, 16, 32, LESS)
 
-/* F(type, from_host, sequenced, body bytes, bytes an item, most items, offset and count of up to three
-   enumerations in the body; count 0: none) */
-#define MESSAGE_FORMS(F) \
+/* F(type, from_host, sequenced, bytes of the body, bytes per item, maximum number of items, then offset and
+   count of up to three enumerations in the body; count 0: none) */
+#define MESSAGE_LAYOUTS(F) \
     F(MESSAGE_HELLO, 1, 0, HELLO_SIZE, 0, 0, 0, 0, 0, 0, 0, 0) \
     F(MESSAGE_LIMITS, 1, 1, LIMITS_SIZE, 0, 0, 0, 0, 0, 0, 0, 0) \
     F(MESSAGE_CLOCK, 1, 0, CLOCK_SIZE, 0, 0, 0, 0, 0, 0, 0, 0) \

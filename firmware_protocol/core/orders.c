@@ -12,7 +12,7 @@
 static bool inputs_safe(const struct board *b) { return b->inputs == (INPUT_INTERLOCK | INPUT_KEY); }
 
 static bool takes_points(const struct board *b) {
-    return b->state == STATE_ARMED || b->state == STATE_RUNNING || b->state == STATE_HOLD;
+    return STATES_ARMED >> b->state & 1u;
 }
 
 /* --- not sequenced --- */
@@ -116,7 +116,7 @@ void obey_unsequenced(struct board *b, const struct frame *frame) {
 
 static uint8_t limit(struct board *b, const uint8_t *body) {
     struct board_limits asked;
-    if (b->state != STATE_DISARMED && b->state != STATE_FAULT) {
+    if (!(STATES_IDLE >> b->state & 1u)) {
         return NAK_STATE;
     }
     limits_get(&asked, body + LIMITS_LIMITS_AT);
@@ -186,7 +186,7 @@ static uint8_t start(struct board *b, const uint8_t *body) {
         uint64_t last = UINT64_MAX - HOLD_MAX_US - 1 - b->epoch_us;
         b->job.start_us = b->epoch_us + (tick < last ? tick : last);
     }
-    set_state(b, STATE_RUNNING, REASON_START);
+    change_state(b, REASON_START);
     return REFUSED_NOTHING;
 }
 
@@ -202,7 +202,7 @@ static uint8_t end(struct board *b, const uint8_t *body) {
     b->job.ends = true;
     if (b->done_index >= end_index) {
         b->job.exists = false;
-        set_state(b, STATE_ARMED, REASON_JOB_DONE);
+        change_state(b, REASON_JOB_DONE);
     }
     refill(b);
     return REFUSED_NOTHING;
@@ -228,7 +228,7 @@ static uint8_t arm(struct board *b, const uint8_t *asked) {
     b->arming_since_us = b->now_us;
     b->confirmed = false;
     b->lease_until_us = b->now_us + (uint64_t)b->limits.lease_ms * MS;
-    set_state(b, STATE_ARMING, REASON_ARM_REQUESTED);
+    change_state(b, REASON_ARM_REQUESTED);
     put_u32(body + ARM_CHALLENGE_HOST_NONCE_AT, b->host_nonce);
     put_u32(body + ARM_CHALLENGE_BOARD_NONCE_AT, b->board_nonce);
     send_message(b, MESSAGE_ARM_CHALLENGE, body, sizeof body);
@@ -264,7 +264,7 @@ static uint8_t clear_fault(struct board *b) {
     }
     b->fault = FAULT_NONE;
     b->underruns_known = 0;
-    set_state(b, STATE_DISARMED, REASON_FAULT_CLEARED);
+    change_state(b, REASON_FAULT_CLEARED);
     return REFUSED_NOTHING;
 }
 
@@ -273,7 +273,7 @@ static uint8_t flush(struct board *b) {
         return NAK_STATE;
     }
     if (b->state != STATE_ARMED) {
-        set_state(b, STATE_ARMED, REASON_FLUSH);
+        change_state(b, REASON_FLUSH);
     }
     drop_queue(b);
     return REFUSED_NOTHING;

@@ -63,7 +63,7 @@ static void underrun(struct board *b) {
         return;
     }
     b->hold_since_us = b->now_us;
-    set_state(b, STATE_HOLD, REASON_QUEUE_EMPTY);
+    change_state(b, REASON_QUEUE_EMPTY);
 }
 
 static void finish_point(struct board *b) {
@@ -82,7 +82,7 @@ static void finish_point(struct board *b) {
     b->has_current = false;
     if (b->job.exists && b->job.ends && b->done_index >= b->job.end_index) {
         b->job.exists = false;
-        set_state(b, STATE_ARMED, REASON_JOB_DONE);
+        change_state(b, REASON_JOB_DONE);
     } else if (b->queue.count > 0) {
         begin_point(b);
     } else {
@@ -102,6 +102,6 @@ void point_due(struct board *b) {
 
 void refill(struct board *b) {
     if (b->state == STATE_HOLD && enough_queued(b)) {
-        set_state(b, STATE_RUNNING, REASON_REFILLED);
+        change_state(b, REASON_REFILLED);
     }
 }

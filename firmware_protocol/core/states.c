@@ -3,7 +3,7 @@
 #include "core.h"
 
 bool is_leased(uint8_t state) {
-    return state == STATE_ARMING || state == STATE_ARMED || state == STATE_RUNNING || state == STATE_HOLD;
+    return STATES_LEASED >> state & 1u;
 }
 
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) {
@@ -60,18 +60,30 @@ static void go_dark(struct board *b, enum reason reason) {
     b->has_current = false;
 }
 
-void set_state(struct board *b, enum state state, enum reason reason) {
+/* The state after an event; an event that the table does not have is a fault, and no caller causes one. */
+static enum state next_state(uint8_t state, enum reason event) {
+#define TRANSITION(from, reason, to) \
+    if (state == (from) && event == (reason)) { \
+        return to; \
+    }
+    STATE_TRANSITIONS(TRANSITION)
+#undef TRANSITION
+    return STATE_FAULT;
+}
+
+void change_state(struct board *b, enum reason event) {
+    enum state state = next_state(b->state, event);
     if (state != STATE_RUNNING) {
-        go_dark(b, reason);
+        go_dark(b, event);
     }
     uint8_t before = b->state, body[EVENT_SIZE];
     b->state = (uint8_t)state;
     b->hal.indicator(b->hal.context, is_leased(b->state));
     b->hal.relay(b->hal.context, state != STATE_FAULT);
-    trace(b, (struct board_trace){.kind = TRACE_STATE, .state = b->state, .before = before, .reason = (uint8_t)reason});
+    trace(b, (struct board_trace){.kind = TRACE_STATE, .state = b->state, .before = before, .reason = (uint8_t)event});
     body[EVENT_STATE_AT] = b->state;
     body[EVENT_FAULT_AT] = b->fault;
-    body[EVENT_REASON_AT] = (uint8_t)reason;
+    body[EVENT_REASON_AT] = (uint8_t)event;
     put_u64(body + EVENT_TICK_AT, b->now_us - b->epoch_us);
     send_message(b, MESSAGE_EVENT, body, sizeof body);
 }
@@ -84,8 +96,8 @@ void drop_queue(struct board *b) {
 
 void disarm(struct board *b, enum reason reason) {
     b->confirmed = b->nonce_good = false;
-    if (b->state != STATE_DISARMED && b->state != STATE_FAULT) {
-        set_state(b, STATE_DISARMED, reason);
+    if (!(STATES_IDLE >> b->state & 1u)) {
+        change_state(b, reason);
     }
     drop_queue(b);
 }
@@ -94,7 +106,7 @@ void fail(struct board *b, enum fault fault) {
     if (b->state != STATE_FAULT) {
         b->fault = (uint8_t)fault;
         trace(b, (struct board_trace){.kind = TRACE_FAULT, .fault = b->fault});
-        set_state(b, STATE_FAULT, REASON_FAULT);
+        change_state(b, REASON_FAULT);
     }
     b->confirmed = b->nonce_good = false;
     drop_queue(b);

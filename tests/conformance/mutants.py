@@ -7,38 +7,41 @@ from optodrive.core.errors import RemoteProtocolError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import BoardLink
 from optodrive.link.protocol.framing import CRC, HEADER, Frame, FrameDecoder, cobs_decode
+from optodrive.link.protocol.states import EventReason
 from optodrive.link.simulator import board_core as core_module
+from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator import board_process
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.board_machine import BoardMachine
 from optodrive.link.simulator.guards import EmissionGuards
 
 # Each function gives what is patched: (owner, name, what takes its place).
 
 
 def b1_states_do_not_darken():
-    return BoardCore, "_close_gate", lambda self, reason: setattr(self, "_current_point", None)
+    return BoardMachine, "_close_gate", lambda self, reason: setattr(self, "_current_point", None)
 
 
 def b1_start_tick_is_not_awaited():
-    start = BoardCore._on_start
-    return BoardCore, "_on_start", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
+    start = BoardMachine.start_job
+    return BoardMachine, "start_job", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
 
 
 def b2_lit_until_more_comes():
-    finish = BoardCore._finish_point
+    finish = BoardMachine._finish_point
 
     def burn_on(self, point):
-        if self._queue:
+        if self.queue:
             finish(self, point)
         else:
             self._due_us += 1000
 
-    return BoardCore, "_finish_point", burn_on
+    return BoardMachine, "_finish_point", burn_on
 
 
 def b3_no_lease():
-    return BoardCore, "_lease_due_us", lambda self: None
+    return BoardMachine, "_lease_due_us", lambda self: None
 
 
 def b3_any_session_renews():
@@ -50,7 +53,7 @@ def b3_anything_renews():
     obey = BoardCore._handle_unsequenced
 
     def renew(self, message):
-        self._lease_until_us = self._now_us + 1000 * self._limits.lease_ms
+        self.machine.lease_until_us = self.machine.now_us + 1000 * self.machine.limits.lease_ms
         obey(self, message)
 
     return BoardCore, "_handle_unsequenced", renew
@@ -61,7 +64,7 @@ def b3_host_says_how_long():
 
     def believe(self, message):
         if isinstance(message, m.Lease):
-            self._lease_until_us = max(self._lease_until_us, self._now_us + 1000 * message.ms)
+            self.machine.lease_until_us = max(self.machine.lease_until_us, self.machine.now_us + 1000 * message.ms)
         else:
             obey(self, message)
 
@@ -73,7 +76,7 @@ def b3_a_short_lease_takes_time_back():
 
     def shorten(self, message):
         if isinstance(message, m.Lease):
-            self._lease_until_us = self._now_us + 1000 * min(message.ms, self._limits.lease_ms)
+            self.machine.lease_until_us = self.machine.now_us + 1000 * min(message.ms, self.machine.limits.lease_ms)
         else:
             obey(self, message)
 
@@ -81,8 +84,8 @@ def b3_a_short_lease_takes_time_back():
 
 
 def b4_points_are_not_looked_at():
-    static = BoardCore._check_point
-    return BoardCore, "_check_point", lambda self, point: static(self, point._replace(on_us=0))
+    static = BoardMachine._check_point
+    return BoardMachine, "_check_point", lambda self, point: static(self, point._replace(on_us=0))
 
 
 def b4_no_account_of_cells():
@@ -110,8 +113,8 @@ def b4_light_elsewhere_is_rest():
 
 
 def b5_any_duty():
-    static = BoardCore._check_point
-    return BoardCore, "_check_point", lambda self, point: static(self, point._replace(duty=0))
+    static = BoardMachine._check_point
+    return BoardMachine, "_check_point", lambda self, point: static(self, point._replace(duty=0))
 
 
 def b5_no_mean():
@@ -138,11 +141,11 @@ def b6_one_grid_whose_borders_hide():
 def _begin(due):
     def begin(self, point):
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
-        settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000) if move else 0
+        settle_us = self.limits.settle_us + -(-move * self.limits.settle_ns_per_code // 1000) if move else 0
         self._position, self._current_point = (point.x, point.y), point
-        self._due_us = self._now_us + due(point.dark_us, settle_us)
+        self._due_us = self.now_us + due(point.dark_us, settle_us)
 
-    return BoardCore, "_begin_point", begin
+    return BoardMachine, "_begin_point", begin
 
 
 def b7_dark_time_alone():
@@ -158,53 +161,53 @@ def b7_forgets_a_move_that_was_broken_off():
 
 
 def b8_no_field():
-    return BoardCore, "_check_point", lambda self, point: ""
+    return BoardMachine, "_check_point", lambda self, point: ""
 
 
 def b8_lit_points_only():
-    static = BoardCore._check_point
-    return BoardCore, "_check_point", lambda self, point: static(self, point) if point.on_us else ""
+    static = BoardMachine._check_point
+    return BoardMachine, "_check_point", lambda self, point: static(self, point) if point.on_us else ""
 
 
 def b9_inputs_are_only_reported():
-    return BoardCore, "set_input", lambda self, name, value, now_us: self.inputs.update({name: value})
+    return BoardMachine, "set_input", lambda self, name, value: self.inputs.update({name: value})
 
 
 def b9_not_latched():
-    set_input = BoardCore.set_input
+    set_input = BoardMachine.set_input
 
-    def forgive(self, name, value, now_us):
-        set_input(self, name, value, now_us)
-        if self.inputs == core_module.SAFE_INPUTS and self.state == "FAULT":
-            self._on_clear_fault(m.ClearFault())
+    def forgive(self, name, value):
+        set_input(self, name, value)
+        if self.inputs == machine_module.SAFE_INPUTS and self.state == "FAULT":
+            self.clear_fault()
 
-    return BoardCore, "set_input", forgive
+    return BoardMachine, "set_input", forgive
 
 
 def b9_cleared_without_a_look():
-    def clear(self, message):
+    def clear(self):
         self.fault = ""
-        self._set_state("DISARMED", "fault cleared")
+        self._change_state(EventReason.FAULT_CLEARED)
         return ""
 
-    return BoardCore, "_on_clear_fault", clear
+    return BoardMachine, "clear_fault", clear
 
 
 def b10_takes_what_it_is_told():
-    return core_module, "tighten", lambda own, asked: asked
+    return machine_module, "tighten", lambda own, asked: asked
 
 
 def b10_against_the_first_only():
-    tightened = core_module.tighten
-    return core_module, "tighten", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
+    tightened = machine_module.tighten
+    return machine_module, "tighten", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
 
 
 def b11_any_echo():
-    def confirm(self, message):
+    def confirm(self, host_nonce, board_nonce):
         self._confirmed, self._key_turned = True, False
         return ""
 
-    return BoardCore, "_on_arm_confirm", confirm
+    return BoardMachine, "confirm_arming", confirm
 
 
 def b11_predictable():
@@ -223,18 +226,18 @@ def b11_predictable():
 
 
 def b11_key_may_stay():
-    confirm = BoardCore._on_arm_confirm
+    confirm = BoardMachine.confirm_arming
 
-    def keep(self, message):
-        refusal = confirm(self, message)
+    def keep(self, host_nonce, board_nonce):
+        refusal = confirm(self, host_nonce, board_nonce)
         self._key_turned = True
         return refusal
 
-    return BoardCore, "_on_arm_confirm", keep
+    return BoardMachine, "confirm_arming", keep
 
 
 def b11_at_once():
-    return core_module, "INDICATOR_US", 1000
+    return machine_module, "INDICATOR_US", 1000
 
 
 def b12_duplicates_are_taken():
@@ -246,8 +249,8 @@ def b12_duplicates_are_taken():
 
 
 def b12_number_is_not_looked_at():
-    data = BoardCore._on_data
-    return BoardCore, "_on_data", lambda self, message: data(self, m.Data(self._next_index, message.points))
+    queue_points = BoardMachine.queue_points
+    return BoardMachine, "queue_points", lambda self, first, points: queue_points(self, self.queue.next_index, points)
 
 
 def b13_no_crc():

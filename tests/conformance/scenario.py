@@ -1,12 +1,16 @@
 """The scenarios by subject, played many at once: most of their time is the two seconds of arming."""
 
 import tempfile
+import tomllib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench import Bench, BoardKind, TooLateError
 
+TABLE = tomllib.loads((Path(__file__).parents[2] / "firmware_protocol" / "messages.toml").read_text())
+TRANSITIONS = {(state, entry["event"], entry["to"]) for entry in TABLE["transition"] for state in entry["from"]}
 AT_ONCE = 12
 ATTEMPTS = 3
 GUARDS = [f"B{k}" for k in range(1, 16)]
@@ -77,6 +81,7 @@ def audit_log(events, state="BOOT"):
     for entry in events:
         if entry["event"] == "state":
             assert entry["before"] in (state, "BOOT"), entry  # a reset goes through BOOT unseen
+            assert (entry["before"], entry["reason"], entry["state"]) in TRANSITIONS, f"no transition: {entry}"
             state = entry["state"]
             assert not gate or state == "RUNNING", f"lit in {entry}"
         elif entry["event"] == "gate":

@@ -156,7 +156,7 @@ class CBoard:
     mirrors = property(lambda self: (self._look("x"), self._look("y")))
 
     @property
-    def _limits(self):
+    def limits(self):
         body = ctypes.create_string_buffer(m.Limits.LAYOUT.size)
         self._library.shim_limits(self._handle, body)
         return m.Limits.parse(body.raw)
@@ -224,6 +224,10 @@ class CBench(Bench):
         self.log.clear()
         own = m.Limits(**{**vars(DEFAULT_LIMITS), **(limits or {})})
         self.core = CBoard(library, BoardSettings(limits=own, **settings), self.log.append)
+
+    @property
+    def limits(self):
+        return self.core.limits
 
     def condition(self):
         return self.core.fingerprint

@@ -34,7 +34,7 @@ class LikePython:
         values = entropy or [source.getrandbits(32) for _ in range(256)]
         self.log, self.c_log = [], []
         self.python = BoardCore(settings, self.log.append)
-        self.python._random = PythonEntropy(values)
+        self.python._random = self.python.machine._random = PythonEntropy(values)
         self.c = CBoard(library, settings, self.c_log.append, values)
         self.now_us = 0
         self.heard = []

@@ -80,15 +80,15 @@ EPISODES = st.lists(
 
 def messages(core, what, detail):
     """What a host would say for a step, mostly such as the board may take in its state."""
-    first = core._queue[0].number if core._queue else core._next_index
+    first = core.machine.queue.first_index
     if what in ("play", "queue"):
-        data = m.Data(core._next_index, b"".join(m.POINT.pack(*point) for point in detail))
-        end = core._next_index + len(detail)
+        data = m.Data(core.machine.queue.next_index, b"".join(m.POINT.pack(*point) for point in detail))
+        end = core.machine.queue.next_index + len(detail)
         return [data, m.Start(1, first, 0, 3), m.End(1, end)] if what == "play" else [data]
     return {
         "start": [m.Start(1, first, 0, 2)],
-        "start later": [m.Start(1, first, core._current_tick() + 50_000, 1)],
-        "end": [m.End(1, core._next_index)],
+        "start later": [m.Start(1, first, core.machine.current_tick + 50_000, 1)],
+        "end": [m.End(1, core.machine.queue.next_index)],
         "clear": [m.ClearFault()],
         "lease": [m.Lease(60_000)],
         "short lease": [m.Lease(30)],
@@ -98,7 +98,7 @@ def messages(core, what, detail):
         "abort": [m.Abort()],
         "get": [m.Get()],
         "clock": [m.ClockRequest(77)],
-        "executed": [m.GetExecuted(max(0, core._done_index - 40))],
+        "executed": [m.GetExecuted(max(0, core.machine.queue.done_index - 40))],
         "limits": [detail],
     }[what]
 
@@ -107,13 +107,13 @@ def arm(both, limits=None):
     """All that leads to ARMED from here, unless limits or a lost lease stand in the way."""
     core = both.python
     for name, safe in (("interlock", True), ("key", True), ("estop", False)):
-        if core.inputs[name] != safe:
+        if core.machine.inputs[name] != safe:
             both.both(lambda board, name=name, safe=safe: board.set_input(name, safe, both.now_us))
     if both.python._settings.key_edge:
         both.both(lambda board: board.set_input("key", False, both.now_us))
         both.both(lambda board: board.set_input("key", True, both.now_us))
     both.say(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
-    both.say(m.ArmConfirm(6, core._board_nonce or 0), m.Lease(60_000))
+    both.say(m.ArmConfirm(6, core.machine._board_nonce or 0), m.Lease(60_000))
     for _ in range(30):
         both.wait(70_000)
         both.say(m.Lease(60_000))
@@ -138,7 +138,7 @@ def step(both, what, detail):
     elif what == "arm":
         arm(both)
     elif what == "input":
-        value = not core.inputs[detail]
+        value = not core.machine.inputs[detail]
         both.both(lambda board: board.set_input(detail, value, both.now_us))
     elif what == "link lost":
         both.both(lambda board: board.on_link_lost(both.now_us))

@@ -164,18 +164,18 @@ STEPS = st.one_of(
 
 def said(core, what, detail):
     """Frames' types and bodies for a step, mostly such as the board may take in its state."""
-    first = core._queue[0].number if core._queue else core._next_index
+    first = core.machine.queue.first_index
     if what == "anything":
         return [(detail[0].TYPE, detail[1])]
     if what in ("play", "queue"):
-        end = core._next_index + len(detail)
-        messages = [m.Data(core._next_index, b"".join(m.POINT.pack(*point) for point in detail))]
+        end = core.machine.queue.next_index + len(detail)
+        messages = [m.Data(core.machine.queue.next_index, b"".join(m.POINT.pack(*point) for point in detail))]
         messages += [m.Start(1, first, 0, 1), m.End(1, end)] if what == "play" else []
     else:
-        confirm = m.ArmConfirm(core._arming_host_nonce or 0, core._board_nonce or 0)
+        confirm = m.ArmConfirm(core.machine._host_nonce or 0, core.machine._board_nonce or 0)
         messages = {
             "start": [m.Start(1, first, 0, 1)],
-            "end": [m.End(1, core._next_index)],
+            "end": [m.End(1, core.machine.queue.next_index)],
             "clear": [m.ClearFault()],
             "arm": [m.ArmReq(5) if core.state == "DISARMED" else confirm],
             "lease": [m.Lease(60_000)],

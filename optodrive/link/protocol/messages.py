@@ -9,11 +9,12 @@ from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
 from optodrive.core.errors import RemoteProtocolError
+from optodrive.link.protocol.states import BoardState, EventReason
 
 MAJOR = 1
 MINOR = 0
 
-STATES = ("BOOT", "DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT")
+STATES = tuple(BoardState)
 FAULTS = (
     "",
     "LINK",
@@ -32,25 +33,7 @@ FAULTS = (
 NAK_REASONS = ("SEQUENCE", "NO_ROOM", "STATE", "INDEX", "NONCE", "KEY_EDGE", "INPUT", "VERSION")
 NOT_CONSUMED = ("SEQUENCE", "NO_ROOM")
 """NAK reasons after which the host resends the same frame. Any other reason consumes the frame's sequence number."""
-EVENT_REASONS = (
-    "",
-    "boot",
-    "hello",
-    "arm requested",
-    "armed",
-    "start",
-    "job done",
-    "queue empty",
-    "refilled",
-    "hold too long",
-    "disarm",
-    "abort",
-    "link lost",
-    "arming timed out",
-    "fault",
-    "fault cleared",
-    "flush",
-)
+EVENT_REASONS = tuple(EventReason)
 INPUTS = ("interlock", "key", "estop")
 
 POINT = struct.Struct("<HHHHH")

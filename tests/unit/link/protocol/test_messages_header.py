@@ -1,20 +1,32 @@
-"""Check that the firmware header is the output of generate.py for messages.toml."""
+"""The generated files: generate.py makes the firmware's header and the page's states from messages.toml."""
 
 import runpy
 import tomllib
 from pathlib import Path
 
+import pytest
+
 CONTRACT = Path(__file__).parents[4] / "firmware_protocol"
 GENERATE = runpy.run_path(str(CONTRACT / "generate.py"))
 TABLE = tomllib.loads((CONTRACT / "messages.toml").read_text())
+GENERATED = {
+    "build_header": CONTRACT / "core" / "messages.h",
+    "build_page_module": GENERATE["PAGE"] / "board_states.js",
+}
 
 
-def test_the_header_is_current():
-    header = (CONTRACT / "core" / "messages.h").read_text()
-    assert header == GENERATE["header"](TABLE), "run python firmware_protocol/generate.py"
+@pytest.mark.parametrize("build", GENERATED)
+def test_a_generated_file_is_current(build):
+    assert GENERATED[build].read_text() == GENERATE[build](TABLE), "run python firmware_protocol/generate.py"
 
 
 def test_a_changed_table_changes_the_header():
     changed = tomllib.loads((CONTRACT / "messages.toml").read_text())
     changed["timing"]["hold_max_us"] += 1
-    assert GENERATE["header"](changed) != GENERATE["header"](TABLE)
+    assert GENERATE["build_header"](changed) != GENERATE["build_header"](TABLE)
+
+
+def test_a_changed_transition_changes_the_header():
+    changed = tomllib.loads((CONTRACT / "messages.toml").read_text())
+    changed["transition"][0]["to"] = "FAULT"
+    assert GENERATE["build_header"](changed) != GENERATE["build_header"](TABLE)

@@ -118,7 +118,7 @@ def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     assert session.is_acknowledged
     assert session.board.state == "DISARMED"
     assert session.board.uid == BoardSettings().uid
-    assert rig.core._limits.spot_uj == session._requirements.build_limits().spot_uj < DEFAULT_LIMITS.spot_uj
+    assert rig.core.machine.limits.spot_uj == session._requirements.build_limits().spot_uj < DEFAULT_LIMITS.spot_uj
     assert session.board_s() == pytest.approx(rig.clock.now_s(), abs=0.003)
     assert session.collect_link_stats()["round_trip_ms"] > 0
 
@@ -201,7 +201,7 @@ def test_limits_hold_also_where_the_session_found_a_fault(rig):
     rig.session.disarm()
     rig.until(lambda: rig.session.board.state == "DISARMED")
     rig.arm()
-    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj
+    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj
 
 
 # --- arming and playing ---------------------------------------------------------------------------------------------
@@ -322,7 +322,7 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
     rig.session.disconnect()
     rig.connect()
     assert rig.session.board.state == "DISARMED"
-    assert rig.session.board_s() == pytest.approx(rig.core._current_tick() * 1e-6, abs=0.01)
+    assert rig.session.board_s() == pytest.approx(rig.core.machine.current_tick * 1e-6, abs=0.01)
 
 
 @pytest.mark.parametrize("kind", [m.HelloReply.TYPE, m.ClockReply.TYPE])
@@ -333,7 +333,7 @@ def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
     rig.link.keep_back = lambda frame: frame.type == kind
     with pytest.raises(LinkError):
         rig.connect()
-    assert rig.session.board_s() == pytest.approx(rig.core._current_tick() * 1e-6, abs=0.01)
+    assert rig.session.board_s() == pytest.approx(rig.core.machine.current_tick * 1e-6, abs=0.01)
     rig.link.keep_back = lambda frame: False
     before_s = rig.session.board_s()
     rig.connect()
@@ -393,7 +393,7 @@ def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
     rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
     rig.run(0.5)
     assert len(rig.pulses()) <= lit + 1
-    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens again"
+    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens again"
     rig.arm()
     asked = plan(50)
     job = rig.play(asked)
@@ -421,7 +421,7 @@ def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_
     assert len(hellos) == 2
     told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
     assert told == [m.Limits.TYPE, m.ArmReq.TYPE]
-    assert rig.core._limits.spot_uj < DEFAULT_LIMITS.spot_uj
+    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj
 
 
 def test_flush_in_mid_job_stays_armed_for_the_next(rig):

@@ -119,9 +119,23 @@ class Bench:
 
     def condition(self):
         """All that junk on the line must leave as it is."""
-        core = self.core
-        job, lease = core._job, core._lease_until_us
-        return core.state, core.gate, list(core._queue), job, core._current_point, core._next_index, lease
+        machine = self.core.machine
+        queue = machine.queue
+        return (
+            machine.state,
+            machine.gate,
+            len(queue),
+            queue.first_index,
+            queue.job,
+            machine._current_point,
+            queue.next_index,
+            machine.lease_until_us,
+        )
+
+    @property
+    def limits(self):
+        """Limits in force."""
+        return self.core.machine.limits
 
     def bad_frames(self):
         """Frames counted as no frames: CRC, form."""

@@ -10,8 +10,10 @@ import pytest
 from board_bench import CENTRE, Bench, here, naks
 
 from optodrive.link.protocol import messages as m
-from optodrive.link.simulator import board_core as core_module
+from optodrive.link.simulator import board_machine as machine_module
+from optodrive.link.simulator.board_core import TICK_HZ
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
+from optodrive.link.simulator.execution_records import RING_RECORDS
 from optodrive.link.simulator.guards import DUTY_FULL, WINDOW_US, EmissionGuards, energy_uj
 
 
@@ -43,14 +45,14 @@ def test_the_timing_of_the_contract():
     contract = Path(__file__).parents[4] / "firmware_protocol" / "messages.toml"
     timing = tomllib.loads(contract.read_text())["timing"]
     assert timing == {
-        "tick_hz": core_module.TICK_HZ,
-        "indicator_us": core_module.INDICATOR_US,
-        "arming_timeout_us": core_module.ARMING_TIMEOUT_US,
-        "hold_max_us": core_module.HOLD_MAX_US,
-        "underruns_max": core_module.UNDERRUNS_MAX,
-        "underrun_window_us": core_module.UNDERRUN_WINDOW_US,
+        "tick_hz": TICK_HZ,
+        "indicator_us": machine_module.INDICATOR_US,
+        "arming_timeout_us": machine_module.ARMING_TIMEOUT_US,
+        "hold_max_us": machine_module.HOLD_MAX_US,
+        "underruns_max": machine_module.UNDERRUNS_MAX,
+        "underrun_window_us": machine_module.UNDERRUN_WINDOW_US,
         "mean_window_us": WINDOW_US,
-        "executed_ring": core_module.RING_RECORDS,
+        "executed_ring": RING_RECORDS,
     }
 
 
@@ -95,7 +97,7 @@ def test_another_major_version_may_talk_but_not_arm():
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])
 def test_no_arming_with_an_input_that_is_not_safe(name, value):
     b = Bench()
-    b.core.inputs[name] = value  # at power-up already, so no fault came of it
+    b.core.machine.inputs[name] = value  # at power-up already, so no fault came of it
     b.hello()
     assert naks(b.say(m.ArmReq(1))) == ["INPUT"]
 
@@ -469,7 +471,7 @@ def test_a_report_never_runs_over_more_than_32_bits_of_time(bench):
     bench.play(*dim(1))
     bench.wait(20_000)
     bench.say(m.Start(2, 1, bench.now_us + (1 << 32), 1), bench.data(*dim(1)), m.End(2, 2))
-    bench.core._lease_until_us = bench.now_us + (1 << 33)  # an hour and more in one step
+    bench.core.machine.lease_until_us = bench.now_us + (1 << 33)  # an hour and more in one step
     bench.now_us += (1 << 32) + 20_000
     bench.core.advance(bench.now_us)
     assert [record[0] for record in executed(bench.take())] == [1]

@@ -12,8 +12,11 @@ from optodrive.core.errors import RemoteProtocolError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import BoardLink
 from optodrive.link.protocol.framing import CRC, HEADER, Frame, FrameDecoder, cobs_decode, encode_frame
+from optodrive.link.protocol.states import EventReason
 from optodrive.link.simulator import board_core as core_module
+from optodrive.link.simulator import board_machine as machine_module
 from optodrive.link.simulator.board_core import BoardCore
+from optodrive.link.simulator.board_machine import BoardMachine
 from optodrive.link.simulator.guards import EmissionGuards
 
 REFUSED = tomllib.loads((Path(__file__).parents[4] / "firmware_protocol" / "refused.toml").read_text())["case"]
@@ -50,7 +53,7 @@ def check_b1(make):
 
 
 def b1_states_do_not_darken(patch):
-    patch.setattr(BoardCore, "_close_gate", lambda self, reason: setattr(self, "_current_point", None))
+    patch.setattr(BoardMachine, "_close_gate", lambda self, reason: setattr(self, "_current_point", None))
 
 
 # --- B2: queue empty: gate off within 100 µs ------------------------------------------------------------------------
@@ -67,15 +70,15 @@ def check_b2(make):
 
 
 def b2_goes_on_until_more_comes(patch):
-    finish = BoardCore._finish_point
+    finish = BoardMachine._finish_point
 
     def burn_on(self, point):
-        if self._queue:
+        if self.queue:
             finish(self, point)
         else:
             self._due_us += 1000
 
-    patch.setattr(BoardCore, "_finish_point", burn_on)
+    patch.setattr(BoardMachine, "_finish_point", burn_on)
 
 
 # --- B3: no valid LEASE in this session for lease_ms: FAULT LINK ----------------------------------------------------
@@ -118,7 +121,7 @@ def check_b3(make):
 
 
 def b3_no_lease(patch):
-    patch.setattr(BoardCore, "_lease_due_us", lambda self: None)
+    patch.setattr(BoardMachine, "_lease_due_us", lambda self: None)
 
 
 def b3_any_session_renews(patch):
@@ -132,7 +135,7 @@ def b3_anything_renews(patch):
     obey = BoardCore._handle_unsequenced
 
     def renew(self, message):
-        self._lease_until_us = self._now_us + 100_000
+        self.machine.lease_until_us = self.machine.now_us + 100_000
         obey(self, message)
 
     patch.setattr(BoardCore, "_handle_unsequenced", renew)
@@ -141,7 +144,7 @@ def b3_anything_renews(patch):
 def b3_host_says_how_long(patch):
     def obey(self, message):
         if isinstance(message, m.Lease):
-            self._lease_until_us = self._now_us + 1000 * message.ms
+            self.machine.lease_until_us = self.machine.now_us + 1000 * message.ms
 
     patch.setattr(BoardCore, "_handle_unsequenced", obey)
 
@@ -181,8 +184,8 @@ def check_b4(make):
 
 
 def b4_no_look_at_points(patch):
-    static = BoardCore._check_point
-    patch.setattr(BoardCore, "_check_point", lambda self, point: static(self, point._replace(on_us=0)))
+    static = BoardMachine._check_point
+    patch.setattr(BoardMachine, "_check_point", lambda self, point: static(self, point._replace(on_us=0)))
 
 
 def b4_no_account_of_cells(patch):
@@ -226,8 +229,8 @@ def check_b5(make):
 
 
 def b5_no_duty(patch):
-    static = BoardCore._check_point
-    patch.setattr(BoardCore, "_check_point", lambda self, point: static(self, point._replace(duty=0)))
+    static = BoardMachine._check_point
+    patch.setattr(BoardMachine, "_check_point", lambda self, point: static(self, point._replace(duty=0)))
 
 
 def b5_no_mean(patch):
@@ -313,7 +316,7 @@ def check_b7(make):
     assert first_light_after_us(b) == 1150, "a move that was broken off is still under way"
 
     b = make().ready()
-    b.say(m.Disarm(), m.Limits(**{**vars(b.core._limits), "settle_us": 3000}))
+    b.say(m.Disarm(), m.Limits(**{**vars(b.limits), "settle_us": 3000}))
     b.arm()
     b.play(here(100, x=CENTRE + 1))
     assert first_light_after_us(b) == 3001
@@ -322,23 +325,23 @@ def check_b7(make):
 def _begin(due):
     def begin(self, point):
         move = max(abs(point.x - self._position[0]), abs(point.y - self._position[1]))
-        settle_us = self._limits.settle_us + -(-move * self._limits.settle_ns_per_code // 1000) if move else 0
+        settle_us = self.limits.settle_us + -(-move * self.limits.settle_ns_per_code // 1000) if move else 0
         self._position, self._current_point = (point.x, point.y), point
-        self._due_us = self._now_us + due(point.dark_us, settle_us)
+        self._due_us = self.now_us + due(point.dark_us, settle_us)
 
     return begin
 
 
 def b7_host_alone(patch):
-    patch.setattr(BoardCore, "_begin_point", _begin(lambda dark_us, settle_us: dark_us))
+    patch.setattr(BoardMachine, "_begin_point", _begin(lambda dark_us, settle_us: dark_us))
 
 
 def b7_board_alone(patch):
-    patch.setattr(BoardCore, "_begin_point", _begin(lambda dark_us, settle_us: settle_us))
+    patch.setattr(BoardMachine, "_begin_point", _begin(lambda dark_us, settle_us: settle_us))
 
 
 def b7_forgets_a_move_that_was_broken_off(patch):
-    patch.setattr(BoardCore, "_begin_point", _begin(max))
+    patch.setattr(BoardMachine, "_begin_point", _begin(max))
 
 
 # --- B8: a position outside the field is a fault, and nothing is lit ------------------------------------------------
@@ -357,7 +360,7 @@ def check_b8(make):
 
 
 def b8_no_field(patch):
-    patch.setattr(BoardCore, "_check_point", lambda self, point: "")
+    patch.setattr(BoardMachine, "_check_point", lambda self, point: "")
 
 
 # --- B9: interlock, key and emergency stop: gate off within 1 ms, latched -------------------------------------------
@@ -389,27 +392,27 @@ def check_b9(make):
 
 
 def b9_inputs_are_only_reported(patch):
-    patch.setattr(BoardCore, "set_input", lambda self, name, value, now_us: self.inputs.update({name: value}))
+    patch.setattr(BoardMachine, "set_input", lambda self, name, value: self.inputs.update({name: value}))
 
 
 def b9_not_latched(patch):
-    set_input = BoardCore.set_input
+    set_input = BoardMachine.set_input
 
-    def forgive(self, name, value, now_us):
-        set_input(self, name, value, now_us)
-        if self.inputs == core_module.SAFE_INPUTS and self.state == "FAULT":
-            self._on_clear_fault(m.ClearFault())
+    def forgive(self, name, value):
+        set_input(self, name, value)
+        if self.inputs == machine_module.SAFE_INPUTS and self.state == "FAULT":
+            self.clear_fault()
 
-    patch.setattr(BoardCore, "set_input", forgive)
+    patch.setattr(BoardMachine, "set_input", forgive)
 
 
 def b9_cleared_without_a_look(patch):
-    def clear(self, message):
+    def clear(self):
         self.fault = ""
-        self._set_state("DISARMED", "fault cleared")
+        self._change_state(EventReason.FAULT_CLEARED)
         return ""
 
-    patch.setattr(BoardCore, "_on_clear_fault", clear)
+    patch.setattr(BoardMachine, "clear_fault", clear)
 
 
 # --- B10: the host only tightens ------------------------------------------------------------------------------------
@@ -428,25 +431,25 @@ def check_b10(make):
     assert b.hello().limits == own
     for asked, power in ((looser, 9), (own, 1)):
         assert naks(b.say(m.Limits(**{**vars(asked), "full_power_uw": power}))) == []
-        assert b.core._limits == own
+        assert b.limits == own
     for asked in (tighter, looser, own):
         b.say(asked)
-        assert vars(b.core._limits) == {**vars(tighter), "full_power_uw": OWN["full_power_uw"]}
+        assert vars(b.limits) == {**vars(tighter), "full_power_uw": OWN["full_power_uw"]}
     b.arm()
     assert naks(b.say(looser)) == ["STATE"]
     b.say(b.data(here(OWN["max_on_us"] // 2 + 1, x=10_000, y=10_000)))
     assert b.fault == "ON_TIME"
     assert b.hello().limits == own, "a new session begins with the board's own"
-    assert b.core._limits == own
+    assert b.limits == own
 
 
 def b10_takes_what_it_is_told(patch):
-    patch.setattr(core_module, "tighten", lambda own, asked: asked)
+    patch.setattr(machine_module, "tighten", lambda own, asked: asked)
 
 
 def b10_against_own_only(patch):
-    tightened = core_module.tighten
-    patch.setattr(core_module, "tighten", lambda own, asked: tightened(m.Limits(**OWN), asked))
+    tightened = machine_module.tighten
+    patch.setattr(machine_module, "tighten", lambda own, asked: tightened(m.Limits(**OWN), asked))
 
 
 # --- B11: arming needs a fresh nonce, and the key's edge where the board wants it -----------------------------------
@@ -500,12 +503,12 @@ def turn_key(b):
 
 
 def b11_any_nonce(patch):
-    def confirm(self, message):
+    def confirm(self, host_nonce, board_nonce):
         self._confirmed = True
         self._key_turned = False
         return ""
 
-    patch.setattr(BoardCore, "_on_arm_confirm", confirm)
+    patch.setattr(BoardMachine, "confirm_arming", confirm)
 
 
 def b11_predictable(patch):
@@ -524,14 +527,14 @@ def b11_predictable(patch):
 
 
 def b11_key_may_stay(patch):
-    confirm = BoardCore._on_arm_confirm
+    confirm = BoardMachine.confirm_arming
 
-    def keep(self, message):
-        refusal = confirm(self, message)
+    def keep(self, host_nonce, board_nonce):
+        refusal = confirm(self, host_nonce, board_nonce)
         self._key_turned = True
         return refusal
 
-    patch.setattr(BoardCore, "_on_arm_confirm", keep)
+    patch.setattr(BoardMachine, "confirm_arming", keep)
 
 
 # --- B12: each index at most once, in order -------------------------------------------------------------------------
@@ -570,8 +573,10 @@ def b12_duplicates_are_taken(patch):
 
 
 def b12_index_is_not_looked_at(patch):
-    data = BoardCore._on_data
-    patch.setattr(BoardCore, "_on_data", lambda self, message: data(self, m.Data(self._next_index, message.points)))
+    queue_points = BoardMachine.queue_points
+    patch.setattr(
+        BoardMachine, "queue_points", lambda self, first, points: queue_points(self, self.queue.next_index, points)
+    )
 
 
 # --- B13: malformed frames change counters only ---------------------------------------------------------------------
