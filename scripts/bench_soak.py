@@ -24,6 +24,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import OptodriveError
 from optodrive.device.config import load_config
 from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
+from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
@@ -184,7 +185,7 @@ class SoakRun:
             self._session.step(STEP_S, renew_lease=True)
             while self._jobs and self._jobs[0][0].finished:
                 self.reports.check_plan(*self._jobs.pop(0))
-            if self._session.board.state in ("DISARMED", "FAULT"):
+            if self._session.board.state in IDLE_STATES:
                 return
             done = self._session.board.done_index
             if done >= samples * self._total / MEMORY_SAMPLES:
@@ -196,7 +197,7 @@ def connect_and_arm(session):
     """Until the board is armed."""
     session.connect()
     session.arm()
-    while session.board.state != "ARMED":
+    while session.board.state != BoardState.ARMED:
         session.step(STEP_S, renew_lease=True)
 
 

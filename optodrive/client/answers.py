@@ -9,6 +9,7 @@ from optodrive.client.http import JsonObject, build_error
 from optodrive.core.errors import OptodriveError, RefusedError
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
 from optodrive.device.config import PixelLayout
+from optodrive.link.protocol.states import ARMED_STATES
 
 UNFINISHED_STATUSES = ("queued", "running")
 
@@ -47,7 +48,7 @@ class State(NamedTuple):
     @property
     def armed(self) -> bool:
         """Whether the board takes plans."""
-        return self.board in ("ARMED", "RUNNING", "HOLD")
+        return self.board in ARMED_STATES
 
 
 @dataclass(frozen=True, eq=False)

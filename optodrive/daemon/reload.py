@@ -12,16 +12,16 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.tokens import read_private_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
+from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.planning.display_model import DisplayModel
 
 RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
 """Keys of [daemon]; the file of tokens is read again too."""
-NON_RELOADABLE_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
 def require_disarmed(board_state: str) -> None:
     """NotReadyError while the board may emit: what it runs under stays as it was when it was armed."""
-    if board_state in NON_RELOADABLE_STATES:
+    if board_state in LEASED_STATES:
         raise NotReadyError(f"nothing is reloaded while the board is {board_state}; disarm it first")
 
 

@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.states import IDLE_STATES
 from optodrive.link.simulator.board_limits import BoardSettings
 from optodrive.link.simulator.board_process import main
 
@@ -136,7 +137,7 @@ class QemuCore:
 
     @property
     def _dark(self) -> bool:
-        return self._state in ("DISARMED", "FAULT")
+        return self._state in IDLE_STATES
 
     def set_input(self, name: str, value: bool, now_us: int) -> None:
         """What an input reads from now on."""

@@ -24,6 +24,7 @@ from optodrive.daemon.engine.planner import Planner, PlanningRequest
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
 from optodrive.daemon.engine.state_waiters import JsonObject, StateWaiters, uncancellable_future
 from optodrive.link.protocol.quantisation import WireScale
+from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
@@ -168,15 +169,15 @@ class Engine:
 
     def arm(self) -> "Future[JsonObject]":
         """Arm the board; done when it is ARMED."""
-        return self._submit_command(self._session.arm, ("ARMED",), "arm")
+        return self._submit_command(self._session.arm, (BoardState.ARMED,), "arm")
 
     def disarm(self) -> "Future[JsonObject]":
         """Disarm, or acknowledge a fault; done when the board is DISARMED."""
-        return self._submit_command(self._session.disarm, ("DISARMED",), "disarm")
+        return self._submit_command(self._session.disarm, (BoardState.DISARMED,), "disarm")
 
     def stop(self) -> "Future[JsonObject]":
         """Abort: gate off, queue dropped; done when the board is dark for good."""
-        return self._submit_command(self._session.abort, ("DISARMED", "FAULT"), "stop")
+        return self._submit_command(self._session.abort, IDLE_STATES, "stop")
 
     def _submit_command(
         self, action: Callable[[], None], states: tuple[str, ...], command: str
@@ -231,7 +232,7 @@ class Engine:
     def _require_armed(self) -> None:
         self._require_link()
         board = self._session.board
-        if board.state not in ("ARMED", "RUNNING", "HOLD"):
+        if board.state not in ARMED_STATES:
             fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
         if len(self._plan_queue.waiting) >= QUEUE_MAX:

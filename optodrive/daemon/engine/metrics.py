@@ -7,11 +7,12 @@ from typing import Any
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.session import BoardSession
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 LATENCY_BUCKETS_S = (0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
-BOARD_STATES = ("DISARMED", "ARMING", "ARMED", "RUNNING", "HOLD", "FAULT")
+REPORTED_STATES = tuple(state for state in BoardState if state != BoardState.BOOT)
 Labels = Mapping[str, str]
 
 
@@ -37,7 +38,7 @@ def render_metrics(snapshot: Mapping[str, Any], counters: PlanCounters, session:
     page = _MetricsPage()
     page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot["display"]}, 1)])
     page.add_gauge(
-        "board_state", "1 for the board's state", [({"state": s}, int(board["state"] == s)) for s in BOARD_STATES]
+        "board_state", "1 for the board's state", [({"state": s}, int(board["state"] == s)) for s in REPORTED_STATES]
     )
     page.add_counter(
         "board_faults_total", "Times the board was seen to go into a fault", _label_counts("fault", session.faults)

@@ -17,6 +17,7 @@ from optodrive.core.types.plans import BudgetState
 from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore, Status
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, apply_executed
+from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
@@ -240,7 +241,7 @@ class PlanQueue:
     def update_jobs(self, refusal: str | None) -> None:
         """Take over what the board did; refusal: what it refused since the last look."""
         board = self._session.board
-        if board.state in ("FAULT", "DISARMED", "ARMING", "BOOT") and self.is_busy:
+        if board.state in UNARMED_STATES and self.is_busy:
             cause = self._session.likely_cause if board.fault == "LINK" else None
             cause_text = get_fault_hint(board.fault) if cause is None else cause.message
             reason = f"{board.fault}: {cause_text}" if board.fault else self._session.last_event_reason

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
+from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 
@@ -69,7 +70,7 @@ class StateWaiters:
             return LinkError(link_error or "no link to the board")
         if refusal is not None:
             return NotReadyError(f"the board refuses to {waiter.command}: {refusal}")
-        if board.state == "FAULT" and waiter.command == "arm":
+        if board.state == BoardState.FAULT and waiter.command == "arm":
             return BoardFaultError(f"the board is in FAULT {board.fault}: {get_fault_hint(board.fault)}")
         if now_s > waiter.deadline_s:
             return NotReadyError(f"the board did not {waiter.command} within {TIMEOUT_S:g} s: it is {board.state}")

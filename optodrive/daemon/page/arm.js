@@ -1,6 +1,7 @@
 // Arming, deliberately: one control asks, another confirms within five seconds. Never by itself.
 
 import { call } from "./api.js";
+import { ARMED_STATES, BoardState } from "./board_states.js";
 
 const CONFIRM_S = 5;
 
@@ -23,14 +24,14 @@ export class Arm {
   show(state) {
     if (state !== this.state) {
       this.state = state;
-      this.button.disabled = state !== "DISARMED";
+      this.button.disabled = state !== BoardState.DISARMED;
       this.line.textContent =
-        state === "ARMING"
+        state === BoardState.ARMING
           ? "The indicator is lit; the laser can emit when its two seconds are over."
-          : ["ARMED", "RUNNING", "HOLD"].includes(state)
+          : ARMED_STATES.includes(state)
             ? "ARMED: the laser emits when a plan plays."
             : this.idle;
-      if (state !== "DISARMED") {
+      if (state !== BoardState.DISARMED) {
         this.#close();
       }
     }
@@ -71,6 +72,6 @@ export class Arm {
     this.#close();
     this.button.disabled = true;
     await call("POST", "/v1/arm").catch(this.failed);
-    this.button.disabled = this.state !== "DISARMED";
+    this.button.disabled = this.state !== BoardState.DISARMED;
   }
 }

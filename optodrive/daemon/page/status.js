@@ -1,7 +1,8 @@
 // The board and the link in words: what state they are in, and what to do where they are not well.
 
-const KINDS = { DISARMED: "none", ARMING: "warn", ARMED: "warn", RUNNING: "warn", HOLD: "warn", FAULT: "bad", BOOT: "none" };
-const WORDS = { HOLD: "HOLD, waiting for points" };
+import { BoardState, LEASED_STATES } from "./board_states.js";
+
+const WORDS = { [BoardState.HOLD]: "HOLD, waiting for points" };
 
 export class Status {
   constructor(find, say, acknowledge) {
@@ -18,9 +19,9 @@ export class Status {
   showState(state) {
     const { board, link, totals } = state;
     const up = link.state === "up";
-    pill(this.board, up ? `board: ${WORDS[board.state] ?? board.state}` : "board: no link", up ? KINDS[board.state] ?? "none" : "bad");
+    pill(this.board, up ? `board: ${WORDS[board.state] ?? board.state}` : "board: no link", up ? kindOf(board.state) : "bad");
     const now = up ? board.state : "no link to the board";
-    if (this.last && now !== this.last && !["RUNNING", "HOLD"].includes(now)) {
+    if (this.last && now !== this.last && ![BoardState.RUNNING, BoardState.HOLD].includes(now)) {
       this.say(`Board: ${now}`);
     }
     this.last = now;
@@ -76,6 +77,13 @@ export class Status {
       this.trouble.hidden = lines.length === 0;
     }
   }
+}
+
+function kindOf(state) {
+  if (state === BoardState.FAULT) {
+    return "bad";
+  }
+  return LEASED_STATES.includes(state) ? "warn" : "none";
 }
 
 function pill(item, text, kind) {

@@ -25,6 +25,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
 from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
+from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
@@ -99,11 +100,11 @@ class ExclusiveBoard:
         """Keep the lease and listen, for a moment; raises where the board ended the task by itself."""
         self.session.step(LOOP_STEP_S, renew_lease=True)
         board, refusal = self.session.board, self.session.pop_refusal()
-        if board.state == "FAULT" and self._arm_requested:
+        if board.state == BoardState.FAULT and self._arm_requested:
             raise self._build_fault_error()
         if refusal is not None:
             raise NotReadyError(f"the board refuses: {refusal}")
-        if self._armed and board.state in ("DISARMED", "ARMING"):
+        if self._armed and board.state in (BoardState.DISARMED, BoardState.ARMING):
             raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_event_reason}")
 
     def _build_fault_error(self) -> BoardFaultError:
@@ -125,7 +126,7 @@ class ExclusiveBoard:
         start_s = self._clock.now_s()
         self.session.arm()
         self._arm_requested = True
-        while self.session.board.state != "ARMED":
+        while self.session.board.state != BoardState.ARMED:
             self.step()
             if self._clock.now_s() - start_s > ARM_TIMEOUT_S:
                 raise NotReadyError(f"the board did not arm within {ARM_TIMEOUT_S:g} s: {self.session.board.state}")
@@ -137,7 +138,7 @@ class ExclusiveBoard:
         self._arm_requested = self._armed = False
         self.session.disarm()
         until_s = self._clock.now_s() + ARM_TIMEOUT_S
-        while self.session.board.state != "DISARMED":
+        while self.session.board.state != BoardState.DISARMED:
             self.session.step(LOOP_STEP_S, renew_lease=False)
             refusal = self.session.pop_refusal()
             if refusal is not None:

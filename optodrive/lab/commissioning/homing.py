@@ -16,6 +16,7 @@ from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.spot_reader import SpotReader
 from optodrive.link.protocol.messages import INPUTS
 from optodrive.link.protocol.quantisation import CENTRE_CODE
+from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
 
 INDICATOR_S = 2.0
@@ -89,9 +90,9 @@ class Homing:
     def check_status(self, name: str) -> HomingResult:
         """The board waits, without a fault."""
         board = self._board.session.board
-        if board.state == "FAULT" and self._acknowledge:
+        if board.state == BoardState.FAULT and self._acknowledge:
             self._board.disarm()
-        if board.state != "DISARMED":
+        if board.state != BoardState.DISARMED:
             fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise _build_refusal(
                 name, "board", f"{board.state}{fault}", "DISARMED; --acknowledge once the cause is gone"
@@ -161,7 +162,7 @@ class Homing:
         """Back to the middle in the dark, and disarmed."""
         self._board.move_to(CENTRE_CODE, CENTRE_CODE)
         self._board.disarm()
-        return HomingResult(name, "mirrors in the middle, DISARMED", {"board": "DISARMED"})
+        return HomingResult(name, "mirrors in the middle, DISARMED", {"board": BoardState.DISARMED})
 
     # --- what they share ----------------------------------------------------------------------------------------
 

@@ -46,6 +46,8 @@ LEASED_STATES = (BoardState.ARMING, BoardState.ARMED, BoardState.RUNNING, BoardS
 """States that require a lease."""
 ARMED_STATES = (BoardState.ARMED, BoardState.RUNNING, BoardState.HOLD)
 """States that accept points."""
+UNARMED_STATES = tuple(state for state in BoardState if state not in ARMED_STATES)
+"""States that end a plan."""
 IDLE_STATES = (BoardState.DISARMED, BoardState.FAULT)
 """States that accept limits and that DISARM, ABORT and HELLO do not change."""
 

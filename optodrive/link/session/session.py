@@ -17,6 +17,7 @@ from optodrive.core.histogram import Histogram
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
+from optodrive.link.protocol.states import IDLE_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
@@ -37,7 +38,6 @@ SILENCE_TIMEOUT_S = 2.0
 SPLICE_LEAD_S = 0.01
 """Minimum time between a splice and the end of the points before it."""
 LEASE_AGE_BUCKETS_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
-LEASED_STATES = ("ARMING", "ARMED", "RUNNING", "HOLD")
 
 
 class BoardSession:
@@ -89,7 +89,7 @@ class BoardSession:
     @property
     def is_ready(self) -> bool:
         """Whether a job may start now."""
-        return self.board.state == "ARMED" and not self._points and self.is_acknowledged
+        return self.board.state == BoardState.ARMED and not self._points and self.is_acknowledged
 
     @property
     def is_acknowledged(self) -> bool:
@@ -304,7 +304,7 @@ class BoardSession:
 
     def _set_state(self, state: str) -> None:
         self.board.state = state
-        if state != "FAULT":
+        if state != BoardState.FAULT:
             self.board.fault = ""
 
     def _on_clock_reply(self, message: m.ClockReply, now_s: float) -> None:
@@ -326,7 +326,7 @@ class BoardSession:
 
     def arm(self) -> None:
         """Request arming. The board shows its indicator and is ARMED two seconds after the confirmation."""
-        if self.board.state != "DISARMED":
+        if self.board.state != BoardState.DISARMED:
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
         self._refusal = None
@@ -338,7 +338,7 @@ class BoardSession:
         """Disarm the board, or acknowledge its fault in FAULT."""
         self._refusal = None
         self._points.clear()
-        self._connection.send(m.ClearFault() if self.board.state == "FAULT" else m.Disarm())
+        self._connection.send(m.ClearFault() if self.board.state == BoardState.FAULT else m.Disarm())
 
     def abort(self) -> None:
         """Turn the gate off, drop the queue and disarm, before all other queued messages."""
@@ -383,11 +383,11 @@ class BoardSession:
     def _stream_points(self) -> None:
         if not self._points:
             return
-        if self.board.state not in ("DISARMED", "FAULT"):  # else the board has ended the job: only collect its reports
+        if self.board.state not in IDLE_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
         self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
-        self._points.drop_finished(self.board.state == "ARMED")
+        self._points.drop_finished(self.board.state == BoardState.ARMED)
 
     # --- statistics ---------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
 from optodrive.core.types.plans import ExecutedPulses
 from optodrive.link.protocol.quantisation import quantise
+from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
@@ -26,7 +27,7 @@ def execute(
     session = BoardSession(MemoryLink(core, clock), clock, BoardRequirements.from_config(display.config))
     session.connect()
     session.arm()
-    while session.board.state != "ARMED":
+    while session.board.state != BoardState.ARMED:
         _step(session)
     scale = session.scale
     points = quantise(prepared.plan, scale)
@@ -42,5 +43,5 @@ def execute(
 def _step(session: BoardSession) -> None:
     session.step(STEP_S, renew_lease=True)
     board = session.board
-    if board.state in ("FAULT", "DISARMED") and session.last_event_reason not in ("", "boot", "hello"):
+    if board.state in IDLE_STATES and session.last_event_reason not in ("", "boot", "hello"):
         raise BoardFaultError(f"the simulated board went to {board.state} {board.fault} ({session.last_event_reason})")
