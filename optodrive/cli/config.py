@@ -19,10 +19,11 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.effective_config import build_effective_config
 
-    document = build_effective_config(DisplayModel.from_config(load_config(config)))
+    effective = build_effective_config(DisplayModel.from_config(load_config(config)))
     if json:
-        print_json(document)
+        print_json(effective)
         return
+    document = effective.model_dump(mode="json")
     pixels = document["display"].pop("pixels")
     document["display"]["pixels"] = f"{len(pixels)} (listed with --json)"
     for section, content in document.items():

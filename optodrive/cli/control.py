@@ -1,10 +1,13 @@
 """`optodrive status | arm | disarm | stop`, against a running daemon."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
 import typer
 
 from optodrive.cli.options import DEFAULT_URL, JsonOption, UrlOption, print_json
+
+if TYPE_CHECKING:
+    from optodrive.daemon.responses.state import StateReport
 
 
 def register(app: typer.Typer) -> None:
@@ -15,41 +18,47 @@ def register(app: typer.Typer) -> None:
 
 def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     """Show the board, the link and the queue."""
-    _print_state(_call(url, "GET", "/v1/state"), json)
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import READ_STATE
+
+    _print(DaemonClient(url).call(READ_STATE), json)
 
 
 def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Arm the board; its indicator is lit for two seconds first."""
-    _print_state(_call(url, "POST", "/v1/arm"), json)
+    """Arm the board; its indicator is on for two seconds first."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import ARM
+
+    _print(DaemonClient(url).call(ARM), json)
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Disarm the board; also acknowledges a fault whose cause is gone."""
-    _print_state(_call(url, "POST", "/v1/disarm"), json)
+    """Disarm the board; this also acknowledges a fault whose cause is gone."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import DISARM
+
+    _print(DaemonClient(url).call(DISARM), json)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Gate off now; everything queued is dropped, the board disarmed."""
-    _print_state(_call(url, "POST", "/v1/stop"), json)
-
-
-def _call(url: str, method: str, path: str) -> dict[str, Any]:
+    """Switch the gate off, drop everything queued, disarm the board."""
     from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import STOP
 
-    return DaemonClient(url).call(method, path)
+    _print(DaemonClient(url).call(STOP), json)
 
 
-def _print_state(state: dict[str, Any], as_json: bool) -> None:
+def _print(state: "StateReport", as_json: bool) -> None:
     if as_json:
         print_json(state)
         return
-    board = state["board"]
-    print(f"display   {state['display']}, {state['pixels']} pixels")
-    print(f"link      {state['link']['port']}: {state['link']['state']}")
-    print(f"board     {board['state']}" + (f", fault {board['fault']}: {board['hint']}" if board["fault"] else ""))
-    print(f"queue     {state['queue']['waiting']} waiting, running {state['queue']['running'] or 'nothing'}")
-    print(f"executed  {state['totals']['executed']} pulses of {state['totals']['sent']} sent")
-    if state["link"]["likely_cause"]:
-        print(f"cause     {state['link']['likely_cause_ago_s']:.0f} s ago: {state['link']['likely_cause']}")
-    if state["link"]["error"]:
-        print(f"error     {state['link']['error']}")
+    board, link, queue, totals = state.board, state.link, state.queue, state.totals
+    print(f"display   {state.display}, {state.pixels} pixels")
+    print(f"link      {link.port}: {link.state}")
+    print(f"board     {board.state}" + (f", fault {board.fault}: {board.hint}" if board.fault else ""))
+    print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
+    print(f"executed  {totals.executed} pulses of {totals.sent} sent")
+    if link.likely_cause:
+        print(f"cause     {link.likely_cause_age_s:.0f} s ago: {link.likely_cause}")
+    if link.error:
+        print(f"error     {link.error}")

@@ -17,11 +17,11 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     announce_compilation,
-    format_plan_summary,
     load_run_config,
     print_json,
     show_progress,
 )
+from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
@@ -92,7 +92,7 @@ def play(
     from optodrive.link.helios.heat_memory import HeatMemory
     from optodrive.link.helios.verification import encode_verified
     from optodrive.planning.display_model import DisplayModel
-    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan
     from optodrive.planning.stimuli.sequence_file import load_sequence
@@ -121,14 +121,12 @@ def play(
             playback = _play_and_store_heat(
                 helios, memory, planned_sequence, proven, clock, _combine_progress(raise_if_signalled, on_progress)
             )
-    document = {
-        **summarize_plan(planned_sequence, feasibility),
-        "helios": _summarise_playback(display, planned_sequence, proven, playback),
-    }
+    summary = summarize_plan(planned_sequence, feasibility)
+    playback_summary = _summarise_playback(display, planned_sequence, proven, playback)
     if json:
-        print_json(document)
+        print_json({**summary.model_dump(mode="json"), "helios": playback_summary})
         return
-    for line in [*format_plan_summary(document), *_format_playback(document["helios"])]:
+    for line in [*format_plan_summary(summary), *_format_playback(playback_summary)]:
         print(line)
 
 

@@ -5,7 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -48,7 +48,6 @@ FitOption = Annotated[
         "--fit", help="What does not fit on the beam: even lowers all of it, priority leaves out the less important."
     ),
 ]
-OMITTED_LISTED_MAX = 5
 DEFAULT_URL = "http://127.0.0.1:8450"
 
 
@@ -87,10 +86,16 @@ def load_run_config(
     return loaded.model_copy(update={"pixel_model": section})
 
 
-def print_json(document: dict[str, Any]) -> None:
-    """One JSON object on stdout."""
-    json.dump(document, sys.stdout, indent=2, ensure_ascii=False)
+def print_json(document: object) -> None:
+    """Print one JSON object on stdout; it may be or contain Pydantic models."""
+    json.dump(document, sys.stdout, indent=2, ensure_ascii=False, default=_convert_model)
     sys.stdout.write("\n")
+
+
+def _convert_model(value: object) -> object:
+    from pydantic_core import to_jsonable_python
+
+    return to_jsonable_python(value)
 
 
 def announce_compilation() -> None:
@@ -114,74 +119,3 @@ def show_progress(label: str) -> Iterator[Callable[[float], None]]:
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(label, total=1.0)
         yield lambda share: bar.update(task, completed=share)
-
-
-def format_plan_summary(summary: dict[str, Any]) -> list[str]:
-    """A plan's summary as a few lines of plain words."""
-    lines = [
-        *_format_feasibility(summary["feasibility"]),
-        f"pulses           {summary['pulses']}",
-        f"duration         {summary['duration_s']:.4f} s",
-        f"beam on          {summary['beam_on_s']:.4f} s, {100 * summary['beam_on_share']:.1f} % of it",
-        f"moves            {summary['moves_s']:.4f} s"
-        + (f", and {summary['galvo_pause_s']:.1f} s of galvo pauses" if summary["galvo_pause_s"] else ""),
-        f"energy           {summary['energy_j']:.4f} J incident",
-        f"tallest          {summary['predicted_max_um']:.1f} µm predicted"
-        + (f", {summary['tallest_asked_um']:.1f} µm asked for" if summary["tallest_asked_um"] else "")
-        + (f", at pixel {summary['tallest_pixel']}" if summary["tallest_pixel"] is not None else ""),
-        f"least headroom   {summary['headroom_min_k']:.1f} K below the absorber cap",
-    ]
-    trimmed = summary["trimmed"]
-    if trimmed["pulses"]:
-        reasons = ", ".join(f"{count} by {reason}" for reason, count in trimmed["by_reason"].items())
-        lines.append(f"trimmed          {trimmed['pulses']} pulses, {trimmed['energy_j'] * 1e3:.2f} mJ: {reasons}")
-        lines.append(f"                 {_format_shortfall(summary['shortfall'])}")
-    else:
-        lines.append("trimmed          nothing")
-    if summary["delays"]:
-        lines.append(f"waited           {_format_delays(summary['delays'])}")
-    lines += [f"late             {sentence}" for sentence in summary["late"][:5]]
-    if len(summary["late"]) > 5:
-        lines.append(f"late             and {len(summary['late']) - 5} more frames")
-    if summary["train_late_s"] > 0:
-        lines.append(
-            f"trains           the mirrors' moves delay pulses by up to {summary['train_late_s'] * 1e3:.2f} ms"
-        )
-    if summary["dead"]["message"]:
-        lines.append(f"dead             {summary['dead']['message']}")
-    if summary["skipped"]:
-        lines.append(f"no pulse needed  {len(summary['skipped'])} times: the heat left in the pixel reaches the target")
-    return lines
-
-
-def _format_feasibility(feasibility: dict[str, Any]) -> list[str]:
-    if feasibility["fits"]:
-        return ["fits: yes" if feasibility["proof"] == "planned" else f"fits: yes, {feasibility['message']}"]
-    lines = [f"fits: no, {feasibility['message']}"]
-    if feasibility["fit"] == "even":
-        lines.append(f"shown            all heights and powers × {feasibility['height_factor']:g}")
-    for omitted in feasibility["omitted"][:OMITTED_LISTED_MAX]:
-        lines.append(f"left out         {omitted['name']}: {_format_pixels(omitted['pixels'])}")
-    more = len(feasibility["omitted"]) - OMITTED_LISTED_MAX
-    if more > 0:
-        lines.append(f"left out         and less of {more} more")
-    return lines
-
-
-def _format_pixels(pixels: list[int]) -> str:
-    listed = ", ".join(map(str, pixels[:20]))
-    return (
-        f"pixel{'s' if len(pixels) > 1 else ''} {listed}{f' and {len(pixels) - 20} more' if len(pixels) > 20 else ''}"
-    )
-
-
-def _format_shortfall(shortfall: dict[str, Any]) -> str:
-    later_s = shortfall["fits_later_s"]
-    fits = "at no later time" if later_s is None else f"{later_s:.3f} s later"
-    return f"first pixel {shortfall['pixel']}, {shortfall['margin_j'] * 1e3:.2f} mJ too much; all of it fits {fits}"
-
-
-def _format_delays(delays: list[dict[str, Any]]) -> str:
-    first, total_s = delays[0], sum(delay["wait_s"] for delay in delays)
-    where = f"{first['source']}, {first['wait_s']:.3f} s for pixel {first['pixel']} ({first['cap']})"
-    return f"{total_s:.3f} s in {len(delays)} frames or trains, first in {where}"

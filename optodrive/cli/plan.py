@@ -16,11 +16,11 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     announce_compilation,
-    format_plan_summary,
     load_run_config,
     print_json,
     show_progress,
 )
+from optodrive.cli.plan_text import format_plan_summary
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
 
@@ -45,7 +45,7 @@ def plan(
 ) -> None:
     """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
     from optodrive.planning.display_model import DisplayModel
-    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence

@@ -3,7 +3,7 @@
 import base64
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,14 +14,15 @@ from optodrive.cli.options import (
     PolicyOption,
     StrictOption,
     UrlOption,
-    format_plan_summary,
     print_json,
     show_progress,
 )
-from optodrive.core.errors import InputError, RefusedError
+from optodrive.cli.plan_text import format_plan_summary
+from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
     from optodrive.client.http import DaemonClient
+    from optodrive.client.plan import Plan
 
 POLL_S = 0.1
 
@@ -45,17 +46,16 @@ def push(
     wait: WaitOption = True,
     json: JsonOption = False,
 ) -> None:
-    """Plan frames and trains, show them, and say what was executed."""
+    """Plan frames and trains, show them, and report what was executed."""
     from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import build_push_request
 
     try:
         body = frames.read_bytes()
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
-    remote = DaemonClient(url)
-    query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
-    answer = remote.call("POST", "/v1/plans", content=body, params=query, headers={"Content-Type": "application/json"})
-    _follow_plan(remote, answer, wait, json)
+    client = DaemonClient(url)
+    _follow_plan(client, client.call(build_push_request(body, policy, fit, dry_run, strict)), wait, json)
 
 
 def play(
@@ -71,12 +71,12 @@ def play(
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
     from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import build_play_request
 
     parameters = _parse_parameters(pattern, values or [])
-    remote = DaemonClient(url)
-    query = {"dry_run": dry_run, "strict": strict, "policy": policy, "fit": fit}
-    answer = remote.call("POST", f"/v1/patterns/{pattern}", json=parameters, params=query)
-    _follow_plan(remote, answer, wait, json)
+    client = DaemonClient(url)
+    request = build_play_request(pattern, parameters, policy, fit, dry_run, strict)
+    _follow_plan(client, client.call(request), wait, json)
 
 
 def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -88,10 +88,10 @@ def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
         print_json({"patterns": descriptions})
         return
     for item in descriptions:
-        print(f"{item['name']}: {item['summary']}")
-        for parameter in item["parameters"]:
-            choices = f" ({', '.join(str(choice) for choice in parameter['choices'])})" if parameter["choices"] else ""
-            print(f"    {parameter['name']}={parameter['default']}{choices}  {parameter['description']}")
+        print(f"{item.name}: {item.summary}")
+        for parameter in item.parameters:
+            choices = f" ({', '.join(parameter.choices)})" if parameter.choices else ""
+            print(f"    {parameter.name}={parameter.default}{choices}  {parameter.description}")
 
 
 def _parse_parameters(pattern: str, values: list[str]) -> dict[str, str]:
@@ -120,25 +120,25 @@ def _encode_file(path: Path) -> str:
         raise InputError(str(path), error.strerror, "a readable file") from None
 
 
-def _follow_plan(remote: "DaemonClient", answer: dict[str, Any], wait: bool, as_json: bool) -> None:
-    if wait and answer["status"] in ("queued", "running"):
-        answer = _wait_until_shown(remote, answer)
+def _follow_plan(client: "DaemonClient", plan: "Plan", wait: bool, as_json: bool) -> None:
+    if wait and not plan.has_ended:
+        plan = _wait_until_shown(client, plan.plan)
     if as_json:
-        print_json(answer)
+        print_json(plan)
     else:
-        for line in format_plan_summary(answer["summary"]):
+        for line in format_plan_summary(plan.summary):
             print(line)
-        print(f"plan             {answer['plan']}: {answer['status']}")
-        if answer["status"] == "done":
-            print(f"executed         {answer['executed']} of {answer['sent']} sent, {answer['planned']} planned")
-    if answer["status"] == "failed":
-        raise RefusedError(f"plan {answer['plan']} failed: {answer['error']}")
+        print(f"plan             {plan.plan}: {plan.status}")
+        if plan.status == "done":
+            print(f"executed         {plan.executed} of {plan.sent} sent, {plan.planned} planned")
+    plan.raise_if_failed()
 
 
-def _wait_until_shown(remote: "DaemonClient", answer: dict[str, Any]) -> dict[str, Any]:
+def _wait_until_shown(client: "DaemonClient", plan_id: str) -> "Plan":
+    from optodrive.client.requests import build_read_request
+
     with show_progress("showing") as on_progress:
-        while answer["status"] in ("queued", "running"):
+        while not (plan := client.call(build_read_request(plan_id, pulses=False))).has_ended:
+            on_progress(plan.executed / max(1, plan.planned))
             time.sleep(POLL_S)
-            answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
-            on_progress(answer["executed"] / max(1, answer["planned"]))
-    return remote.call("GET", f"/v1/plans/{answer['plan']}")
+    return client.call(build_read_request(plan_id))

@@ -13,12 +13,12 @@ from optodrive.cli.options import (
     ModelOption,
     PixelMapOption,
     announce_compilation,
-    format_plan_summary,
     load_run_config,
     print_json,
     show_progress,
 )
 from optodrive.cli.plan import FramesArgument
+from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.physics.thermal_state import ThermalState
     from optodrive.planning.display_model import DisplayModel
-    from optodrive.planning.feasibility import FeasibilityReport
+    from optodrive.planning.feasibility.report import FeasibilityReport
     from optodrive.planning.planned_sequence import PlannedSequence
 
 PIXELS_RECORDED_MAX = 16
@@ -79,7 +79,7 @@ def simulate(
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
     from optodrive.planning.display_model import DisplayModel
-    from optodrive.planning.feasibility import check_feasibility
+    from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
     if not 1e-6 <= dt <= 1.0:

@@ -1,8 +1,11 @@
-"""The driver from Python: `Display`, and `AsyncDisplay` for asyncio, over a running daemon (docs/how-to/use-the-python-client.md)."""
+"""The Python client: `Display`, and `AsyncDisplay` for asyncio, for a running daemon."""
 
-from optodrive.client.answers import FrameResult, Plan, State
-from optodrive.client.async_display import AsyncDisplay, AsyncStream
+from optodrive.client.async_display import AsyncDisplay
+from optodrive.client.async_stream import AsyncStream
 from optodrive.client.display import Display
+from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
+from optodrive.daemon.responses.state import StateReport
+from optodrive.daemon.responses.stream import FrameResult
 
-__all__ = ["AsyncDisplay", "AsyncStream", "Display", "FrameResult", "Plan", "State", "Stream"]
+__all__ = ["AsyncDisplay", "AsyncStream", "Display", "FrameResult", "Plan", "StateReport", "Stream"]

@@ -1,6 +1,5 @@
-"""A display, driven from Python."""
+"""A display, controlled from Python."""
 
-import time
 from base64 import b64encode
 from collections.abc import Mapping
 from html import escape
@@ -9,42 +8,39 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.client.answers import Plan, State
-from optodrive.client.heights import HeightsLike, build_layout, convert_to_pixels
-from optodrive.client.http import DEFAULT_URL, DaemonClient, JsonObject
-from optodrive.client.requests import (
-    ApiRequest,
-    Fit,
-    Policy,
-    build_frame_body,
-    build_plan_path,
-    build_play_request,
-    build_push_request,
-)
+from optodrive.client.endpoint import DEFAULT_URL
+from optodrive.client.heights import HeightsLike
+from optodrive.client.http import DaemonClient
+from optodrive.client.operations import DisplayOperations
+from optodrive.client.plan import Plan
 from optodrive.client.stream import Stream
 from optodrive.core.errors import OptodriveError
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout
+from optodrive.planning.effective_config import EffectiveConfig
+from optodrive.planning.feasibility.report import FitMode
+from optodrive.planning.stimuli.pattern import PatternDescription
 
-POLL_PERIOD_S = 0.03
 RECONNECT_TIMEOUT_S = 5.0
 
 
 class Display:
-    """A display behind a running daemon, for `with`: whatever ends the block, what this caller lit is stopped.
+    """A display behind a running daemon, as a context manager that stops what this client has started.
 
-    token: else OPTODRIVE_TOKEN, else the file the daemon wrote. patience_s: how long a daemon that has gone, once it
-    has answered, is asked again. Nothing here ever arms but `arm`: a daemon that comes back is found DISARMED.
-    Whoever only looks (state, preview, patterns, …) stops nobody.
+    token: if None, OPTODRIVE_TOKEN, else the file that the daemon wrote
+    reconnect_timeout_s: how long requests to a daemon that has responded before are repeated if it is unreachable
+
+    Only `arm` arms; a restarted daemon has a DISARMED board. A client that only reads (state, preview, patterns, …)
+    stops nothing.
     """
 
     def __init__(
         self, url: str = DEFAULT_URL, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
         self._client = DaemonClient(url, token, reconnect_timeout_s)
+        self._operations = DisplayOperations(self._client.policy)
         self._reconnect_timeout_s = reconnect_timeout_s
-        self._layout: PixelLayout | None = None
-        self._last_plan: Plan | None = None
-        self._may_emit = False
 
     def __enter__(self) -> Self:
         return self
@@ -53,50 +49,45 @@ class Display:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            if self._may_emit:
+            if self._operations.may_emit:
                 self.stop()
         except OptodriveError as stop_error:
             if error is None:
                 raise
-            error.add_note(f"optodrive: {stop_error}")  # what the block raised is not to be lost for it
+            error.add_note(f"optodrive: {stop_error}")  # the block's own exception takes precedence
         finally:
             self.close()
 
     def close(self) -> None:
-        """Close the connections, and stop nothing."""
+        """Close the connections without stopping anything."""
         self._client.close()
 
     # --- the board ----------------------------------------------------------------------------------------------
 
-    def arm(self) -> State:
-        """Arm the board, deliberately; its indicator is lit for two seconds first. NotReadyError, BoardFaultError."""
-        self._may_emit = True
-        return State.from_response(self._client.call("POST", "/v1/arm"))
+    def arm(self) -> StateReport:
+        """Arm the board; its indicator is on for two seconds first. Raises NotReadyError or BoardFaultError."""
+        return self._client.run(self._operations.arm())
 
-    def disarm(self) -> State:
-        """Disarm; also acknowledges a fault whose cause is gone."""
-        return State.from_response(self._client.call("POST", "/v1/disarm"))
+    def disarm(self) -> StateReport:
+        """Disarm the board; this also acknowledges a fault whose cause is gone."""
+        return self._client.run(self._operations.disarm())
 
-    def stop(self) -> State:
-        """Gate off now, everything dropped, board disarmed; LinkError where that was not heard."""
-        state = State.from_response(self._client.stop())
-        self._may_emit = False
-        return state
+    def stop(self) -> StateReport:
+        """Switch the gate off, drop all plans, disarm the board; LinkError if no answer confirms it."""
+        return self._client.run(self._operations.stop())
 
-    def state(self) -> State:
-        """The board, the link, the queue."""
-        return State.from_response(self._client.call("GET", "/v1/state"))
+    def state(self) -> StateReport:
+        """Return the state of board, link and queue."""
+        return self._client.run(self._operations.read_state())
 
-    def config(self) -> JsonObject:
-        """The daemon's configuration, with everything derived from it."""
-        return self._client.call("GET", "/v1/config")
+    def config(self) -> EffectiveConfig:
+        """Return the daemon's configuration with everything derived from it."""
+        return self._client.run(self._operations.read_config())
 
     @property
     def layout(self) -> PixelLayout:
-        """Where the pixels lie: x_m, y_m, row, column, all [p]; rows from the bottom."""
-        if self._layout is None:
-            self._layout = build_layout(self.config())
-        return self._layout
+        """The positions of the pixels: x_m, y_m, row, column, all [p]; rows count from the bottom."""
+        return self._client.run(self._operations.read_layout())
 
     # --- showing ------------------------------------------------------------------------------------------------
 
@@ -107,36 +98,35 @@ class Display:
         *,
         simultaneous: bool = False,
         policy: Policy = "trim",
-        fit: Fit = "as_is",
+        fit: FitMode = "as_is",
         wait: bool = True,
     ) -> Plan:
-        """Let each pixel rise once to its height, within duration_s; waits until it was shown, if not told otherwise.
+        """Raise each pixel once to its height within duration_s; wait until that is done unless `wait` is False.
 
-        heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by place, row 0 at the bottom (what is said of
-        places without a pixel is passed over)
+        heights_um: {pixel: height}, [p] by pixel, or [rows, columns] by position, row 0 at the bottom (values at
+        positions without a pixel are ignored)
         """
-        body = build_frame_body(convert_to_pixels(heights_um, self.layout), duration_s, simultaneous)
-        return self.push(body, policy=policy, fit=fit, wait=wait)
+        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, False, wait)
+        return self._client.run(operation)
 
     def push(
-        self, sequence: Mapping[str, Any], *, policy: Policy = "trim", fit: Fit = "as_is", wait: bool = True
+        self, sequence: Mapping[str, Any], *, policy: Policy = "trim", fit: FitMode = "as_is", wait: bool = True
     ) -> Plan:
-        """Show frames and trains as FRAMES.json has them."""
-        return self._submit_and_wait(build_push_request(sequence, policy, fit, dry_run=False), wait)
+        """Show frames and trains in the form of FRAMES.json."""
+        return self._client.run(self._operations.push(sequence, policy, fit, False, wait))
 
     def play(
         self,
         name: str,
         *,
         policy: Policy = "trim",
-        fit: Fit = "as_is",
+        fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
         **parameters: Any,
     ) -> Plan:
-        """Play a named pattern: its name, and its parameters by name. dry_run: plan only."""
-        request = build_play_request(name, parameters, policy, fit, dry_run)
-        return self._submit(request) if dry_run else self._submit_and_wait(request, wait)
+        """Play a named pattern with its parameters by name; `dry_run` plans only."""
+        return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait))
 
     def preview(
         self,
@@ -145,60 +135,43 @@ class Display:
         *,
         simultaneous: bool = False,
         policy: Policy = "trim",
-        fit: Fit = "as_is",
+        fit: FitMode = "as_is",
     ) -> Plan:
-        """What `show` would do: planned and limited, nothing moves."""
-        body = build_frame_body(convert_to_pixels(heights_um, self.layout), duration_s, simultaneous)
-        return self._submit(build_push_request(body, policy, fit, dry_run=True))
+        """Plan what `show` would show; nothing moves."""
+        operation = self._operations.show(heights_um, duration_s, simultaneous, policy, fit, True, False)
+        return self._client.run(operation)
 
     def stream(self, policy: Policy = "trim") -> Stream:
-        """Frames that keep coming, the newest wins: `with display.stream() as stream: stream.send(heights_um)`."""
-        return Stream(self._client.endpoint, self.layout, policy, self._reconnect_timeout_s, self._record_emission)
+        """Open a stream of frames, of which the newest wins: `with display.stream() as stream: stream.send(…)`."""
+        return Stream(
+            self._client.policy.endpoint, self.layout, policy, self._reconnect_timeout_s, self._record_emission
+        )
 
-    def patterns(self) -> list[dict[str, Any]]:
-        """The named patterns and their parameters."""
-        patterns: list[dict[str, Any]] = self._client.call("GET", "/v1/patterns")["patterns"]
-        return patterns
+    def patterns(self) -> list[PatternDescription]:
+        """Return the named patterns and their parameters."""
+        return self._client.run(self._operations.list_patterns())
 
     # --- plans --------------------------------------------------------------------------------------------------
 
     def plan(self, plan: Plan | str) -> Plan:
-        """A plan as it stands now."""
-        return self._record_plan(self._client.call("GET", build_plan_path(_get_plan_id(plan))))
+        """Return a plan's present report."""
+        return self._client.run(self._operations.read_plan(plan))
 
     def cancel(self, plan: Plan | str) -> Plan:
-        """Take a plan out of the queue, or end it dark; the board stays armed."""
-        return self._record_plan(self._client.call("DELETE", build_plan_path(_get_plan_id(plan))))
+        """Remove a plan from the queue, or end it if it runs; the board stays armed."""
+        return self._client.run(self._operations.cancel_plan(plan))
 
     def wait(self, plan: Plan | str) -> Plan:
-        """A plan once it has ended; RefusedError where it failed."""
-        path = build_plan_path(_get_plan_id(plan))
-        while self._client.call("GET", path, params={"pulses": False})["status"] in ("queued", "running"):
-            time.sleep(POLL_PERIOD_S)
-        return self.plan(plan).raise_if_failed()
-
-    def _submit(self, request: ApiRequest) -> Plan:
-        return self._record_plan(
-            self._client.call(request.method, request.path, request.idempotent, **request.arguments)
-        )
-
-    def _submit_and_wait(self, request: ApiRequest, wait: bool) -> Plan:
-        self._record_emission()
-        plan = self._submit(request)
-        return self.wait(plan) if wait else plan
-
-    def _record_plan(self, answer: JsonObject) -> Plan:
-        self._last_plan = Plan.from_response(answer, self.layout)
-        return self._last_plan
+        """Wait until a plan has ended and return it; RefusedError if it failed."""
+        return self._client.run(self._operations.wait_for_plan(plan))
 
     def _record_emission(self) -> None:
-        # Before it is sent: an answer that is lost may have lit something.
-        self._may_emit = True
+        self._operations.may_emit = True
 
     # --- notebooks ----------------------------------------------------------------------------------------------
 
     def __repr__(self) -> str:
-        return f"<Display at {self._client.endpoint.url}>"
+        return f"<Display at {self._client.policy.endpoint.url}>"
 
     def _repr_png_(self) -> bytes | None:
         from optodrive.client.picture import render_png
@@ -207,7 +180,8 @@ class Display:
             layout = self.layout
         except OptodriveError:
             return None
-        heights_um = None if self._last_plan is None else self._last_plan.heights_um
+        plan = self._operations.last_plan
+        heights_um = None if plan is None else plan.heights_um
         return render_png(layout, np.zeros(len(layout)) if heights_um is None else heights_um)
 
     def _repr_html_(self) -> str:
@@ -215,16 +189,13 @@ class Display:
             state = self.state()
         except OptodriveError as error:
             return f"<p>{escape(repr(self))}: {escape(str(error))}</p>"
-        parts = [state.display, f"{state.pixels} pixels", state.board, f"link {state.link}"]
-        if state.fault:
-            parts.append(f"{state.fault}: {state.hint}")
-        caption = "nothing shown yet" if self._last_plan is None else repr(self._last_plan)
+        board, plan = state.board, self._operations.last_plan
+        parts = [state.display, f"{state.pixels} pixels", board.state, f"link {state.link.state}"]
+        if board.fault:
+            parts.append(f"{board.fault}: {board.hint}")
+        caption = "nothing shown yet" if plan is None else repr(plan)
         picture = b64encode(self._repr_png_() or b"").decode()
         return (
             f"<p>{escape(', '.join(parts))}<br>{escape(caption)}</p>"
             f'<img alt="heights of {escape(caption)}" src="data:image/png;base64,{picture}">'
         )
-
-
-def _get_plan_id(plan: Plan | str) -> str:
-    return plan if isinstance(plan, str) else plan.plan_id

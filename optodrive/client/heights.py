@@ -9,19 +9,13 @@ from numpy.typing import ArrayLike
 from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.units import um_to_m
-from optodrive.device.config import DisplaySection, PixelLayout, build_pixel_layout
+from optodrive.device.config import PixelLayout
 from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 
 HeightsLike = Mapping[int, float] | ArrayLike
 """Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by place; NaN or 0 where nothing is asked."""
 
 TENTHS_UM_MAX = 0xFFFF
-
-
-def build_layout(config: Mapping[str, Any]) -> PixelLayout:
-    """Where the pixels lie, from the daemon's configuration."""
-    section = {key: value for key, value in config["display"].items() if key != "pixels"}
-    return build_pixel_layout(DisplaySection.model_validate(section))
 
 
 def convert_to_pixels(heights_um: HeightsLike, layout: PixelLayout) -> FloatArray:

@@ -1,46 +1,84 @@
-"""Requests, the same for `Display` and `AsyncDisplay`: method, path, whether it may be sent again, and the rest."""
+"""The requests of the API, stated once for both displays and the command line."""
 
 from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Generic, TypeVar
 from urllib.parse import quote
 
+from pydantic import BaseModel
+
 from optodrive.client.heights import encode_json
+from optodrive.client.plan import Plan
 from optodrive.core.types.arrays import FloatArray
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.patterns import PatternList
+from optodrive.daemon.responses.state import StateReport
+from optodrive.planning.effective_config import EffectiveConfig
+from optodrive.planning.feasibility.report import FitMode
 
-Policy = Literal["trim", "delay", "refuse"]
-Fit = Literal["as_is", "even", "priority"]
+Response = TypeVar("Response", bound=BaseModel)
 
 
-class ApiRequest(NamedTuple):
-    """A request. safe: nothing comes of it but the answer, so that it may be sent again."""
+@dataclass(frozen=True)
+class ApiRequest(Generic[Response]):
+    """One request and the model of its response.
+
+    idempotent: the request has no effect but its response, so that it may be sent again
+    arguments: of the HTTP client's `request`
+    """
 
     method: str
     path: str
-    idempotent: bool
-    arguments: dict[str, Any]
+    response: type[Response]
+    idempotent: bool = False
+    arguments: Mapping[str, Any] = field(default_factory=dict)
+
+
+READ_STATE = ApiRequest("GET", "/v1/state", StateReport, idempotent=True)
+READ_CONFIG = ApiRequest("GET", "/v1/config", EffectiveConfig, idempotent=True)
+LIST_PATTERNS = ApiRequest("GET", "/v1/patterns", PatternList, idempotent=True)
+ARM = ApiRequest("POST", "/v1/arm", StateReport)
+DISARM = ApiRequest("POST", "/v1/disarm", StateReport)
+STOP = ApiRequest("POST", "/v1/stop", StateReport)
 
 
 def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
-    """One frame, shown at once, as FRAMES.json has it."""
+    """Build the body of one frame that starts at once, in the form of FRAMES.json."""
     frame: dict[str, Any] = {"show_at_s": 0.0, "duration_s": duration_s, "target_um": encode_json(heights_um)}
     return {"frames": [frame | ({"simultaneous": True} if simultaneous else {})]}
 
 
 def build_push_request(
-    body: Mapping[str, Any], policy: Policy, fit: Fit, dry_run: bool, newest: bool = False
-) -> ApiRequest:
-    """Frames and trains."""
-    query = {"policy": policy, "fit": fit, "dry_run": dry_run, "newest": newest}
-    return ApiRequest("POST", "/v1/plans", dry_run, {"json": body, "params": query})
+    body: Mapping[str, Any] | bytes, policy: Policy, fit: FitMode, dry_run: bool, strict: bool = False
+) -> ApiRequest[Plan]:
+    """Build the request that plans frames and trains, given as an object or as the bytes of a file."""
+    query = {"policy": policy, "fit": fit, "dry_run": dry_run, "strict": strict}
+    content: dict[str, Any] = (
+        {"content": body, "headers": {"Content-Type": "application/json"}}
+        if isinstance(body, bytes)
+        else {"json": body}
+    )
+    return ApiRequest("POST", "/v1/plans", Plan, dry_run, content | {"params": query})
 
 
-def build_play_request(name: str, parameters: Mapping[str, Any], policy: Policy, fit: Fit, dry_run: bool) -> ApiRequest:
-    """A named pattern."""
-    query = {"policy": policy, "fit": fit, "dry_run": dry_run}
+def build_play_request(
+    name: str, parameters: Mapping[str, Any], policy: Policy, fit: FitMode, dry_run: bool, strict: bool = False
+) -> ApiRequest[Plan]:
+    """Build the request that plays a named pattern."""
+    query = {"policy": policy, "fit": fit, "dry_run": dry_run, "strict": strict}
     path = f"/v1/patterns/{quote(name, safe='')}"
-    return ApiRequest("POST", path, dry_run, {"json": dict(parameters), "params": query})
+    return ApiRequest("POST", path, Plan, dry_run, {"json": dict(parameters), "params": query})
 
 
-def build_plan_path(plan_id: str) -> str:
-    """Where a plan is found."""
+def build_read_request(plan_id: str, pulses: bool = True) -> ApiRequest[Plan]:
+    """Build the request that reads a plan, with or without its pulses."""
+    return ApiRequest("GET", _build_plan_path(plan_id), Plan, True, {"params": {"pulses": pulses}})
+
+
+def build_cancel_request(plan_id: str) -> ApiRequest[Plan]:
+    """Build the request that cancels a plan."""
+    return ApiRequest("DELETE", _build_plan_path(plan_id), Plan)
+
+
+def _build_plan_path(plan_id: str) -> str:
     return f"/v1/plans/{quote(plan_id, safe='')}"

@@ -1,83 +1,39 @@
-"""Frames that keep coming, from Python: the newest wins, and each is told what became of it."""
+"""A stream of frames, of which the newest wins, with a blocking interface."""
 
-import json
 import threading
 import time
-from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from optodrive.client.answers import FrameResult
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import RETRY_S
+from optodrive.client.frame_results import (
+    CONNECTION_ERRORS,
+    OPEN_TIMEOUT_S,
+    RESULT_TIMEOUT_S,
+    ResultBuffer,
+    build_stream_url,
+    build_timeout_error,
+    parse_refusal,
+    raise_if_failed,
+)
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
-from optodrive.client.http import RETRY_S, Endpoint, build_error
-from optodrive.client.requests import Policy
-from optodrive.core.errors import LinkError, OptodriveError
+from optodrive.core.errors import LinkError
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.stream import FrameResult
 from optodrive.device.config import PixelLayout
-
-RESULTS_MAX = 1000
-"""Results kept for a caller who does not ask for them; the oldest go first."""
-OPEN_TIMEOUT_S = 10.0
-RESULT_TIMEOUT_S = 30.0
-CONNECTION_ERRORS = (OSError, InvalidHandshake, ConnectionClosed, TimeoutError)
-
-
-class ResultBuffer:
-    """What became of frames, for one reader; whoever takes it in may be another thread."""
-
-    def __init__(self) -> None:
-        self._unread: deque[FrameResult] = deque(maxlen=RESULTS_MAX)
-        self._final: dict[int | None, FrameResult] = {}
-
-    def add(self, text: str | bytes) -> FrameResult:
-        """One answer of the daemon."""
-        result = FrameResult.from_message(json.loads(text))
-        self._unread.append(result)
-        if result.final:
-            self._final[result.frame] = result
-            while len(self._final) > RESULTS_MAX:
-                del self._final[next(iter(self._final))]
-        return result
-
-    def drain(self) -> list[FrameResult]:
-        """Those that came since the last call, in order."""
-        results = []
-        while self._unread:
-            results.append(self._unread.popleft())
-        return results
-
-    def find_final(self, frame: int) -> FrameResult | None:
-        """What became of a frame once nothing more comes of it; or, once, of one that the daemon could not read."""
-        return self._final.get(frame) or self._final.pop(None, None)
-
-
-def build_stream_url(endpoint: Endpoint, policy: Policy) -> str:
-    """Where the stream is."""
-    return f"ws{endpoint.url.removeprefix('http')}/v1/stream?policy={policy}"
-
-
-def parse_refusal(error: InvalidStatus) -> OptodriveError:
-    """The package's error for a stream that was not let in."""
-    try:
-        document = json.loads(error.response.body or b"")
-    except ValueError:
-        document = None
-    return build_error(error.response.status_code, document)
-
-
-def raise_if_failed(result: FrameResult) -> FrameResult:
-    """The result; its error where it was refused or failed."""
-    if result.error is not None and result.status in ("refused", "failed"):
-        raise result.error
-    return result
 
 
 class Stream:
-    """An open stream; `Display.stream()` makes one. A link that breaks is made again at the next frame."""
+    """An open stream; `Display.stream()` builds one. A broken connection is restored at the next frame.
+
+    on_send: called before each frame
+    """
 
     def __init__(
         self,
@@ -95,7 +51,6 @@ class Stream:
         self._next_frame = 0
         self._results = ResultBuffer()
         self._results_changed = threading.Condition()
-        self._lost_before = 0
         self._exit_stack = ExitStack()
         self._connection = self._connect()
 
@@ -108,14 +63,14 @@ class Stream:
         self.close()
 
     def close(self) -> None:
-        """Leave; the daemon drops what has not left for the board."""
+        """Close the stream; the daemon drops the pulses that are not yet committed to the board."""
         self._exit_stack.close()
 
     def send(self, heights_um: HeightsLike) -> int:
-        """Show a frame, in the place of what has not left of the one before; its number.
+        """Show a frame in place of the uncommitted rest of the previous one; return its number.
 
-        LinkError where the daemon cannot be reached again. A daemon that restarted has a board that is not armed: the
-        frame is then refused, and stays so until someone arms.
+        LinkError if the daemon cannot be reached again. The board of a restarted daemon is not armed; frames are then
+        refused until somebody arms it.
         """
         number, self._next_frame = self._next_frame, self._next_frame + 1
         frame = encode_frame(number, convert_to_pixels(heights_um, self._layout))
@@ -129,20 +84,18 @@ class Stream:
                 self._reconnect(deadline_s)
 
     def results(self) -> list[FrameResult]:
-        """What the daemon said since the last call, in order."""
+        """Return the results since the last call, in order."""
         with self._results_changed:
             return self._results.drain()
 
     def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
-        """What became of a frame, the last one sent if not said; raises its error where it was refused or failed."""
+        """Wait for the final result of a frame, by default the last one sent; raise its error if it failed."""
         number = self._next_frame - 1 if frame is None else frame
         deadline_s = time.monotonic() + timeout_s
         with self._results_changed:
             while (result := self._results.find_final(number)) is None:
-                if number < self._lost_before:
-                    raise LinkError(f"the link broke before it was heard what became of frame {number}")
                 if not self._results_changed.wait(deadline_s - time.monotonic()):
-                    raise LinkError(f"nothing was heard of frame {number} for {timeout_s:g} s")
+                    raise build_timeout_error(number, timeout_s)
         return raise_if_failed(result)
 
     def _connect(self) -> ClientConnection:
@@ -180,15 +133,15 @@ class Stream:
                 time.sleep(RETRY_S)
 
     def _read(self, connection: ClientConnection) -> None:
-        """Take answers in as they come: a caller that leaves too many unread is cut off."""
+        """Read messages as they arrive: the daemon disconnects a client that leaves too many unread."""
         try:
             for message in connection:
                 with self._results_changed:
                     self._results.add(message)
                     self._results_changed.notify_all()
         except ConnectionClosed:
-            pass  # found out, and mended, by whoever sends
+            pass  # the next `send` detects and repairs this
         finally:
             with self._results_changed:
-                self._lost_before = self._next_frame
+                self._results.mark_lost_before(self._next_frame)
                 self._results_changed.notify_all()

@@ -1,33 +1,82 @@
-"""The configuration with everything derived from it filled in."""
+"""The effective configuration: the configuration with everything that is derived from it."""
 
-from typing import Any
+from typing import TYPE_CHECKING
 
-from optodrive.planning.display_model import DisplayModel
+from optodrive.device.config import Config, DisplaySection, PixelModelSection, ScannerSection, Section
+
+if TYPE_CHECKING:
+    from optodrive.planning.display_model import DisplayModel
+
+UNITS = {"R": "K/W", "C": "J/K", "epsilon": "1", "tau_g": "s", "kappa": "m/K", "phi": "N/K"}
 
 
-def build_effective_config(display: DisplayModel) -> dict[str, Any]:
-    """`optodrive config show --json`: sections as configured, pixels' places, a move's time, the model's numbers."""
+class PixelPlace(Section):
+    """The position of one pixel on the display, and the width of its bridges."""
+
+    index: int
+    x_m: float
+    y_m: float
+    bridge_width_m: float
+
+
+class EffectiveDisplay(DisplaySection):
+    """The section [display] and its pixels, by index."""
+
+    pixels: list[PixelPlace]
+
+
+class EffectiveScanner(ScannerSection):
+    """The section [scanner] and the settling time of a move by one pitch, after a long dwell."""
+
+    settling_pitch_s: float
+
+
+class EffectivePixelModel(PixelModelSection):
+    """The section [pixel_model] and the parameters of a pixel; `planner_terms` holds the parameters of each term."""
+
+    R: float
+    C: float
+    epsilon: float
+    tau_g: float
+    kappa: float
+    phi: float
+    planner_terms: dict[str, dict[str, float]]
+    units: dict[str, str]
+
+
+class EffectiveConfig(Config):
+    """The configuration as `optodrive config show --json` prints it and GET /v1/config sends it."""
+
+    display: EffectiveDisplay
+    scanner: EffectiveScanner
+    pixel_model: EffectivePixelModel
+
+
+def build_effective_config(display: "DisplayModel") -> EffectiveConfig:
+    """Add pixel positions, the settling time of one pitch, and the pixel model's parameters to a configuration."""
     config, layout = display.config, display.layout
-    resolved = config.model_dump(mode="json")
-    resolved["display"]["pixels"] = [
-        {"index": index, "x_m": x_m, "y_m": y_m, "bridge_width_m": config.display.bridge_width_m}
+    settling = display.scan_head.settling
+    settling_us = settling.settling_us(settling.pitch_rad, settling.pitch_rad, settling.long_dwell_us)
+    pixel = display.parameters.build_pixel(config.display.bridge_width_m)
+    places = [
+        PixelPlace(index=index, x_m=x_m, y_m=y_m, bridge_width_m=config.display.bridge_width_m)
         for index, (x_m, y_m) in enumerate(zip(layout.x_m.tolist(), layout.y_m.tolist(), strict=True))
     ]
-    moves = display.scan_head.settling
-    resolved["scanner"]["move_pitch_s"] = (
-        moves.settling_us(moves.pitch_rad, moves.pitch_rad, moves.long_dwell_us) * 1e-6
-    )
-    pixel = display.parameters.build_pixel(config.display.bridge_width_m)
-    resolved["pixel_model"].update(
-        {
-            "R": pixel.r_k_per_w,
-            "C": pixel.c_j_per_k,
-            "epsilon": pixel.epsilon,
-            "tau_g": pixel.tau_g_s,
-            "kappa": pixel.kappa_m_per_k,
-            "phi": pixel.phi_n_per_k,
-            "planner_terms": {key: display.parameters.term_values(key) for key in display.parameters.planner_terms},
-            "units": {"R": "K/W", "C": "J/K", "epsilon": "1", "tau_g": "s", "kappa": "m/K", "phi": "N/K"},
+    return EffectiveConfig.model_validate(
+        dict(config)
+        | {
+            "display": dict(config.display) | {"pixels": places},
+            "scanner": dict(config.scanner) | {"settling_pitch_s": settling_us * 1e-6},
+            "pixel_model": {
+                **dict(config.pixel_model),
+                "R": pixel.r_k_per_w,
+                "C": pixel.c_j_per_k,
+                "epsilon": pixel.epsilon,
+                "tau_g": pixel.tau_g_s,
+                "kappa": pixel.kappa_m_per_k,
+                "phi": pixel.phi_n_per_k,
+                "planner_terms": {key: display.parameters.term_values(key) for key in display.parameters.planner_terms},
+                "units": UNITS,
+            },
         }
     )
-    return resolved

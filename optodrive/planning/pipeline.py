@@ -11,11 +11,12 @@ import numpy as np
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.types.arrays import IntArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import Policy, cold_state, concatenate
+from optodrive.planning.limiter.limiter import cold_state, concatenate
 from optodrive.planning.limiter.usage import compute_usage
 from optodrive.planning.planned_sequence import (
     TIME_TOLERANCE_S,

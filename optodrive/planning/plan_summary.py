@@ -1,111 +1,135 @@
-"""A prepared plan in figures: what the command line prints and REST answers, in one place."""
+"""The summary of a planned sequence, its pulses by column, and plan.csv."""
 
 import csv
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from optodrive.core.files import atomic_write
 from optodrive.core.units import m_to_um
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility import FeasibilityReport
+from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.planned_sequence import PlannedSequence, Shortfall, describe_lateness
 from optodrive.planning.scheduler.interleaving import SimultaneousFrame
+from optodrive.planning.summary_schema import (
+    DeadPixelSummary,
+    DelaySummary,
+    FrameSummary,
+    PlanSummary,
+    PulseColumns,
+    ShortfallSummary,
+    SimultaneitySummary,
+    SkippedTarget,
+    TrimmedPulse,
+    TrimmingSummary,
+)
 
 DEAD_LISTED_MAX = 20
+TRIMMED_LISTED_MAX = 20
 PULSES_LISTED_MAX = 20_000
-"""An answer lists pulses one by one up to this many."""
+"""The largest number of pulses that a response lists one by one."""
+SKIP_REASON = "the heat left in the pixel reaches the target by itself"
 
 
-def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | None = None) -> dict[str, Any]:
-    """Whether all of it fits, what will be shown, when, how high, what was taken away and why; JSON-able."""
+def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | None = None) -> PlanSummary:
+    """Summarize timing, energy, predicted displacement and the limiter's changes."""
     plan = planned.plan
     beam_on_s = float(plan.width_s[plan.power_w > 0].sum())
     target_m = np.nan_to_num(plan.target_m)
-    simultaneous = {item.source: _simultaneous_to_json(item) for item in planned.simultaneous}
-    tallest = int(np.argmax(planned.predicted_m)) if len(plan) else None
-    return {
-        "feasibility": None if feasibility is None else feasibility.to_dict(),
-        "pulses": len(plan),
-        "duration_s": planned.duration_s,
-        "beam_on_s": beam_on_s,
-        "beam_on_share": beam_on_s / planned.duration_s if len(plan) else 0.0,
-        "moves_s": float(plan.settling_s.sum()),
-        "lead_s": planned.lead_in_s,
-        "galvo_pause_s": planned.galvo_pause_s,
-        "energy_j": float(plan.energy_j.sum()),
-        "tallest_pixel": None if tallest is None else int(plan.pixel[tallest]),
-        "predicted_max_um": 0.0 if tallest is None else m_to_um(float(planned.predicted_m[tallest])),
-        "tallest_asked_um": None if tallest is None else _finite_or_none(m_to_um(float(plan.target_m[tallest]))),
-        "asked_max_um": m_to_um(float(target_m.max())) if len(plan) else 0.0,
-        "headroom_min_k": float(plan.headroom_k.min()),
-        "trimmed": _summarize_trimming(planned),
-        "shortfall": _shortfall_to_json(planned.shortfall),
-        "delays": [
-            {
-                "source": _name_source(planned, item.source),
-                "pixel": item.pixel,
-                "cap": item.cap,
-                "wait_s": item.wait_s,
-            }
-            for item in planned.delays
+    max_row = int(np.argmax(planned.predicted_m)) if len(plan) else None
+    return PlanSummary(
+        feasibility=feasibility,
+        pulses=len(plan),
+        duration_s=planned.duration_s,
+        beam_on_s=beam_on_s,
+        beam_on_fraction=beam_on_s / planned.duration_s if len(plan) else 0.0,
+        settling_s=float(plan.settling_s.sum()),
+        lead_in_s=planned.lead_in_s,
+        galvo_pause_s=planned.galvo_pause_s,
+        energy_j=float(plan.energy_j.sum()),
+        predicted_max_pixel=None if max_row is None else int(plan.pixel[max_row]),
+        predicted_max_um=0.0 if max_row is None else m_to_um(float(planned.predicted_m[max_row])),
+        predicted_max_target_um=None if max_row is None else _finite_or_none(m_to_um(float(plan.target_m[max_row]))),
+        target_max_um=m_to_um(float(target_m.max())) if len(plan) else 0.0,
+        headroom_min_k=float(plan.headroom_k.min()),
+        trimmed=_summarize_trimming(planned),
+        shortfall=None if planned.shortfall is None else _summarize_shortfall(planned.shortfall),
+        delays=[
+            DelaySummary(
+                source=_name_source(planned, delay.source), pixel=delay.pixel, cap=delay.cap, wait_s=delay.wait_s
+            )
+            for delay in planned.delays
         ],
-        "dead": {
-            "pixels": list(planned.dead_pixels),
-            "count": len(planned.dead_pixels),
-            "message": describe_dead_pixels(planned.dead_pixels),
-        },
-        "skipped": [
-            {
-                "frame": _name_source(planned, item.source),
-                "pixel": item.pixel,
-                "target_um": m_to_um(item.target_m),
-                "reason": "the heat left in the pixel reaches the target by itself",
-            }
+        dead=DeadPixelSummary(
+            pixels=list(planned.dead_pixels),
+            count=len(planned.dead_pixels),
+            message=describe_dead_pixels(planned.dead_pixels),
+        ),
+        skipped=[
+            SkippedTarget(
+                frame=_name_source(planned, item.source),
+                pixel=item.pixel,
+                target_um=m_to_um(item.target_m),
+                reason=SKIP_REASON,
+            )
             for item in planned.skipped
         ],
-        "frames": [
-            {
-                "frame": timing.frame_id,
-                "show_at_s": timing.show_at_s,
-                "first_pulse_s": timing.first_pulse_s,
-                "finished_s": timing.end_s,
-                "due_s": timing.deadline_s,
-                "late_s": timing.late_s,
-                "pulses": timing.pulses,
-                "in_time": timing.on_time,
-                "simultaneous": simultaneous.get(timing.source),
-            }
-            for timing in planned.frames
+        frames=_summarize_frames(planned),
+        # A frame that waited for a cap, or follows one that did, is late for that reason and not for lack of beam time.
+        late_messages=[
+            describe_lateness(timing) for timing in planned.frames if timing.late_s > 0 and not planned.delays
         ],
-        # A frame that waited for a cap, or comes after one that did, is late for that and not for want of beam time.
-        "late": [describe_lateness(timing) for timing in planned.frames if timing.late_s > 0 and not planned.delays],
-        "train_late_s": planned.train_lateness_max_s,
-    }
+        train_lateness_max_s=planned.train_lateness_max_s,
+    )
 
 
 def describe_dead_pixels(dead: tuple[int, ...]) -> str | None:
-    """Which pixels were left out, in words; None where none were."""
+    """Describe which dead pixels are omitted; None if there are none."""
     if not dead:
         return None
     if len(dead) == 1:
-        return f"pixel {dead[0]} is dead: left out"
+        return f"pixel {dead[0]} is dead: omitted"
     if len(dead) > DEAD_LISTED_MAX:
         listed = f"{', '.join(map(str, dead[:DEAD_LISTED_MAX]))} and {len(dead) - DEAD_LISTED_MAX} more"
     else:
         listed = f"{', '.join(map(str, dead[:-1]))} and {dead[-1]}"
-    return f"pixels {listed} are dead: left out"
+    return f"pixels {listed} are dead: omitted"
 
 
-def _shortfall_to_json(shortfall: Shortfall | None) -> dict[str, Any] | None:
-    if shortfall is None:
-        return None
-    return vars(shortfall) | {"fits_later_s": _finite_or_none(shortfall.fits_after_s)}
+def _summarize_shortfall(shortfall: Shortfall) -> ShortfallSummary:
+    return ShortfallSummary(
+        pixel=shortfall.pixel,
+        cap=shortfall.cap,
+        margin_j=shortfall.margin_j,
+        fits_after_s=_finite_or_none(shortfall.fits_after_s),
+    )
 
 
-def _simultaneous_to_json(item: SimultaneousFrame) -> dict[str, Any]:
-    return {key: value for key, value in vars(item).items() if key != "source"}
+def _summarize_frames(planned: PlannedSequence) -> list[FrameSummary]:
+    simultaneous = {item.source: _summarize_simultaneity(item) for item in planned.simultaneous}
+    return [
+        FrameSummary(
+            frame=timing.frame_id,
+            show_at_s=timing.show_at_s,
+            first_pulse_s=timing.first_pulse_s,
+            end_s=timing.end_s,
+            deadline_s=timing.deadline_s,
+            late_s=timing.late_s,
+            pulses=timing.pulses,
+            on_time=timing.on_time,
+            simultaneous=simultaneous.get(timing.source),
+        )
+        for timing in planned.frames
+    ]
+
+
+def _summarize_simultaneity(frame: SimultaneousFrame) -> SimultaneitySummary:
+    return SimultaneitySummary(
+        interleaved_rounds=frame.interleaved_rounds,
+        simultaneity=frame.simultaneity,
+        simultaneity_single_pulse=frame.simultaneity_single_pulse,
+        extra_s=frame.extra_s,
+    )
 
 
 def _name_source(planned: PlannedSequence, source: int) -> str:
@@ -113,49 +137,49 @@ def _name_source(planned: PlannedSequence, source: int) -> str:
     return frames[source].frame_id if source < len(frames) else f"train {source - len(frames)}"
 
 
-def _summarize_trimming(planned: PlannedSequence) -> dict[str, Any]:
+def _summarize_trimming(planned: PlannedSequence) -> TrimmingSummary:
     plan = planned.plan
     rows = np.flatnonzero(plan.reason != "")
     reasons, counts = np.unique(plan.reason[rows], return_counts=True)
-    worst = rows[np.argsort(-plan.trimmed_j[rows], kind="stable")[:20]]
-    return {
-        "pulses": len(rows),
-        "energy_j": float(plan.trimmed_j.sum()),
-        "by_reason": {str(reason): int(count) for reason, count in zip(reasons, counts, strict=True)},
-        "worst": [
-            {
-                "pixel": int(plan.pixel[row]),
-                "start_s": float(plan.start_s[row]),
-                "trimmed_j": float(plan.trimmed_j[row]),
-                "reason": str(plan.reason[row]),
-                "predicted_um": m_to_um(float(planned.predicted_m[row])),
-                "target_um": _finite_or_none(m_to_um(float(plan.target_m[row]))),
-            }
+    worst = rows[np.argsort(-plan.trimmed_j[rows], kind="stable")[:TRIMMED_LISTED_MAX]]
+    return TrimmingSummary(
+        pulses=len(rows),
+        energy_j=float(plan.trimmed_j.sum()),
+        by_reason={str(reason): int(count) for reason, count in zip(reasons, counts, strict=True)},
+        worst=[
+            TrimmedPulse(
+                pixel=int(plan.pixel[row]),
+                start_s=float(plan.start_s[row]),
+                trimmed_j=float(plan.trimmed_j[row]),
+                reason=str(plan.reason[row]),
+                predicted_um=m_to_um(float(planned.predicted_m[row])),
+                target_um=_finite_or_none(m_to_um(float(plan.target_m[row]))),
+            )
             for row in worst
         ],
-    }
+    )
 
 
 def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def list_pulse_columns(planned: PlannedSequence) -> dict[str, list[Any]] | None:
-    """The plan's pulses by column, or None where there are more than PULSES_LISTED_MAX."""
+def list_pulse_columns(planned: PlannedSequence) -> PulseColumns | None:
+    """List the plan's pulses by column; None if there are more than PULSES_LISTED_MAX."""
     plan = planned.plan
     if len(plan) > PULSES_LISTED_MAX:
         return None
-    return {
-        "start_s": plan.start_s.tolist(),
-        "width_s": plan.width_s.tolist(),
-        "power_w": plan.power_w.tolist(),
-        "pixel": plan.pixel.tolist(),
-        "energy_j": plan.energy_j.tolist(),
-        "trimmed_j": plan.trimmed_j.tolist(),
-        "reason": [str(reason) for reason in plan.reason],
-        "target_um": [_finite_or_none(value) for value in m_to_um(plan.target_m).tolist()],
-        "predicted_um": m_to_um(planned.predicted_m).tolist(),
-    }
+    return PulseColumns(
+        start_s=plan.start_s.tolist(),
+        width_s=plan.width_s.tolist(),
+        power_w=plan.power_w.tolist(),
+        pixel=plan.pixel.tolist(),
+        energy_j=plan.energy_j.tolist(),
+        trimmed_j=plan.trimmed_j.tolist(),
+        reason=[str(reason) for reason in plan.reason],
+        target_um=[_finite_or_none(value) for value in m_to_um(plan.target_m).tolist()],
+        predicted_um=m_to_um(planned.predicted_m).tolist(),
+    )
 
 
 PLAN_COLUMNS = (

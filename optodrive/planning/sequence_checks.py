@@ -34,7 +34,7 @@ def check_targets_reachable(display: DisplayModel, sequence: FrameSequence) -> N
         round(m_to_um(float(frame.target_m[pixel])), 3),
         f"at most {m_to_um(max_m):.0f} µm, the reach of the longest pulse "
         f"({limits.pulse_width_max_s * 1e3:g} ms at {laser.max_power_w:g} W)",
-        code="target_out_of_reach",
+        code="target_unreachable",
     )
 
 

@@ -86,7 +86,7 @@ def test_errors_are_the_packages_own_with_the_problems_fields(daemon, display):
     assert refused.value.code == "unknown_pattern"
     with pytest.raises(InputError) as refused:
         display.plan("p999")
-    assert refused.value.code == "no_plan"
+    assert refused.value.code == "plan_not_found"
     with Display(daemon.url, "wrong") as stranger:
         for ask in (stranger.state, stranger.stream):
             with pytest.raises(InputError) as refused:
@@ -123,7 +123,7 @@ def test_a_stream_says_what_became_of_each_frame(board, daemon):
             assert sorted(result.frame for result in final) == list(range(last + 1))
             with pytest.raises(InputError) as refused:
                 stream.wait(stream.send({5: 6000.0}))
-            assert refused.value.code == "target_out_of_reach"
+            assert refused.value.code == "target_unreachable"
             assert stream.wait(stream.send({7: 60.0})).status == "done"
         assert display.state().underruns == before
     assert dark_and_disarmed(board)

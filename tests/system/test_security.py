@@ -144,7 +144,7 @@ def test_a_route_without_an_entry_is_not_answered_and_is_caught():
             return await client.post("/v1/laser", headers=build_bearer_header(TOKEN))
 
     response = asyncio.run(call())
-    assert (response.status_code, response.json()["code"]) == (404, "no_such_route")
+    assert (response.status_code, response.json()["code"]) == (404, "route_not_found")
 
 
 def test_a_guard_that_is_forgotten_is_caught():
@@ -156,10 +156,10 @@ REFUSALS = {
     "an empty token": ({"Authorization": "Bearer"}, (401, "bad_token")),
     "a wrong token": (build_bearer_header("wrong" * 8), (401, "bad_token")),
     "another scheme": ({"Authorization": f"Basic {TOKEN}"}, (401, "bad_token")),
-    "a foreign Host": ({**build_bearer_header(TOKEN), "Host": "evil.example"}, (421, "foreign_host")),
-    "a Host like ours": ({**build_bearer_header(TOKEN), "Host": "localhost.evil.example"}, (421, "foreign_host")),
-    "a foreign Origin": ({**build_bearer_header(TOKEN), "Origin": "https://evil.example"}, (403, "foreign_origin")),
-    "no page's Origin": ({**build_bearer_header(TOKEN), "Origin": "null"}, (403, "foreign_origin")),
+    "a foreign Host": ({**build_bearer_header(TOKEN), "Host": "evil.example"}, (421, "host_not_allowed")),
+    "a Host like ours": ({**build_bearer_header(TOKEN), "Host": "localhost.evil.example"}, (421, "host_not_allowed")),
+    "a foreign Origin": ({**build_bearer_header(TOKEN), "Origin": "https://evil.example"}, (403, "origin_not_allowed")),
+    "no page's Origin": ({**build_bearer_header(TOKEN), "Origin": "null"}, (403, "origin_not_allowed")),
 }
 
 
@@ -179,7 +179,7 @@ def test_every_route_refuses_a_role_too_low(running, key):
     for role in ROLES[: ROLES.index(ROUTES[key])]:
         assert request_route(running, key, build_bearer_header(read_role_tokens(running)[role])) == (
             403,
-            "role_too_low",
+            "insufficient_role",
         )
 
 
@@ -330,7 +330,7 @@ def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board,
         assert stopped["state"] == "DISARMED", (stopped, board.events()[-6:])
         assert board.of("gate")[-1]["on"] is False
         refused = daemon.call("POST", "/v1/arm", status=409)
-        assert refused["code"] == "not_audited"
+        assert refused["code"] == "audit_unavailable"
         assert daemon.board_state() == "DISARMED"
         assert "arming is refused" in daemon.errors.read_text()
         full(before)

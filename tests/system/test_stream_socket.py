@@ -82,7 +82,7 @@ def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
         assert refused["error"]["code"] == "unknown_pixel"
         stream.send('{"frame": 1, "target_um": {"17": 9000}}')
         (refused,) = until(stream, {"status": "refused"})
-        assert refused["error"]["code"] == "target_out_of_reach"
+        assert refused["error"]["code"] == "target_unreachable"
         stream.send(binary(2, [3]))
         until(stream, {"frame": 2, "status": "done"})
 

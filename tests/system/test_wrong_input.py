@@ -48,7 +48,7 @@ BODIES = {
     "unknown pixel": ({"frames": [frame(target_um={"437": 50})]}, "unknown_pixel"),
     "negative target": ({"frames": [frame(target_um={"17": -5})]}, "bad_target"),
     "NaN target": ('{"frames": [{"show_at_s": 0, "duration_s": 1, "target_um": {"17": NaN}}]}', "bad_target"),
-    "target out of reach": ({"frames": [frame(target_um={"17": 5000})]}, "target_out_of_reach"),
+    "target out of reach": ({"frames": [frame(target_um={"17": 5000})]}, "target_unreachable"),
     "overlapping trains": ({"trains": [train(), train(pixel=18, start_s=0.01)]}, "overlapping_trains"),
     "frame in the past": ({"frames": [frame(show_at_s=-1.0)]}, "bad_time"),
     "bad JSON": ('{"frames": [', "bad_json"),
@@ -154,9 +154,9 @@ def test_every_route_but_health_wants_the_token(armed):
 
 def test_a_foreign_host_and_a_foreign_origin(armed):
     host = armed.client.get("/v1/health", headers={"Host": "evil.example"})
-    assert (host.status_code, host.json()["code"]) == (421, "foreign_host")
+    assert (host.status_code, host.json()["code"]) == (421, "host_not_allowed")
     origin = armed.client.get("/v1/state", headers={"Origin": "https://evil.example"})
-    assert (origin.status_code, origin.json()["code"]) == (403, "foreign_origin")
+    assert (origin.status_code, origin.json()["code"]) == (403, "origin_not_allowed")
     assert armed.client.get("/v1/state", headers={"Origin": armed.url}).status_code == 200
 
 

@@ -16,13 +16,24 @@ import numpy as np
 
 from optodrive.core.clock import Clock, request_realtime_scheduling
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
 from optodrive.daemon.engine.planner import Planner, PlanningRequest
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
-from optodrive.daemon.engine.state_waiters import JsonObject, StateWaiters, uncancellable_future
+from optodrive.daemon.engine.state_waiters import StateWaiters, uncancellable_future
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.state import (
+    BoardReport,
+    LinkReport,
+    PlannerReport,
+    PulseTotals,
+    QueueReport,
+    RecentPlan,
+    StateReport,
+)
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
@@ -31,8 +42,7 @@ from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility import FitMode
-from optodrive.planning.limiter.limiter import Policy
+from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.pipeline import warm_up
 
 LOOP_WAIT_S = 0.002
@@ -167,22 +177,22 @@ class Engine:
 
     # --- commands from any thread -------------------------------------------------------------------------------
 
-    def arm(self) -> "Future[JsonObject]":
+    def arm(self) -> "Future[StateReport]":
         """Arm the board; done when it is ARMED."""
         return self._submit_command(self._session.arm, (BoardState.ARMED,), "arm")
 
-    def disarm(self) -> "Future[JsonObject]":
+    def disarm(self) -> "Future[StateReport]":
         """Disarm, or acknowledge a fault; done when the board is DISARMED."""
         return self._submit_command(self._session.disarm, (BoardState.DISARMED,), "disarm")
 
-    def stop(self) -> "Future[JsonObject]":
+    def stop(self) -> "Future[StateReport]":
         """Abort: gate off, queue dropped; done when the board is dark for good."""
         return self._submit_command(self._session.abort, IDLE_STATES, "stop")
 
     def _submit_command(
         self, action: Callable[[], None], states: tuple[str, ...], command: str
-    ) -> "Future[JsonObject]":
-        future: Future[JsonObject] = uncancellable_future()
+    ) -> "Future[StateReport]":
+        future: Future[StateReport] = uncancellable_future()
 
         def run_command() -> None:
             try:
@@ -216,7 +226,7 @@ class Engine:
         fit: FitMode = "as_is",
         streamed: bool = False,
         arrived_s: float | None = None,
-    ) -> "Future[JsonObject]":
+    ) -> "Future[PlanReport]":
         """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when.
 
         streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
@@ -263,25 +273,25 @@ class Engine:
         return self._session.board_s()
 
     def get_end_future(self, plan_id: str) -> "Future[None]":
-        """Done when nothing more will happen to a plan; InputError (no_plan) where there is none."""
+        """Done when nothing more will happen to a plan; InputError (plan_not_found) where there is none."""
         return self._plan_store.find(plan_id).end_future
 
-    def end_stream(self) -> "Future[JsonObject]":
+    def end_stream(self) -> "Future[PlanReport]":
         """Let go what has not left of a stream's last plan: whoever sent it is gone."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
         return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True)
 
-    def get_plan(self, plan_id: str, pulses: bool = True) -> JsonObject:
-        """A plan by its id; InputError (no_plan) where there is none."""
-        return self._plan_store.find(plan_id).to_json(self._session.board_s(), pulses)
+    def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
+        """A plan by its id; InputError (plan_not_found) where there is none."""
+        return self._plan_store.find(plan_id).build_report(self._session.board_s(), pulses)
 
-    def cancel(self, plan_id: str) -> "Future[JsonObject]":
+    def cancel(self, plan_id: str) -> "Future[PlanReport]":
         """Take a plan out of the queue, or end it dark; the board stays armed."""
 
-        def end() -> JsonObject:
+        def end() -> PlanReport:
             record = self._plan_store.find(plan_id)
             self._plan_queue.cancel(record)
-            return record.to_json(self._session.board_s())
+            return record.build_report(self._session.board_s())
 
         return self._submit_to_loop(end)
 
@@ -329,31 +339,29 @@ class Engine:
         """The board's state, or the link's."""
         return self._session.board.state if self._session.connected else "no link"
 
-    def snapshot(self) -> JsonObject:
-        """Everything GET /v1/state answers."""
-        plan_queue = self._plan_queue
+    def snapshot(self) -> StateReport:
+        """Report everything that GET /v1/state sends."""
+        plan_queue, session = self._plan_queue, self._session
         running = next(iter(plan_queue.running.copy()), None)
-        return {
-            "display": self.display.config.name,
-            "pixels": len(self.display.layout),
-            "link": {
-                "port": self._session.port,
-                "state": "up" if self._session.connected else "down",
-                "error": self._link_error,
-                **self._session.collect_link_stats(),
-            },
-            "board": self._session.board.to_dict(),
-            "queue": {
-                "waiting": len(plan_queue.waiting),
-                "running": None if running is None else running.record.plan_id,
-                "plans": [
-                    {"plan": item.plan_id, "name": item.name, "status": item.status}
-                    for item in self._plan_store.list_recent()
-                ],
-            },
-            "totals": {**plan_queue.totals, "timing_error": plan_queue.timing.to_dict()},
-            "planner": {"busy": self._planner.is_busy, "alive": self._planner.is_alive},
-        }
+        recent = self._plan_store.list_recent()
+        return StateReport(
+            display=self.display.config.name,
+            pixels=len(self.display.layout),
+            link=LinkReport(
+                port=session.port,
+                state="up" if session.connected else "down",
+                error=self._link_error,
+                **session.collect_link_stats(),
+            ),
+            board=BoardReport(**session.board.to_dict()),
+            queue=QueueReport(
+                waiting=len(plan_queue.waiting),
+                running=None if running is None else running.record.plan_id,
+                plans=[RecentPlan(plan=item.plan_id, name=item.name, status=item.status) for item in recent],
+            ),
+            totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
+            planner=PlannerReport(busy=self._planner.is_busy, alive=self._planner.is_alive),
+        )
 
     def render_metrics(self) -> str:
         """Everything GET /metrics answers."""

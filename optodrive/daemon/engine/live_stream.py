@@ -4,21 +4,22 @@ import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import partial
-from typing import Any
 
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from optodrive.core.errors import OptodriveError
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.engine import Engine
-from optodrive.planning.limiter.limiter import Policy
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.problem import Problem
+from optodrive.daemon.responses.stream import FrameResult
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 OUTBOX_MAX = 1000
 """A caller that leaves so many answers unread is cut off."""
 CLOSE_SLOW_READER = 1013
-JsonObject = dict[str, Any]
-ProblemFormatter = Callable[[OptodriveError], JsonObject]
+ProblemFormatter = Callable[[OptodriveError], Problem]
 
 
 class LiveStream:
@@ -33,7 +34,7 @@ class LiveStream:
         self._next_number = 0
         self._pending: tuple[int, FrameSequence, float] | None = None
         self._arrived = asyncio.Event()
-        self._outbox: asyncio.Queue[JsonObject] = asyncio.Queue(OUTBOX_MAX)
+        self._outbox: asyncio.Queue[FrameResult] = asyncio.Queue(OUTBOX_MAX)
         self._watchers: set[asyncio.Task[None]] = set()
         self._last_end_future: Future[None] | None = None
 
@@ -60,10 +61,10 @@ class LiveStream:
             try:
                 number, sequence = parse_live_frame(data, self._next_number, self._pixels)
             except OptodriveError as error:
-                self._publish({"frame": None, "status": "refused", "error": self._to_problem(error)})
+                self._publish(FrameResult(frame=None, status="refused", problem=self._to_problem(error)))
                 continue
             if self._pending is not None:
-                self._publish({"frame": self._pending[0], "status": "superseded", "by": number, "plan": None})
+                self._publish(FrameResult(frame=self._pending[0], status="superseded", superseded_by=number))
             self._pending, self._next_number = (number, sequence, arrived_s), number + 1
             self._arrived.set()
 
@@ -81,49 +82,59 @@ class LiveStream:
                 arrived_s=arrived_s,
             )
             try:
-                answer = await asyncio.wrap_future(future)
+                report = await asyncio.wrap_future(future)
             except OptodriveError as error:
-                self._publish({"frame": number, "status": "refused", "error": self._to_problem(error)})
+                self._publish(FrameResult(frame=number, status="refused", problem=self._to_problem(error)))
                 continue
-            self._last_end_future = self._engine.get_end_future(answer["plan"])
-            self._publish({"frame": number, "status": "planned", **_format_planned(answer)})
-            watcher = asyncio.create_task(self._watch(number, answer["plan"], self._last_end_future))
+            self._last_end_future = self._engine.get_end_future(report.plan)
+            self._publish(_report_planned(number, report))
+            watcher = asyncio.create_task(self._watch(number, report.plan, self._last_end_future))
             self._watchers.add(watcher)
             watcher.add_done_callback(self._watchers.discard)
 
     async def _watch(self, number: int, plan_id: str, end_future: "Future[None]") -> None:
         await asyncio.wrap_future(end_future)
-        self._publish({"frame": number, **_format_ended(self._engine.get_plan(plan_id, pulses=False))})
+        self._publish(_report_ended(number, self._engine.get_plan(plan_id, pulses=False)))
 
-    def _publish(self, answer: JsonObject) -> None:
+    def _publish(self, result: FrameResult) -> None:
         try:
-            self._outbox.put_nowait(answer)
+            self._outbox.put_nowait(result)
         except asyncio.QueueFull:
             self._arrived.clear()
             raise WebSocketDisconnect(CLOSE_SLOW_READER) from None
 
     async def _write(self) -> None:
         while True:
-            await self._socket.send_json(await self._outbox.get())
+            await self._socket.send_text((await self._outbox.get()).model_dump_json())
 
 
 def _return_sequence(sequence: FrameSequence) -> FrameSequence:
     return sequence
 
 
-def _format_planned(answer: JsonObject) -> JsonObject:
-    summary = answer["summary"]
-    return {
-        "plan": answer["plan"],
-        "pulses": answer["planned"],
-        "skipped": len(summary["skipped"]),
-        "trimmed": summary["trimmed"]["pulses"],
-        "starts_in_s": answer["starts_in_s"],
-        "duration_s": summary["duration_s"],
-        "latency": answer["latency"],
-    }
+def _report_planned(number: int, report: PlanReport) -> FrameResult:
+    return FrameResult(
+        frame=number,
+        status="planned",
+        plan=report.plan,
+        pulses=report.planned,
+        skipped=len(report.summary.skipped),
+        trimmed=report.summary.trimmed.pulses,
+        starts_in_s=report.starts_in_s,
+        duration_s=report.summary.duration_s,
+        latency=report.latency,
+    )
 
 
-def _format_ended(answer: JsonObject) -> JsonObject:
-    keys = ("plan", "status", "error", "planned", "executed", "dropped", "simulated_max_um", "latency")
-    return {key: answer[key] for key in keys}
+def _report_ended(number: int, report: PlanReport) -> FrameResult:
+    return FrameResult(
+        frame=number,
+        status=report.status,
+        plan=report.plan,
+        error=report.error,
+        planned=report.planned,
+        executed=report.executed,
+        dropped=report.dropped,
+        simulated_max_um=report.simulated_max_um,
+        latency=report.latency,
+    )

@@ -7,6 +7,7 @@ from typing import Any
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.session import BoardSession
 
@@ -32,33 +33,33 @@ class PlanCounters:
             self.first_light.add(record.first_light_after_s)
 
 
-def render_metrics(snapshot: Mapping[str, Any], counters: PlanCounters, session: BoardSession, lease_s: float) -> str:
+def render_metrics(snapshot: StateReport, counters: PlanCounters, session: BoardSession, lease_s: float) -> str:
     """The page. snapshot: as GET /v1/state answers it."""
-    board, link, totals, queue = (snapshot[key] for key in ("board", "link", "totals", "queue"))
+    board, link, totals, queue = snapshot.board, snapshot.link, snapshot.totals, snapshot.queue
     page = _MetricsPage()
-    page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot["display"]}, 1)])
+    page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot.display}, 1)])
     page.add_gauge(
-        "board_state", "1 for the board's state", [({"state": s}, int(board["state"] == s)) for s in REPORTED_STATES]
+        "board_state", "1 for the board's state", [({"state": s}, int(board.state == s)) for s in REPORTED_STATES]
     )
     page.add_counter(
         "board_faults_total", "Times the board was seen to go into a fault", _label_counts("fault", session.faults)
     )
-    page.add_counter("laser_on_seconds_total", "Gate-on time × duty since the board's power-up, s", board["laser_on_s"])
-    page.add_counter("underruns_total", "Times the board ran out of points", board["underruns"])
-    page.add_gauge("board_temperature_celsius", "The board's temperature", board["temperature_c"])
-    page.add_gauge("link_up", "1 while there is a link to the board", int(link["state"] == "up"))
+    page.add_counter("laser_on_seconds_total", "Gate-on time × duty since the board's power-up, s", board.laser_on_s)
+    page.add_counter("underruns_total", "Times the board ran out of points", board.underruns)
+    page.add_gauge("board_temperature_celsius", "The board's temperature", board.temperature_c)
+    page.add_gauge("link_up", "1 while there is a link to the board", int(link.state == "up"))
     received, sent = {"at": "host"}, {"at": "board"}
-    bad = [(received, link["received_bad"]), (sent, link["board_bad"])]
+    bad = [(received, link.host_bad_frames), (sent, link.board_bad_frames)]
     page.add_counter("link_bad_frames_total", "Damaged frames since the link was opened", bad)
-    page.add_counter("link_retransmitted_total", "Frames sent again since the link was opened", link["retransmitted"])
-    page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link["naks"])
-    page.add_gauge("link_round_trip_seconds", "Least round trip to the board", _ms_to_s(link["round_trip_ms"]))
-    page.add_gauge("link_longest_stall_seconds", "Longest turn of the loop", _ms_to_s(link["longest_stall_ms"]))
-    pulses = [({"stage": stage}, totals[stage]) for stage in ("planned", "sent", "executed")]
+    page.add_counter("link_retransmitted_total", "Frames sent again since the link was opened", link.retransmitted)
+    page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link.naks)
+    page.add_gauge("link_round_trip_seconds", "Least round trip to the board", _ms_to_s(link.round_trip_ms))
+    page.add_gauge("link_longest_stall_seconds", "Longest turn of the loop", _ms_to_s(link.longest_stall_ms))
+    pulses = [({"stage": stage}, getattr(totals, stage)) for stage in ("planned", "sent", "executed")]
     page.add_counter("pulses_total", "Pulses planned, sent to the board, executed by it", pulses)
     page.add_counter("plans_total", "Ended plans by how they ended", _label_counts("status", counters.ended))
-    page.add_gauge("plans_waiting", "Plans that wait for the beam", queue["waiting"])
-    page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(snapshot["planner"]["alive"]))
+    page.add_gauge("plans_waiting", "Plans that wait for the beam", queue.waiting)
+    page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(snapshot.planner.alive))
     page.add_gauge(
         "plan_headroom_kelvin", "Least distance of an absorber's bound from its cap, last plan", counters.min_headroom_k
     )

@@ -14,9 +14,10 @@ import numpy as np
 
 from optodrive.core.types.arrays import BoolArray, FloatArray
 from optodrive.core.types.plans import BudgetState
-from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore, Status
+from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, apply_executed
+from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
@@ -268,7 +269,7 @@ class PlanQueue:
             if record.delay_s > MIN_DELAY_S:
                 self._delay_all(record.delay_s)
 
-    def _conclude(self, record: PlanRecord, job: PlanJob, status: Status, error: str | None) -> None:
+    def _conclude(self, record: PlanRecord, job: PlanJob, status: PlanStatus, error: str | None) -> None:
         scale = self._session.scale
         executed = job.build_executed(record.planned.plan, scale.full_power_w, scale.tick_s)
         record.executed = executed
@@ -299,7 +300,7 @@ class PlanQueue:
             for run in self.running:
                 run.job.delay(round(delay_s / self._session.scale.tick_s))
 
-    def end_running(self, status: Status, error: str | None) -> None:
+    def end_running(self, status: PlanStatus, error: str | None) -> None:
         """End everything that runs; what was executed is taken over."""
         with self.lock:
             ended = list(self.running)
@@ -362,7 +363,7 @@ def _mark_refreshed(record: PlanRecord, cut_row: int) -> BoolArray:
     return refreshed if not refreshed[pixel[cut_row:]].all() else np.zeros_like(refreshed)
 
 
-def simulate_record(record: PlanRecord, status: Status, error: str | None) -> None:
+def simulate_record(record: PlanRecord, status: PlanStatus, error: str | None) -> None:
     """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
     try:
         record.simulated_m = compute_simulated_m(record)

@@ -3,8 +3,7 @@
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -13,10 +12,11 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses
 from optodrive.core.units import m_to_um
 from optodrive.daemon.engine.state_waiters import uncancellable_future
+from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanReport, PlanStatus
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session.timing_error import TimingError
 from optodrive.physics.thermal_state import ThermalState
-from optodrive.planning.feasibility import FeasibilityReport
+from optodrive.planning.feasibility.report import FeasibilityReport
 from optodrive.planning.plan_summary import PULSES_LISTED_MAX, list_pulse_columns, summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
 
@@ -24,8 +24,6 @@ RECORDS_MAX = 200
 PULSES_MAX = 1_000_000
 """Ended plans are forgotten beyond so many plans or pulses."""
 RECENT_PLANS = 20
-
-Status = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
 
 
 @dataclass
@@ -50,7 +48,7 @@ class PlanRecord:
     start_s: float
     arrived_s: float
     streamed: bool = False
-    status: Status = "planned"
+    status: PlanStatus = "planned"
     error: str | None = None
     sent: int = 0
     executed: ExecutedPulses | None = None
@@ -72,47 +70,42 @@ class PlanRecord:
         """Whether nothing more will happen to it."""
         return self.status in ("done", "superseded", "failed", "cancelled")
 
-    def end(self, status: Status, error: str | None) -> None:
+    def end(self, status: PlanStatus, error: str | None) -> None:
         """Nothing more will happen to it."""
         self.status, self.error = status, error
         self.end_future.set_result(None)
         self.on_end(self)
 
-    def to_json(self, board_now_s: float, pulses: bool = True) -> dict[str, Any]:
-        """The plan as REST answers it; pulses: list them one by one."""
-        answer: dict[str, Any] = {
-            "plan": self.plan_id,
-            "name": self.name,
-            "status": self.status,
-            "error": self.error,
-            "starts_in_s": self.start_s + self.delay_s - board_now_s,
-            "planned": len(self.planned.plan),
-            "sent": self.sent,
-            "executed": self.executed_count,
-            "dropped": self.dropped,
-            "latency": {
-                "planned_s": self.planned_after_s,
-                "first_byte_s": self.first_byte_after_s,
-                "first_light_s": self.first_light_after_s,
-            },
-            "timing_error": None if self.timing_error is None else asdict(self.timing_error),
-            "summary": summarize_plan(self.planned, self.feasibility),
-            "pulses": list_pulse_columns(self.planned) if pulses else None,
-            "simulated_max_um": None,
-            "tallest_asked": self._describe_max_target(),
-            "executed_pulses": None,
-        }
-        if self.executed is not None:
-            answer["executed_complete"] = self.executed.complete
-            answer["delay_s"] = self.delay_s
-            if self.simulated_m is not None and len(self.simulated_m):
-                answer["simulated_max_um"] = m_to_um(float(self.simulated_m.max()))
-            if pulses and len(self.executed) <= PULSES_LISTED_MAX:
-                answer["executed_pulses"] = self._list_executed()
-        return answer
+    def build_report(self, board_now_s: float, pulses: bool = True) -> PlanReport:
+        """Report the plan; `pulses` lists them one by one."""
+        executed, simulated_m = self.executed, self.simulated_m
+        return PlanReport(
+            plan=self.plan_id,
+            name=self.name,
+            status=self.status,
+            error=self.error,
+            starts_in_s=self.start_s + self.delay_s - board_now_s,
+            planned=len(self.planned.plan),
+            sent=self.sent,
+            executed=self.executed_count,
+            dropped=self.dropped,
+            latency=PlanLatency(
+                planned_s=self.planned_after_s,
+                first_byte_s=self.first_byte_after_s,
+                first_light_s=self.first_light_after_s,
+            ),
+            timing_error=self.timing_error,
+            summary=summarize_plan(self.planned, self.feasibility),
+            pulses=list_pulse_columns(self.planned) if pulses else None,
+            simulated_max_um=_max_um(simulated_m) if executed is not None else None,
+            max_target=self._report_max_target(),
+            executed_pulses=_list_executed(executed, simulated_m) if pulses and executed is not None else None,
+            executed_complete=None if executed is None else executed.complete,
+            delay_s=None if executed is None else self.delay_s,
+        )
 
-    def _describe_max_target(self) -> dict[str, Any] | None:
-        """The pulse asked to be the tallest: asked for, predicted, and simulated from what was executed."""
+    def _report_max_target(self) -> MaxTarget | None:
+        """Report the pulse with the largest target; None if no pulse has a target."""
         plan = self.planned.plan
         target_m = np.nan_to_num(plan.target_m)
         if not len(plan) or not target_m.any():
@@ -121,23 +114,28 @@ class PlanRecord:
         simulated_um = None
         if self.simulated_m is not None and self.executed_rows is not None and row in self.executed_rows:
             simulated_um = m_to_um(float(self.simulated_m[self.executed_rows == row][0]))
-        return {
-            "pixel": int(plan.pixel[row]),
-            "asked_um": m_to_um(float(target_m[row])),
-            "predicted_um": m_to_um(float(self.planned.predicted_m[row])),
-            "simulated_um": simulated_um,
-        }
+        return MaxTarget(
+            pixel=int(plan.pixel[row]),
+            target_um=m_to_um(float(target_m[row])),
+            predicted_um=m_to_um(float(self.planned.predicted_m[row])),
+            simulated_um=simulated_um,
+        )
 
-    def _list_executed(self) -> dict[str, list[Any]]:
-        executed = self.executed
-        assert executed is not None  # noqa: S101 - the only caller has just looked
-        return {
-            "start_s": executed.start_s.tolist(),
-            "width_s": executed.width_s.tolist(),
-            "power_w": executed.power_w.tolist(),
-            "pixel": executed.pixel.tolist(),
-            "simulated_um": [] if self.simulated_m is None else m_to_um(self.simulated_m).tolist(),
-        }
+
+def _max_um(displacement_m: FloatArray | None) -> float | None:
+    return None if displacement_m is None or not len(displacement_m) else m_to_um(float(displacement_m.max()))
+
+
+def _list_executed(executed: ExecutedPulses, simulated_m: FloatArray | None) -> ExecutedColumns | None:
+    if len(executed) > PULSES_LISTED_MAX:
+        return None
+    return ExecutedColumns(
+        start_s=executed.start_s.tolist(),
+        width_s=executed.width_s.tolist(),
+        power_w=executed.power_w.tolist(),
+        pixel=executed.pixel.tolist(),
+        simulated_um=[] if simulated_m is None else m_to_um(simulated_m).tolist(),
+    )
 
 
 class PlanStore:
@@ -168,11 +166,11 @@ class PlanStore:
             callback(record)
 
     def find(self, plan_id: str) -> PlanRecord:
-        """A plan by its id; InputError (no_plan) where there is none."""
+        """A plan by its id; InputError (plan_not_found) where there is none."""
         with self._lock:
             record = self._records.get(plan_id)
         if record is None:
-            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "no_plan")
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "plan_not_found")
         return record
 
     def list_recent(self) -> list[PlanRecord]:

@@ -8,15 +8,17 @@ from typing import NamedTuple, Protocol, TypeVar
 
 from optodrive.core.clock import Clock
 from optodrive.core.types.plans import BudgetState
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.plan_queue import PlanningSnapshot, PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.state_waiters import JsonObject
+from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.session import BoardSession
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility import FeasibilityReport, FitMode, check_feasibility
-from optodrive.planning.limiter.limiter import Policy, verify
+from optodrive.planning.feasibility.check import check_feasibility
+from optodrive.planning.feasibility.report import FeasibilityReport, FitMode
+from optodrive.planning.limiter.limiter import verify
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
@@ -90,7 +92,7 @@ class Planner:
         """Make no more plans."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
-    def submit(self, request: PlanningRequest) -> "Future[JsonObject]":
+    def submit(self, request: PlanningRequest) -> "Future[PlanReport]":
         """Make a plan and have it shown; answers what will be shown when. Any thread."""
         with self._lock:
             if self._pending_count == 0:
@@ -98,7 +100,7 @@ class Planner:
             self._pending_count += 1
         return self._executor.submit(self._process, request)
 
-    def _process(self, request: PlanningRequest) -> JsonObject:
+    def _process(self, request: PlanningRequest) -> PlanReport:
         try:
             self._record_progress(0.0)
             sequence = request.build()
@@ -110,7 +112,7 @@ class Planner:
                     self._run_in_loop(self._plan_queue.preempt)
                 record = self._plan_once(sequence, request, planning_time_s)
                 if record is not None:
-                    return record.to_json(self._session.board_s())
+                    return record.build_report(self._session.board_s())
                 # What runs went on beyond where this would have followed.
                 late_count += 1
                 planning_time_s = PLANNING_TIME_FACTOR * (1 + late_count) * self._last_planning_s

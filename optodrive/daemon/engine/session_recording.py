@@ -34,7 +34,7 @@ def describe_display(display: DisplayModel) -> dict[str, Any]:
         "optodrive": __version__,
         "ambient_K": display.ambient_k,
         "bridge_width_m": display.config.display.bridge_width_m,
-        "config": json.dumps(build_effective_config(display)),
+        "config": build_effective_config(display).model_dump_json(),
     }
 
 
@@ -49,7 +49,7 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
         "status": record.status,
         "error": record.error,
         "start_s": record.start_s,
-        "summary": json.dumps(summarize_plan(planned, record.feasibility)),
+        "summary": summarize_plan(planned, record.feasibility).model_dump_json(),
         "trains": json.dumps(trains),
     }
     arrays = {

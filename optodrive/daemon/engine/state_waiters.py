@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
+from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 
-JsonObject = dict[str, Any]
 TIMEOUT_S = 5.0
 
 
@@ -26,7 +26,7 @@ class _Waiter:
     states: tuple[str, ...]
     command: str
     deadline_s: float
-    future: "Future[JsonObject]"
+    future: "Future[StateReport]"
 
 
 class StateWaiters:
@@ -38,7 +38,7 @@ class StateWaiters:
     def __bool__(self) -> bool:
         return bool(self._waiters)
 
-    def add(self, states: tuple[str, ...], command: str, now_s: float, future: "Future[JsonObject]") -> None:
+    def add(self, states: tuple[str, ...], command: str, now_s: float, future: "Future[StateReport]") -> None:
         """Let a future wait. what: the order, as the error names it."""
         self._waiters.append(_Waiter(states, command, now_s + TIMEOUT_S, future))
 
@@ -48,7 +48,7 @@ class StateWaiters:
         refusal: str | None,
         link_error: str | None,
         now_s: float,
-        get_snapshot: Callable[[], JsonObject],
+        get_snapshot: Callable[[], StateReport],
     ) -> None:
         """End the waits that are over. refusal: what the board refused since the last look."""
         for waiter in list(self._waiters):

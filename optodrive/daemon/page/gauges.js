@@ -11,15 +11,15 @@ export class Gauges {
   show(caps) {
     for (const cap of caps) {
       const gauge = this.each.get(cap.cap) ?? this.#make(cap);
-      const at = cap.pixel !== null && cap.share > 0.5 ? `, pixel ${cap.pixel}` : "";
+      const at = cap.pixel !== null && cap.fraction > 0.5 ? `, pixel ${cap.pixel}` : "";
       const [thousand, k] = cap.limit >= 1e4 ? [1000, "k"] : [1, ""];
       const limit = cap.limit / thousand;
       const digits = Math.max(0, 2 - Math.floor(Math.log10(limit)));
       const text = `${(cap.value / thousand).toFixed(digits)} of ${limit.toFixed(digits)} ${k}${cap.unit}${at}`;
       gauge.text.textContent = text;
-      gauge.bar.style.setProperty("--share", Math.min(1, Math.max(0, cap.share)));
-      gauge.item.dataset.kind = cap.share > 0.95 ? "bad" : cap.share > 0.8 ? "warn" : "";
-      gauge.bar.setAttribute("aria-valuenow", Math.round(100 * Math.max(0, Math.min(1, cap.share))));
+      gauge.bar.style.setProperty("--fraction", Math.min(1, Math.max(0, cap.fraction)));
+      gauge.item.dataset.kind = cap.fraction > 0.95 ? "bad" : cap.fraction > 0.8 ? "warn" : "";
+      gauge.bar.setAttribute("aria-valuenow", Math.round(100 * Math.max(0, Math.min(1, cap.fraction))));
       gauge.bar.setAttribute("aria-valuetext", text);
     }
   }

@@ -81,7 +81,7 @@ SEQUENCE_EXAMPLE: Schema = {
     ],
 }
 """An example that every display can show."""
-PATTERN_NAME_EXAMPLES: Schema = {"examples": [item["name"] for item in describe_patterns()]}
+PATTERN_NAME_EXAMPLES: Schema = {"examples": [item.name for item in describe_patterns()]}
 PARAMETERS_SCHEMA: Schema = {"type": "object", "description": "as GET /v1/patterns lists them; a file in base64"}
 
 

@@ -7,9 +7,10 @@ import asyncio
 import json
 from collections.abc import Iterator
 from contextlib import suppress
-from typing import Any
 
 from fastapi.responses import Response
+from pydantic import BaseModel
+from pydantic_core import to_json
 from starlette.concurrency import run_in_threadpool
 
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
@@ -63,23 +64,24 @@ class StopPriorityMiddleware:
                 self._stop_done.set()
 
 
-async def build_json_response(content: dict[str, Any], status: int = 200) -> Response:
-    """A JSON answer, which may list thousands of pulses, written beside the web server's loop.
+async def build_json_response(model: BaseModel, status: int = 200) -> Response:
+    """Encode a model, which may list thousands of pulses, outside the web server's loop.
 
-    The encoder holds the interpreter as long as it is at one piece; a column of a plan's pulses takes milliseconds.
+    The encoder holds the interpreter lock for one column of pulses at a time, less than a millisecond.
     """
-    body = await run_in_threadpool(lambda: "".join(iterate_json(content)).encode())
+    body = await run_in_threadpool(lambda: b"".join(iterate_json(model)))
     return Response(body, status, media_type="application/json")
 
 
-def iterate_json(value: object) -> Iterator[str]:
-    """JSON, one piece for whatever is no object."""
-    if not isinstance(value, dict) or not value:
-        yield json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-        return
-    separator = "{"
-    for key, item in value.items():
-        yield f"{separator}{json.dumps(str(key), ensure_ascii=False)}:"
-        yield from iterate_json(item)
-        separator = ","
-    yield "}"
+def iterate_json(model: BaseModel) -> Iterator[bytes]:
+    """Encode a model as JSON in pieces: one for each member that is not a model itself."""
+    separator = b"{"
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        yield separator + json.dumps(name).encode() + b":"
+        if isinstance(value, BaseModel):
+            yield from iterate_json(value)
+        else:
+            yield to_json(value)
+        separator = b","
+    yield b"}" if separator == b"," else b"{}"

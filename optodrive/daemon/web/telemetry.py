@@ -5,27 +5,25 @@ reader that is slow is handed the newest when it is ready for more; nothing wait
 """
 
 import asyncio
-import json
-from base64 import b64encode
 from collections import deque
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from math import isfinite, sqrt
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from starlette.responses import StreamingResponse
 
 from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import NotReadyError
+from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.progress import ClockShift, merge_events
-from optodrive.physics.nominal_display import DisplayState
-from optodrive.planning.limiter.usage import Usage
+from optodrive.daemon.responses.telemetry import BudgetEvent, FaultEvent
+from optodrive.daemon.web.telemetry_events import build_display_event, build_pulse_batch, describe_caps
 
 DEFAULT_RATE_HZ = 30.0
 IDLE_RATE_HZ = 20.0
@@ -41,8 +39,6 @@ ANNOUNCE_LEAD_S = 1.0
 BATCHES_MAX = 300
 """Batches of pulses kept for whoever comes late."""
 PULSES_MAX = 3000
-HEIGHT_UNIT_M, TEMPERATURE_UNIT_K = 1e-7, 0.1
-"""Units of what `display` holds."""
 
 
 class EventStream(StreamingResponse):
@@ -66,6 +62,7 @@ class Telemetry:
 
     def __init__(self, engine: Engine, clock: Clock | None = None) -> None:
         self._engine = engine
+        self._config = engine.display.config
         self._clock = clock or MonotonicClock()
         self._executed_state = LiveThermalState(engine.display)
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="telemetry")
@@ -150,9 +147,8 @@ class Telemetry:
         self._publish_state(now_s)
         self._publish_display(now_s, board_s)
         if self._is_due("budget", now_s, BUDGET_PERIOD_S):
-            self._publish(
-                "budget", {"board_s": board_s, "caps": self._describe_caps(self._executed_state.compute_usage(board_s))}
-            )
+            usages = self._executed_state.compute_usage(board_s)
+            self._publish("budget", BudgetEvent(board_s=board_s, caps=describe_caps(usages, self._config.limits)))
         self._refreshed_s = self._clock.now_s()
 
     def _estimate_board_s(self, now_s: float) -> float:
@@ -167,9 +163,9 @@ class Telemetry:
             self._due_s[kind] = now_s + period_s
         return due
 
-    def _publish(self, kind: str, data: dict[str, Any]) -> None:
+    def _publish(self, kind: str, event: JsonModel) -> None:
         number = self._latest.get(kind, (0, ""))[0] + 1
-        self._latest[kind] = number, f"event: {kind}\ndata: {json.dumps(data, separators=(',', ':'))}\n\n"
+        self._latest[kind] = number, _format_event(kind, event)
 
     def _collect_executed(self) -> None:
         for event in merge_events(self._engine.drain_events()):
@@ -205,52 +201,43 @@ class Telemetry:
         width_s: FloatArray,
         power_w: FloatArray,
     ) -> None:
-        row, start_s, width_s, power_w = (
-            row[-PULSES_MAX:],
-            start_s[-PULSES_MAX:],
-            width_s[-PULSES_MAX:],
-            power_w[-PULSES_MAX:],
-        )
-        plan = record.planned.plan
-        columns = {
-            "plan": record.plan_id,
-            "name": record.name,
-            "row": row.tolist(),
-            "pixel": plan.pixel[row].tolist(),
-            "start_s": _round_values(start_s, 6),
-            "width_s": _round_values(width_s, 6),
-            "power_w": _round_values(power_w, 4),
-            "trimmed_j": _round_values(plan.trimmed_j[row], 6),
-            "reason": [str(reason) for reason in plan.reason[row]],
-        }
+        newest = slice(-PULSES_MAX, None)
+        row = row[newest]
+        batch = build_pulse_batch(record, row, start_s[newest], width_s[newest], power_w[newest])
         self._batch_number += 1
-        self._batches.append(_Batch(self._batch_number, len(row), kind, json.dumps(columns, separators=(",", ":"))))
+        self._batches.append(_Batch(self._batch_number, len(row), kind, batch.model_dump_json()))
 
     def _format_pulses_since(self, number: int) -> str:
-        """One event with what a reader has not had, the newest where that is too much."""
-        parts: dict[str, list[str]] = {"planned": [], "executed": []}
+        """Format the event of all batches after a number; if those are too many, of the newest.
+
+        Every batch is encoded once, in this class's thread; the readers' events, which the web server's loop formats,
+        only join the texts. The result is a `PulsesEvent`.
+        """
+        texts: dict[str, list[str]] = {"planned": [], "executed": []}
         pulses = 0
         for batch in reversed(self._batches):
             pulses += batch.pulse_count
             if batch.number <= number or pulses > 2 * PULSES_MAX:
                 break
-            parts[batch.kind].insert(0, batch.text)
-        lists = ",".join(f'"{kind}":[{",".join(texts)}]' for kind, texts in parts.items())
+            texts[batch.kind].insert(0, batch.text)
+        lists = ",".join(f'"{kind}":[{",".join(batches)}]' for kind, batches in texts.items())
         return f'event: pulses\ndata: {{"board_s":{self._board_clock_reference[1]:.6f},{lists}}}\n\n'
 
     def _publish_state(self, now_s: float) -> None:
         state = self._engine.snapshot()
-        board, queue = state["board"], state["queue"]
-        plans = tuple((plan["plan"], plan["status"]) for plan in queue["plans"])
-        key = (board["state"], board["fault"], board["inputs"], state["link"]["state"], state["planner"]["busy"], plans)
+        board, link = state.board, state.link
+        plans = tuple((plan.plan, plan.status) for plan in state.queue.plans)
+        key = (board.state, board.fault, board.inputs, link.state, state.planner.busy, plans)
         changed, due = key != self._state_key, self._is_due("state", now_s, STATE_PERIOD_S)
         if changed or due:
             self._state_key = key
             self._publish("state", state)
-        fault = {"fault": board["fault"], "hint": board["hint"], "link_error": state["link"]["error"]}
-        if tuple(fault.values()) != self._fault_key:
-            self._fault_key = tuple(fault.values())
-            self._publish("fault", {"board": board["state"], "link": state["link"]["state"], **fault})
+        fault_key = board.fault, board.hint, link.error
+        if fault_key != self._fault_key:
+            self._fault_key = fault_key
+            fault, hint, link_error = fault_key
+            event = FaultEvent(board=board.state, link=link.state, fault=fault, hint=hint, link_error=link_error)
+            self._publish("fault", event)
 
     def _publish_display(self, now_s: float, board_s: float) -> None:
         pixel_state = self._executed_state.state_at(board_s)
@@ -259,57 +246,12 @@ class Telemetry:
             pixel_state.displacement_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K
         )
         if self._is_warm or was_warm or self._is_due("display", now_s, COLD_DISPLAY_PERIOD_S):
-            self._publish(
-                "display", {"board_s": round(board_s, 6), "warm": self._is_warm, **self._encode_display(pixel_state)}
-            )
-
-    def _encode_display(self, pixel_state: DisplayState) -> dict[str, str]:
-        absorber_c = self._engine.display.config.ambient_c + pixel_state.absorber_k
-        return {
-            "height": _encode_base64(pixel_state.displacement_m / HEIGHT_UNIT_M),
-            "absorber": _encode_base64(absorber_c / TEMPERATURE_UNIT_K),
-        }
-
-    def _describe_caps(self, usages: tuple[Usage, ...]) -> list[dict[str, Any]]:
-        """Caps as people read them: temperatures in °C, energy in J, power in W, acceleration in rad/s² rms."""
-        limits = self._engine.display.config.limits
-        max_c = {
-            "absorber_temperature": limits.absorber_max_c,
-            "wall_temperature": limits.wall_max_c,
-            "touch_temperature": limits.touch_max_c,
-        }
-        units = {"spot_energy": "J", "galvo_acceleration": "rad/s²"}
-        caps = []
-        for usage in usages:
-            if not isfinite(usage.limit):
-                continue
-            value, limit, unit = usage.used, usage.limit, units.get(usage.cap, "W")
-            if usage.cap in max_c:
-                value, limit, unit = max_c[usage.cap] - (usage.limit - usage.used), max_c[usage.cap], "°C"
-            elif usage.cap == "galvo_acceleration":
-                value, limit = sqrt(value), sqrt(limit)
-            fraction = usage.used / usage.limit
-            caps.append(
-                {
-                    "cap": usage.cap,
-                    "share": round(fraction, 4),
-                    "value": float(f"{value:.5g}"),
-                    "limit": float(f"{limit:.5g}"),
-                    "unit": unit,
-                    "pixel": usage.pixel,
-                }
-            )
-        return caps
+            self._publish("display", build_display_event(board_s, self._is_warm, pixel_state, self._config.ambient_c))
 
 
 async def _wait_for(future: "asyncio.Future[None]") -> None:
     await future
 
 
-def _encode_base64(values: FloatArray) -> str:
-    return b64encode(np.clip(np.rint(values), 0, 65535).astype("<u2").tobytes()).decode()
-
-
-def _round_values(values: FloatArray, digits: int) -> list[float]:
-    rounded: list[float] = np.round(values, digits).tolist()
-    return rounded
+def _format_event(kind: str, event: JsonModel) -> str:
+    return f"event: {kind}\ndata: {event.model_dump_json()}\n\n"

@@ -17,9 +17,9 @@ from optodrive.core.files import read_toml
 from optodrive.daemon.web.roles import ROLES, Role
 from optodrive.device.config import Section, check_format
 
-TOKEN_VARIABLE = "OPTODRIVE_TOKEN"
+TOKEN_VARIABLE = "OPTODRIVE_TOKEN"  # noqa: S105 - the name of a variable
 TOKENS_FILE_VARIABLE = "OPTODRIVE_TOKENS"
-SECRET_PATTERN = r"^[!-~]{16,200}$"
+SECRET_PATTERN = r"^[!-~]{16,200}$"  # noqa: S105 - what a secret looks like
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1

@@ -401,14 +401,14 @@ class BoardSession:
         counts, round_trip_s, cause = self._count_errors(), self._clock_sync.round_trip_s, self._watch.cause
         return {
             "round_trip_ms": None if round_trip_s is None else round_trip_s * 1e3,
-            "received_bad": counts.host_bad_frames,
+            "host_bad_frames": counts.host_bad_frames,
             "retransmitted": counts.retransmitted,
             "naks": counts.naks,
-            "board_bad": counts.board_bad_frames,
+            "board_bad_frames": counts.board_bad_frames,
             "underruns": self.board.underruns,
             "longest_stall_ms": self._watch.longest_stall_s * 1e3,
             "likely_cause": None if cause is None else cause.message,
-            "likely_cause_ago_s": None if cause is None else self._clock.now_s() - cause.noticed_s,
+            "likely_cause_age_s": None if cause is None else self._clock.now_s() - cause.noticed_s,
         }
 
     def _count_errors(self) -> LinkErrorCounts:

@@ -11,14 +11,14 @@ from optodrive.core.types.arrays import FloatArray
 class TimingError:
     """Executed start − planned start of a plan's pulses, both from the plan's zero on the board's clock, s.
 
-    start_delay_s: the first pulse's, which shifts the whole plan; median_s; largest_s: the one largest either way
+    start_delay_s: the first pulse's, which shifts the whole plan; median_s; max_abs_s: the one largest either way
     drift_ppm: slope of what is left without the delay over the plan's time; 0 where all pulses start at one time
     """
 
     pulses: int
     start_delay_s: float
     median_s: float
-    largest_s: float
+    max_abs_s: float
     drift_ppm: float
 
 
@@ -33,7 +33,7 @@ def compute_timing_error(planned_s: FloatArray, executed_s: FloatArray) -> Timin
         pulses=len(error_s),
         start_delay_s=float(error_s[0]),
         median_s=float(np.median(error_s)),
-        largest_s=float(error_s[np.abs(error_s).argmax()]),
+        max_abs_s=float(error_s[np.abs(error_s).argmax()]),
         drift_ppm=1e6 * float(centred_s @ residual_s) / spread_s2 if spread_s2 else 0.0,
     )
 
@@ -42,21 +42,17 @@ class TimingTotals:
     """Over all plans: pulses, and of each figure the one that was largest either way."""
 
     def __init__(self) -> None:
-        self._worst: TimingError | None = None
+        self.worst: TimingError | None = None
 
     def add(self, error: TimingError) -> None:
         """Take a plan's in."""
-        previous = self._worst
+        previous = self.worst
         if previous is None:
-            self._worst = error
+            self.worst = error
             return
         worst = {
             name: max(value, getattr(previous, name), key=abs)
             for name, value in asdict(error).items()
             if name != "pulses"
         }
-        self._worst = TimingError(pulses=previous.pulses + error.pulses, **worst)
-
-    def to_dict(self) -> dict[str, float] | None:
-        """As the state answers it; None before any pulse."""
-        return None if self._worst is None else asdict(self._worst)
+        self.worst = TimingError(pulses=previous.pulses + error.pulses, **worst)

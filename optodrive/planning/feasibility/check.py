@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 from optodrive.core.errors import OverBudgetError, RefusedError
 from optodrive.core.types.plans import BudgetState
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
@@ -21,7 +22,6 @@ from optodrive.planning.feasibility.report_builder import (
 )
 from optodrive.planning.feasibility.sequence_edits import omit_pixels, scale_sequence
 from optodrive.planning.feasibility.violation import Violation, deadlines_s, find_first_violation
-from optodrive.planning.limiter.limiter import Policy
 from optodrive.planning.pipeline import Progress, plan_sequence
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.sequence_checks import first_unreachable, remove_dead_pixels

@@ -7,13 +7,14 @@ later moment too warm.
 
 from dataclasses import fields, replace
 from math import inf
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from optodrive.core.errors import LocalProtocolError, OverBudgetError, RefusedError
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.plans import EMPTY_PLAN, BudgetState, LimitedPlan, PulsePlan
+from optodrive.core.types.policy import Policy
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.caps import CAPS_BY_KEY, REASONS, WRONG_ORDER
 from optodrive.planning.limiter.galvo_moves import count_galvo_feasible
@@ -24,8 +25,6 @@ from optodrive.planning.limiter.pulse_application import (
     apply_pulses,
 )
 from optodrive.planning.limiter.workspace import LimiterWorkspace, PixelBudgets, close_workspace, open_workspace
-
-Policy = Literal["trim", "delay", "refuse"]
 
 
 class _EncodedPulses(NamedTuple):

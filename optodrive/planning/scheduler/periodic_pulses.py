@@ -75,7 +75,7 @@ class PeriodicSteadyState:
 def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> PulseRecipe:
     """How the train's pulses are planned; drive.max_periods: the longest pulse its cycle has room for.
 
-    Raises InputError (target_out_of_reach, bad_train) where no steady cycle has the train's height or swing.
+    Raises InputError (target_unreachable, bad_train) where no steady cycle has the train's height or swing.
     """
     periods, lead_ratio = _find_min_periods(train, cold_heat, drive, where), 0.0
     min_periods = 1
@@ -160,7 +160,7 @@ def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveR
             round(m_to_um(train.target_m), 3),
             f"at most {m_to_um(max_m):.0f} µm, what pulses of {high * drive.period_s * 1e3:.4g} ms at "
             f"{drive.max_power_w:g} W every {train.period_s * 1e3:.4g} ms come to",
-            code="target_out_of_reach",
+            code="target_unreachable",
         )
     while high - low > 1:
         middle = (low + high) // 2

@@ -27,13 +27,23 @@ class PatternParameter:
 
     name: str
     kind: ParameterKind
-    default: ParameterValue
+    default: str | int | float | bool | None
     description: str
     unit: str = ""
     choices: tuple[str, ...] = ()
     min: float | None = None
     max: float | None = None
     required: bool = False
+
+
+@dataclass(frozen=True)
+class PatternDescription:
+    """A pattern without its builder, as GET /v1/patterns lists it."""
+
+    name: str
+    summary: str
+    notes: str
+    parameters: tuple[PatternParameter, ...]
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,10 @@
 """Registry of the named patterns that `play` and the REST API offer."""
 
-from dataclasses import asdict
-from typing import Any
-
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config
 from optodrive.planning.stimuli import experiments, images, shapes
-from optodrive.planning.stimuli.pattern import Pattern, PatternParameter
+from optodrive.planning.stimuli.pattern import Pattern, PatternDescription, PatternParameter
 from optodrive.planning.stimuli.sequence_file import validate_sequence
 from optodrive.planning.stimuli.showcase import build_showcase
 from optodrive.planning.stimuli.text import build_text
@@ -236,14 +233,9 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
     return validate_sequence(sequence, where, config)
 
 
-def describe_patterns() -> list[dict[str, Any]]:
-    """Return every pattern with its parameters, JSON-serialisable."""
+def describe_patterns() -> list[PatternDescription]:
+    """Describe every pattern and its parameters."""
     return [
-        {
-            "name": pattern.name,
-            "summary": pattern.summary,
-            "notes": pattern.notes,
-            "parameters": [asdict(parameter) for parameter in pattern.parameters],
-        }
+        PatternDescription(pattern.name, pattern.summary, pattern.notes, pattern.parameters)
         for pattern in _PATTERN_LIST
     ]

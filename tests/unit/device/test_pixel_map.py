@@ -21,7 +21,7 @@ from optodrive.device.pixel_map import (
 )
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.feasibility import check_feasibility
+from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.pipeline import plan_sequence, warm_up
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.pixel_lattice import Lattice

@@ -60,7 +60,7 @@ def test_no_pulse_where_the_heat_is_enough():
     assert pulse_for_peak(PIXEL, 100.0, 50.0, 150e-6, DRIVE) is None
 
 
-def test_a_target_out_of_reach_gets_the_longest_pulse():
+def test_a_target_unreachable_gets_the_longest_pulse():
     assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * max_displacement_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.planning.feasibility import check_feasibility
+from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.limiter.limiter import limit
 from optodrive.planning.pipeline import plan_sequence
 

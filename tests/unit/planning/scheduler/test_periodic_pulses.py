@@ -185,12 +185,12 @@ def test_a_cycle_whose_height_is_still_there_has_no_pulse_and_is_named():
 
 def test_a_height_out_of_reach_is_refused_with_the_most_there_is():
     code, message = refusal(HeightTrain(17, 0.0, 1.0, 0.04, 5e-3))
-    assert code == "target_out_of_reach"
+    assert code == "target_unreachable"
     assert message.startswith("trains[0].target_um: got 5000.0, expected at most ")
     most_um = float(message.split("at most ")[1].split()[0])
     train = HeightTrain(17, 0.0, 0.08, 0.04, (most_um - 1) * 1e-6)
     prepared(train)
-    assert refusal(replace(train, target_m=(most_um + 1) * 1e-6))[0] == "target_out_of_reach"
+    assert refusal(replace(train, target_m=(most_um + 1) * 1e-6))[0] == "target_unreachable"
 
 
 @pytest.mark.parametrize(("swing_um", "word", "kind"), [(199.0, "at most", "shortest"), (0.01, "at least", "longest")])

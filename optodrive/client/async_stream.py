@@ -1,0 +1,140 @@
+"""A stream of frames, of which the newest wins, with an asynchronous interface."""
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import AsyncExitStack
+from types import TracebackType
+from typing import Self
+
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import RETRY_S
+from optodrive.client.frame_results import (
+    CONNECTION_ERRORS,
+    OPEN_TIMEOUT_S,
+    RESULT_TIMEOUT_S,
+    ResultBuffer,
+    build_stream_url,
+    build_timeout_error,
+    parse_refusal,
+    raise_if_failed,
+)
+from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
+from optodrive.core.errors import LinkError
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.stream import FrameResult
+from optodrive.device.config import PixelLayout
+
+
+class AsyncStream:
+    """A stream that opens when entered; see `Stream`."""
+
+    def __init__(
+        self,
+        endpoint: Endpoint,
+        read_layout: Callable[[], Awaitable[PixelLayout]],
+        policy: Policy,
+        reconnect_timeout_s: float,
+        on_send: Callable[[], None],
+    ) -> None:
+        self._endpoint = endpoint
+        self._read_layout = read_layout
+        self._url = build_stream_url(endpoint, policy)
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._on_send = on_send
+        self._next_frame = 0
+        self._results = ResultBuffer()
+        self._results_changed = asyncio.Condition()
+        self._exit_stack = AsyncExitStack()
+        self._connection: ClientConnection | None = None
+        self._reader_task: asyncio.Task[None] | None = None
+
+    async def __aenter__(self) -> Self:
+        await self._connect()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """See `Stream.close`."""
+        await self._exit_stack.aclose()
+        if self._reader_task is not None:
+            await asyncio.gather(self._reader_task, return_exceptions=True)
+
+    async def send(self, heights_um: HeightsLike) -> int:
+        """See `Stream.send`."""
+        number, self._next_frame = self._next_frame, self._next_frame + 1
+        frame = encode_frame(number, convert_to_pixels(heights_um, await self._read_layout()))
+        self._on_send()
+        deadline_s = time.monotonic() + self._reconnect_timeout_s
+        while True:
+            try:
+                if self._connection is not None:
+                    await self._connection.send(frame)
+                    return number
+            except ConnectionClosed:
+                self._connection = None
+            try:
+                await self._connect()
+            except LinkError:
+                if time.monotonic() >= deadline_s:
+                    raise
+                await asyncio.sleep(RETRY_S)
+
+    async def results(self) -> list[FrameResult]:
+        """See `Stream.results`."""
+        async with self._results_changed:
+            return self._results.drain()
+
+    async def wait(self, frame: int | None = None, timeout_s: float = RESULT_TIMEOUT_S) -> FrameResult:
+        """See `Stream.wait`."""
+        number = self._next_frame - 1 if frame is None else frame
+        try:
+            async with asyncio.timeout(timeout_s), self._results_changed:
+                while (result := self._results.find_final(number)) is None:
+                    await self._results_changed.wait()
+        except TimeoutError:
+            raise build_timeout_error(number, timeout_s) from None
+        return raise_if_failed(result)
+
+    async def _connect(self) -> None:
+        try:
+            self._connection = await self._open_connection()
+        except InvalidStatus as error:
+            if error.response.status_code != 401 or not self._endpoint.renew_token():
+                raise parse_refusal(error) from None
+            self._connection = await self._open_connection()
+        except CONNECTION_ERRORS as error:
+            raise self._endpoint.build_unreachable_error(error) from None
+        self._reader_task = asyncio.create_task(self._read(self._connection))
+
+    async def _open_connection(self) -> ClientConnection:
+        await self._exit_stack.aclose()
+        connection = connect(
+            self._url,
+            additional_headers=self._endpoint.headers,
+            sock=self._endpoint.open_unix_socket(),
+            proxy=None,
+            open_timeout=OPEN_TIMEOUT_S,
+            compression=None,
+        )
+        return await self._exit_stack.enter_async_context(connection)
+
+    async def _read(self, connection: ClientConnection) -> None:
+        try:
+            async for message in connection:
+                async with self._results_changed:
+                    self._results.add(message)
+                    self._results_changed.notify_all()
+        except ConnectionClosed:
+            pass  # the next `send` detects and repairs this
+        finally:
+            async with self._results_changed:
+                self._results.mark_lost_before(self._next_frame)
+                self._results_changed.notify_all()

@@ -1,0 +1,96 @@
+"""Exchanges with a daemon, stated once for both HTTP clients.
+
+An exchange is a generator: it yields requests and pauses, receives responses or transport errors, and returns a result.
+A client runs it with blocking or with asynchronous input and output.
+"""
+
+import time
+from collections.abc import Generator
+from typing import Any, NamedTuple, TypeVar
+
+import httpx
+
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.problems import parse_problem
+from optodrive.client.requests import STOP, ApiRequest, Response
+from optodrive.core.errors import LinkError
+from optodrive.daemon.responses.state import StateReport
+
+RETRY_S = 0.1
+STOP_ATTEMPTS = 3
+NOT_SENT_ERRORS = (httpx.ConnectError, httpx.ConnectTimeout)
+T = TypeVar("T")
+
+
+class Transmission(NamedTuple):
+    """A request to send; `on_new_connection`: a connection of its own with a short timeout."""
+
+    request: ApiRequest[Any]
+    on_new_connection: bool = False
+
+
+class Pause(NamedTuple):
+    """A time to wait before the exchange goes on."""
+
+    duration_s: float
+
+
+Step = Transmission | Pause
+Exchange = Generator[Step, httpx.Response | None, T]
+
+
+class ExchangePolicy:
+    """Retries: how often and how long a request is repeated.
+
+    reconnect_timeout_s: how long a request that may be sent again is repeated, once the daemon has responded before
+    """
+
+    def __init__(self, endpoint: Endpoint, reconnect_timeout_s: float = 0.0) -> None:
+        self.endpoint = endpoint
+        self._reconnect_timeout_s = reconnect_timeout_s
+        self._has_responded = False
+
+    def call(self, request: ApiRequest[Response]) -> Exchange[Response]:
+        """Send a request and parse its response; raise the error that a problem document describes.
+
+        A request that is not idempotent is repeated only if it was certainly not received.
+        """
+        deadline_s = time.monotonic() + (self._reconnect_timeout_s if self._has_responded else 0.0)
+        while True:
+            try:
+                response = yield Transmission(request)
+            except httpx.TransportError as error:
+                if time.monotonic() >= deadline_s or not (request.idempotent or isinstance(error, NOT_SENT_ERRORS)):
+                    raise self.endpoint.build_unreachable_error(error) from None
+                yield Pause(RETRY_S)
+                continue
+            assert response is not None  # noqa: S101 - the reply to a transmission
+            if response.status_code == 401 and self.endpoint.renew_token():
+                continue
+            self._has_responded = True
+            return parse_response(request, response)
+
+    def stop(self) -> Exchange[StateReport]:
+        """Stop on new connections, since an open one may be broken unnoticed; three attempts."""
+        error: Exception = LinkError("not attempted")
+        for _ in range(STOP_ATTEMPTS):
+            try:
+                response = yield Transmission(STOP, on_new_connection=True)
+                assert response is not None  # noqa: S101 - the reply to a transmission
+                if response.status_code == 401 and self.endpoint.renew_token():
+                    response = yield Transmission(STOP, on_new_connection=True)
+                    assert response is not None  # noqa: S101 - the reply to a transmission
+                return parse_response(STOP, response)
+            except httpx.TransportError as transport_error:
+                error = transport_error
+        raise self.endpoint.build_stop_error(error)
+
+
+def parse_response(request: ApiRequest[Response], response: httpx.Response) -> Response:
+    """Parse a response as the request's model; raise the error that a problem document describes.
+
+    Members that the model does not have are ignored: a newer daemon may send them.
+    """
+    if response.is_success:
+        return request.response.model_validate_json(response.content, extra="ignore")
+    raise parse_problem(response.status_code, response.content)

@@ -1,0 +1,80 @@
+"""What both streams share: the address, the buffer of results, and the errors of refused frames."""
+
+from collections import deque
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.problems import build_error, parse_problem
+from optodrive.core.errors import LinkError, OptodriveError, RefusedError
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.stream import FrameResult
+
+RESULTS_MAX = 1000
+"""Results that are kept for a caller who does not read them; the oldest are dropped first."""
+OPEN_TIMEOUT_S = 10.0
+RESULT_TIMEOUT_S = 30.0
+CONNECTION_ERRORS = (OSError, InvalidHandshake, ConnectionClosed, TimeoutError)
+
+
+class ResultBuffer:
+    """Results of frames for one reader; another thread may add them."""
+
+    def __init__(self) -> None:
+        self._unread: deque[FrameResult] = deque(maxlen=RESULTS_MAX)
+        self._final: dict[int | None, FrameResult] = {}
+        self._lost_before = 0
+
+    def add(self, text: str | bytes) -> None:
+        """Parse and add one message of the daemon."""
+        result = FrameResult.model_validate_json(text, extra="ignore")
+        self._unread.append(result)
+        if result.is_final:
+            self._final[result.frame] = result
+            while len(self._final) > RESULTS_MAX:
+                del self._final[next(iter(self._final))]
+
+    def mark_lost_before(self, frame: int) -> None:
+        """Record that the connection broke: missing results of frames below this one will not arrive."""
+        self._lost_before = frame
+
+    def drain(self) -> list[FrameResult]:
+        """Return the results since the last call, in order."""
+        results = []
+        while self._unread:
+            results.append(self._unread.popleft())
+        return results
+
+    def find_final(self, frame: int) -> FrameResult | None:
+        """Return the final result of a frame, or once that of a frame that the daemon could not read.
+
+        None if neither has arrived; LinkError if it was lost with the connection.
+        """
+        result = self._final.get(frame) or self._final.pop(None, None)
+        if result is None and frame < self._lost_before:
+            raise LinkError(f"the connection broke before the result of frame {frame} arrived")
+        return result
+
+
+def build_stream_url(endpoint: Endpoint, policy: Policy) -> str:
+    """Build the WebSocket address of the stream."""
+    return f"ws{endpoint.url.removeprefix('http')}/v1/stream?policy={policy}"
+
+
+def parse_refusal(error: InvalidStatus) -> OptodriveError:
+    """Build the error for a refused WebSocket handshake."""
+    return parse_problem(error.response.status_code, bytes(error.response.body or b""))
+
+
+def build_timeout_error(frame: int, timeout_s: float) -> LinkError:
+    """Build the error for a result that did not arrive in time."""
+    return LinkError(f"no result of frame {frame} arrived within {timeout_s:g} s")
+
+
+def raise_if_failed(result: FrameResult) -> FrameResult:
+    """Return the result; raise its error if the frame was refused or its plan failed."""
+    if result.problem is not None:
+        raise build_error(result.problem)
+    if result.status == "failed":
+        raise RefusedError(f"frame {result.frame}: {result.error}")
+    return result

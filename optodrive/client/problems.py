@@ -1,0 +1,68 @@
+"""Conversion of problem documents to this package's errors."""
+
+from math import inf
+
+from pydantic import ValidationError
+
+from optodrive.core.errors import (
+    BoardFaultError,
+    InputError,
+    LinkError,
+    NotReadyError,
+    OptodriveError,
+    OverBudgetError,
+    RefusedError,
+)
+from optodrive.daemon.responses.problem import Problem
+from optodrive.daemon.web.tokens import TOKEN_VARIABLE
+
+INPUT_ERROR_STATUSES = (400, 404, 413, 422)
+ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
+    "not_ready": NotReadyError,
+    "board_fault": BoardFaultError,
+    "link": LinkError,
+}
+
+
+def parse_problem(status: int, body: bytes) -> OptodriveError:
+    """Parse the body of an error response; LinkError if it is not a problem document."""
+    try:
+        problem = Problem.model_validate_json(body, extra="ignore")
+    except ValidationError:
+        return LinkError(f"the daemon answered {status} without a problem document")
+    return build_error(problem)
+
+
+def build_error(problem: Problem) -> OptodriveError:
+    """Build the error that a problem document describes; the error keeps the document as `problem`."""
+    error = _build_typed_error(problem)
+    error.problem = problem.to_dict()
+    error.code = problem.code
+    if isinstance(error, RefusedError):
+        error.feasibility = error.problem.get("feasibility")
+    return error
+
+
+def _build_typed_error(problem: Problem) -> OptodriveError:
+    detail = problem.detail
+    if problem.status == 401:
+        expected = f"the daemon's own ({TOKEN_VARIABLE}, or the file it wrote): {detail}"
+        return InputError("token", "the one given", expected)
+    if problem.status in INPUT_ERROR_STATUSES:
+        if problem.where is not None and problem.expected is not None:
+            return InputError(problem.where, _PreformattedRepr(str(problem.value)), problem.expected)
+        return InputError("request", problem.status, detail)
+    if problem.pixel is not None and problem.cap is not None and problem.margin_j is not None:
+        earliest_s = inf if problem.fits_after_s is None else problem.fits_after_s
+        return OverBudgetError(detail, problem.pixel, problem.cap, problem.margin_j, earliest_s)
+    return ERROR_BY_CODE.get(problem.code, RefusedError)(detail)
+
+
+class _PreformattedRepr:
+    """A value whose repr the daemon has already formatted."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text

@@ -1,0 +1,74 @@
+"""The response of the routes that submit, read or cancel a plan."""
+
+from typing import Literal
+
+from optodrive.core.json_model import JsonModel
+from optodrive.link.session.timing_error import TimingError
+from optodrive.planning.summary_schema import PlanSummary, PulseColumns
+
+PlanStatus = Literal["planned", "queued", "running", "done", "superseded", "failed", "cancelled"]
+
+
+class PlanLatency(JsonModel):
+    """Seconds from the request's arrival to three events of its plan; None before the event."""
+
+    planned_s: float | None
+    first_byte_s: float | None
+    first_light_s: float | None
+
+
+class MaxTarget(JsonModel):
+    """The pulse with the largest target: target, prediction, and simulation from the executed pulses."""
+
+    pixel: int
+    target_um: float
+    predicted_um: float
+    simulated_um: float | None
+
+
+class ExecutedColumns(JsonModel):
+    """Executed pulses by column, in order; `simulated_um` is empty until the simulation is done."""
+
+    start_s: list[float]
+    width_s: list[float]
+    power_w: list[float]
+    pixel: list[int]
+    simulated_um: list[float]
+
+
+class PlanReport(JsonModel):
+    """A plan: what was planned, sent and executed.
+
+    pulses, executed_pulses: None if they were not requested or are too many
+    executed_complete, delay_s: None before the plan has ended
+    """
+
+    plan: str
+    name: str
+    status: PlanStatus
+    error: str | None
+    starts_in_s: float
+    planned: int
+    sent: int
+    executed: int
+    dropped: int
+    latency: PlanLatency
+    timing_error: TimingError | None
+    summary: PlanSummary
+    pulses: PulseColumns | None
+    simulated_max_um: float | None
+    max_target: MaxTarget | None
+    executed_pulses: ExecutedColumns | None
+    executed_complete: bool | None
+    delay_s: float | None
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the plan's status is final."""
+        return self.status not in ("queued", "running")
+
+    @property
+    def fits(self) -> bool | None:
+        """Whether the whole sequence fits on the beam; None if that was not requested (a stream)."""
+        feasibility = self.summary.feasibility
+        return None if feasibility is None else feasibility.fits

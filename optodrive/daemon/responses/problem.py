@@ -1,0 +1,56 @@
+"""The problem document (RFC 9457) that describes an error."""
+
+from typing import Any
+
+from pydantic import ConfigDict
+
+from optodrive.core.json_model import JsonModel
+from optodrive.planning.feasibility.report import FeasibilityReport
+
+MEDIA_TYPE = "application/problem+json"
+
+
+class Problem(JsonModel):
+    """RFC 9457 problem document with a stable code.
+
+    The members after `code` are extensions; a document has only those that its code calls for.
+
+    where, value, expected: the wrong input, in words
+    pixel, cap, margin_j, fits_after_s: the first pulse that exceeds a cap; fits_after_s is null if it never fits
+    feasibility: the report on a sequence that does not fit
+    retry_after_s: time until the next request is accepted; allow: the methods that the path accepts
+    role, required_role: of the token, and the lowest that the route accepts
+    """
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=False)
+
+    type: str
+    title: str
+    status: int
+    detail: str
+    code: str
+    where: str | None = None
+    value: str | None = None
+    expected: str | None = None
+    pixel: int | None = None
+    cap: str | None = None
+    margin_j: float | None = None
+    fits_after_s: float | None = None
+    feasibility: FeasibilityReport | None = None
+    retry_after_s: float | None = None
+    allow: str | None = None
+    role: str | None = None
+    required_role: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the members that the document has."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    def to_json(self) -> bytes:
+        """Encode the members that the document has."""
+        return self.model_dump_json(exclude_unset=True).encode()
+
+
+def build_problem(status: int, code: str, title: str, detail: str, **extensions: Any) -> Problem:
+    """Build a problem document; its type is a URN made of the code."""
+    return Problem(type=f"urn:optodrive:{code}", title=title, status=status, detail=detail, code=code, **extensions)

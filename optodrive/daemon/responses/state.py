@@ -1,0 +1,93 @@
+"""The response of GET /v1/state, and of arm, disarm and stop."""
+
+from typing import Literal
+
+from optodrive.core.json_model import JsonModel
+from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.link.session.timing_error import TimingError
+
+
+class LinkReport(JsonModel):
+    """The link to the board: its error counters, and the likely cause of the last problem."""
+
+    port: str
+    state: Literal["up", "down"]
+    error: str | None
+    round_trip_ms: float | None
+    host_bad_frames: int
+    retransmitted: int
+    naks: int
+    board_bad_frames: int
+    underruns: int
+    longest_stall_ms: float
+    likely_cause: str | None
+    likely_cause_age_s: float | None
+
+
+class BoardReport(JsonModel):
+    """The board's last reported status; `hint` explains the fault and its remedy."""
+
+    state: str
+    fault: str | None
+    hint: str
+    inputs: int
+    done_index: int
+    queued: int
+    free_points: int
+    underruns: int
+    crc_errors: int
+    format_errors: int
+    seq_errors: int
+    laser_on_s: float
+    temperature_c: float | None
+    uid: str
+    firmware: int
+
+    @property
+    def is_armed(self) -> bool:
+        """Whether the board accepts plans."""
+        return self.state in ("ARMED", "RUNNING", "HOLD")
+
+
+class RecentPlan(JsonModel):
+    """One of the latest plans."""
+
+    plan: str
+    name: str
+    status: PlanStatus
+
+
+class QueueReport(JsonModel):
+    """Plans: how many wait, which one runs, and the latest 20."""
+
+    waiting: int
+    running: str | None
+    plans: list[RecentPlan]
+
+
+class PulseTotals(JsonModel):
+    """Pulses since the daemon started; `timing_error` is None before the first executed pulse."""
+
+    planned: int
+    sent: int
+    executed: int
+    timing_error: TimingError | None
+
+
+class PlannerReport(JsonModel):
+    """Whether the planner works, and whether it is idle or makes progress."""
+
+    busy: bool
+    alive: bool
+
+
+class StateReport(JsonModel):
+    """The daemon's state: display, link, board, queue, totals and planner."""
+
+    display: str
+    pixels: int
+    link: LinkReport
+    board: BoardReport
+    queue: QueueReport
+    totals: PulseTotals
+    planner: PlannerReport

@@ -1,0 +1,50 @@
+"""The messages that the daemon sends on the WebSocket /v1/stream."""
+
+from typing import Literal
+
+from pydantic import ConfigDict
+
+from optodrive.core.json_model import JsonModel
+from optodrive.daemon.responses.plan import PlanLatency, PlanStatus
+from optodrive.daemon.responses.problem import Problem
+
+FrameStatus = PlanStatus | Literal["refused"]
+
+
+class FrameResult(JsonModel):
+    """The outcome of one streamed frame so far; a message has only the members that apply to its status.
+
+    frame: None if the daemon could not read the frame
+    superseded_by: the newer frame, if that arrived before this one was planned
+    problem: why the frame was refused; error: why its plan failed or was cancelled
+    pulses, skipped, trimmed, starts_in_s, duration_s: of its plan, with status "planned"
+    planned, executed, dropped, simulated_max_um: of its plan, once that has ended
+    """
+
+    model_config = ConfigDict(json_schema_serialization_defaults_required=False)
+
+    frame: int | None
+    status: FrameStatus
+    plan: str | None = None
+    superseded_by: int | None = None
+    problem: Problem | None = None
+    error: str | None = None
+    pulses: int | None = None
+    skipped: int | None = None
+    trimmed: int | None = None
+    starts_in_s: float | None = None
+    duration_s: float | None = None
+    planned: int | None = None
+    executed: int | None = None
+    dropped: int | None = None
+    simulated_max_um: float | None = None
+    latency: PlanLatency | None = None
+
+    @property
+    def is_final(self) -> bool:
+        """Whether no further message follows for this frame."""
+        return self.status != "planned"
+
+    def to_json(self) -> str:
+        """Encode the members that the message has."""
+        return self.model_dump_json(exclude_unset=True)

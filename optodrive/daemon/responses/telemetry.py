@@ -1,0 +1,75 @@
+"""The events of GET /v1/telemetry; the event `state` is a StateReport."""
+
+from collections.abc import Mapping
+
+from optodrive.core.json_model import JsonModel
+from optodrive.daemon.responses.state import StateReport
+
+
+class FaultEvent(JsonModel):
+    """A fault of the board or the link; all members except the states are null or empty without one."""
+
+    board: str
+    link: str
+    fault: str | None
+    hint: str
+    link_error: str | None
+
+
+class DisplayEvent(JsonModel):
+    """Every pixel at a board time; `height` in 0.1 µm, `absorber` in 0.1 °C: base64 of little-endian u16."""
+
+    board_s: float
+    warm: bool
+    height: str
+    absorber: str
+
+
+class PulseBatch(JsonModel):
+    """Pulses of one plan by column; `row` counts in the plan, `start_s` is board time."""
+
+    plan: str
+    name: str
+    row: list[int]
+    pixel: list[int]
+    start_s: list[float]
+    width_s: list[float]
+    power_w: list[float]
+    trimmed_j: list[float]
+    reason: list[str]
+
+
+class PulsesEvent(JsonModel):
+    """Pulses planned within the next second and pulses executed, since the previous event."""
+
+    board_s: float
+    planned: list[PulseBatch]
+    executed: list[PulseBatch]
+
+
+class CapUsage(JsonModel):
+    """How much of a cap is used, and the pixel nearest to it; `fraction` is relative to ambient for temperatures."""
+
+    cap: str
+    fraction: float
+    value: float
+    limit: float
+    unit: str
+    pixel: int | None
+
+
+class BudgetEvent(JsonModel):
+    """The usage of every cap at a board time."""
+
+    board_s: float
+    caps: list[CapUsage]
+
+
+EVENTS: Mapping[str, type[JsonModel]] = {
+    "state": StateReport,
+    "display": DisplayEvent,
+    "pulses": PulsesEvent,
+    "budget": BudgetEvent,
+    "fault": FaultEvent,
+}
+"""Every event by its name."""

@@ -1,0 +1,139 @@
+"""ASGI middleware that applies the access policy to every request and writes the audit log.
+
+It runs in front of the application, so that no new route can omit the checks.
+"""
+
+import math
+
+from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
+from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
+from optodrive.daemon.web.request_limits import (
+    App,
+    BoundedBody,
+    Message,
+    RateLimitedFrames,
+    Receive,
+    Scope,
+    Send,
+    receive_empty_body,
+)
+from optodrive.daemon.web.route_table import ARM, STOP
+from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
+
+AUDIT_FIELDS = "optodrive.audit_fields"
+"""Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
+
+
+class AccessMiddleware:
+    """Refuses the requests that the policy does not accept, and forwards the others with their input bounded."""
+
+    def __init__(self, app: App, policy: AccessPolicy) -> None:
+        self._app = app
+        self._policy = policy
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send a refusal, or forward the request."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        request = _read_request(scope)
+        problem = self._policy.check(request)
+        if problem is None and request.route is not None and request.route.key == ARM:
+            problem = await self._record_intent(request)
+        if problem is None:
+            await self._forward(request, scope, receive, send)
+            return
+        if problem.status != 429:
+            self._record(request, {"event": "refused", "status": problem.status, "code": problem.code})
+        prefix = "websocket.http" if scope["type"] == "websocket" else "http"
+        if problem.status == 401 and is_page_request(request.method, request.path):
+            await _send_login_page(send, prefix)
+        else:
+            await _send_problem(send, problem, prefix)
+
+    async def _forward(self, request: RequestContext, scope: Scope, receive: Receive, send: Send) -> None:
+        body = self._bound_receive(request, receive)
+        audit_fields: dict[str, object] = {}
+        scope[AUDIT_FIELDS] = audit_fields
+        status_recorder = _StatusRecorder(send)
+        try:
+            await self._app(scope, body, status_recorder)
+        finally:
+            if isinstance(body, BoundedBody | RateLimitedFrames):
+                audit_fields |= body.audit_fields
+            self._record(request, {**audit_fields, "event": "answered", "status": status_recorder.status})
+
+    def _bound_receive(self, request: RequestContext, receive: Receive) -> Receive:
+        if request.route is not None and request.route.key == STOP:
+            return receive_empty_body
+        if request.method == "WEBSOCKET":
+            return RateLimitedFrames(receive, lambda: self._policy.acquire_frame(request))
+        return BoundedBody(receive, self._policy.body_max_bytes)
+
+    async def _record_intent(self, request: RequestContext) -> Problem | None:
+        """Write an audit entry to disk before arming; return why arming is refused if that fails."""
+        if self._policy.audit is None:
+            return None
+        error_text = await self._policy.audit.record_durably(request.audit_fields | {"event": "requested"})
+        if error_text is None:
+            return None
+        detail = f"the audit log cannot be written ({error_text}), and arming requires an audit entry"
+        return build_problem(409, "audit_unavailable", "Audit log unavailable", detail)
+
+    def _record(self, request: RequestContext, fields: dict[str, object]) -> None:
+        if self._policy.audit is not None and request.route is not None and request.route.is_audited:
+            self._policy.audit.record(request.audit_fields | fields)
+
+
+class _StatusRecorder:
+    """Forwards the messages of a response and records its status."""
+
+    def __init__(self, send: Send) -> None:
+        self._send = send
+        self.status: int | None = None
+
+    async def __call__(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self.status = message["status"]
+        elif message["type"] == "websocket.accept":
+            self.status = 101
+        await self._send(message)
+
+
+def _read_request(scope: Scope) -> RequestContext:
+    headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
+    client = scope.get("client")
+    # A caller on the Unix socket has no address.
+    address = client[0] if client and client[0] else "unix"
+    return RequestContext(scope.get("method", "WEBSOCKET"), scope["path"], headers, address)
+
+
+async def _send_problem(send: Send, problem: Problem, prefix: str) -> None:
+    headers = []
+    if problem.status == 401:
+        headers.append((b"www-authenticate", b"Bearer"))
+    if problem.allow is not None:
+        headers.append((b"allow", problem.allow.encode()))
+    if problem.status == 413:
+        headers.append((b"connection", b"close"))
+    if problem.retry_after_s is not None:
+        headers.append((b"retry-after", str(math.ceil(problem.retry_after_s)).encode()))
+    await _send_response(send, prefix, problem.status, problem.to_json(), MEDIA_TYPE, headers)
+
+
+async def _send_login_page(send: Send, prefix: str) -> None:
+    headers = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
+    headers.append((b"www-authenticate", b"Bearer"))
+    await _send_response(send, prefix, 401, load_login_page(), "text/html", headers)
+
+
+async def _send_response(
+    send: Send, prefix: str, status: int, body: bytes, content_type: str, headers: list[tuple[bytes, bytes]]
+) -> None:
+    headers = [
+        (b"content-type", content_type.encode()),
+        (b"content-length", str(len(body)).encode()),
+        *headers,
+    ]
+    await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
+    await send({"type": f"{prefix}.response.body", "body": body})

@@ -1,0 +1,128 @@
+"""The summary of a plan and its pulses, as the command line prints them and the daemon sends them."""
+
+from optodrive.core.json_model import JsonModel
+from optodrive.planning.feasibility.report import FeasibilityReport
+
+
+class TrimmedPulse(JsonModel):
+    """One pulse that the limiter reduced; `target_um` is None for a pulse of a train given by its width."""
+
+    pixel: int
+    start_s: float
+    trimmed_j: float
+    reason: str
+    predicted_um: float
+    target_um: float | None
+
+
+class TrimmingSummary(JsonModel):
+    """Energy that the limiter removed, by cap; `worst` lists up to 20 pulses, the largest reduction first."""
+
+    pulses: int
+    energy_j: float
+    by_reason: dict[str, int]
+    worst: list[TrimmedPulse]
+
+
+class ShortfallSummary(JsonModel):
+    """The first pulse that a cap reduced; `fits_after_s` is None if no delay makes it fit."""
+
+    pixel: int
+    cap: str
+    margin_j: float
+    fits_after_s: float | None
+
+
+class DelaySummary(JsonModel):
+    """Time that a frame or train waited for a cap, and the first pixel that needed it."""
+
+    source: str
+    pixel: int
+    cap: str
+    wait_s: float
+
+
+class DeadPixelSummary(JsonModel):
+    """Dead pixels that the frames request and the plan omits; `message` is None if there are none."""
+
+    pixels: list[int]
+    count: int
+    message: str | None
+
+
+class SkippedTarget(JsonModel):
+    """A target that needs no pulse."""
+
+    frame: str
+    pixel: int
+    target_um: float
+    reason: str
+
+
+class SimultaneitySummary(JsonModel):
+    """How the pulses of a simultaneous frame were interleaved; without interleaving: `simultaneity_single_pulse`."""
+
+    interleaved_rounds: int
+    simultaneity: float
+    simultaneity_single_pulse: float
+    extra_s: float
+
+
+class FrameSummary(JsonModel):
+    """Times of one frame on the plan's time line, s; `on_time` counts its pulses that end before the deadline."""
+
+    frame: str
+    show_at_s: float
+    first_pulse_s: float
+    end_s: float
+    deadline_s: float
+    late_s: float
+    pulses: int
+    on_time: int
+    simultaneous: SimultaneitySummary | None
+
+
+class PlanSummary(JsonModel):
+    """A limited plan: feasibility, timing, energy, predicted displacement, and what the limiter changed.
+
+    feasibility: None if it was not requested (a stream)
+    predicted_max_pixel, predicted_max_um, predicted_max_target_um: the pulse with the largest predicted displacement
+    target_max_um: the largest target
+    """
+
+    feasibility: FeasibilityReport | None
+    pulses: int
+    duration_s: float
+    beam_on_s: float
+    beam_on_fraction: float
+    settling_s: float
+    lead_in_s: float
+    galvo_pause_s: float
+    energy_j: float
+    predicted_max_pixel: int | None
+    predicted_max_um: float
+    predicted_max_target_um: float | None
+    target_max_um: float
+    headroom_min_k: float
+    trimmed: TrimmingSummary
+    shortfall: ShortfallSummary | None
+    delays: list[DelaySummary]
+    dead: DeadPixelSummary
+    skipped: list[SkippedTarget]
+    frames: list[FrameSummary]
+    late_messages: list[str]
+    train_lateness_max_s: float
+
+
+class PulseColumns(JsonModel):
+    """The pulses of a plan by column, in order; `target_um` is None for a pulse without a target height."""
+
+    start_s: list[float]
+    width_s: list[float]
+    power_w: list[float]
+    pixel: list[int]
+    energy_j: list[float]
+    trimmed_j: list[float]
+    reason: list[str]
+    target_um: list[float | None]
+    predicted_um: list[float]
