@@ -248,7 +248,7 @@ def run_soak(total):
 
 
 def _count_bad_frames(figures):
-    return figures["received_bad"] + figures["board_bad"]
+    return figures["host_bad_frames"] + figures["board_bad_frames"]
 
 
 def _format_memory(memory, column):

@@ -154,14 +154,12 @@ def measure_full_frames():
     def collect(plan):
         engine.get_end_future(plan).result(20)
         record = engine.get_plan(plan)
-        if record["executed"]:
-            asked_um = dict(zip(record["pulses"]["pixel"], record["pulses"]["target_um"], strict=True))
-            done = record["executed_pulses"]
-            errors.extend(
-                um / asked_um[pixel] - 1 for pixel, um in zip(done["pixel"], done["simulated_um"], strict=True)
-            )
-            first_light_s.append(record["latency"]["first_light_s"])
-            plans.append(set(done["pixel"]))
+        if record.executed:
+            target_um = dict(zip(record.pulses.pixel, record.pulses.target_um, strict=True))
+            done = record.executed_pulses
+            errors.extend(um / target_um[pixel] - 1 for pixel, um in zip(done.pixel, done.simulated_um, strict=True))
+            first_light_s.append(record.latency.first_light_s)
+            plans.append(set(done.pixel))
 
     try:
         begin_s = time.monotonic()
@@ -169,7 +167,7 @@ def measure_full_frames():
             target = 60e-6 * (1 + np.sin(0.3 * k + display.layout.column / 4))
             target[target < 5e-6] = 0
             sequence = FrameSequence((TactileFrame(str(k), 0.0, 3600.0, target),))
-            open_plans.append(engine.submit(lambda s=sequence: s, "frame", streamed=True).result(20)["plan"])
+            open_plans.append(engine.submit(lambda s=sequence: s, "frame", streamed=True).result(20).plan)
             if len(open_plans) > 5:
                 collect(open_plans.pop(0))
             time.sleep(max(0.0, begin_s + (k + 1) / FULL_HZ - time.monotonic()))
@@ -177,7 +175,7 @@ def measure_full_frames():
         time.sleep(1.0)
         for plan in open_plans:
             collect(plan)
-        underruns = engine.snapshot()["board"]["underruns"]
+        underruns = engine.snapshot().board.underruns
     finally:
         engine.close()
         board.release()

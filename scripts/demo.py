@@ -12,6 +12,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from optodrive.client.http import DaemonClient
+from optodrive.client.plan import Plan
+from optodrive.client.requests import ARM, READ_STATE, STOP, build_play_request, build_read_request
 from optodrive.core.errors import LinkError, OptodriveError, RefusedError
 from optodrive.daemon.web.tokens import build_tokens_path
 
@@ -27,60 +29,60 @@ def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
     deadline_s = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < deadline_s and daemon.poll() is None:
         if build_tokens_path(port).exists():
-            remote = DaemonClient(f"http://127.0.0.1:{port}")
+            client = DaemonClient(f"http://127.0.0.1:{port}")
             try:
-                remote.call("GET", "/v1/state")
+                client.call(READ_STATE)
             except LinkError:
                 pass
             else:
-                return daemon, remote
+                return daemon, client
         time.sleep(0.05)
     daemon.terminate()
     raise RefusedError("the daemon did not start; its own line above says why")
 
 
-def play_pattern(remote: DaemonClient, pattern: str) -> dict:
-    """Play a pattern to its end; what came of it."""
-    answer = remote.call("POST", f"/v1/patterns/{pattern}")
+def play_pattern(client: DaemonClient, pattern: str) -> Plan:
+    """Play a pattern to its end; return its plan."""
+    plan = client.call(build_play_request(pattern, {}, "trim", "as_is", dry_run=False))
     with Progress(
         TextColumn("{task.description}"),
         BarColumn(),
         TextColumn("{task.completed} of {task.total} pulses"),
         TimeElapsedColumn(),
     ) as bar:
-        task = bar.add_task(f"{pattern:12}", total=answer["planned"])
-        while answer["status"] in ("queued", "running"):
+        task = bar.add_task(f"{pattern:12}", total=plan.planned)
+        while not plan.has_ended:
             time.sleep(0.05)
-            answer = remote.call("GET", f"/v1/plans/{answer['plan']}", params={"pulses": False})
-            bar.update(task, completed=answer["executed"])
-    return answer
+            plan = client.call(build_read_request(plan.plan, pulses=False))
+            bar.update(task, completed=plan.executed)
+    return plan
 
 
-def format_row(name: str, answer: dict) -> list[str]:
-    asked = answer["tallest_asked"]
+def format_row(name: str, plan: Plan) -> list[str]:
+    target = plan.max_target
     heights = (
-        [f"{asked['asked_um']:.1f}", f"{asked['simulated_um']:.1f}"]
-        if asked
-        else ["by pulse", f"{answer['simulated_max_um']:.1f}"]
+        [f"{target.target_um:.1f}", f"{target.simulated_um:.1f}"]
+        if target
+        else ["by pulse", f"{plan.simulated_max_um:.1f}"]
     )
-    return [name, *(str(answer[key]) for key in ("planned", "sent", "executed")), *heights]
+    return [name, str(plan.planned), str(plan.sent), str(plan.executed), *heights]
 
 
-def print_report(shown: list[tuple[str, dict]]) -> bool:
-    """Print what came of it; whether every pulse planned was sent and executed."""
-    done = [(name, answer) for name, answer in shown if answer["status"] == "done"]
+def print_report(shown: list[tuple[str, Plan]]) -> bool:
+    """Print what was shown; return whether every planned pulse was sent and executed."""
+    done = [(name, plan) for name, plan in shown if plan.status == "done"]
     table = Table(*COLUMNS)
-    for name, answer in done:
-        table.add_row(*format_row(name, answer))
+    for name, plan in done:
+        table.add_row(*format_row(name, plan))
     Console().print(table)
-    planned, sent, executed = (sum(answer[key] for _, answer in shown) for key in ("planned", "sent", "executed"))
+    planned, sent, executed = (sum(getattr(plan, key) for _, plan in shown) for key in ("planned", "sent", "executed"))
     print(f"pulses planned {planned}, sent {sent}, executed {executed}")
-    with_target = [answer["tallest_asked"] for _, answer in done if answer["tallest_asked"]]
-    if with_target:
-        tallest = max(with_target, key=lambda item: item["asked_um"])
+    targets = [plan.max_target for _, plan in done if plan.max_target]
+    if targets:
+        highest = max(targets, key=lambda item: item.target_um)
         print(
-            f"tallest membrane displacement {tallest['simulated_um']:.1f} µm, computed from the executed pulses; "
-            f"{tallest['asked_um']:.1f} µm asked for"
+            f"largest membrane displacement {highest.simulated_um:.1f} µm, computed from the executed pulses; "
+            f"target {highest.target_um:.1f} µm"
         )
     return planned == sent == executed > 0 and len(done) == len(shown)
 
@@ -90,18 +92,18 @@ def main() -> int:
     parser.add_argument("--seconds", type=float, help="show for about so long, then end; without it, until Ctrl-C")
     parser.add_argument("--port", type=int, default=8450, help="TCP port of the daemon")
     options = parser.parse_args()
-    shown: list[tuple[str, dict]] = []
+    shown: list[tuple[str, Plan]] = []
     daemon = None
     try:
-        daemon, remote = start_daemon(options.port)
+        daemon, client = start_daemon(options.port)
         print("arming: the board's indicator is lit for two seconds first", flush=True)
-        remote.call("POST", "/v1/arm")
+        client.call(ARM)
         started_s = time.monotonic()
         for pattern in itertools.cycle(PATTERNS):
             if options.seconds is not None and shown and time.monotonic() - started_s >= options.seconds:
                 break
-            shown.append((pattern, play_pattern(remote, pattern)))
-        remote.call("POST", "/v1/stop")
+            shown.append((pattern, play_pattern(client, pattern)))
+        client.call(STOP)
     except KeyboardInterrupt:
         print("\nending")
     except OptodriveError as error:

@@ -70,7 +70,7 @@ def test_draw_preview_arm_play_and_what_was_felt(visit, daemon):
     result = page.locator("#result")
     expect(result).to_contain_text("All of it fits.")
     expect(result).to_contain_text("9 pulses")
-    expect(result).to_contain_text("100.0 µm of 100.0 µm asked for")
+    expect(result).to_contain_text("100.0 µm of 100.0 µm requested")
     before = daemon.state()["totals"]
     arm(page)
     page.get_by_role("button", name="Play").dblclick()
@@ -262,7 +262,7 @@ def test_a_picture_lies_on_the_grid_and_the_display_shows_its_heights(visit, dae
     expect(drawn).to_have_text(re.compile(r"\d+ drawn"))
     assert int(drawn.inner_text().split()[0]) in range(208, 232)
     preview(page)
-    expect(page.locator("#result")).to_contain_text("100.0 µm asked for")
+    expect(page.locator("#result")).to_contain_text("100.0 µm requested")
 
 
 def test_the_library_offers_every_pattern_with_its_parameters(visit, daemon):

@@ -36,12 +36,13 @@ def wait_for(condition, what, patience_s=PATIENCE_S):
     raise AssertionError(f"waited {patience_s} s in vain for {what}")
 
 
-def ended(engine, answer):
-    """A plan of an engine in this process, once it has ended."""
+def ended(engine, plan):
+    """The report of a plan of an engine in this process, given by its id or a report, once it has ended."""
+    plan_id = plan if isinstance(plan, str) else plan.plan
 
     def look():
-        record = engine.plan(answer["plan"])
-        return record if record["status"] in ENDED else None
+        report = engine.get_plan(plan_id)
+        return report if report.status in ENDED else None
 
     return wait_for(look, "the plan's end")
 

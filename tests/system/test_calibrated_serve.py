@@ -51,7 +51,7 @@ def test_a_frame_lands_where_the_field_and_the_map_lead_it(tmp_path, mapped):
     code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
     assert np.abs(codes - (32768 + places_m.T / code_m)).max() > 100  # without the field they would land far off
 
-    assert answer["summary"]["dead"]["message"] == (f"pixel {DEAD_PIXEL} is dead: left out" if mapped else None)
+    assert answer["summary"]["dead"]["message"] == (f"pixel {DEAD_PIXEL} is dead: omitted" if mapped else None)
     assert answer["pulses"]["predicted_um"] == pytest.approx([60.0] * len(order), rel=1e-3)
     energy_j = dict(zip(order, answer["pulses"]["energy_j"], strict=True))
     assert energy_j[LOW] / energy_j[20] == pytest.approx(1.4 if mapped else 1.0, abs=0.1)

@@ -28,8 +28,8 @@ def dark_and_disarmed(board):
 
 def test_arm_show_and_what_came_of_it(board, daemon):
     with Display(daemon.url, TOKEN) as display:
-        assert not display.state().armed
-        assert display.arm().armed
+        assert not display.state().board.is_armed
+        assert display.arm().board.is_armed
         heights_um = np.zeros(len(display.layout))
         heights_um[[17, 200]] = 90.0, 120.0
         plan = display.show(heights_um)
@@ -71,7 +71,7 @@ def test_an_exception_stops_what_was_lit(board, daemon):
     with pytest.raises(ArithmeticError):
         session()
     assert dark_and_disarmed(board)
-    assert daemon.finished(plans[0].plan_id)["error"] == "ended by stop"
+    assert daemon.finished(plans[0].plan)["error"] == "ended by stop"
 
 
 def test_errors_are_the_packages_own_with_the_problems_fields(daemon, display):
@@ -102,15 +102,15 @@ def test_a_fault_while_something_is_shown_is_an_error(make_board, make_daemon):
         with pytest.raises(RefusedError, match="INTERLOCK"):
             display.push(long_train(seconds=20.0))
         state = display.state()
-        assert state.fault == "INTERLOCK"
-        assert state.hint
+        assert state.board.fault == "INTERLOCK"
+        assert state.board.hint
         with pytest.raises((BoardFaultError, NotReadyError)):
             display.arm()
 
 
 def test_a_stream_says_what_became_of_each_frame(board, daemon):
     with Display(daemon.url, TOKEN) as display:
-        before = display.arm().underruns
+        before = display.arm().board.underruns
         with display.stream() as stream:
             for k in range(20):
                 stream.send(dict.fromkeys(range(50 + k), 80.0))
@@ -118,14 +118,14 @@ def test_a_stream_says_what_became_of_each_frame(board, daemon):
             done = stream.wait(last)
             assert done.status == "done"
             assert done.simulated_max_um == pytest.approx(100.0, rel=0.02)
-            assert done.latency["first_light_s"] > 0
-            final = [result for result in stream.results() if result.final]
+            assert done.latency.first_light_s > 0
+            final = [result for result in stream.results() if result.is_final]
             assert sorted(result.frame for result in final) == list(range(last + 1))
             with pytest.raises(InputError) as refused:
                 stream.wait(stream.send({5: 6000.0}))
             assert refused.value.code == "target_unreachable"
             assert stream.wait(stream.send({7: 60.0})).status == "done"
-        assert display.state().underruns == before
+        assert display.state().board.underruns == before
     assert dark_and_disarmed(board)
 
 
@@ -145,14 +145,14 @@ def test_a_daemon_that_restarts_is_found_again_and_is_not_armed(make_board, make
             with monkeypatch.context() as other:
                 other.setattr("rig.TOKEN", "another-token-for-tests")
                 restarted.start()
-                assert display.state().board == "DISARMED"
+                assert display.state().board.state == "DISARMED"
                 restarted.join()
             with pytest.raises(NotReadyError, match="arm it first"):
                 stream.wait(stream.send({6: 60.0}))
         with pytest.raises(NotReadyError, match="arm it first"):
             display.show({5: 60.0})
         assert [state["state"] for state in board.of("state")].count("ARMED") <= 2  # before and after the one plan
-        assert display.arm().armed
+        assert display.arm().board.is_armed
         assert display.show({5: 60.0}).status == "done"
 
 
@@ -234,7 +234,7 @@ def test_a_stop_that_nobody_hears_is_told_and_hides_no_error(make_board, make_da
 def test_the_same_with_await(board, daemon):
     async def session():
         async with AsyncDisplay(daemon.url, TOKEN) as display:
-            assert (await display.arm()).armed
+            assert (await display.arm()).board.is_armed
             assert (await display.preview({17: 50.0})).sent == 0
             plan = await display.show({17: 90.0})
             assert (plan.status, plan.executed) == ("done", 1)
@@ -244,7 +244,7 @@ def test_the_same_with_await(board, daemon):
                     last = await stream.send(dict.fromkeys(range(60), 80.0))
                 last = await stream.send({5: 100.0})
                 assert (await stream.wait(last)).status == "done"
-                assert len([result for result in await stream.results() if result.final]) == last + 1
+                assert len([result for result in await stream.results() if result.is_final]) == last + 1
                 with pytest.raises(InputError):
                     await stream.wait(await stream.send({5: 6000.0}))
             with pytest.raises(OptodriveError):

@@ -38,7 +38,7 @@ def test_a_planner_at_work_keeps_the_lease(armed):
     long_one = train(200.0)
     answers = [armed.submit(lambda: long_one, "long", dry_run=True) for _ in range(3)]
     for answer in answers:
-        assert answer.result(60)["planned"] == 10_000
+        assert answer.result(60).planned == 10_000
     assert armed.board_state == "ARMED"
 
 
@@ -46,41 +46,41 @@ def test_plans_queue_and_the_next_knows_the_heat_of_the_last(armed):
     first = armed.submit(lambda: frame(300.0), "first").result(10)
     second = armed.submit(lambda: frame(350.0), "second").result(10)
     rest = armed.submit(lambda: frame(350.0, pixel=300), "rest", dry_run=True).result(10)
-    assert second["pulses"]["energy_j"][0] < 0.99 * rest["pulses"]["energy_j"][0]
+    assert second.pulses.energy_j[0] < 0.99 * rest.pulses.energy_j[0]
     for answer, height_um in ((first, 300.0), (second, 350.0)):
         record = ended(armed, answer)
-        assert record["status"] == "done"
-        assert record["tallest_asked"]["simulated_um"] == pytest.approx(height_um, rel=0.01)
+        assert record.status == "done"
+        assert record.max_target.simulated_um == pytest.approx(height_um, rel=0.01)
 
 
 def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
     running = armed.submit(lambda: train(1.0), "a").result(10)
     waiting = armed.submit(lambda: train(1.0), "b").result(10)
     last = armed.submit(lambda: train(0.1), "c").result(10)
-    assert armed.cancel(waiting["plan"]).result(10)["status"] == "cancelled"
-    assert ended(armed, running)["status"] == "done"
-    assert ended(armed, last)["status"] == "done"
-    assert armed.plan(waiting["plan"])["executed"] == 0
+    assert armed.cancel(waiting.plan).result(10).status == "cancelled"
+    assert ended(armed, running).status == "done"
+    assert ended(armed, last).status == "done"
+    assert armed.get_plan(waiting.plan).executed == 0
 
 
 def test_the_queue_is_bounded_and_ended_plans_are_forgotten(armed, monkeypatch):
     monkeypatch.setattr("optodrive.daemon.engine.engine.QUEUE_MAX", 2)
     monkeypatch.setattr("optodrive.daemon.engine.plan_record.RECORDS_MAX", 3)
     first = armed.submit(lambda: train(1.0), "first").result(10)
-    wait_for(lambda: armed.plan(first["plan"])["status"] == "running", "the first to run")
+    wait_for(lambda: armed.get_plan(first.plan).status == "running", "the first to run")
     waiting = [armed.submit(lambda: train(0.02), "waiting").result(10) for _ in range(2)]
     with pytest.raises(NotReadyError, match="2 plans wait already"):
         armed.submit(lambda: train(0.02), "too many").result(10)
     for answer in (first, *waiting):
-        assert ended(armed, answer)["status"] == "done"
+        assert ended(armed, answer).status == "done"
     armed.submit(lambda: train(0.02), "one more").result(10)
     with pytest.raises(InputError, match="plan"):
-        armed.plan(first["plan"])
+        armed.get_plan(first.plan)
 
 
 def test_a_blank_plan_is_done_at_once(armed):
     answer = armed.submit(lambda: frame(0.0), "blank").result(10)
-    assert ended(armed, answer)["status"] == "done"
+    assert ended(armed, answer).status == "done"
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
@@ -104,7 +104,7 @@ def test_a_crash_of_the_loop_ends_dark_and_is_told(armed, board, monkeypatch):
 def test_an_unarmed_board_gets_no_plan_but_answers_dry_runs(engine):
     with pytest.raises(NotReadyError, match="arm it first"):
         engine.submit(frame, "x").result(10)
-    assert engine.submit(frame, "x", dry_run=True).result(10)["status"] == "planned"
+    assert engine.submit(frame, "x", dry_run=True).result(10).status == "planned"
 
 
 def test_arming_twice_is_refused(armed):
@@ -114,14 +114,14 @@ def test_arming_twice_is_refused(armed):
 
 def test_a_failed_plan_leaves_its_heat_uncounted_and_its_energy_counted(armed):
     answer = armed.submit(lambda: train(5.0), "long").result(10)
-    wait_for(lambda: armed.plan(answer["plan"])["executed"] > 10, "pulses")
+    wait_for(lambda: armed.get_plan(answer.plan).executed > 10, "pulses")
     armed.stop().result(10)
-    record = armed.plan(answer["plan"])
-    assert record["status"] == "failed"
-    assert len(record["executed_pulses"]["start_s"]) < record["planned"]
+    record = armed.get_plan(answer.plan)
+    assert record.status == "failed"
+    assert len(record.executed_pulses.start_s) < record.planned
     armed.arm().result(10)
     again = armed.submit(lambda: frame(100.0, pixel=200), "again").result(10)
-    assert ended(armed, again)["status"] == "done"
+    assert ended(armed, again).status == "done"
 
 
 def test_what_cannot_be_planned_is_refused_by_name(armed):
@@ -130,4 +130,4 @@ def test_what_cannot_be_planned_is_refused_by_name(armed):
     with pytest.raises(RefusedError, match="needs"):
         armed.submit(lambda: frame(500.0, duration_s=0.01), "x", policy="refuse").result(10)
     with pytest.raises(InputError, match="plan"):
-        armed.plan("p99")
+        armed.get_plan("p99")

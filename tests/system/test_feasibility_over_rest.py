@@ -50,12 +50,12 @@ def test_best_effort_is_executed_in_time(armed, fit):
     answer = armed.finished(plan)
     assert answer["status"] == "done", answer["error"]
     figures = answer["summary"]
-    assert figures["late"] == []
+    assert figures["late_messages"] == []
     assert (figures["feasibility"]["height_factor"] < 1.0) == (fit == "even")
     omitted = [pixel for item in figures["feasibility"]["omitted"] for pixel in item["pixels"]]
     assert answer["executed"] == 40 - len(omitted)
     executed = answer["executed_pulses"]
-    assert executed["start_s"][-1] + executed["width_s"][-1] <= figures["lead_s"] + 0.1 + 1e-4
+    assert executed["start_s"][-1] + executed["width_s"][-1] <= figures["lead_in_s"] + 0.1 + 1e-4
 
 
 def test_a_pattern_takes_it_too(armed):
@@ -97,12 +97,12 @@ def test_the_command_line_says_it_in_one_line(armed, tmp_path):
     assert late.startswith("fits: no, frame late needs 0.2")
     assert "nearest feasible: " in late
     figures = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
-    assert figures["late"] == []
+    assert figures["late_messages"] == []
     assert figures["feasibility"]["height_factor"] < 1.0
     refused = run("plan", path, "--strict")
     assert refused.returncode == 1
     assert "nearest feasible: " in refused.stderr
     pushed = run("push", path, "--fit", "priority", "--dry-run", "--url", armed.url).stdout
-    assert "left out         late: pixels " in pushed
+    assert "omitted          late: pixels " in pushed
     simulated = run("simulate", path, "--pixels", "0").stdout
     assert simulated.splitlines()[0] == late

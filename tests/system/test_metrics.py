@@ -12,7 +12,7 @@ def read(text):
     for family in text_string_to_metric_families(text):
         assert family.documentation.endswith(".")
         for sample in family.samples:
-            labels = tuple(value for _, value in sorted(sample.hypothesis_labels.items()))
+            labels = tuple(value for _, value in sorted(sample.labels.items()))
             key = (sample.name, *labels) if labels else sample.name
             assert key not in found
             found[key] = sample.value
@@ -58,11 +58,11 @@ def test_faults_are_counted_by_their_name_and_once(armed):
     plan = engine.submit(lambda: _frames(engine), "asked").result(10)
     ended(engine, plan)
     engine._planner._progress_at_s = -1e9  # as if it hung: no lease from now on
-    engine._planner._pending = 1
+    engine._planner._pending_count = 1
     wait_for(lambda: engine.board_state == "FAULT", "the lease to lapse")
     for _ in range(3):
         assert read(engine.render_metrics())["optodrive_board_faults_total", "LINK"] == 1
-    engine._planner._pending = 0
+    engine._planner._pending_count = 0
 
 
 def test_without_a_token_there_are_no_figures(daemon):

@@ -22,7 +22,7 @@ def test_trim_names_pixel_cap_and_when_all_would_fit(armed):
     assert shortfall["pixel"] in (200, 201)
     assert shortfall["cap"] == "touch_temperature"
     assert shortfall["margin_j"] > 0
-    assert 0 < shortfall["fits_later_s"] < 10
+    assert 0 < shortfall["fits_after_s"] < 10
 
 
 def test_refuse_is_a_problem_document_and_nothing_moves(armed):

@@ -22,7 +22,8 @@ from optodrive.core.errors import NotReadyError
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
-from optodrive.daemon.web.roles import ARM, ROLES, ROUTES, STOP
+from optodrive.daemon.web.roles import ROLES
+from optodrive.daemon.web.route_table import ARM, ROUTES, STOP
 from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import load_config
@@ -270,13 +271,13 @@ def test_the_audit_file_says_who_did_what(running, folder):
 
     def look():
         lines = read_audit(folder)
-        begin = next(index for index, line in enumerate(lines) if line["event"] == "asked")
+        begin = next(index for index, line in enumerate(lines) if line["event"] == "requested")
         return lines[begin:] if any(line["call"] == "POST /v1/stop" for line in lines[begin:]) else None
 
     lines = wait_for(look, "the stop's line")
     said = [(line["name"], line["role"], line["call"], line["event"], line.get("status")) for line in lines]
     assert said == [
-        ("armer", "armer", "POST /v1/arm", "asked", None),
+        ("armer", "armer", "POST /v1/arm", "requested", None),
         ("armer", "armer", "POST /v1/arm", "answered", 200),
         ("operator", "operator", "POST /v1/plans", "answered", 201),
         ("viewer", "viewer", "POST /v1/arm", "refused", 403),

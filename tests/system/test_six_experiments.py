@@ -39,7 +39,7 @@ def play(board, daemon, name, **parameters):
     assert answer["summary"]["trimmed"]["pulses"] == 0
     columns = {key: np.array(value) for key, value in answer["executed_pulses"].items()}
     assert_logged(board, columns, daemon.state()["totals"]["executed"])
-    columns["moves_s"] = answer["summary"]["moves_s"]
+    columns["settling_s"] = answer["summary"]["settling_s"]
     columns["first_s"] = columns["start_s"] - columns["start_s"][0]
     columns["total_s"] = columns["first_s"][-1] + columns["width_s"][-1]
     return columns
@@ -90,7 +90,7 @@ def test_experiment_1_linear_motion(executed):
     for rows in visits:
         assert_train(pulses, rows, 0.020, 0.060)
     starts = [pulses["first_s"][rows[0]] for rows in visits]
-    assert starts == pytest.approx([0.0, 0.3, 0.6, 1.4, 1.7, 2.0], abs=PWM_S + pulses["moves_s"])
+    assert starts == pytest.approx([0.0, 0.3, 0.6, 1.4, 1.7, 2.0], abs=PWM_S + pulses["settling_s"])
     pixels = [int(pulses["pixel"][rows[0]]) for rows in visits]
     assert pixels[:3] == pixels[3:] == list(range(pixels[0], pixels[0] + 3))
 
@@ -103,7 +103,7 @@ def test_experiment_2_rotation(executed, speed, slot_s):
     for rows in visits:
         assert_train(pulses, rows, 0.025, 0.071)
     starts = [pulses["first_s"][rows[0]] for rows in visits]
-    assert starts == pytest.approx(slot_s * np.arange(8), abs=PWM_S + pulses["moves_s"])
+    assert starts == pytest.approx(slot_s * np.arange(8), abs=PWM_S + pulses["settling_s"])
 
 
 def test_experiment_3_localisation(executed):
@@ -112,7 +112,7 @@ def test_experiment_3_localisation(executed):
     for rows in (reference, target):
         assert len(rows) == 10
         assert_train(pulses, rows, 0.025, 0.025)
-    assert pulses["first_s"][target[0]] == pytest.approx(0.5 + 0.75, abs=PWM_S + pulses["moves_s"])
+    assert pulses["first_s"][target[0]] == pytest.approx(0.5 + 0.75, abs=PWM_S + pulses["settling_s"])
 
 
 @pytest.mark.parametrize(("level", "power_w"), [(1, 0.5), (5, 1.5), (9, 2.45)])
@@ -142,7 +142,7 @@ def test_experiment_6_two_fingers_interleaved(executed):
     assert len(first) == len(second) == 4
     assert not first & second
     assert pulses["pixel"].tolist() == pulses["pixel"][:8].tolist() * 5
-    assert pulses["total_s"] == pytest.approx(0.600 + pulses["moves_s"], abs=PWM_S + 0.005)
+    assert pulses["total_s"] == pytest.approx(0.600 + pulses["settling_s"], abs=PWM_S + 0.005)
     gaps = np.diff(pulses["start_s"]) - pulses["width_s"][:-1]
     assert gaps.min() > 0
-    assert gaps.sum() <= pulses["moves_s"] + PWM_S
+    assert gaps.sum() <= pulses["settling_s"] + PWM_S

@@ -67,10 +67,10 @@ def test_frames_faster_than_light_are_superseded_and_say_so(daemon):
                 ends[answer["frame"]] = answer
         assert sorted(ends) == list(range(61))
         assert all(ends[number]["status"] == "superseded" for number in range(60))
-        unplanned = [answer for answer in ends.values() if answer.get("by")]
+        unplanned = [answer for answer in ends.values() if answer.get("superseded_by")]
         assert unplanned
         for answer in ends.values():
-            if answer["plan"] is not None:
+            if answer.get("plan") is not None:
                 assert answer["planned"] == answer["executed"] + answer["dropped"]
     assert daemon.state()["board"]["underruns"] == 0
 
@@ -79,10 +79,10 @@ def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
     with socket(daemon) as stream:
         stream.send('{"target_um": {"9999": 1}}')
         (refused,) = until(stream, {"status": "refused"})
-        assert refused["error"]["code"] == "unknown_pixel"
+        assert refused["problem"]["code"] == "unknown_pixel"
         stream.send('{"frame": 1, "target_um": {"17": 9000}}')
         (refused,) = until(stream, {"status": "refused"})
-        assert refused["error"]["code"] == "target_unreachable"
+        assert refused["problem"]["code"] == "target_unreachable"
         stream.send(binary(2, [3]))
         until(stream, {"frame": 2, "status": "done"})
 
@@ -120,7 +120,7 @@ def test_without_arming_a_frame_is_refused(make_board, make_daemon):
     with socket(daemon) as stream:
         stream.send(binary(0, [1]))
         (refused,) = until(stream, {"status": "refused"})
-        assert refused["error"]["status"] == 409
+        assert refused["problem"]["status"] == 409
 
 
 @pytest.mark.parametrize(

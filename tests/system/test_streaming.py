@@ -27,28 +27,28 @@ def test_the_newest_frame_wins_without_a_pause(armed, board):
     answers = []
     for k in range(5):
         answers.append(stream(armed, frame(range(60 * k, 60 * k + 60))))
-        wait_for(lambda: armed.plan(answers[-1]["plan"])["executed"] >= 12, "a part of the frame")
+        wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
     records = [ended(armed, answer) for answer in answers]
-    assert [record["status"] for record in records] == ["superseded"] * 4 + ["done"]
+    assert [record.status for record in records] == ["superseded"] * 4 + ["done"]
     for record in records:
-        assert record["executed"] + record["dropped"] == record["planned"] == 60
-        assert record["executed_complete"]
-        assert record["latency"]["first_light_s"] > record["latency"]["planned_s"] > 0
-    assert all(10 <= record["executed"] < 60 for record in records[:4])
+        assert record.executed + record.dropped == record.planned == 60
+        assert record.executed_complete
+        assert record.latency.first_light_s > record.latency.planned_s > 0
+    assert all(10 <= record.executed < 60 for record in records[:4])
     pulses = board.of("pulse")
-    assert len(pulses) == sum(record["executed"] for record in records)
+    assert len(pulses) == sum(record.executed for record in records)
     assert [pulse["index"] for pulse in pulses] == sorted({pulse["index"] for pulse in pulses})
     # One job from START to END: between frames the beam is dark for no longer than a move takes.
     gaps_us = [after["on_us"] - before["off_us"] for before, after in pairwise(pulses)]
     assert max(gaps_us) < 3_000
-    assert armed.snapshot()["board"]["underruns"] == 0
+    assert armed.snapshot().board.underruns == 0
 
 
 def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where_light_came_late(armed, monkeypatch):
     """What runs ends by itself when two plans came too late to follow it; the third is in time however slow."""
     stream(armed, frame(range(30)))
     first = stream(armed, frame(range(300)))
-    wait_for(lambda: armed.plan(first["plan"])["executed"] >= 4, "a part of the frame")
+    wait_for(lambda: armed.get_plan(first.plan).executed >= 4, "a part of the frame")
     naps_s = iter([0.1, 0.6, 1.5, 1.5])
     tries = []
 
@@ -60,11 +60,11 @@ def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where
     second = stream(armed, frame(range(40, 60)))
     records = [ended(armed, answer) for answer in (first, second)]
     assert len(tries) in (3, 4)  # once more where what ran came late, so that its heat was otherwise
-    assert [record["status"] for record in records] == ["superseded", "done"]
+    assert [record.status for record in records] == ["superseded", "done"]
     for record in records:
-        assert record["executed"] + record["dropped"] == record["planned"]
-        assert np.array(record["executed_pulses"]["simulated_um"]) == pytest.approx(100.0, rel=0.01)
-    assert armed.snapshot()["board"]["underruns"] == 0
+        assert record.executed + record.dropped == record.planned
+        assert np.array(record.executed_pulses.simulated_um) == pytest.approx(100.0, rel=0.01)
+    assert armed.snapshot().board.underruns == 0
 
 
 def test_heights_come_out_as_asked_across_frames(armed):
@@ -72,33 +72,33 @@ def test_heights_come_out_as_asked_across_frames(armed):
     answers = []
     for height_um in (100.0, 250.0, 120.0, 300.0):
         answers.append(stream(armed, frame(range(20), height_um)))
-        wait_for(lambda: armed.plan(answers[-1]["plan"])["executed"] >= 4, "a part of the frame")
+        wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 4, "a part of the frame")
     heights = [ended(armed, answer) for answer in answers]
     for record, height_um in zip(heights, (100.0, 250.0, 120.0, 300.0), strict=True):
-        simulated_um = np.array(record["executed_pulses"]["simulated_um"])
+        simulated_um = np.array(record.executed_pulses.simulated_um)
         assert simulated_um == pytest.approx(height_um, rel=0.01)
 
 
 def test_an_empty_frame_ends_what_was_shown(armed, board):
     first = stream(armed, frame(range(100)))
-    wait_for(lambda: armed.plan(first["plan"])["executed"] >= 5, "a part of the frame")
+    wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     nothing = stream(armed, frame(()))
-    assert ended(armed, first)["status"] == "superseded"
-    assert ended(armed, nothing)["status"] == "done"
+    assert ended(armed, first).status == "superseded"
+    assert ended(armed, nothing).status == "done"
     assert 5 <= len(board.of("pulse")) < 60
     wait_for(lambda: armed.board_state == "ARMED", "the job's end")
-    assert ended(armed, stream(armed, frame((3,))))["executed"] == 1
+    assert ended(armed, stream(armed, frame((3,)))).executed == 1
 
 
 def test_a_frame_takes_the_place_of_plans_that_run_or_wait(armed, board):
     train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
     running = armed.submit(lambda: train, "train").result(10)
     waiting = armed.submit(lambda: frame(range(50)), "waiting").result(10)
-    wait_for(lambda: armed.plan(running["plan"])["executed"] >= 3, "a part of the train")
+    wait_for(lambda: armed.get_plan(running.plan).executed >= 3, "a part of the train")
     newest = ended(armed, stream(armed, frame(range(5), 200.0)))
-    assert newest["status"] == "done"
-    assert [armed.plan(answer["plan"])["status"] for answer in (running, waiting)] == ["superseded"] * 2
-    assert newest["executed_pulses"]["simulated_um"] == pytest.approx([200.0] * 5, rel=0.01)
+    assert newest.status == "done"
+    assert [armed.get_plan(answer.plan).status for answer in (running, waiting)] == ["superseded"] * 2
+    assert newest.executed_pulses.simulated_um == pytest.approx([200.0] * 5, rel=0.01)
     assert len(board.of("pulse")) < 100
 
 
@@ -106,22 +106,22 @@ def test_a_plan_after_a_stream_waits_for_its_end(armed):
     first = stream(armed, frame(range(30)))
     second = armed.submit(lambda: frame(range(30)), "second").result(10)
     records = [ended(armed, answer) for answer in (first, second)]
-    assert [record["status"] for record in records] == ["done", "done"]
+    assert [record.status for record in records] == ["done", "done"]
     for record in records:
-        assert record["executed_pulses"]["simulated_um"] == pytest.approx([100.0] * 30, rel=0.01)
+        assert record.executed_pulses.simulated_um == pytest.approx([100.0] * 30, rel=0.01)
 
 
 def test_a_stop_ends_a_stream_dark_and_the_heat_is_remembered(armed, board):
     first = stream(armed, frame(range(60), 300.0))
-    wait_for(lambda: armed.plan(first["plan"])["executed"] >= 5, "a part of the frame")
+    wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     second = stream(armed, frame(range(60, 120), 300.0))
     armed.stop().result(10)
     for answer in (first, second):
-        assert ended(armed, answer)["status"] in ("failed", "superseded")
+        assert ended(armed, answer).status in ("failed", "superseded")
     count = len(board.of("pulse"))
     armed.arm().result(10)
     assert len(board.of("pulse")) == count
-    assert ended(armed, stream(armed, frame(range(60), 300.0)))["status"] == "done"
+    assert ended(armed, stream(armed, frame(range(60), 300.0))).status == "done"
 
 
 def test_every_pixel_has_its_turn_when_frames_outrun_the_light(armed):
@@ -130,10 +130,10 @@ def test_every_pixel_has_its_turn_when_frames_outrun_the_light(armed):
     shown = []
     for _ in range(40):
         answer = stream(armed, whole)
-        shown.append(answer["plan"])
-        wait_for(lambda: armed.plan(shown[-1])["executed"] >= 4, "a part of the frame")
-        if len(shown) > 3 and sum(armed.plan(plan)["executed"] for plan in shown) >= 100:
+        shown.append(answer.plan)
+        wait_for(lambda: armed.get_plan(shown[-1]).executed >= 4, "a part of the frame")
+        if len(shown) > 3 and sum(armed.get_plan(plan).executed for plan in shown) >= 100:
             break
     ended(armed, stream(armed, frame(())))
-    pixels = [pixel for plan in shown for pixel in ended(armed, {"plan": plan})["executed_pulses"]["pixel"]]
+    pixels = [pixel for plan in shown for pixel in ended(armed, plan).executed_pulses.pixel]
     assert len(set(pixels[:100])) >= 98  # a pixel or two are lit on the way again where a sweep begins anew

@@ -181,8 +181,8 @@ def test_trimmed_pulses_come_with_their_reason_and_the_budget_rises(daemon, read
     shares = {cap["cap"]: [] for cap in follower.last("budget")["caps"]}
     for _, event in follower.of("budget"):
         for cap in event["caps"]:
-            shares[cap["cap"]].append(cap["share"])
-            assert cap["share"] <= 1.01
+            shares[cap["cap"]].append(cap["fraction"])
+            assert cap["fraction"] <= 1.01
     assert max(max(values) for values in shares.values()) > 0.7
 
 

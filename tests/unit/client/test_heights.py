@@ -6,17 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from displays import DISPLAYS
-from optodrive.client.heights import build_layout, convert_to_pixels, encode_frame, encode_json
+from optodrive.client.heights import convert_to_pixels, encode_frame, encode_json
 from optodrive.client.picture import interpolate_colour, render_png
 from optodrive.core.errors import InputError
-from optodrive.planning.effective_config import build_effective_config
+from optodrive.device.config import build_pixel_layout
+from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 LAYOUT = DISPLAYS["display-437"].layout
 
 
 def test_the_layout_comes_out_of_the_daemons_configuration(any_display):
-    layout = build_layout(build_effective_config(any_display))
+    sent = build_effective_config(any_display).model_dump_json()
+    layout = build_pixel_layout(EffectiveConfig.model_validate_json(sent).display)
     for name in ("x_m", "y_m", "row", "column"):
         np.testing.assert_array_equal(getattr(layout, name), getattr(any_display.layout, name))
 

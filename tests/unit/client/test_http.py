@@ -1,19 +1,32 @@
+"""The client's exchanges with a daemon, without one: retries, tokens and errors."""
+
+import asyncio
 from math import inf
 
 import httpx
 import pytest
 
-from optodrive.client.http import Endpoint, build_error, parse_response
+from optodrive.client.endpoint import Endpoint
+from optodrive.client.exchange import ExchangePolicy, parse_response
+from optodrive.client.http import AsyncDaemonClient, DaemonClient
+from optodrive.client.problems import build_error, parse_problem
+from optodrive.client.requests import READ_STATE, STOP, ApiRequest, build_push_request
 from optodrive.core.errors import (
     BoardFaultError,
     InputError,
     LinkError,
     NotReadyError,
-    OptodriveError,
     OverBudgetError,
     RefusedError,
 )
-from optodrive.daemon.web.api import build_error_problem
+from optodrive.daemon.responses.health import HealthReport
+from optodrive.daemon.responses.problem import build_problem
+from optodrive.daemon.web.error_handlers import build_error_problem
+
+HEALTH = ApiRequest("GET", "/v1/health", HealthReport, idempotent=True)
+PUSH = build_push_request({}, "trim", "as_is", dry_run=False)
+HEALTHY = 200, b'{"status": "ok", "version": "1", "added later": {}}'
+REFUSED_TOKEN = 401, build_problem(401, "bad_token", "Not authorised", "no").to_json()
 
 
 @pytest.mark.parametrize(
@@ -22,37 +35,149 @@ from optodrive.daemon.web.api import build_error_problem
         InputError("frames[0].target_um", 9, "a height", "unknown_pixel"),
         RefusedError("refused: it does not fit"),
         OverBudgetError("too hot", 17, "absorber_temperature", 0.01, 2.5),
-        OverBudgetError("too hot for ever", 17, "touch_temperature", 0.01, inf),
+        OverBudgetError("always too hot", 17, "touch_temperature", 0.01, inf),
         NotReadyError("the board is DISARMED"),
         BoardFaultError("the board is in FAULT"),
         LinkError("no link to the board"),
     ],
 )
-def test_what_the_daemon_raises_comes_out_the_same_at_the_caller(error):
-    document = build_error_problem(error)
-    found = build_error(document["status"], document)
+def test_an_error_of_the_daemon_arrives_at_the_caller_unchanged(error):
+    problem = build_error_problem(error)
+    found = parse_problem(problem.status, problem.to_json())
     assert type(found) is type(error)
     assert str(found) == str(error)
     assert found.code == error.code
-    assert found.problem == document
+    assert found.problem == problem.to_dict()
     for name in ("where", "expected", "pixel", "cap", "margin_j", "earliest_s"):
         assert getattr(found, name, None) == getattr(error, name, None)
 
 
-def test_an_answer_that_is_no_problem_document_is_said_to_be_none():
+def test_a_response_without_a_problem_document_is_a_link_error():
     for body in (b"<html>", b"[1]", b'{"error": 1}'):
         with pytest.raises(LinkError, match="502 without a problem document"):
-            parse_response(httpx.Response(502, content=body))
+            parse_response(HEALTH, httpx.Response(502, content=body))
 
 
-def test_codes_that_are_not_known_here_are_refusals_with_their_code():
-    error = build_error(429, {"detail": "too often", "code": "too_many_requests"})
+def test_an_unknown_code_is_a_refusal_that_keeps_the_code():
+    error = build_error(build_problem(429, "too_many_requests", "Too many requests", "too often"))
     assert type(error) is RefusedError
     assert error.code == "too_many_requests"
-    assert isinstance(build_error(500, {"detail": "?"}), OptodriveError)
+    assert type(build_error(build_problem(500, "internal", "Internal", "?"))) is RefusedError
 
 
 @pytest.mark.parametrize("url", ["127.0.0.1:8450", "ftp://127.0.0.1", "http://", "unix:", "unix://host/path", "unix:/"])
-def test_an_address_that_is_none_is_refused(url):
+def test_an_invalid_address_is_refused(url):
     with pytest.raises(InputError, match="--url"):
         Endpoint(url, "token")
+
+
+class Scripted:
+    """An HTTP transport that replies from a list: errors, or status and body."""
+
+    def __init__(self, replies):
+        self.replies = list(replies)
+        self.requests = []
+
+    def __call__(self, request):
+        self.requests.append((request.method, request.url.path, request.headers["authorization"]))
+        reply = self.replies.pop(0)
+        if isinstance(reply, Exception):
+            raise reply
+        status, body = reply
+        return httpx.Response(status, content=body)
+
+
+@pytest.fixture(params=["blocking", "asynchronous"])
+def call(request, monkeypatch):
+    """Runs exchanges with scripted replies, in both clients: call(replies, *exchanges) → results, requests."""
+    monkeypatch.setattr("optodrive.client.exchange.RETRY_S", 0.0)
+
+    def blocking(replies, *exchanges, reconnect_timeout_s=0.0):
+        script = Scripted(replies)
+        transport = httpx.MockTransport(script)
+        monkeypatch.setattr(
+            Endpoint, "open_client", lambda self, timeout_s: httpx.Client(base_url=self.url, transport=transport)
+        )
+        client = DaemonClient("http://localhost", "token", reconnect_timeout_s)
+        return [client.run(exchange(client.policy)) for exchange in exchanges], script.requests
+
+    def asynchronous(replies, *exchanges, reconnect_timeout_s=0.0):
+        script = Scripted(replies)
+        transport = httpx.MockTransport(script)
+        monkeypatch.setattr(
+            Endpoint,
+            "open_async_client",
+            lambda self, timeout_s: httpx.AsyncClient(base_url=self.url, transport=transport),
+        )
+
+        async def run():
+            client = AsyncDaemonClient("http://localhost", "token", reconnect_timeout_s)
+            return [await client.run(exchange(client.policy)) for exchange in exchanges]
+
+        return asyncio.run(run()), script.requests
+
+    return {"blocking": blocking, "asynchronous": asynchronous}[request.param]
+
+
+def send(request):
+    return lambda policy: policy.call(request)
+
+
+def test_a_response_is_the_requests_model_and_members_added_later_are_ignored(call):
+    (report,), requests = call([HEALTHY], send(HEALTH))
+    assert report == HealthReport(version="1")
+    assert requests == [("GET", "/v1/health", "Bearer token")]
+
+
+def test_an_idempotent_request_is_repeated_once_the_daemon_has_responded(call):
+    lost = httpx.ReadError("connection reset")
+    results, requests = call([HEALTHY, lost, lost, HEALTHY], send(HEALTH), send(HEALTH), reconnect_timeout_s=60.0)
+    assert len(results) == 2
+    assert len(requests) == 4
+    with pytest.raises(LinkError, match="no daemon answers"):
+        call([lost], send(HEALTH), reconnect_timeout_s=60.0)
+
+
+def test_a_request_with_an_effect_is_repeated_only_if_it_was_not_sent(call):
+    with pytest.raises(LinkError, match="connection reset"):
+        call([HEALTHY, httpx.ReadError("connection reset")], send(HEALTH), send(PUSH), reconnect_timeout_s=60.0)
+    refused = 409, build_problem(409, "refused", "Refused", "no").to_json()
+    with pytest.raises(RefusedError):
+        call([HEALTHY, httpx.ConnectError("down"), refused], send(HEALTH), send(PUSH), reconnect_timeout_s=60.0)
+
+
+def test_a_refused_token_is_read_again_once(call, monkeypatch):
+    tokens = iter(["second", "second"])
+    monkeypatch.setattr("optodrive.client.endpoint.read_token", lambda port: next(tokens))
+    monkeypatch.setattr(Endpoint, "__init__", explicit_first_token(Endpoint.__init__))
+    _, requests = call([REFUSED_TOKEN, HEALTHY], send(HEALTH))
+    assert [authorization for _, _, authorization in requests] == ["Bearer token", "Bearer second"]
+
+
+def explicit_first_token(init):
+    """An endpoint that got its first token from a file, which is then read again."""
+
+    def patched(self, address, token):
+        init(self, address, token)
+        self._explicit_token = None
+
+    return patched
+
+
+def test_a_given_token_that_is_refused_is_an_input_error(call):
+    with pytest.raises(InputError, match="token"):
+        call([REFUSED_TOKEN], send(READ_STATE))
+
+
+def test_stop_is_attempted_three_times(call):
+    with pytest.raises(LinkError, match="emergency stop"):
+        call([httpx.ReadTimeout("silence")] * 3, ExchangePolicy.stop)
+
+
+def test_stop_is_not_answered_by_a_problem_document(call):
+    with pytest.raises(LinkError, match="no link"):
+        call([(503, build_problem(503, "link", "Link", "no link").to_json())], ExchangePolicy.stop)
+
+
+def test_every_request_states_its_model():
+    assert STOP.response is READ_STATE.response

@@ -24,14 +24,14 @@ def test_pixels_count_by_rows_from_the_lower_left():
 
 
 def test_the_resolved_configuration_carries_what_others_rely_on():
-    resolved = build_effective_config(DisplayModel.from_config(load_config()))
+    resolved = build_effective_config(DisplayModel.from_config(load_config())).model_dump(mode="json")
     assert resolved["name"] == "display-437"
     assert len(resolved["display"]["pixels"]) == 437
     assert set(resolved["display"]["pixels"][0]) == {"index", "x_m", "y_m", "bridge_width_m"}
     assert set(resolved["pixel_model"]) >= {"R", "C", "epsilon", "tau_g", "kappa", "phi"}
     assert set(resolved["laser"]) == {"max_power_w", "pwm_hz", "focus_width_m", "focus_height_m"}
     assert {"bandwidth_hz", "damping", "delay_s", "slew_rad_per_s", "aim_error_m"} <= set(resolved["scanner"])
-    assert resolved["scanner"]["move_pitch_s"] == pytest.approx(317e-6)
+    assert resolved["scanner"]["settling_pitch_s"] == pytest.approx(317e-6)
     assert set(resolved["limits"]) >= {
         "absorber_max_c",
         "pulse_energy_max_j",

@@ -26,6 +26,7 @@ from optodrive.planning.pipeline import plan_sequence, warm_up
 from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.refresh import BeamTimeEstimator
+from optodrive.planning.summary_schema import DeadPixelSummary
 
 PLAIN = DISPLAYS["display-16"]
 CONFIG, COUNT = PLAIN.config, len(PLAIN.layout)
@@ -152,23 +153,21 @@ def test_the_dead_are_left_out_and_named(display):
     prepared, feasibility = check_feasibility(display, everywhere(60e-6), *display.build_cold_state())
     figures = summarize_plan(prepared, feasibility)
     assert feasibility.fits
-    assert figures["dead"] == {
-        "pixels": [DEAD_PIXEL],
-        "count": 1,
-        "message": f"pixel {DEAD_PIXEL} is dead: left out",
-    }
+    assert figures.dead == DeadPixelSummary(
+        pixels=[DEAD_PIXEL], count=1, message=f"pixel {DEAD_PIXEL} is dead: omitted"
+    )
     alone = np.zeros(COUNT)
     alone[DEAD_PIXEL] = 5e-3  # out of anyone's reach
     nothing, _ = check_feasibility(
         display, FrameSequence((TactileFrame("dead", 0.0, 1.0, alone),)), *display.build_cold_state()
     )
     assert len(nothing.plan) == 0
-    assert summarize_plan(nothing)["dead"]["count"] == 1
+    assert summarize_plan(nothing).dead.count == 1
     alive = np.where(np.arange(COUNT) == DEAD_PIXEL, 0.0, 60e-6)
     fine, _ = check_feasibility(
         display, FrameSequence((TactileFrame("alive", 0.0, 1.0, alive),)), *display.build_cold_state()
     )
-    assert summarize_plan(fine)["dead"] == {"pixels": [], "count": 0, "message": None}
+    assert summarize_plan(fine).dead == DeadPixelSummary(pixels=[], count=0, message=None)
 
 
 @pytest.mark.parametrize(

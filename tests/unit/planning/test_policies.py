@@ -28,12 +28,12 @@ def frames(count, height_m=300e-6, every_s=0.1):
 def test_trim_says_which_pixel_and_when_all_would_fit():
     result = plan_sequence(colder(touch_k=2.0), frames(6), *DISPLAY.build_cold_state())
     figures = summarize_plan(result)
-    assert figures["trimmed"]["by_reason"] == {"touch_temperature": figures["trimmed"]["pulses"]}
-    shortfall = figures["shortfall"]
-    assert shortfall["pixel"] in (200, 201)
-    assert shortfall["cap"] == "touch_temperature"
-    assert shortfall["margin_j"] > 0
-    assert 0 < shortfall["fits_later_s"] < 10
+    assert figures.trimmed.by_reason == {"touch_temperature": figures.trimmed.pulses}
+    shortfall = figures.shortfall
+    assert shortfall.pixel in (200, 201)
+    assert shortfall.cap == "touch_temperature"
+    assert shortfall.margin_j > 0
+    assert 0 < shortfall.fits_after_s < 10
 
 
 def test_delay_shows_everything_as_tall_as_asked_only_later():

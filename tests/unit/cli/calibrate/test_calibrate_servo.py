@@ -85,15 +85,15 @@ def test_a_plan_takes_longer_by_the_option_as_by_the_configuration(folder, capsy
     frames = folder / "frames.json"
     frames.write_text('{"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "300": 60}}]}')
 
-    def moves_s(*more):
+    def settling_s(*more):
         assert run(["plan", str(frames), "--json", *more]) == 0
-        return json.loads(capsys.readouterr().out)["moves_s"]
+        return json.loads(capsys.readouterr().out)["settling_s"]
 
-    by_option = moves_s("--mirrors", f"{folder}/mirrors.toml")
-    assert by_option > moves_s()
-    assert by_option == moves_s("--config", str(write_config(folder)))
+    by_option = settling_s("--mirrors", f"{folder}/mirrors.toml")
+    assert by_option > settling_s()
+    assert by_option == settling_s("--config", str(write_config(folder)))
     # Asked for beside a configuration that names them too, the cap is lowered once.
-    assert by_option == moves_s("--config", str(write_config(folder)), "--mirrors", f"{folder}/mirrors.toml")
+    assert by_option == settling_s("--config", str(write_config(folder)), "--mirrors", f"{folder}/mirrors.toml")
 
 
 @pytest.mark.parametrize(

@@ -18,8 +18,8 @@ def reports():
 
 
 @pytest.fixture
-def audit(tmp_path, said):
-    audit = AuditLog(tmp_path / "audit.jsonl", said.append, lambda: NOW)
+def audit(tmp_path, reports):
+    audit = AuditLog(tmp_path / "audit.jsonl", reports.append, lambda: NOW)
     yield audit
     audit.close()
 
@@ -28,18 +28,18 @@ def read_entries(folder):
     return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines() if line.endswith("}")]
 
 
-def test_lines_are_added_in_order_to_a_private_file(audit, tmp_path, said):
+def test_lines_are_added_in_order_to_a_private_file(audit, tmp_path, reports):
     (tmp_path / "audit.jsonl").write_text('{"event": "older"}\n')
     for number in range(5):
-        audit.note({"event": "push", "number": number})
-    assert asyncio.run(audit.record_durably({"event": "asked"})) is None
-    assert [line["event"] for line in read_entries(tmp_path)] == ["older", *["push"] * 5, "asked"]
+        audit.record({"event": "push", "number": number})
+    assert asyncio.run(audit.record_durably({"event": "requested"})) is None
+    assert [line["event"] for line in read_entries(tmp_path)] == ["older", *["push"] * 5, "requested"]
     assert read_entries(tmp_path)[1]["at"] == "2026-01-02T03:04:05.678+00:00"
-    assert said == []
+    assert reports == []
 
 
 def test_a_new_file_is_its_owners_alone(audit, tmp_path):
-    asyncio.run(audit.record_durably({"event": "asked"}))
+    asyncio.run(audit.record_durably({"event": "requested"}))
     assert (tmp_path / "audit.jsonl").stat().st_mode & 0o777 == 0o600
 
 
@@ -48,36 +48,36 @@ def test_one_event_is_one_line_whatever_it_holds(audit, tmp_path):
     assert len((tmp_path / "audit.jsonl").read_text().splitlines()) == 1
 
 
-def test_a_disk_that_is_full_is_said_once_and_again_when_it_is_not(audit, tmp_path, said):
+def test_a_disk_that_is_full_is_said_once_and_again_when_it_is_not(audit, tmp_path, reports):
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
     try:
-        assert asyncio.run(audit.record_durably({"event": "asked"})) is None
+        assert asyncio.run(audit.record_durably({"event": "requested"})) is None
         for _ in range(3):
-            assert "large" in asyncio.run(audit.record_durably({"event": "asked", "more": "x" * 50}))
+            assert "large" in asyncio.run(audit.record_durably({"event": "requested", "more": "x" * 50}))
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-    assert len(said) == 1
-    assert "arming is refused" in said[0]
+    assert len(reports) == 1
+    assert "arming is refused" in reports[0]
     assert asyncio.run(audit.record_durably({"event": "after"})) is None
     # The torn line stays by itself: what comes after it can be read.
-    assert [line["event"] for line in read_entries(tmp_path)] == ["asked", "after"]
-    assert "again" in said[1]
+    assert [line["event"] for line in read_entries(tmp_path)] == ["requested", "after"]
+    assert "again" in reports[1]
 
 
-def test_a_disk_that_stands_still_holds_nothing_up(audit, said, monkeypatch):
+def test_a_disk_that_stands_still_holds_nothing_up(audit, reports, monkeypatch):
     go_on = threading.Event()
-    monkeypatch.setattr(audit_module, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(audit_module, "WRITE_TIMEOUT_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
     for _ in range(3 * audit_module.QUEUE_MAX):
-        audit.note({"event": "stop"})
-    assert "too many lines" in asyncio.run(audit.record_durably({"event": "asked"}))
+        audit.record({"event": "stop"})
+    assert "too many lines" in asyncio.run(audit.record_durably({"event": "requested"}))
     go_on.set()
 
 
 def test_arming_does_not_wait_for_ever(audit, monkeypatch):
     go_on = threading.Event()
-    monkeypatch.setattr(audit_module, "PATIENCE_S", 0.05)
+    monkeypatch.setattr(audit_module, "WRITE_TIMEOUT_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
-    assert "not written within" in asyncio.run(audit.record_durably({"event": "asked"}))
+    assert "not written within" in asyncio.run(audit.record_durably({"event": "requested"}))
     go_on.set()

@@ -1,6 +1,7 @@
 import pytest
 
-from optodrive.daemon.web.roles import ROLES, ROUTES, RouteTable, is_role_sufficient
+from optodrive.daemon.web.roles import ROLES, is_role_sufficient
+from optodrive.daemon.web.route_table import ROUTES, RouteTable
 from optodrive.daemon.web.static_files import LOGIN_PATHS
 
 

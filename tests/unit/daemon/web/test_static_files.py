@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from optodrive.daemon.web.access_policy import AccessMiddleware, AccessPolicy
+from optodrive.daemon.web.access_middleware import AccessMiddleware
+from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection

@@ -57,7 +57,7 @@ def test_a_link_that_stands_has_no_cause_and_counts_its_turns():
     rig.run(1.0)
     figures = rig.session.collect_link_stats()
     assert figures["likely_cause"] is None
-    assert figures["likely_cause_ago_s"] is None
+    assert figures["likely_cause_age_s"] is None
     assert 1.9 < figures["longest_stall_ms"] < 3.0
 
 
@@ -120,7 +120,7 @@ def test_a_link_that_comes_back_to_the_same_board_does_not_blame_a_restart():
     rig.link.cut = False
     rig.connect()
     assert "restarted" not in cause(rig)
-    assert rig.session.collect_link_stats()["likely_cause_ago_s"] > 0
+    assert rig.session.collect_link_stats()["likely_cause_age_s"] > 0
 
 
 def test_damage_of_what_the_board_sends_is_told_at_once():

@@ -24,8 +24,8 @@ def test_a_delay_and_a_drift_are_told_apart(delay_s, drift_ppm):
 @given(arrays(float, 100, elements=st.floats(-1e-3, 1e-3)))
 def test_the_largest_is_the_one_farthest_from_the_plan_with_its_sign(off_s):
     error = compute_timing_error(PLANNED_S, PLANNED_S + off_s)
-    assert abs(error.largest_s) == pytest.approx(np.abs(off_s).max(), abs=1e-12)
-    assert np.abs(off_s - error.largest_s).min() < 1e-12
+    assert abs(error.max_abs_s) == pytest.approx(np.abs(off_s).max(), abs=1e-12)
+    assert np.abs(off_s - error.max_abs_s).min() < 1e-12
 
 
 def test_no_pulse_has_no_error_and_one_has_no_drift():
@@ -35,13 +35,13 @@ def test_no_pulse_has_no_error_and_one_has_no_drift():
 
 def test_totals_keep_the_worst_either_way():
     totals = TimingTotals()
-    assert totals.to_dict() is None
+    assert totals.worst is None
     for off_s in (1e-5, -3e-5, 2e-5):
         totals.add(compute_timing_error(PLANNED_S, PLANNED_S + off_s))
-    figures = totals.to_dict()
-    assert figures["pulses"] == 300
-    assert (figures["largest_s"], figures["median_s"]) == pytest.approx((-3e-5, -3e-5))
-    assert figures["drift_ppm"] == pytest.approx(0.0, abs=1e-6)
+    worst = totals.worst
+    assert worst.pulses == 300
+    assert (worst.max_abs_s, worst.median_s) == pytest.approx((-3e-5, -3e-5))
+    assert worst.drift_ppm == pytest.approx(0.0, abs=1e-6)
 
 
 def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
@@ -55,7 +55,7 @@ def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
 
     job = rig.play(limited)
     rig.until(lambda: job.is_finished)
-    assert error_of(job).largest_s == pytest.approx(0.0, abs=1e-6)
+    assert error_of(job).max_abs_s == pytest.approx(0.0, abs=1e-6)
     job = rig.play(limited)
     rig.run(0.15)
     rig.link.keep_back = lambda frame: frame.type == 0x10
@@ -66,5 +66,5 @@ def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
     assert rig.session.board.underruns == 1
     error = error_of(job)
     assert error.start_delay_s == pytest.approx(0.0, abs=1e-6)
-    assert 0.01 < error.largest_s < 0.5
+    assert 0.01 < error.max_abs_s < 0.5
     assert error.drift_ppm > 100

@@ -20,6 +20,7 @@ from optodrive.planning.scheduler.interleaving import (
     split_pulses,
 )
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
+from optodrive.planning.summary_schema import SimultaneitySummary
 
 DISPLAY = DISPLAYS["display-437"]
 FOUR = {200: 100, 201: 100, 221: 100, 222: 100}
@@ -81,13 +82,16 @@ def test_slices_have_no_height_of_their_own_to_answer_for():
     result = prepared(frame(FOUR))
     told = summarize_plan(result)
     assert np.isnan(result.plan.target_m[:4]).all()
-    assert told["asked_max_um"] == pytest.approx(100.0)
-    assert told["predicted_max_um"] == pytest.approx(100.0, rel=0.01)
-    assert told["frames"][0]["simultaneous"] == {
-        key: getattr(result.simultaneous[0], key)
-        for key in ("interleaved_rounds", "simultaneity", "simultaneity_single_pulse", "extra_s")
-    }
-    assert summarize_plan(prepared(frame(FOUR, together=False)))["frames"][0]["simultaneous"] is None
+    assert told.target_max_um == pytest.approx(100.0)
+    assert told.predicted_max_um == pytest.approx(100.0, rel=0.01)
+    split = result.simultaneous[0]
+    assert told.frames[0].simultaneous == SimultaneitySummary(
+        interleaved_rounds=split.interleaved_rounds,
+        simultaneity=split.simultaneity,
+        simultaneity_single_pulse=split.simultaneity_single_pulse,
+        extra_s=split.extra_s,
+    )
+    assert summarize_plan(prepared(frame(FOUR, together=False))).frames[0].simultaneous is None
 
 
 def test_heat_that_is_there_counts_and_a_frame_after_another_is_split_too():

@@ -179,7 +179,7 @@ def test_a_cycle_whose_height_is_still_there_has_no_pulse_and_is_named():
     train = HeightTrain(17, 0.06, 0.2, 0.04, 40e-6)
     result = prepared(train, frames=[TactileFrame("f", 0.0, 0.06, target_m)])
     assert [(item.source, item.pixel) for item in result.skipped] == [(1, 17)]
-    assert summarize_plan(result)["skipped"][0]["frame"] == "train 0"
+    assert summarize_plan(result).skipped[0].frame == "train 0"
     assert len(result.plan) == 5
 
 

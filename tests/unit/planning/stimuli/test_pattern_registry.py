@@ -9,6 +9,7 @@ import pytest
 from PIL import Image
 
 from optodrive.core.errors import InputError
+from optodrive.daemon.responses.patterns import PatternList
 from optodrive.device.config import load_config
 from optodrive.planning.stimuli.pattern_registry import PATTERNS, build_pattern, describe_patterns, find_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
@@ -52,7 +53,7 @@ def test_the_six_experiments_are_there():
 
 
 def test_the_description_is_json():
-    described = json.loads(json.dumps(describe_patterns(), allow_nan=False))
+    described = json.loads(PatternList(patterns=describe_patterns()).model_dump_json())["patterns"]
     assert [item["name"] for item in described] == list(PATTERNS)
     for item in described:
         assert item["summary"]
