@@ -9,10 +9,10 @@ export function token() {
 
 // What the daemon refused, with its problem document; status 0 where nothing answered.
 export class Problem extends Error {
-  constructor(status, document) {
-    super(document.detail || document.title || `the daemon answered ${status}`);
+  constructor(status, problem) {
+    super(problem.detail || problem.title || `the daemon answered ${status}`);
     this.status = status;
-    this.document = document;
+    this.problem = problem;
   }
 }
 
@@ -35,9 +35,9 @@ export async function call(method, path, options = {}) {
     }
     throw new Problem(0, { detail: "The daemon does not answer." });
   }
-  const document = await answer.json().catch(() => ({}));
+  const body = await answer.json().catch(() => ({}));
   if (!answer.ok) {
-    throw new Problem(answer.status, document);
+    throw new Problem(answer.status, body);
   }
-  return document;
+  return body;
 }

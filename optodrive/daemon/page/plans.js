@@ -140,7 +140,7 @@ export class Plans extends EventTarget {
       this.#tell(["soft", "Given up."]);
       return;
     }
-    const where = error.document?.where ? `${error.document.where}: ` : "";
+    const where = error.problem?.where ? `${error.problem.where}: ` : "";
     this.#tell(["bad", error.message.startsWith(where) ? error.message : where + error.message]);
   }
 
