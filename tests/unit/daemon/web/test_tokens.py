@@ -2,8 +2,8 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.daemon.web.tokens import (
-    TOKEN_VARIABLE,
-    TOKENS_FILE_VARIABLE,
+    ENVIRONMENT_VARIABLE,
+    FILE_ENVIRONMENT_VARIABLE,
     Tokens,
     build_tokens_path,
     create_tokens,
@@ -27,8 +27,8 @@ def write_tokens(path, *entries, version=1):
 @pytest.fixture(autouse=True)
 def _own_place(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
-    monkeypatch.delenv(TOKENS_FILE_VARIABLE, raising=False)
+    monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
+    monkeypatch.delenv(FILE_ENVIRONMENT_VARIABLE, raising=False)
 
 
 def test_a_fresh_token_for_each_role_which_only_its_user_may_read(tmp_path):
@@ -49,7 +49,7 @@ def test_a_file_that_is_kept_outlives_the_daemon(tmp_path):
 
 
 def test_the_environment_gives_the_armers(monkeypatch):
-    monkeypatch.setenv(TOKEN_VARIABLE, SECRET)
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, SECRET)
     tokens, path = load_daemon_tokens("", 1)
     assert tokens.find(SECRET).role == "armer"
     assert read_tokens(path).most_privileged.secret == SECRET
@@ -102,9 +102,9 @@ def test_a_caller_uses_whichever_is_there(tmp_path, monkeypatch):
     tokens, _ = load_daemon_tokens("", 8450)
     assert read_token(8450) == tokens.find(tokens.all[2].secret).secret == tokens.all[2].secret
     given = write_tokens(tmp_path / "mine.toml", ("ben", "viewer", SECRET))
-    monkeypatch.setenv(TOKENS_FILE_VARIABLE, str(given))
+    monkeypatch.setenv(FILE_ENVIRONMENT_VARIABLE, str(given))
     assert read_token(8450) == read_token(None) == SECRET
-    monkeypatch.setenv(TOKEN_VARIABLE, "another")
+    monkeypatch.setenv(ENVIRONMENT_VARIABLE, "another")
     assert read_token(8450) == "another"
 
 
@@ -117,7 +117,7 @@ def test_a_given_secret_is_kept_as_it_is_or_refused_without_being_shown(tmp_path
     assert create_tokens(tmp_path / "a.toml", sign).find(sign).role == "armer"
     assert read_tokens(tmp_path / "a.toml").find(sign).role == "armer"
     for wrong in ("tooshort-token", "sixteen signs and more", "x" * 201, "sixteen-signs-ünd-more"):
-        with pytest.raises(InputError, match=TOKEN_VARIABLE) as caught:
+        with pytest.raises(InputError, match=ENVIRONMENT_VARIABLE) as caught:
             create_tokens(tmp_path / "b.toml", wrong)
         assert wrong not in str(caught.value)
         assert not (tmp_path / "b.toml").exists()
