@@ -1,4 +1,8 @@
-"""Check identifiers and public keys against the retired words of docs/glossary.md."""
+"""Check names and prose against docs/glossary.md.
+
+Three rules: no retired word in an identifier or a public key, no retired phrase in any text, and one plain sentence as
+the first line of every module's docstring.
+"""
 
 import ast
 import re
@@ -12,8 +16,11 @@ from typing import NamedTuple
 ROOT = Path(__file__).resolve().parent.parent
 GLOSSARY = ROOT / "docs" / "glossary.md"
 CODE = ("optodrive", "firmware_protocol", "configs", "scripts", "tests")
+DOCUMENTS = ("docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 ENTRY = re.compile(r"`([^`]+)`")
 WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
+TEXT = (".py", ".c", ".h", ".js", ".css", ".html", ".md", ".toml", ".pml", ".service")
+VAGUE = re.compile(r";|\b(what|whoever|whatever)\b", re.IGNORECASE)
 C_NOISE = re.compile(
     r'/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|^\s*#\s*include[^\n]*', re.S | re.M
 )
@@ -50,6 +57,29 @@ class Retired(NamedTuple):
             if any(words[start : start + size] == phrase for start in range(len(words) - size + 1)):
                 return "_".join(phrase)
         return None
+
+
+def load_phrases(text: str) -> re.Pattern[str]:
+    """Return a pattern for the phrases in the table of two columns."""
+    rows = [line for line in text.splitlines() if line.startswith("|") and line.count("|") == 3]
+    phrases = [entry for line in rows for entry in ENTRY.findall(line.split("|")[1])]
+    alternatives = "|".join(r"\s+".join(map(re.escape, phrase.split())) for phrase in phrases)
+    return re.compile(rf"\b(?:{alternatives})", re.IGNORECASE)
+
+
+def find_phrases(path: str, source: str, phrases: re.Pattern[str]) -> Iterator[str]:
+    """Yield one problem per retired phrase in a text."""
+    for number, line in enumerate(source.splitlines(), 1):
+        match = phrases.search(line)
+        if match:
+            yield f"{path}:{number}: {match[0]!r} (docs/glossary.md retires the phrase)"
+
+
+def find_vague_docstring(path: str, source: str) -> Iterator[str]:
+    """Yield a problem if a module's docstring does not begin with one plain sentence."""
+    lines = (ast.get_docstring(ast.parse(source)) or "").splitlines()
+    if lines and (not lines[0].endswith(".") or VAGUE.search(lines[0])):
+        yield f"{path}:1: {lines[0]!r} is not one plain sentence"
 
 
 def split_words(name: str) -> tuple[str, ...]:
@@ -132,21 +162,27 @@ READERS = {".py": python_names, ".c": c_names, ".h": c_names, ".js": c_names, ".
 
 def tracked_files() -> list[str]:
     """Return the files under version control, without vendored ones."""
-    listed = subprocess.run(["git", "ls-files", *CODE], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    command = ["git", "ls-files", *CODE, *DOCUMENTS]
+    listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True).stdout
     return [path for path in listed.splitlines() if "/vendor/" not in path and (ROOT / path).exists()]
 
 
 def main() -> int:
-    """Print every retired name with its place; exit status 1 where there is one."""
-    retired = load_retired(GLOSSARY.read_text(encoding="utf-8"))
+    """Print every problem with its place; exit status 1 if there is one."""
+    glossary = GLOSSARY.read_text(encoding="utf-8")
+    retired, phrases = load_retired(glossary), load_phrases(glossary)
     verdicts: dict[tuple[str, bool], str | None] = {}
     problems = set()
     for path in tracked_files():
-        reader = READERS.get(Path(path).suffix)
-        if reader is None:
+        suffix = Path(path).suffix
+        if suffix not in TEXT:
             continue
         source = (ROOT / path).read_text(encoding="utf-8")
-        for name in reader(path, source):
+        if ROOT / path != GLOSSARY:
+            problems.update(find_phrases(path, source, phrases))
+        if suffix == ".py" and path.startswith("optodrive/"):
+            problems.update(find_vague_docstring(path, source))
+        for name in READERS[suffix](path, source) if suffix in READERS else ():
             key = (name.text, name.is_function)
             if key not in verdicts:
                 verdicts[key] = retired.find(name)

@@ -7,7 +7,16 @@ import pytest
 
 sys.path.append(str(Path(__file__).parents[2] / "scripts"))
 
-from vocabulary import c_names, load_retired, python_names, split_words, toml_names
+from vocabulary import (
+    c_names,
+    find_phrases,
+    find_vague_docstring,
+    load_phrases,
+    load_retired,
+    python_names,
+    split_words,
+    toml_names,
+)
 
 RETIRED = load_retired("| term | meaning | `standing_on`, `=Basis`, `tick()` |\n| other | text `kept` | |\n")
 
@@ -71,3 +80,24 @@ def test_c_identifiers_without_comments_and_strings():
 def test_toml_keys_at_every_depth():
     assert find(toml_names("x.toml", "[a]\nb = [{standing_on = 1}]"))
     assert not find(toml_names("x.toml", 'a = "standing_on"'))
+
+
+PHRASES = load_phrases("| `for ever`, `reckon` | compute |\n| term | meaning | `kept` |\n")
+
+
+@pytest.mark.parametrize(("text", "count"), [("it goes on for  ever", 1), ("Reckoned anew", 1), ("forever kept", 0)])
+def test_a_retired_phrase_is_found_in_any_text(text, count):
+    assert len(list(find_phrases("x.md", text, PHRASES))) == count
+
+
+@pytest.mark.parametrize(
+    ("docstring", "count"),
+    [
+        ("The thermal state of a display.", 0),
+        ("The thermal state of a display", 1),
+        ("The thermal state; and more.", 1),
+        ("What a display does.", 1),
+    ],
+)
+def test_the_first_line_of_a_module_is_one_plain_sentence(docstring, count):
+    assert len(list(find_vague_docstring("x.py", f'"""{docstring}"""'))) == count
