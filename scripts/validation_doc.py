@@ -80,22 +80,23 @@ Not data:
 JSON_KEYS = """\
 `--diagnose --json` prints one object, SI units, temperatures as rises in K:
 
-- `nominal`: the parameter set that is diagnosed
-- `facts`: each `id`, `group`, `value`, `relative_error`, `reading` (`relative_error`, `source`), `literal_ratio`,
-  `extended_ratio`, `misses_by_sigma`
-- `not_data`: outcome → why it is no measurement
-- `chi2`, `factor`: `literal`, `extended`; of χ² also `degrees_of_freedom`
-- `named_from_aicc`, `alike_within_aicc`: thresholds
-- `causes`: each `cause`, `words`, `parameter`, `value`, `unit`, `ci95`, `chi2_taken`, `rests_on`, `alike`, `settled_by`
-- `candidates`, the other causes: each `cause`, `words`, `verdict`, `value` (beside the named ones), `unit`,
-  `chi2_taken_alone`, `chi2_taken_beside`, `best_in_place_of`, `chi2_share_there`
-- `contradictions`: each `assumption`, `words`, `ratio`
-- `unexplained`: facts still off by more than two standard errors
-- `gain`: `groups` and `facts`, each `left_out`, `facts`, `causes`, `lost`, `before_ratio`, `after_ratio`, `before`,
-  `after`; `factor_groups` and `factor_each`, each `before`, `after`
+- `parameter_set`: the parameter set that is diagnosed
+- `facts`: each `id`, `group`, `value`, `relative_error`, `reading` (`relative_error`, `source`), `nominal_ratio`,
+  `extended_ratio`, `error_sigma`
+- `excluded`: outcome → why it is no measurement
+- `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`
+- `aicc_per_cause`, `aicc_indistinguishable`: thresholds
+- `causes`: each `cause`, `description`, `parameter`, `value`, `unit`, `ci95`, `chi2_reduction`, `evidence`,
+  `alternatives`, `deciding_measurement`
+- `candidates`, the other causes: each `cause`, `description`, `verdict`, `value` (beside the identified ones), `unit`,
+  `chi2_reduction_alone`, `chi2_reduction_added`, `replaces`, `replaced_fraction`
+- `contradictions`: each `assumption`, `description`, `ratio`
+- `unexplained`: facts that deviate by more than two standard errors
+- `gain`: `groups` and `facts`, each `held_out`, `facts`, `causes`, `unobservable`, `nominal_ratio`, `extended_ratio`,
+  `nominal_factor`, `extended_factor`; `factor_groups` and `factor_each`, each `nominal`, `extended`
 
-Verdicts of candidates: `alike` (would do in the place of a cause), `as good` (another law, beside them), `ruled out`,
-`not needed`, `not shown`.
+Verdicts of candidates: `alternative cause` (fits as well in place of a cause), `alternative law` (fits as well beside
+them), `ruled out`, `not needed`, `not observable`.
 """
 
 

@@ -3,8 +3,8 @@
 A separate process writes the file: the HDF5 library holds the interpreter lock while it waits for the disk, and a
 daemon that is blocked for a tenth of a second loses its board's lease. The daemon's side is a thread that feeds a pipe.
 
-The file is a recording (docs/reference/recordings.md) whose runs have pulses as executed and no signals yet, with one group
-/plans/ID per plan. A run begins after a pause of COLD_AFTER_S; a plan's attribute `run` names its run.
+The file is a recording (docs/reference/recordings.md) whose runs have pulses as executed and no signals yet, with one
+group /plans/ID per plan. A run begins after a pause of COLD_AFTER_S; a plan's attribute `run` names its run.
 """
 
 import io

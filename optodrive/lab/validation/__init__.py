@@ -1,1 +1,1 @@
-"""The paper's measured numbers as a recording: what Text S1 gets wrong in them, and what mending it gains."""
+"""Validation of the physics against the paper's facts, and search for the causes of its deviations."""

@@ -1,4 +1,4 @@
-"""What Text S1 may have wrong: each a physical cause in words, with one number that is free within physical limits."""
+"""Hypotheses on the errors of Text S1, each with one free parameter within physical limits."""
 
 from dataclasses import dataclass
 from math import exp, log
@@ -8,12 +8,12 @@ import numpy as np
 
 @dataclass(frozen=True)
 class CauseHypothesis:
-    """One hypothesis.
+    """Hypothesis on an error of Text S1.
 
-    words: what is wrong; symbol, unit, low, high: the number that is freed, and its plausible range, all alike likely
-    (by its logarithm, unless none of it is possible); source: of the range; without: causes that speak of the same
-    thing, so that both together mean nothing; settle: the measurement that would tell; instead: it takes the place of a
-    law of the nominal model, which no value of its number gives back
+    symbol, unit, low, high: the free parameter and its plausible range, equally likely throughout, by its logarithm if
+    the range excludes zero; source: of the range; excludes: causes for the same quantity, which make no sense together;
+    deciding_measurement: the measurement that would confirm it; replaces_law: it replaces a law of the nominal model
+    that no value of its parameter reproduces
     """
 
     key: str
@@ -29,17 +29,17 @@ class CauseHypothesis:
 
     @property
     def logarithmic(self) -> bool:
-        """Whether the number is fitted by its logarithm."""
+        """Whether the parameter is fitted by its logarithm."""
         return self.low > 0.0
 
     def compute_value(self, fraction: float) -> float:
-        """The number at a share of its range, 0 to 1."""
+        """Return the parameter at a fraction of its range, 0 to 1."""
         if self.logarithmic:
             return exp(log(self.low) + fraction * log(self.high / self.low))
         return self.low + fraction * (self.high - self.low)
 
     def compute_fraction(self, value: float) -> float:
-        """Where in its range a number is, 0 to 1."""
+        """Return the position of a value in the range, 0 to 1."""
         if self.logarithmic:
             return float(np.clip(log(max(value, 1e-300) / self.low) / log(self.high / self.low), 0.0, 1.0))
         return float(np.clip((value - self.low) / (self.high - self.low), 0.0, 1.0))
@@ -50,44 +50,44 @@ GAS_CAUSES, LIFT_CAUSES, FORCE_CAUSES = (
     ("membrane_plate", "gas_membrane"),
     ("force_area", "load_cell_gives"),
 )
-THERMAL_MEASUREMENT = "the absorber's temperature through a pulse and the cooling after it, at three powers"
+THERMAL_MEASUREMENT = "the absorber's temperature during a pulse and the cooling after it, at three powers"
 
 CAUSES = (
     CauseHypothesis(
         "gas_lag",
-        "the gas follows the absorber in another time than R_air C_air / 2",
+        "the gas lags the absorber by a time constant other than R_air C_air / 2",
         "tau_g",
         "s",
         1e-3,
         0.1,
-        "conduction over half the cavity, 1.2 ms, to Text S1's 64 ms and sluggish corners",
+        "conduction over half the cavity, 1.2 ms, to 64 ms of Text S1 and slower corners",
         "displacement at 10 kHz through the first 10 ms of a pulse",
     ),
     CauseHypothesis(
         "gas_share",
-        "the gas settles at another share of the absorber's rise than half",
+        "the gas settles at a share of the absorber's rise other than half",
         "share",
         "1",
         0.1,
         0.5,
         "half at most, conduction both ways",
-        "pressure in a closed cavity, beside displacement",
+        "pressure in a closed cavity together with displacement",
         GAS_CAUSES,
     ),
     CauseHypothesis(
         "membrane_plate",
-        "the constant of the membrane's plate formula is another than 3/1280",
+        "the constant of the membrane's plate formula differs from 3/1280",
         "kappa_factor",
         "1",
         0.05,
         80.0,
-        "3/16 of a clamped plate is 80 times as much; room for the gas takes some of it back",
+        "3/16 of a clamped plate is 80 times as much; the added gas volume compensates part of it",
         "displacement against a known static pressure, to 1 mm",
         LIFT_CAUSES,
     ),
     CauseHypothesis(
         "gas_membrane",
-        "the membrane stretches and the gas makes room under it: no plate, no constant volume",
+        "the membrane stretches and the gas volume grows: neither plate nor constant volume",
         "share",
         "1",
         0.1,
@@ -99,7 +99,7 @@ CAUSES = (
     ),
     CauseHypothesis(
         "force_area",
-        "the blocked force was felt on less than the whole aperture",
+        "the blocked force was measured on less than the whole aperture",
         "area",
         "m^2",
         0.1e-6,
@@ -110,28 +110,28 @@ CAUSES = (
     ),
     CauseHypothesis(
         "load_cell_gives",
-        "the blocked membrane gave way: the gas made room against the load cell",
+        "the blocked membrane yielded: the gas volume grew against the load cell",
         "compliance",
         "m^3/Pa",
         1e-14,
         1e-11,
-        "volume a pascal: 0.08 µL to several cavities at 8 kPa",
+        "volume per pascal: 0.08 µL to several cavities at 8 kPa",
         "blocked force with probes of two areas, and the pressure in the cavity beside it",
         FORCE_CAUSES,
     ),
     CauseHypothesis(
         "absorber_resistance",
-        "the bridges' resistances are all off by one factor",
+        "all bridge resistances are wrong by one factor",
         "r_factor",
         "1",
         0.7,
         1.4,
-        "R fitted on 30 ms of a rise that takes longer",
+        "R was fitted to the first 30 ms of a longer rise",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
         "absorber_capacity",
-        "the absorbers' heat capacities are all off by one factor",
+        "all heat capacities of the absorbers are wrong by one factor",
         "c_factor",
         "1",
         0.7,
@@ -141,12 +141,12 @@ CAUSES = (
     ),
     CauseHypothesis(
         "absorbed_power",
-        "the absorbed power is off by one factor",
+        "the absorbed power is wrong by one factor",
         "power_factor",
         "1",
         0.8,
         1.2,
-        "2.45 W or 2.5, absorption by two routes",
+        "2.45 W or 2.5 W, two estimates of the absorption",
         THERMAL_MEASUREMENT,
     ),
     CauseHypothesis(
@@ -171,7 +171,7 @@ CAUSES = (
     ),
     CauseHypothesis(
         "wall_heating",
-        "the wall at the bridges' far end warms",
+        "the wall at the outer end of the bridges warms up",
         "resistance",
         "K/W",
         0.0,
@@ -181,27 +181,27 @@ CAUSES = (
     ),
     CauseHypothesis(
         "laser_late",
-        "the light comes later than the pulse, in every pulse",
+        "the light of every pulse starts late",
         "delay",
         "s",
         1e-5,
         2.4e-3,
-        "driver and diode, 0.02 to 3 ms, but at 200 Hz there was some; a ramp misses as much energy as a delay",
+        "driver and diode, 0.02 to 3 ms, less at 200 Hz; a ramp loses as much energy as a delay",
         "a photodiode beside the sample",
     ),
     CauseHypothesis(
         "dead_time",
-        "a pixel rate counts a time without light beside each pulse: the mirrors' move and settling",
+        "a pixel rate includes time without light per pulse: move and settling of the mirrors",
         "dead_time",
         "s",
         1e-4,
         5e-3,
-        "small steps of cheap mirrors 0.3 ms, long ones some ms; the paper speaks of pulse times alone",
-        "pixel rates at two distances between pixels, with the mirrors' positions",
+        "small steps of low-cost mirrors 0.3 ms, large steps several ms; the paper states pulse times only",
+        "pixel rates at two pixel distances, with mirror positions",
     ),
     CauseHypothesis(
         "rate_pixel",
-        "the pixel rates are those of a pixel of another bridge width than 0.55 mm",
+        "the pixel rates belong to a bridge width other than 0.55 mm",
         "width",
         "m",
         0.2e-3,
@@ -216,13 +216,10 @@ CAUSES = (
         "1",
         0.3,
         1.0,
-        "Fig. 3F says full power; scanning optics in between lose some",
-        "power at the sample while the pixels of Fig. 3F are scanned",
+        "Fig. 3F states full power; the scanning optics attenuate it",
+        "power at the sample during the scan of Fig. 3F",
     ),
 )
-"""Every cause that can be named."""
+"""All causes that can be identified."""
 
-
-def index_causes() -> dict[str, CauseHypothesis]:
-    """By key."""
-    return {cause.key: cause for cause in CAUSES}
+CAUSES_BY_KEY = {cause.key: cause for cause in CAUSES}

@@ -1,4 +1,4 @@
-"""Which causes the measured facts ask for: fits, a criterion for few numbers, the choice among sets of causes."""
+"""Search for the causes that explain the measured facts: least squares and a corrected information criterion."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,31 +7,31 @@ from math import inf, log
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray
-from optodrive.lab.validation.candidate_causes import CAUSES, CauseHypothesis, index_causes
+from optodrive.lab.validation.candidate_causes import CAUSES, CAUSES_BY_KEY, CauseHypothesis
 from optodrive.lab.validation.corrected_model import CorrectedModel
 from optodrive.lab.validation.measured_facts import Datum
 from optodrive.physics.parameters import ParameterSet
 
 START_FRACTIONS = (0.1, 0.3, 0.5, 0.7, 0.9)
-"""Shares of a cause's range at which its fit may begin."""
+"""Start positions of a fit in the range of a parameter."""
 FRACTION_STEP = 1e-3
-"""Of a share, for differences."""
+"""Step of finite differences."""
 MAX_ITERATIONS = 25
 CHI2_CONVERGED = 1e-2
-"""A fit ends where a round gains less of χ²."""
+"""Decrease of χ² per iteration below which a fit ends."""
 BEAM_WIDTH = 3
-"""Sets of each size from which larger ones are made."""
+"""Number of sets of each size that are extended."""
 REQUIRED_ODDS = 20.0
 """Odds at which one explanation is preferred to another."""
 CAUSE_COST = 2.0 * log(REQUIRED_ODDS * len(CAUSES))
-"""By so much each cause must lower the criterion: odds of SURE after as many causes had an equal chance before."""
+"""Decrease of the criterion required per cause: REQUIRED_ODDS after all causes were equally likely a priori."""
 AICC_INDISTINGUISHABLE = 2.0 * log(REQUIRED_ODDS)
-"""Explanations whose criteria differ by less cannot be told apart."""
+"""Explanations within this difference of the criterion cannot be told apart."""
 
 
 @dataclass(frozen=True)
 class CauseFit:
-    """Causes at work, the shares of their ranges that fit best, χ² and the criterion; lower is better."""
+    """Set of causes with the positions in their ranges that fit best, χ² and the criterion; lower is better."""
 
     keys: tuple[str, ...]
     fractions: tuple[float, ...]
@@ -40,25 +40,26 @@ class CauseFit:
 
     @property
     def values(self) -> dict[str, float]:
-        """The causes' numbers, SI."""
+        """Parameters of the causes, SI."""
         return {
-            key: index_causes()[key].compute_value(share) for key, share in zip(self.keys, self.fractions, strict=True)
+            key: CAUSES_BY_KEY[key].compute_value(fraction)
+            for key, fraction in zip(self.keys, self.fractions, strict=True)
         }
 
     @property
     def cost(self) -> float:
-        """The criterion and the price of the causes."""
+        """Criterion plus the cost of the causes."""
         return compute_cost(self.aicc, len(self.keys))
 
     @property
     def at_limit(self) -> tuple[str, ...]:
-        """Causes whose number lies at an end of its range."""
+        """Causes whose parameter lies at a limit of its range."""
         pairs = zip(self.keys, self.fractions, strict=True)
-        return tuple(key for key, share in pairs if min(share, 1.0 - share) < 1e-3)
+        return tuple(key for key, fraction in pairs if min(fraction, 1.0 - fraction) < 1e-3)
 
 
 class CauseSearch:
-    """The facts in data, the set they are held against, and every fit made so far."""
+    """Search over sets of causes for given facts and a base parameter set, with a cache of all fits."""
 
     def __init__(self, base: ParameterSet, data: Sequence[Datum], causes: Sequence[CauseHypothesis] = CAUSES) -> None:
         self.base, self.data, self.causes = base, tuple(data), tuple(causes)
@@ -68,11 +69,11 @@ class CauseSearch:
         self._fits[frozenset()] = self.nominal
 
     def build_model(self, fit: CauseFit) -> CorrectedModel:
-        """The model of a fit."""
+        """Return the model of a fit."""
         return CorrectedModel(self.base, fit.values)
 
     def fit(self, keys: Sequence[str], start_fit: CauseFit | None = None) -> CauseFit:
-        """Causes fitted together; near: a fit of most of them, to begin from."""
+        """Fit causes together; start_fit: a fit of most of them that provides the start."""
         cached = self._fits.get(frozenset(keys))
         if cached is None:
             cached = self._fit_from_starts(tuple(keys), start_fit or self.nominal)
@@ -80,13 +81,13 @@ class CauseSearch:
         return cached
 
     def choose(self) -> CauseFit:
-        """The set of causes that is worth the most, found size by size from the BEAM best sets one smaller.
+        """Return the set with the least cost, by beam search over the size of the set.
 
-        Causes hide each other (a lag looks like a softer membrane until a dead time is there), so one set a size is
-        not enough to go on from.
+        Causes mask each other (a lag looks like a softer membrane until a dead time is added), so each size keeps
+        BEAM_WIDTH sets.
         """
         best, beam = self.nominal, [self.nominal]
-        # Where even a perfect fit would cost more than the best set so far, no larger one needs a look.
+        # Stop where even a perfect fit of a larger set would cost more than the best set.
         while (
             beam
             and compute_cost(compute_aicc(0.0, len(beam[0].keys) + 1, len(self.data)), len(beam[0].keys) + 1)
@@ -98,15 +99,15 @@ class CauseSearch:
         return best
 
     def fit_additions(self, fit: CauseFit) -> list[CauseFit]:
-        """With each further cause that may stand beside those at work."""
+        """Return the fits with one further cause that is compatible with the set."""
         return [self.fit((*fit.keys, cause.key), fit) for cause in self._list_allowed(fit.keys)]
 
     def fit_removals(self, fit: CauseFit) -> dict[str, CauseFit]:
-        """Without each cause."""
+        """Return the fits without each of the causes."""
         return {key: self.fit([other for other in fit.keys if other != key], fit) for key in fit.keys}
 
     def fit_exchanges(self, fit: CauseFit) -> dict[tuple[str, str], CauseFit]:
-        """With another cause in the place of each: (cause, other) → fit."""
+        """Return the fits with another cause in place of each: (cause, other) → fit."""
         out = {}
         for key in fit.keys:
             rest = [other for other in fit.keys if other != key]
@@ -116,27 +117,27 @@ class CauseSearch:
         return out
 
     def compute_chi2_terms(self, fit: CauseFit) -> FloatArray:
-        """What each fact adds to χ²."""
+        """Return the contribution of each fact to χ²."""
         return np.asarray(self._compute_residuals(fit.keys, np.array(fit.fractions)) ** 2)
 
     def compute_interval(self, fit: CauseFit, key: str) -> tuple[float, float]:
-        """95 % of a cause's number, by the slopes at the fit, within its range."""
+        """Return the linearised 95 % interval of a cause's parameter, clipped to its range."""
         fractions = np.array(fit.fractions)
-        slopes = self._compute_jacobian(fit.keys, fractions, self._compute_residuals(fit.keys, fractions))
-        place = fit.keys.index(key)
-        sigma = float(np.sqrt(np.linalg.pinv(slopes.T @ slopes)[place, place]))
+        jacobian = self._compute_jacobian(fit.keys, fractions, self._compute_residuals(fit.keys, fractions))
+        index = fit.keys.index(key)
+        sigma = float(np.sqrt(np.linalg.pinv(jacobian.T @ jacobian)[index, index]))
         low, high = np.clip(
-            [fit.fractions[place] - 1.96 * sigma, fit.fractions[place] + 1.96 * sigma], 0.0, 1.0
+            [fit.fractions[index] - 1.96 * sigma, fit.fractions[index] + 1.96 * sigma], 0.0, 1.0
         ).tolist()
-        return index_causes()[key].compute_value(low), index_causes()[key].compute_value(high)
+        return CAUSES_BY_KEY[key].compute_value(low), CAUSES_BY_KEY[key].compute_value(high)
 
     def compute_max_chi2_increase(self, fit: CauseFit, key: str) -> float:
-        """The most that a further cause adds to χ² anywhere in its range, everything else as fitted."""
-        ends = (self._evaluate((*fit.keys, key), np.array([*fit.fractions, share])) for share in (0.0, 1.0))
+        """Return the largest increase of χ² by a further cause at the limits of its range, all else as fitted."""
+        ends = (self._evaluate((*fit.keys, key), np.array([*fit.fractions, fraction])) for fraction in (0.0, 1.0))
         return max(end.chi2 for end in ends) - fit.chi2
 
     def _list_allowed(self, keys: Sequence[str]) -> list[CauseHypothesis]:
-        excluded = {other for key in keys for other in index_causes()[key].excludes}
+        excluded = {other for key in keys for other in CAUSES_BY_KEY[key].excludes}
         return [
             cause
             for cause in self.causes
@@ -144,8 +145,10 @@ class CauseSearch:
         ]
 
     def _compute_residuals(self, keys: tuple[str, ...], fractions: FloatArray) -> FloatArray:
-        causes = index_causes()
-        values = {key: causes[key].compute_value(share) for key, share in zip(keys, fractions.tolist(), strict=True)}
+        values = {
+            key: CAUSES_BY_KEY[key].compute_value(fraction)
+            for key, fraction in zip(keys, fractions.tolist(), strict=True)
+        }
         return np.asarray(CorrectedModel(self.base, values).compute_log_errors(self.data) / self._sigma)
 
     def _evaluate(self, keys: tuple[str, ...], fractions: FloatArray) -> CauseFit:
@@ -158,24 +161,24 @@ class CauseSearch:
         starts = [
             np.array([known.get(key, start) for key in keys]) for start in (START_FRACTIONS if new_keys else (0.0,))
         ]
-        start = min(starts, key=lambda shares: float((self._compute_residuals(keys, shares) ** 2).sum()))
+        start = min(starts, key=lambda fractions: float((self._compute_residuals(keys, fractions) ** 2).sum()))
         return self._evaluate(keys, self._minimize(keys, start))
 
     def _minimize(self, keys: tuple[str, ...], fractions: FloatArray) -> FloatArray:
-        """Levenberg and Marquardt, held to the ranges."""
+        """Minimise χ² by Levenberg–Marquardt with bounds."""
         if not keys:
             return fractions
         damping, residuals = 1e-2, self._compute_residuals(keys, fractions)
         chi2 = float(residuals @ residuals)
         for _ in range(MAX_ITERATIONS):
-            slopes = self._compute_jacobian(keys, fractions, residuals)
-            descent = -slopes.T @ residuals
-            # A number that pushes against its limit is held there, so that the others move freely.
-            held = ((fractions <= 0.0) & (descent < 0.0)) | ((fractions >= 1.0) & (descent > 0.0))
-            free = ~held
+            jacobian = self._compute_jacobian(keys, fractions, residuals)
+            descent = -jacobian.T @ residuals
+            # A parameter that pushes against its limit is held there, so that the others move freely.
+            is_held = ((fractions <= 0.0) & (descent < 0.0)) | ((fractions >= 1.0) & (descent > 0.0))
+            free = ~is_held
             reduction = 0.0
             while free.any() and damping < 1e6:
-                normal = slopes[:, free].T @ slopes[:, free]
+                normal = jacobian[:, free].T @ jacobian[:, free]
                 step = np.linalg.solve(
                     normal + damping * (np.diag(np.diag(normal)) + 1e-9 * np.eye(len(normal))), descent[free]
                 )
@@ -206,11 +209,11 @@ class CauseSearch:
 
 
 def compute_aicc(chi2: float, cause_count: int, fact_count: int) -> float:
-    """Akaike's with its correction for few numbers; the errors are known, χ² is −2 log of the likelihood."""
+    """Return Akaike's criterion corrected for small samples; errors are known, so χ² is −2 log likelihood."""
     spare = fact_count - cause_count - 1
     return chi2 + 2.0 * cause_count + 2.0 * cause_count * (cause_count + 1) / spare if spare > 0 else inf
 
 
 def compute_cost(aicc: float, cause_count: int) -> float:
-    """A criterion and the price of so many causes: the set with the least is chosen."""
+    """Return the criterion plus the cost of the causes; the set with the least cost is chosen."""
     return aicc + CAUSE_COST * cause_count

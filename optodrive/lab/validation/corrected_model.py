@@ -1,4 +1,4 @@
-"""What Text S1 says of the measured facts when some of its causes are at work."""
+"""Predictions of the measured facts by Text S1 with some of its hypothetical errors corrected."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,15 +25,15 @@ from optodrive.physics.pixel import GAS_FRACTION, Pixel
 from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA, equilibrium_height_m
 
 CauseValues = Mapping[str, float]
-"""Causes at work and the number of each."""
+"""Active causes and the parameter of each."""
 
 WALL_TAU_S = 1.2
-"""Relaxation time of the wall: the estimate of the shipped surroundings."""
+"""Relaxation time of the wall, as estimated in the shipped parameter set `surroundings`."""
 HALF_PERIOD_S = 2.5e-3
 """Half a period of 200 Hz."""
 MIN_PULSE_S = 1e-5
 MAX_PULSE_S = 1.0
-"""Pulses looked for that reach a height."""
+"""Limits of the search for the pulse that reaches a height."""
 PULSE_FACTS = {
     "dT_peak_w020": (0.20e-3, LONG_PULSE_S),
     "T_peak_w075": (0.75e-3, LONG_PULSE_S),
@@ -43,33 +43,33 @@ PULSE_FACTS = {
     "F_peak_w020": (0.20e-3, LONG_PULSE_S),
     "F_peak_w055": (0.55e-3, LONG_PULSE_S),
 }
-"""Bridge and pulse of the facts that are read from one pulse."""
+"""Bridge width and pulse width of the facts read from one pulse."""
 
 
 GAS_GRID_K = np.linspace(0.0, 1500.0, 6001)
-"""Rises of the gas between which the membrane's height is interpolated."""
+"""Gas rises at which the membrane's displacement is tabulated."""
 
 
 @cache
 def _membrane_table_m() -> FloatArray:
-    """Height of the stretched membrane at GAS_K; only share × rise matters, so one table serves every share."""
+    """Return the displacement of the stretched membrane at GAS_GRID_K; it depends on share × rise only."""
     volume_m3 = load_paper_facts()["V_pixel"].value
     return np.array([equilibrium_height_m(gas_k / AMBIENT_K, volume_m3) for gas_k in GAS_GRID_K])
 
 
 @dataclass(frozen=True)
 class CorrectedModel:
-    """A parameter set with causes at work."""
+    """Parameter set with active causes."""
 
     base: ParameterSet
     values: CauseValues
 
     def compute_log_errors(self, data: Sequence[Datum]) -> FloatArray:
-        """Logarithm of model over measured; of rates, of the height in the time that they leave a pixel."""
+        """Return the logarithms of model over measured; for rates, of the height reached in the time per pixel."""
         return np.array([self._compute_log_error(datum) for datum in data])
 
     def compute_outcome(self, name: str) -> float:
-        """A fact, SI, temperatures as rises; of a height that is out of reach, the rate of the longest pulse."""
+        """Return a fact, SI, temperatures as rises; for an unreachable height, the rate of the longest pulse."""
         if name in RATE_HEIGHTS_M:
             return self._rate_per_s(RATE_HEIGHTS_M[name])
         if name in PULSE_FACTS:
@@ -83,7 +83,7 @@ class CorrectedModel:
         return log(self.compute_outcome(datum.id) / datum.value)
 
     def _build_pixel(self, width_m: float, from_table: bool = True) -> Pixel:
-        """As the literal set has it, scaled; row: R and C of Table S3, else the smooth law between its rows."""
+        """Return the pixel with scaled parameters; R and C from Table S3, or from the smooth law between its rows."""
         base, values = self.base, self.values
         pixel = base.build_pixel(width_m)
         if not from_table:
@@ -109,20 +109,20 @@ class CorrectedModel:
         return freeze_terms(out)
 
     def _on_time_s(self, pulse_s: float) -> float:
-        """How long there is light in a pulse."""
+        """Return the time with light per pulse."""
         return max(pulse_s - self.values.get("laser_late", 0.0), MIN_PULSE_S)
 
     def _train_gas_k(self, pulse_s: float) -> FloatArray:
-        """A steady train's, as long lit as dark, over a period."""
+        """Return the gas rise over a period of a steady train with equal on and off times."""
         on_s = self._on_time_s(pulse_s)
         return train_gas_k(TrainStimulus(self._build_pixel(0.55e-3), on_s, 2.0 * pulse_s - on_s), self._terms)
 
     def _pulse_rises_k(self, pixel: Pixel, pulse_s: float) -> tuple[float, float]:
-        """Absorber's and gas's largest."""
+        """Return the largest rises of absorber and gas."""
         return pulse_rises_k(PulseStimulus(pixel, self._on_time_s(pulse_s)), self._terms)
 
     def _displacement_m(self, gas_k: FloatArray) -> FloatArray:
-        """Displacement of a gas that settles at half the absorber's rise."""
+        """Return the displacement for a gas that settles at half the absorber's rise."""
         values = self.values
         if "gas_membrane" in values:
             return np.interp(values["gas_membrane"] / GAS_FRACTION * gas_k, GAS_GRID_K, _membrane_table_m())
@@ -134,7 +134,7 @@ class CorrectedModel:
         return self.values.get("gas_share", self.values.get("gas_membrane", GAS_FRACTION))
 
     def _force_n(self, gas_k: float) -> float:
-        """Blocked force of a gas that settles at half the absorber's rise."""
+        """Return the blocked force for a gas that settles at half the absorber's rise."""
         aperture_m2 = pi * load_paper_facts()["cavity_r"].value ** 2
         full_n: float = self.base.phi.value * self._gas_share / GAS_FRACTION * gas_k
         if "force_area" in self.values:
@@ -155,7 +155,7 @@ class CorrectedModel:
         return float(self._displacement_m(np.array([gas_k]))[0]) if name.startswith("z_") else absorber_k
 
     def _rate_height_m(self, time_s: float) -> float:
-        """Height that a pixel reaches in the time that a rate leaves it."""
+        """Return the height that a pixel reaches in the time per pixel of a rate."""
         other = "rate_pixel" in self.values
         pixel = self._build_pixel(self.values.get("rate_pixel", 0.55e-3), from_table=not other)
         pixel = pixel._replace(epsilon=pixel.epsilon * self.values.get("rate_power", 1.0))
@@ -174,7 +174,7 @@ class CorrectedModel:
         pixel = self._build_pixel(0.55e-3)
         if name == "dpp_200Hz":
             return float(np.ptp(self._displacement_m(self._train_gas_k(HALF_PERIOD_S))))
-        # Fig. 3D's laws at t_p = t_g = τ, the τ of Table S3 whatever the causes: it is a setting of the drive.
+        # The laws of Fig. 3D at t_p = t_g = τ. τ is that of Table S3 for all causes, as a setting of the drive.
         tau_s = self.base.build_pixel(0.55e-3).tau_s
         first_k = self._pulse_rises_k(pixel, tau_s)[1]
         heights_m = self._displacement_m(np.append(self._train_gas_k(tau_s), first_k))

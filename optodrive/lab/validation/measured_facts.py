@@ -1,4 +1,4 @@
-"""Which of the paper's facts are measurements, how well each is known, and why the others are left out."""
+"""Measured facts of the paper with their errors, and the reasons for excluding the others."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from optodrive.physics.paper_facts import AMBIENT_C, PaperFact
 from optodrive.physics.parameters import ParameterSet
 
 READING_ERROR = 0.05
-"""Relative error of a number read from a figure or rounded in the text, where the paper states none."""
+"""Relative error of a value read from a figure or rounded in the text, where the paper states none."""
 
 GROUPS = {
     "temperatures": ("dT_peak_w020", "T_peak_w075"),
@@ -17,34 +17,34 @@ GROUPS = {
     "rates": ("N_50um", "N_400um"),
     "vibration": ("dpp_200Hz", "dpp_law", "slow_law"),
 }
-"""Measured facts by what was measured."""
+"""Measured facts by measurement."""
 
 MEASURED_IDS = tuple(name for group in GROUPS.values() for name in group)
 
 LAW_R2 = {"dpp_law": 0.95, "slow_law": 0.81}
-"""Two facts are a law at one point: its r² (Fig. 3D) leaves √(1 − r²) of the spread, taken as large as the value."""
+"""r² of two facts that are a law at one point (Fig. 3D); √(1 − r²) is taken as their relative error."""
 
 RATE_HEIGHTS_M = {"N_50um": 50e-6, "N_400um": 400e-6}
-"""Rates are compared as the height reached in the time that they leave a pixel: near the plateau a rate says little."""
+"""Heights of the rates; rates are compared by the height reached per pixel, because they saturate near the plateau."""
 
 EXCLUDED = {
     "T_peak_w020": "the same reading as dT_peak_w020",
-    "z_repeat_w040": "an upper bound, which every model here meets",
-    "F_linear_in_P": "a statement; no number was read",
+    "z_repeat_w040": "an upper bound that every model here satisfies",
+    "F_linear_in_P": "a statement without a value",
     "dT_air_isometric": "inferred from F_peak_w020, not measured",
     "dQ_air": "inferred from F_peak_w020, not measured",
     "eta_stroke": "arithmetic of F_peak_w020 and z_peak_w020",
     "eta_qt": "arithmetic of dQ_air",
     "eta_tm": "arithmetic of eta_stroke and eta_qt",
 }
-"""Outcomes that are no measurements of their own."""
+"""Outcomes that are no independent measurements."""
 
 
 @dataclass(frozen=True)
 class Datum:
-    """One measured number: value in SI (temperatures as rises, K) and its relative standard errors.
+    """Measured value in SI (temperatures as rises, K) with its relative standard errors.
 
-    reading: of the number itself, and its source; scatter: of the sample, which no model of one pixel knows
+    reading_error: of the value itself, with its source; scatter: between samples, which no model of one pixel predicts
     """
 
     id: str
@@ -56,21 +56,22 @@ class Datum:
 
     @property
     def sigma(self) -> float:
-        """Of the logarithm."""
+        """Standard error of the logarithm."""
         return sqrt(self.reading_error**2 + self.scatter**2)
 
 
 def compute_scatter(parameters: ParameterSet) -> float:
-    """Relative scatter from sample to sample, which no model of one pixel can know.
+    """Return the relative scatter between samples, which no model of one pixel predicts.
 
-    The geometric mean of what Table S3 shows of R w and of C: which of them a fact feels depends on its pulse.
+    It is the geometric mean of the scatters of R w and of C in Table S3: a fact depends on either according to its
+    pulse.
     """
     shares = [(item.sigma or 0.0) / item.value for item in (parameters.R_width_product, parameters.C_mean)]
     return sqrt(shares[0] * shares[1])
 
 
 def build_data(facts: Mapping[str, PaperFact], parameters: ParameterSet) -> tuple[Datum, ...]:
-    """The measured facts, in the order of GROUPS."""
+    """Return the measured facts in the order of GROUPS."""
     scatter = compute_scatter(parameters)
     return tuple(_build_datum(facts[name], group, scatter) for group, names in GROUPS.items() for name in names)
 

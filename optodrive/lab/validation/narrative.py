@@ -1,15 +1,15 @@
-"""What the paper's facts say of Text S1, in plain words and as JSON."""
+"""Comparison of Text S1 with the paper's facts as text and as JSON."""
 
 from collections.abc import Sequence
 from typing import Any
 
 from optodrive.lab.diagnosis.narrative import format_quantity
-from optodrive.lab.validation.candidate_causes import index_causes
+from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST
 from optodrive.lab.validation.measured_facts import EXCLUDED, READING_ERROR
 from optodrive.lab.validation.study import (
     UNEXPLAINED_SIGMA,
-    LeaveOutPrediction,
+    HeldOutPrediction,
     NamedCause,
     StudyResult,
     UnchosenCause,
@@ -17,32 +17,33 @@ from optodrive.lab.validation.study import (
 )
 
 SCALED_UNITS = {"m^3/Pa": (1e12, "µL/kPa"), "m^2": (1e6, "mm²")}
-"""Units whose prefixes are powers."""
-HEADINGS = ("left out", "causes chosen without", "literal", "extended", "off by")
+"""Units whose prefixes are raised to powers."""
+HEADINGS = ("held out", "causes chosen without", "nominal", "extended", "error factor")
 
 
 def format_value(key: str, value: float) -> str:
-    """A cause's number in readable units."""
-    unit = index_causes()[key].unit
+    """Return the parameter of a cause in readable units."""
+    unit = CAUSES_BY_KEY[key].unit
     scale, name = SCALED_UNITS.get(unit, (1.0, ""))
     return f"{value * scale:.3g} {name}" if name else format_quantity(value, unit)
 
 
 def describe_findings(result: StudyResult) -> list[str]:
-    """What is wrong, what causes it, what the facts refuse by themselves, what is not it."""
+    """Return the lines on the error, its causes, contradictions among the facts and rejected causes."""
     facts = len(result.data)
     lines = [
         f"Text S1 as it stands ({result.base}) misses {facts} measured facts by a factor of "
         f"{compute_error_factor(result.nominal_ratios):.2f}, χ² {result.nominal_fit.chi2:.0f}."
     ]
     if not result.named:
-        lines.append("No cause earns its place: within the facts' errors nothing is wrong with it.")
+        lines.append("No cause is needed: it agrees with the facts within their errors.")
     else:
-        lines += ["", "What it gets wrong:"]
+        lines += ["", "Causes:"]
         lines += [line for item in result.named for line in _describe_named(item)]
         lines += [
             "",
-            f"With {'it' if len(result.named) == 1 else 'these'} the factor is {compute_error_factor(result.extended_ratios):.3g}, "
+            f"With {'it' if len(result.named) == 1 else 'these'} the factor is "
+            f"{compute_error_factor(result.extended_ratios):.3g}, "
             f"χ² {result.fit.chi2:.1f} with {facts - len(result.named)} degrees of freedom.",
         ]
     if result.unexplained:
@@ -55,34 +56,35 @@ def describe_findings(result: StudyResult) -> list[str]:
 
 
 def _describe_named(item: NamedCause) -> list[str]:
-    cause = index_causes()[item.key]
-    numbers = f"{format_value(item.key, item.value)} (95 %: {format_value(item.key, item.low)} to {format_value(item.key, item.high)})"
+    cause = CAUSES_BY_KEY[item.key]
+    value, low, high = (format_value(item.key, number) for number in (item.value, item.low, item.high))
     lines = [
         f"- {cause.description} ({item.key}).",
-        f"  {cause.symbol} = {numbers}; without it χ² grows by {item.chi2_reduction:.0f}.",
+        f"  {cause.symbol} = {value} (95 %: {low} to {high}); without it χ² grows by {item.chi2_reduction:.0f}.",
     ]
     lines += [
-        f"  Or: {index_causes()[other].description} ({other}). The facts cannot tell." for other in item.alternatives
+        f"  Or: {CAUSES_BY_KEY[other].description} ({other}); the facts cannot decide." for other in item.alternatives
     ]
     if len(item.evidence) == 1:
-        lines.append(f"  It rests on one number, {item.evidence[0]}: another explanation of that one would do.")
+        lines.append(f"  Evidence: {item.evidence[0]} alone; another explanation of that value would suffice.")
     else:
-        lines.append(f"  It rests on {', '.join(item.evidence)}.")
+        lines.append(f"  Evidence: {', '.join(item.evidence)}.")
     return lines
 
 
 def _describe_contradictions(result: StudyResult) -> list[str]:
     lines = [f"- {item.description}." for item in result.contradictions]
     if lines:
-        lines = ["", "What the facts refuse by themselves, whatever is fitted:", *lines]
+        lines = ["", "Assumptions contradicted by the facts alone, independent of any fit:", *lines]
     unchosen = {item.key: item for item in result.unchosen}
     membrane, plate = unchosen.get("gas_membrane"), unchosen.get("membrane_plate")
-    if result.contradictions and membrane and membrane.verdict == "as good" and membrane.value is not None:
-        best_factor = "" if plate is None or plate.value is None else f", {plate.value:.2f} times it would be best"
+    law = CAUSES_BY_KEY["gas_membrane"].description
+    if result.contradictions and membrane and membrane.verdict == "alternative law" and membrane.value is not None:
+        best_factor = "" if plate is None or plate.value is None else f", {plate.value:.2f} times it fits best"
         lines.append(
-            f"  No height shows it, for Text S1's displacement per kelvin is right by chance{best_factor}. The other way, "
-            f"{index_causes()['gas_membrane'].description}, with a gas at {membrane.value:.2f} of the absorber's rise, does as "
-            f"well (gas_membrane, χ² {-membrane.chi2_reduction_added:+.1f})."
+            "  The heights do not show it, because the displacement per kelvin of Text S1 is right by "
+            f"chance{best_factor}. The alternative law, {law}, with a gas at {membrane.value:.2f} of the absorber's "
+            f"rise, fits as well (gas_membrane, χ² {-membrane.chi2_reduction_added:+.1f})."
         )
     return lines
 
@@ -93,33 +95,33 @@ def _describe_ruled_out(candidates: Sequence[UnchosenCause]) -> list[str]:
     if ruled_out:
         lines += [
             "",
-            "Ruled out: each takes much of χ² alone or in a named cause's place, but leaves much and adds nothing:",
+            "Ruled out: each reduces χ² much alone or in place of a cause above, but leaves much and adds little:",
         ]
         lines += [
-            f"- {index_causes()[item.key].description} ({item.key}): {max(0.0, item.chi2_reduction_alone):.0f} alone"
+            f"- {CAUSES_BY_KEY[item.key].description} ({item.key}): {max(0.0, item.chi2_reduction_alone):.0f} alone"
             + (
-                f", {100 * item.replaced_fraction:.0f} % of what {item.replaces} takes in its place"
+                f", {100 * item.replaced_fraction:.0f} % of the reduction by {item.replaces} in its place"
                 if item.replaces
                 else ""
             )
-            + f", {abs(item.chi2_reduction_added):.1f} beside them"
+            + f", {abs(item.chi2_reduction_added):.1f} in addition"
             for item in ruled_out
         ]
-    for verdict, words in (("not needed", "Not needed"), ("not shown", "These facts cannot show")):
+    for verdict, title in (("not needed", "Not needed"), ("not observable", "Not observable in these facts")):
         keys = [item.key for item in candidates if item.verdict == verdict]
         if keys:
-            lines.append(f"{words}: {', '.join(keys)}.")
+            lines.append(f"{title}: {', '.join(keys)}.")
     return lines
 
 
 def build_rows(result: StudyResult) -> list[tuple[str, ...]]:
-    """The predictions as text under HEADINGS."""
+    """Return the held-out predictions as text under HEADINGS."""
     return [_build_row(item) for item in (*result.group_predictions, *result.fact_predictions)]
 
 
-def _build_row(item: LeaveOutPrediction) -> tuple[str, ...]:
+def _build_row(item: HeldOutPrediction) -> tuple[str, ...]:
     causes = ", ".join(item.causes) or "none"
-    ratios = (" ".join(f"{ratio:.2f}" for ratio in side) for side in (item.nominal, item.extended))
+    ratios = (" ".join(f"{ratio:.2f}" for ratio in values) for values in (item.nominal, item.extended))
     return (
         item.label,
         causes,
@@ -129,53 +131,58 @@ def _build_row(item: LeaveOutPrediction) -> tuple[str, ...]:
 
 
 def describe_predictions(result: StudyResult) -> list[str]:
-    """The gain, where nothing can be predicted, and what would settle the rest."""
+    """Return the lines on the gain, on unpredictable facts and on measurements to make."""
     groups, each = compute_overall_factors(result.group_predictions), compute_overall_factors(result.predictions)
-    lines = [f"Predicted without having been seen, all groups: off by {groups[0]:.2f} before, {groups[1]:.2f} after."]
+    lines = [f"Held-out predictions, all groups: error factor {groups[0]:.2f} nominal, {groups[1]:.2f} extended."]
     for item in result.unpredictable:
-        lost = ", ".join(item.unobservable)
-        lines.append(f"Only {item.label} show {lost}: without them nothing mends it.")
+        unobservable = ", ".join(item.unobservable)
+        lines.append(f"Only {item.label} show {unobservable}: it cannot be predicted without them.")
     lines += [
         f"Of these, {item.label} alone shows {', '.join(item.unobservable)}."
         for item in result.fact_predictions
         if item.unobservable
     ]
     if result.unpredictable:
-        lines.append(f"Those fact by fact, the others by groups: off by {each[0]:.2f} before, {each[1]:.2f} after.")
+        lines.append(
+            f"These fact by fact, the others by groups: error factor {each[0]:.2f} nominal, {each[1]:.2f} extended."
+        )
     measurements: dict[str, None] = {}
     for cause in result.named:
         if cause.alternatives or len(cause.evidence) == 1:
-            measurements[index_causes()[cause.key].deciding_measurement] = None
+            measurements[CAUSES_BY_KEY[cause.key].deciding_measurement] = None
     for candidate in result.unchosen:
-        if candidate.verdict == "as good":
-            measurements[index_causes()[candidate.key].deciding_measurement] = None
+        if candidate.verdict == "alternative law":
+            measurements[CAUSES_BY_KEY[candidate.key].deciding_measurement] = None
     if measurements:
-        lines += ["", "Measure next:", *(f"- {words}." for words in measurements)]
+        lines += ["", "Measure next:", *(f"- {measurement}." for measurement in measurements)]
     return lines
 
 
-def compute_overall_factors(left_out: Sequence[LeaveOutPrediction]) -> tuple[float, float]:
-    """The factor over all facts, before and after."""
-    nominal = [ratio for item in left_out for ratio in item.nominal]
-    return compute_error_factor(nominal), compute_error_factor([ratio for item in left_out for ratio in item.extended])
+def compute_overall_factors(predictions: Sequence[HeldOutPrediction]) -> tuple[float, float]:
+    """Return the error factors over all facts, nominal and extended."""
+    nominal = [ratio for item in predictions for ratio in item.nominal]
+    return compute_error_factor(nominal), compute_error_factor(
+        [ratio for item in predictions for ratio in item.extended]
+    )
 
 
 def describe_assumptions(result: StudyResult) -> list[str]:
-    """How well the facts are taken to be known."""
+    """Return the lines on the errors assumed for the facts."""
     scatter = result.data[0].scatter
     return [
-        f"Errors: {100 * scatter:.0f} % from sample to sample (the scatter of R and C in Table S3), and of reading "
-        f"what the paper states, else {100 * READING_ERROR:.0f} %; the two laws of Fig. 3D by their r².",
-        f"A cause is named if it lowers AICc by {CAUSE_COST:.1f}; explanations within {AICC_INDISTINGUISHABLE:.1f} cannot be told apart.",
+        f"Errors: {100 * scatter:.0f} % between samples (the scatter of R and C in Table S3), and of reading as stated "
+        f"in the paper, else {100 * READING_ERROR:.0f} %; the two laws of Fig. 3D by their r².",
+        f"A cause is identified if it reduces AICc by {CAUSE_COST:.1f}; explanations within "
+        f"{AICC_INDISTINGUISHABLE:.1f} are indistinguishable.",
     ]
 
 
 def build_study_answer(result: StudyResult) -> dict[str, Any]:
-    """The same as JSON, SI units; temperatures as rises, K."""
+    """Return the result as JSON values, SI units; temperatures as rises, K."""
     groups, each = compute_overall_factors(result.group_predictions), compute_overall_factors(result.predictions)
     sides = zip(result.data, result.nominal_ratios, result.extended_ratios, result.errors_sigma, strict=True)
     return {
-        "nominal": result.base,
+        "parameter_set": result.base,
         "facts": [
             {
                 "id": datum.id,
@@ -183,74 +190,75 @@ def build_study_answer(result: StudyResult) -> dict[str, Any]:
                 "value": datum.value,
                 "relative_error": datum.sigma,
                 "reading": {"relative_error": datum.reading_error, "source": datum.source},
-                "literal_ratio": before,
-                "extended_ratio": after,
-                "misses_by_sigma": miss,
+                "nominal_ratio": nominal,
+                "extended_ratio": extended,
+                "error_sigma": error,
             }
-            for datum, before, after, miss in sides
+            for datum, nominal, extended, error in sides
         ],
-        "not_data": dict(EXCLUDED),
+        "excluded": dict(EXCLUDED),
         "chi2": {
-            "literal": result.nominal_fit.chi2,
+            "nominal": result.nominal_fit.chi2,
             "extended": result.fit.chi2,
             "degrees_of_freedom": len(result.data) - len(result.named),
         },
         "factor": {
-            "literal": compute_error_factor(result.nominal_ratios),
+            "nominal": compute_error_factor(result.nominal_ratios),
             "extended": compute_error_factor(result.extended_ratios),
         },
-        "named_from_aicc": CAUSE_COST,
-        "alike_within_aicc": AICC_INDISTINGUISHABLE,
+        "aicc_per_cause": CAUSE_COST,
+        "aicc_indistinguishable": AICC_INDISTINGUISHABLE,
         "causes": [
             {
                 "cause": item.key,
-                "words": index_causes()[item.key].description,
-                "parameter": index_causes()[item.key].symbol,
+                "description": CAUSES_BY_KEY[item.key].description,
+                "parameter": CAUSES_BY_KEY[item.key].symbol,
                 "value": item.value,
-                "unit": index_causes()[item.key].unit,
+                "unit": CAUSES_BY_KEY[item.key].unit,
                 "ci95": [item.low, item.high],
-                "chi2_taken": item.chi2_reduction,
-                "rests_on": list(item.evidence),
-                "alike": list(item.alternatives),
-                "settled_by": index_causes()[item.key].deciding_measurement,
+                "chi2_reduction": item.chi2_reduction,
+                "evidence": list(item.evidence),
+                "alternatives": list(item.alternatives),
+                "deciding_measurement": CAUSES_BY_KEY[item.key].deciding_measurement,
             }
             for item in result.named
         ],
         "candidates": [
             {
                 "cause": item.key,
-                "words": index_causes()[item.key].description,
+                "description": CAUSES_BY_KEY[item.key].description,
                 "verdict": item.verdict,
                 "value": item.value,
-                "unit": index_causes()[item.key].unit,
-                "chi2_taken_alone": item.chi2_reduction_alone,
-                "chi2_taken_beside": item.chi2_reduction_added,
-                "best_in_place_of": item.replaces,
-                "chi2_share_there": item.replaced_fraction,
+                "unit": CAUSES_BY_KEY[item.key].unit,
+                "chi2_reduction_alone": item.chi2_reduction_alone,
+                "chi2_reduction_added": item.chi2_reduction_added,
+                "replaces": item.replaces,
+                "replaced_fraction": item.replaced_fraction,
             }
             for item in result.unchosen
         ],
         "contradictions": [
-            {"assumption": item.key, "words": item.description, "ratio": item.ratio} for item in result.contradictions
+            {"assumption": item.key, "description": item.description, "ratio": item.ratio}
+            for item in result.contradictions
         ],
         "unexplained": list(result.unexplained),
         "gain": {
             "groups": [_prediction_to_json(item) for item in result.group_predictions],
             "facts": [_prediction_to_json(item) for item in result.fact_predictions],
-            "factor_groups": {"before": groups[0], "after": groups[1]},
-            "factor_each": {"before": each[0], "after": each[1]},
+            "factor_groups": {"nominal": groups[0], "extended": groups[1]},
+            "factor_each": {"nominal": each[0], "extended": each[1]},
         },
     }
 
 
-def _prediction_to_json(item: LeaveOutPrediction) -> dict[str, Any]:
+def _prediction_to_json(item: HeldOutPrediction) -> dict[str, Any]:
     return {
-        "left_out": item.label,
+        "held_out": item.label,
         "facts": list(item.facts),
         "causes": list(item.causes),
-        "lost": list(item.unobservable),
-        "before_ratio": list(item.nominal),
-        "after_ratio": list(item.extended),
-        "before": compute_error_factor(item.nominal),
-        "after": compute_error_factor(item.extended),
+        "unobservable": list(item.unobservable),
+        "nominal_ratio": list(item.nominal),
+        "extended_ratio": list(item.extended),
+        "nominal_factor": compute_error_factor(item.nominal),
+        "extended_factor": compute_error_factor(item.extended),
     }

@@ -1,4 +1,4 @@
-"""Which of the paper's facts a parameter set can speak to, how, and why it is silent on the others."""
+"""Closed-form predictions of the paper's facts by a parameter set, and why other facts are not modelled."""
 
 from collections.abc import Callable
 
@@ -12,13 +12,13 @@ OutcomeFunction = Callable[[ParameterSet], float]
 FULL_POWER_W = load_paper_facts()["incident_power"].value
 GAS_J_PER_K = load_paper_facts()["C_gas"].value
 LONG_PULSE_S = 50e-3
-"""The paper's pulse for peak temperatures, displacements and forces."""
+"""The paper's pulse width for peak temperatures, displacements and forces."""
 
 FITTED_ON = {"kappa": "z_peak_w020", "tau_g": "dpp_200Hz", "phi": "F_peak_w020"}
-"""Parameters of the calibrated set and the one fact each was fitted on; every other outcome is predicted."""
+"""Parameters of the calibrated set and the one fact each was fitted to; every other outcome is a prediction."""
 
 DERIVED_FROM_FITTED = {"eta_stroke"}
-"""Outcomes made of fitted facts alone, hence no test of the set."""
+"""Outcomes computed from fitted facts only, hence no test of the set."""
 
 EXTENDED_FITTED_ON = {
     "bridge_conductivity.exponent": "dT_peak_w020",
@@ -26,10 +26,10 @@ EXTENDED_FITTED_ON = {
     "tau_g": "dpp_200Hz",
     "force_area.area": "F_peak_w020",
 }
-"""The extended set's parameters and their facts: the calibrated set's, and the temperature of the same pixel."""
+"""Parameters of the extended set and their facts: those of the calibrated set and the temperature of the same pixel."""
 
 EXTENDED_DERIVED_FROM_FITTED = {"T_peak_w020", "dT_air_isometric", "dQ_air", "eta_stroke", "eta_qt", "eta_tm"}
-"""Outcomes that follow from these by arithmetic; the gas is had from the force as the paper had it."""
+"""Outcomes that follow from these by arithmetic; the gas rise is derived from the force as in the paper."""
 
 
 def _rise_k(width_mm: float) -> OutcomeFunction:
@@ -136,7 +136,7 @@ INPUTS: dict[str, OutcomeFunction] = {
     "R_of_w": _r_width_product_k_m_per_w,
     "energy_range_high": lambda s: FULL_POWER_W * LONG_PULSE_S,
 }
-"""Facts that a set takes from the paper, read back from it or followed from it by arithmetic alone."""
+"""Facts that a set takes from the paper or that follow from it by arithmetic."""
 
 OUTCOMES: dict[str, OutcomeFunction] = {
     "T_peak_w020": _temperature_c(0.20),
@@ -160,39 +160,39 @@ OUTCOMES: dict[str, OutcomeFunction] = {
     "dpp_law": _dpp_over_first,
     "slow_law": _mean_over_first,
 }
-"""Facts that follow from a set: fitted on (FITTED_ON) or predicted."""
+"""Facts that follow from a set: fitted (FITTED_ON) or predicted."""
 
 NOT_MODELLED = {
-    "incident_power": "the drive of every other row",
+    "incident_power": "the drive of all other rows",
     "acrylic_transmission": "a part of ε: 0.924 × 0.723 = 0.668",
     "pgs_absorption": "a part of ε: 0.924 × 0.723 = 0.668",
     "pwm_frequency": "a setting of the laser",
-    "T_fea_w020": "the outcome of another model, the paper's finite elements",
-    "T_fea_w075": "the outcome of another model, the paper's finite elements",
-    "z_fea_w020": "the outcome of another model, the paper's finite elements",
-    "z_fea_w075": "the outcome of another model, the paper's finite elements",
-    "V_pixel": "displacement is linear in gas rise here, no volume appears",
-    "energy_range_low": "the paper names no pulse width or height that belongs to it",
-    "C_gas": "turns a gas rise into heat (dQ_air, eta_qt, eta_tm), and sets tau_g of the literal set",
-    "membrane_E": "sets kappa of the literal set; the calibrated set takes kappa from a displacement",
-    "membrane_nu": "sets kappa of the literal set; the calibrated set takes kappa from a displacement",
-    "membrane_h": "sets kappa of the literal set; the calibrated set takes kappa from a displacement",
-    "cavity_r": "sets kappa and phi of the literal set",
-    "pitch_display": "the lattice, no matter of one pixel",
-    "pitch_perception": "the lattice, no matter of one pixel",
-    "pgs_k": "R is taken from Table S3; R from k needs the bridges' length, which the paper does not give",
+    "T_fea_w020": "an outcome of the paper's finite element model",
+    "T_fea_w075": "an outcome of the paper's finite element model",
+    "z_fea_w020": "an outcome of the paper's finite element model",
+    "z_fea_w075": "an outcome of the paper's finite element model",
+    "V_pixel": "displacement is linear in the gas rise here, without a volume",
+    "energy_range_low": "the paper states no pulse width or height for it",
+    "C_gas": "converts a gas rise to heat (dQ_air, eta_qt, eta_tm), and determines tau_g of the literal set",
+    "membrane_E": "determines kappa of the literal set; the calibrated set takes kappa from a displacement",
+    "membrane_nu": "determines kappa of the literal set; the calibrated set takes kappa from a displacement",
+    "membrane_h": "determines kappa of the literal set; the calibrated set takes kappa from a displacement",
+    "cavity_r": "determines kappa and phi of the literal set",
+    "pitch_display": "a property of the lattice, not of one pixel",
+    "pitch_perception": "a property of the lattice, not of one pixel",
+    "pgs_k": "R is taken from Table S3; R from k requires the bridge length, which the paper does not state",
 }
-"""Facts that no parameter set here can speak to, and why."""
+"""Facts that no parameter set here can predict, and why."""
 
 REMARKS = {
-    "F_peak_w055": "from w = 0.20 to 0.55 mm the force falls to 0.56, the gas rise to 0.47: no single φ gives both",
-    "dT_air_isometric": "20.5 K comes from the force, taken on the whole aperture at constant volume; a membrane at "
-    "0.97 mm adds 44 % to the volume, which no gas does that is less than 100 K warmer",
+    "F_peak_w055": "from w = 0.20 to 0.55 mm the force falls to 0.56, the gas rise to 0.47: no single φ fits both",
+    "dT_air_isometric": "20.5 K follows from the force on the whole aperture at constant volume; a membrane at "
+    "0.97 mm adds 44 % to the volume, which requires a gas rise of more than 100 K",
     "dQ_air": "follows dT_air_isometric; 0.18 mJ for 20.5 K is 8.8 µJ/K, where C_gas is 10",
     "eta_qt": "follows dT_air_isometric",
     "eta_tm": "follows dT_air_isometric: the same work from more heat",
-    "N_50um": "217/s leaves 4.6 ms a pulse, which lifts the model twice as high; at every width of Table S3 it makes "
-    "374/s or more; the measured 155 µm at 8 ms points to some 90 µm there too",
-    "N_400um": "26.5/s leaves 37.7 ms a pulse, 7 % too high here; near the plateau 7 % of height is 24 % of time",
+    "N_50um": "217/s leaves 4.6 ms per pulse, in which the model rises twice as high; at every width of Table S3 it "
+    "reaches 374/s or more; the measured 155 µm at 8 ms also implies some 90 µm there",
+    "N_400um": "26.5/s leaves 37.7 ms per pulse, 7 % too high here; near the plateau 7 % of height is 24 % of time",
 }
-"""What there is to say where the calibrated set misses by more than 15 %."""
+"""Explanations of the deviations of the calibrated set of more than 15 %."""

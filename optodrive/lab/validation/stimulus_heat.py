@@ -1,4 +1,4 @@
-"""Absorber and gas under the paper's stimuli: in closed form, and simulated where a cause has none."""
+"""Rises of absorber and gas for the paper's stimuli: in closed form, or simulated if terms are active."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -13,11 +13,11 @@ from optodrive.physics.pixel import Pixel, advance, cooling_peak
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
 
 PERIOD_SAMPLES = 48
-"""Of a period of a steady train."""
+"""Samples per period of a steady train."""
 PEAK_TIMES_TAU = np.concatenate([[0.0], np.geomspace(0.02, 1.5, 24)])
-"""When a simulated gas is looked at after a pulse, in its own time constants: its peak lies there."""
+"""Sample times of the gas after a pulse, in its time constants; its peak lies in this range."""
 SETTLING_PERIODS = 5
-"""Periods of a simulated train after the mean power has settled."""
+"""Simulated periods of a train after settling at the mean power."""
 
 
 class PulseStimulus(NamedTuple):
@@ -28,7 +28,7 @@ class PulseStimulus(NamedTuple):
 
 
 class TrainStimulus(NamedTuple):
-    """A steady train at full power."""
+    """Steady train at full power."""
 
     pixel: Pixel
     on_s: float
@@ -40,17 +40,17 @@ FrozenTerms = tuple[tuple[str, tuple[tuple[str, float], ...]], ...]
 
 
 def freeze_terms(terms: Mapping[str, Mapping[str, float]]) -> FrozenTerms:
-    """As a key of the caches."""
-    return tuple((key, tuple(own.items())) for key, own in terms.items())
+    """Return terms as a key for the caches."""
+    return tuple((key, tuple(values.items())) for key, values in terms.items())
 
 
 def _build_active_terms(terms: FrozenTerms) -> ActiveTerms:
-    return ActiveTerms.from_values({key: dict(own) for key, own in terms})
+    return ActiveTerms.from_values({key: dict(values) for key, values in terms})
 
 
 @lru_cache(maxsize=100_000)
 def pulse_rises_k(pulse: PulseStimulus, terms: FrozenTerms) -> tuple[float, float]:
-    """Absorber's rise at the end of a pulse from rest, and the gas's largest rise, K."""
+    """Return the absorber's rise at the end of a pulse from the cold state, and the largest gas rise, K."""
     pixel, width_s = pulse
     if not terms:
         theta_k, gamma_k = advance(pixel, 0.0, 0.0, FULL_POWER_W, width_s)
@@ -68,7 +68,7 @@ def _train_gas_bytes(train: TrainStimulus, terms: FrozenTerms) -> bytes:
 
 
 def train_gas_k(train: TrainStimulus, terms: FrozenTerms) -> FloatArray:
-    """The gas's rise, K, at SAMPLES + 1 equal steps of one period of the steady train."""
+    """Return the gas rise, K, at PERIOD_SAMPLES + 1 equidistant times of one period of the steady train."""
     return np.frombuffer(_train_gas_bytes(train, terms))
 
 
@@ -76,10 +76,10 @@ def _closed_form_gas_k(train: TrainStimulus) -> FloatArray:
     pixel, on_s, off_s = train
 
     def advance_period(theta_k: float, gamma_k: float) -> FloatArray:
-        lit = advance(pixel, theta_k, gamma_k, FULL_POWER_W, on_s)
-        return np.array(advance(pixel, *lit, 0.0, off_s))
+        gate_off_state = advance(pixel, theta_k, gamma_k, FULL_POWER_W, on_s)
+        return np.array(advance(pixel, *gate_off_state, 0.0, off_s))
 
-    # A period maps states linearly, so the state that it maps to itself solves two equations.
+    # A period maps states linearly; the steady state is the fixed point of that map.
     offset = advance_period(0.0, 0.0)
     matrix = np.stack([advance_period(1.0, 0.0) - offset, advance_period(0.0, 1.0) - offset], axis=1)
     state = np.linalg.solve(np.eye(2) - matrix, offset)
@@ -98,7 +98,7 @@ def _closed_form_gas_k(train: TrainStimulus) -> FloatArray:
 
 
 def _simulated_gas_k(train: TrainStimulus, terms: FrozenTerms) -> FloatArray:
-    """The mean power first, until it has settled; then the train, begun in mid-pulse, where it crosses its mean."""
+    """Simulate the mean power until it has settled, then the train, starting in mid-pulse where it crosses its mean."""
     pixel, on_s, off_s = train
     period_s = on_s + off_s
     preheat_s = 6.0 * (pixel.tau_s + pixel.tau_g_s) + LONG_PULSE_S

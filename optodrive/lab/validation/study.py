@@ -1,11 +1,11 @@
-"""The whole question: which causes the facts ask for, what is like them, and what they predict of facts left out."""
+"""Study of Text S1: necessary causes, their alternatives, and predictions of held-out facts."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from optodrive.lab.validation.candidate_causes import index_causes
+from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import AICC_INDISTINGUISHABLE, CAUSE_COST, CauseFit, CauseSearch
 from optodrive.lab.validation.contradictions import Contradiction, find_contradictions
 from optodrive.lab.validation.measured_facts import GROUPS, Datum, build_data
@@ -13,21 +13,21 @@ from optodrive.physics.paper_facts import PaperFact
 from optodrive.physics.parameters import ParameterSet
 
 CHI2_NOT_OBSERVABLE = 4.0
-"""A cause that changes χ² by less, at either end of its range, is one that these facts cannot show: two σ."""
+"""A cause that changes χ² by less than this at both limits of its range is not observable: two σ."""
 EVIDENCE_FRACTION = 0.8
-"""A cause rests on the facts that hold so much of what it takes."""
+"""The evidence for a cause is the facts that hold this share of its reduction of χ²."""
 RULED_OUT_FRACTION = 0.5
-"""A cause that takes so much in a named one's place is told as ruled out, not as idle."""
+"""A cause that achieves this share of another's reduction counts as ruled out rather than as not needed."""
 UNEXPLAINED_SIGMA = 2.0
-"""Standard errors from which a fact counts as unexplained."""
+"""Deviation in standard errors from which a fact counts as unexplained."""
 
 
 @dataclass(frozen=True)
 class NamedCause:
-    """A cause that is needed: its number and 95 % of it.
+    """Necessary cause with its parameter and 95 % interval.
 
-    taken: by how much χ² grows without it; rests_on: the facts that hold most of that; alike: causes that would do
-    as well
+    chi2_reduction: increase of χ² without it; evidence: the facts that hold most of that; alternatives: causes that fit
+    as well in its place
     """
 
     key: str
@@ -41,13 +41,13 @@ class NamedCause:
 
 @dataclass(frozen=True)
 class UnchosenCause:
-    """A cause that is not in the chosen set.
+    """Cause outside the chosen set.
 
-    verdict: "alike" one that is, "as good" beside them in the place of a law, "not shown" by these facts whatever its
-    number, "ruled out" though it takes enough alone or HALF in a named one's place, or "not needed"
-    value: its number beside the chosen causes, None where it cannot stand there; alone, beside: χ² that it takes from
-    the nominal model, and from the chosen causes; place: the named cause that it replaces best, '' where it can replace
-    none; regained: the share of that cause's χ² that it takes there
+    verdict: "alternative cause" for a chosen one; "alternative law" in addition to the chosen causes; "not observable"
+    in these facts; "ruled out" although it reduces χ² enough alone or by RULED_OUT_FRACTION in place of a chosen cause;
+    or "not needed". value: its parameter beside the chosen causes, None where it is incompatible with them.
+    chi2_reduction_alone, chi2_reduction_added: from the nominal model, and from the chosen causes; replaces: the chosen
+    cause that it replaces best, or ''; replaced_fraction: the share of that cause's reduction of χ² that it achieves
     """
 
     key: str
@@ -60,10 +60,10 @@ class UnchosenCause:
 
 
 @dataclass(frozen=True)
-class LeaveOutPrediction:
-    """Facts left out of choice and fit, and predicted.
+class HeldOutPrediction:
+    """Prediction of facts held out of choice and fit.
 
-    before, after: ratios model over measured, nominal and extended; lost: named causes that no fact left shows
+    nominal, extended: ratios model over measured; unobservable: named causes that no remaining fact shows
     """
 
     label: str
@@ -76,7 +76,7 @@ class LeaveOutPrediction:
 
 @dataclass(frozen=True)
 class StudyResult:
-    """All there is to tell; nominal, extended: model over measured, fact by fact; misses: in standard errors."""
+    """Result of a study; nominal_ratios, extended_ratios: model over measured, by fact."""
 
     base: str
     data: tuple[Datum, ...]
@@ -88,33 +88,33 @@ class StudyResult:
     named: tuple[NamedCause, ...]
     unchosen: tuple[UnchosenCause, ...]
     contradictions: tuple[Contradiction, ...]
-    group_predictions: tuple[LeaveOutPrediction, ...]
-    fact_predictions: tuple[LeaveOutPrediction, ...]
+    group_predictions: tuple[HeldOutPrediction, ...]
+    fact_predictions: tuple[HeldOutPrediction, ...]
 
     @property
-    def unpredictable(self) -> tuple[LeaveOutPrediction, ...]:
-        """Groups that alone show one of the named causes."""
+    def unpredictable(self) -> tuple[HeldOutPrediction, ...]:
+        """Groups of facts that alone show one of the named causes."""
         return tuple(item for item in self.group_predictions if item.unobservable)
 
     @property
-    def predictions(self) -> tuple[LeaveOutPrediction, ...]:
-        """Each fact once: with its whole group left out, or by itself where nothing else shows a cause."""
-        lost = {name for group in self.unpredictable for name in group.facts}
+    def predictions(self) -> tuple[HeldOutPrediction, ...]:
+        """Predictions with each fact once: held out with its group, or alone where only its group shows a cause."""
+        held_out_alone = {name for group in self.unpredictable for name in group.facts}
         return tuple(
             item
             for item in (*self.group_predictions, *self.fact_predictions)
-            if item.label in lost or not item.unobservable
+            if item.label in held_out_alone or not item.unobservable
         )
 
     @property
     def unexplained(self) -> tuple[str, ...]:
-        """Facts that the extended model misses."""
+        """Facts that the extended model does not explain."""
         pairs = zip(self.data, self.errors_sigma, strict=True)
-        return tuple(datum.id for datum, miss in pairs if abs(miss) > UNEXPLAINED_SIGMA)
+        return tuple(datum.id for datum, error in pairs if abs(error) > UNEXPLAINED_SIGMA)
 
 
 def compute_error_factor(ratios: Sequence[float]) -> float:
-    """The factor by which facts are missed, geometric rms: 1 is perfect."""
+    """Return the typical error factor, the geometric rms of the ratios: 1 is perfect."""
     return float(np.exp(np.sqrt(np.mean(np.log(np.array(ratios)) ** 2)))) if ratios else float("nan")
 
 
@@ -129,11 +129,11 @@ def run_study(
     named = _build_named_causes(search, chosen)
     group_predictions, fact_predictions = [], []
     for group, names in GROUPS.items():
-        on_progress(f"leaving out {group}")
-        prediction = predict_left_out(base, data, group, names, named)
+        on_progress(f"holding out {group}")
+        prediction = predict_held_out(base, data, group, names, named)
         group_predictions.append(prediction)
         if prediction.unobservable:
-            fact_predictions += [predict_left_out(base, data, name, (name,), named) for name in names]
+            fact_predictions += [predict_held_out(base, data, name, (name,), named) for name in names]
     return StudyResult(
         base=base.name,
         data=data,
@@ -152,19 +152,19 @@ def run_study(
     )
 
 
-def predict_left_out(
+def predict_held_out(
     base: ParameterSet, data: Sequence[Datum], label: str, names: Sequence[str], named: Sequence[NamedCause]
-) -> LeaveOutPrediction:
-    """Choice and fit made anew without some facts, then those predicted; named: what all facts together name."""
+) -> HeldOutPrediction:
+    """Repeat choice and fit without some facts and predict these; named: the causes named by all facts."""
     search = CauseSearch(base, [datum for datum in data if datum.id not in names])
     chosen = search.choose()
-    left_out_data = [datum for datum in data if datum.id in names]
+    held_out_data = [datum for datum in data if datum.id in names]
     unobservable = [item.key for item in named if not {item.key, *item.alternatives} & set(chosen.keys)]
     nominal, extended = (
-        _compute_ratios(search, search.nominal, left_out_data),
-        _compute_ratios(search, chosen, left_out_data),
+        _compute_ratios(search, search.nominal, held_out_data),
+        _compute_ratios(search, chosen, held_out_data),
     )
-    return LeaveOutPrediction(label, tuple(names), chosen.keys, tuple(unobservable), nominal, extended)
+    return HeldOutPrediction(label, tuple(names), chosen.keys, tuple(unobservable), nominal, extended)
 
 
 def _compute_ratios(search: CauseSearch, fit: CauseFit, data: Sequence[Datum]) -> tuple[float, ...]:
@@ -178,8 +178,8 @@ def _build_named_causes(search: CauseSearch, chosen: CauseFit) -> tuple[NamedCau
     for key in chosen.keys:
         alternatives = [
             other
-            for (own, other), fit in exchanged.items()
-            if own == key and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
+            for (chosen_key, other), fit in exchanged.items()
+            if chosen_key == key and fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE
         ]
         low, high = search.compute_interval(chosen, key)
         chi2_reduction = removed[key].chi2 - chosen.chi2
@@ -189,15 +189,15 @@ def _build_named_causes(search: CauseSearch, chosen: CauseFit) -> tuple[NamedCau
 
 
 def _find_evidence(search: CauseSearch, without: CauseFit, chosen: CauseFit) -> tuple[str, ...]:
-    """The facts that, the most first, hold MOST_OF of what a cause takes."""
+    """Return the facts that hold EVIDENCE_FRACTION of a cause's reduction of χ², largest first."""
     reductions = search.compute_chi2_terms(without) - search.compute_chi2_terms(chosen)
     out: list[str] = []
     total = 0.0
-    for place in np.argsort(-reductions).tolist():
+    for index in np.argsort(-reductions).tolist():
         if total >= EVIDENCE_FRACTION * reductions.clip(0.0).sum():
             break
-        total += float(reductions[place])
-        out.append(search.data[place].id)
+        total += float(reductions[index])
+        out.append(search.data[index].id)
     return tuple(out)
 
 
@@ -205,24 +205,27 @@ def _judge_unchosen(search: CauseSearch, chosen: CauseFit) -> tuple[UnchosenCaus
     exchanged, removed = search.fit_exchanges(chosen), search.fit_removals(chosen)
     added = {fit.keys[-1]: fit for fit in search.fit_additions(chosen)}
     out = []
-    for key, cause in index_causes().items():
+    for key, cause in CAUSES_BY_KEY.items():
         if key in chosen.keys:
             continue
         chi2_reduction_alone = search.nominal.chi2 - search.fit((key,)).chi2
-        swaps = {own: fit for (own, other), fit in exchanged.items() if other == key}
-        replaced_fractions = {own: _compute_replaced_fraction(removed[own], fit, chosen) for own, fit in swaps.items()}
-        replaces = max(replaced_fractions, key=lambda own: replaced_fractions[own], default="")
+        swaps = {chosen_key: fit for (chosen_key, other), fit in exchanged.items() if other == key}
+        replaced_fractions = {
+            chosen_key: _compute_replaced_fraction(removed[chosen_key], fit, chosen)
+            for chosen_key, fit in swaps.items()
+        }
+        replaces = max(replaced_fractions, key=lambda chosen_key: replaced_fractions[chosen_key], default="")
         chi2_reduction_added = chosen.chi2 - added[key].chi2 if key in added else 0.0
         if any(fit.aicc - chosen.aicc < AICC_INDISTINGUISHABLE for fit in swaps.values()):
-            verdict = "alike"
+            verdict = "alternative cause"
         elif key in added and cause.replaces_law and added[key].aicc - chosen.aicc < AICC_INDISTINGUISHABLE:
-            verdict = "as good"
+            verdict = "alternative law"
         elif (
             key in added
             and not cause.replaces_law
             and search.compute_max_chi2_increase(chosen, key) < CHI2_NOT_OBSERVABLE
         ):
-            verdict = "not shown"
+            verdict = "not observable"
         else:
             is_plausible = (
                 chi2_reduction_alone >= CAUSE_COST or replaced_fractions.get(replaces, 0.0) >= RULED_OUT_FRACTION
@@ -244,5 +247,5 @@ def _judge_unchosen(search: CauseSearch, chosen: CauseFit) -> tuple[UnchosenCaus
 
 
 def _compute_replaced_fraction(without: CauseFit, swapped: CauseFit, chosen: CauseFit) -> float:
-    """Share of what a cause takes that another takes in its place."""
+    """Return the share of one cause's reduction of χ² that another achieves in its place."""
     return (without.chi2 - swapped.chi2) / (without.chi2 - chosen.chi2)

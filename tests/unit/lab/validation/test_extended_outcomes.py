@@ -1,4 +1,4 @@
-"""The paper's outcomes simulated are those in closed form, where both can speak."""
+"""Simulated outcomes of the paper equal those in closed form where both exist."""
 
 import pytest
 
@@ -9,12 +9,12 @@ from optodrive.physics.parameters import load_parameters
 CALIBRATED = load_parameters("calibrated")
 SIMULATED = simulate_outcomes(CALIBRATED)
 FROM_THE_FORCE = {"dT_air_isometric", "dQ_air", "eta_qt", "eta_tm"}
-"""Here the simulation follows the paper's own way to its gas."""
+"""The simulation derives the gas rise from the force, as the paper does."""
 
 
 @pytest.mark.parametrize("name", sorted(set(OUTCOMES) - FROM_THE_FORCE))
 def test_without_terms_the_simulation_is_the_closed_form(name):
-    # Heights at rates are interpolated between pulse widths a twelfth apart.
+    # Rates are interpolated between pulse widths a twelfth apart.
     tolerance = 3e-3 if name.startswith("N_") else 1e-4
     assert SIMULATED[name] == pytest.approx(OUTCOMES[name](CALIBRATED), rel=tolerance, abs=1e-12)
 

@@ -1,4 +1,4 @@
-"""Every fact is spoken to or passed over with a reason; what the models say is held against sums done here."""
+"""Every fact is predicted or excluded with a reason; predictions agree with independent calculations."""
 
 import csv
 from math import exp, pi
@@ -68,8 +68,8 @@ def test_heat_in_the_gas():
 
 
 def test_the_literal_set_lags():
-    for name, at_most in {"z_peak_w020": 0.5, "z_tp8_w040": 0.3, "dpp_200Hz": 0.05}.items():
-        assert 0 < OUTCOMES[name](LITERAL) / FACTS[name].value < at_most
+    for name, max_ratio in {"z_peak_w020": 0.5, "z_tp8_w040": 0.3, "dpp_200Hz": 0.05}.items():
+        assert 0 < OUTCOMES[name](LITERAL) / FACTS[name].value < max_ratio
 
 
 def test_repeats_agree_and_force_is_linear():
@@ -83,16 +83,16 @@ def said(name):
 
 def test_figures_in_the_remarks_are_so():
     added = 0.5 * pi * FACTS["cavity_r"].value ** 2 * FACTS["z_peak_w020"].value
-    figures = {
+    values = {
         "F_peak_w055": (FACTS["F_peak_w055"].value / FACTS["F_peak_w020"].value, "0.56", ".2f"),
         "dT_air_isometric": (100 * added / FACTS["V_pixel"].value, "44 %", ".0f"),
         "dQ_air": (1e6 * FACTS["dQ_air"].value / FACTS["dT_air_isometric"].value, "8.8 µJ/K", ".1f"),
         "N_50um": (1e3 / FACTS["N_50um"].value, "4.6 ms", ".1f"),
         "N_400um": (1e3 / FACTS["N_400um"].value, "37.7 ms", ".1f"),
     }
-    for name, (figure, words, digits) in figures.items():
-        assert words in REMARKS[name]
-        assert words.startswith(format(figure, digits)), name
+    for name, (value, text, digits) in values.items():
+        assert text in REMARKS[name]
+        assert text.startswith(format(value, digits)), name
     assert 293 * added / FACTS["V_pixel"].value > 100
     assert format(said("F_peak_w055") / said("F_peak_w020"), ".2f") == "0.47"
     assert format(said("N_400um") / FACTS["N_400um"].value, ".2f") == "1.24"

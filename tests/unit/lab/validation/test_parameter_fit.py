@@ -1,4 +1,4 @@
-"""The scripts that made the shipped files make them again, byte for byte."""
+"""The scripts reproduce the shipped files byte for byte."""
 
 import subprocess
 import sys

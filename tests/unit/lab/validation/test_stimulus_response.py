@@ -1,4 +1,4 @@
-"""Pulses and trains against dense searches of the same pixel, and against sums worked out by hand."""
+"""Pulses and trains agree with dense searches and with closed-form results."""
 
 from math import exp, inf
 
@@ -17,8 +17,8 @@ def area(t_s, gas):
 
 
 def test_pulse_peak_meets_a_dense_search():
-    lit = advance(PIXEL, 0.0, 0.0, 2.45, 0.008)
-    gas = [advance(PIXEL, *lit, 0.0, t)[1] for t in np.linspace(0, 0.02, 20_001)]
+    gate_off_state = advance(PIXEL, 0.0, 0.0, 2.45, 0.008)
+    gas = [advance(PIXEL, *gate_off_state, 0.0, t)[1] for t in np.linspace(0, 0.02, 20_001)]
     assert pulse_peak_k(PIXEL, 2.45, 0.008) == pytest.approx(max(gas), rel=1e-7)
 
 
@@ -38,10 +38,10 @@ def test_steady_train_meets_a_long_dense_run(width_s, gap_s):
     state = (0.0, 0.0)
     for _ in range(int(1.0 / (width_s + gap_s)) + 2):
         state = advance(PIXEL, *advance(PIXEL, *state, 2.45, width_s), 0.0, gap_s)
-    lit = advance(PIXEL, *state, 2.45, width_s)
+    gate_off_state = advance(PIXEL, *state, 2.45, width_s)
     on_s, off_s = (span_s * np.linspace(0, 1, 8001) ** 3 for span_s in (width_s, gap_s))
     on = [advance(PIXEL, *state, 2.45, t)[1] for t in on_s]
-    off = [advance(PIXEL, *lit, 0.0, t)[1] for t in off_s]
+    off = [advance(PIXEL, *gate_off_state, 0.0, t)[1] for t in off_s]
     mean = (area(on_s, on) + area(off_s, off)) / (width_s + gap_s)
     train = compute_steady_train(PIXEL, 2.45, width_s, gap_s)
     assert train.max_k == pytest.approx(max(on + off), rel=1e-6)

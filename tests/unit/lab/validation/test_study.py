@@ -1,4 +1,4 @@
-"""`optodrive validate --diagnose`: hidden faults are named, the paper's facts tell their story, nothing leaks."""
+"""`optodrive validate --diagnose`: hidden errors are identified, and held-out facts do not leak."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.lab.validation.candidate_causes import index_causes
+from optodrive.lab.validation.candidate_causes import CAUSES_BY_KEY
 from optodrive.lab.validation.cause_search import CauseSearch
 from optodrive.lab.validation.contradictions import find_contradictions
 from optodrive.lab.validation.corrected_model import MAX_PULSE_S, CorrectedModel
@@ -18,7 +18,7 @@ from optodrive.lab.validation.measured_facts import EXCLUDED, GROUPS, MEASURED_I
 from optodrive.lab.validation.narrative import build_rows, build_study_answer, describe_findings, describe_predictions
 from optodrive.lab.validation.paper_outcomes import FULL_POWER_W, OUTCOMES
 from optodrive.lab.validation.stimulus_response import width_to_reach_s
-from optodrive.lab.validation.study import compute_error_factor, predict_left_out, run_study
+from optodrive.lab.validation.study import compute_error_factor, predict_held_out, run_study
 from optodrive.physics.paper_facts import AMBIENT_C, load_paper_facts
 from optodrive.physics.parameters import Parameter, load_parameters
 
@@ -33,7 +33,7 @@ def found():
 
 
 def changed(**factors):
-    """The literal set with some parameters multiplied, by the closed forms of the physics."""
+    """Return the literal set with some parameters multiplied."""
     scaled = {}
     for name, times in factors.items():
         own = getattr(LITERAL, name)
@@ -41,8 +41,8 @@ def changed(**factors):
     return LITERAL.model_copy(update=scaled)
 
 
-def facts_of(parameters, seed):
-    """Facts that a set would have made, each with its error; of rates, the error is that of the height."""
+def generate_facts(parameters, seed):
+    """Generate facts from a set, each with its error; for rates, the error is that of the height."""
     rng = np.random.default_rng(seed)
     facts = dict(load_paper_facts())
     for datum in build_data(facts, LITERAL):
@@ -59,8 +59,8 @@ def facts_of(parameters, seed):
 
 
 def rate(parameters, height_m):
-    """Of a height out of reach, the rate that the longest pulse gives."""
-    return 1.0 / min(width_to_reach_s(parameters.pixel(0.55e-3), FULL_POWER_W, height_m), MAX_PULSE_S)
+    """Return the rate of a height; for an unreachable height, the rate of the longest pulse."""
+    return 1.0 / min(width_to_reach_s(parameters.build_pixel(0.55e-3), FULL_POWER_W, height_m), MAX_PULSE_S)
 
 
 def named(facts):
@@ -69,32 +69,32 @@ def named(facts):
 
 @pytest.mark.parametrize("seed", range(6))
 def test_nothing_hidden_names_nothing(seed):
-    assert named(facts_of(LITERAL, seed)) == set()
+    assert named(generate_facts(LITERAL, seed)) == set()
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_hidden_lag_is_named_alone(seed):
     tau_g_s = float(np.exp(np.random.default_rng(100 + seed).uniform(np.log(1.5e-3), np.log(20e-3))))
-    facts = facts_of(changed(tau_g=tau_g_s / LITERAL.tau_g.value), seed)
+    facts = generate_facts(changed(tau_g=tau_g_s / LITERAL.tau_g.value), seed)
     assert named(facts) == {"gas_lag"}
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_hidden_force_fault_is_named_alone(seed):
     share = float(np.random.default_rng(200 + seed).uniform(0.05, 0.5))
-    told = named(facts_of(changed(phi=share), seed))
-    assert len(told) == 1
-    assert told <= ALIKE
+    keys = named(generate_facts(changed(phi=share), seed))
+    assert len(keys) == 1
+    assert keys <= ALIKE
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_two_hidden_faults_are_both_named(seed):
     rng = np.random.default_rng(300 + seed)
-    facts = facts_of(changed(tau_g=float(rng.uniform(0.03, 0.3)), phi=float(rng.uniform(0.05, 0.4))), seed)
-    told = named(facts)
-    assert "gas_lag" in told
-    assert len(told & ALIKE) == 1
-    assert len(told) == 2
+    facts = generate_facts(changed(tau_g=float(rng.uniform(0.03, 0.3)), phi=float(rng.uniform(0.05, 0.4))), seed)
+    keys = named(facts)
+    assert "gas_lag" in keys
+    assert len(keys & ALIKE) == 1
+    assert len(keys) == 2
 
 
 def test_every_outcome_is_data_or_has_a_reason_not_to_be():
@@ -139,13 +139,13 @@ def test_the_papers_facts_name_lag_force_and_dead_time(found):
     assert dead.evidence == ("N_50um",)
     assert found.unexplained == ()
     assert found.fit.chi2 < len(found.data)
-    assert not found.chosen.at_limit
+    assert not found.fit.at_limit
 
 
 def test_the_facts_refuse_plate_and_constant_volume_by_themselves(found):
     assert {item.key for item in found.contradictions} == {"constant_volume", "small_deflection"}
     verdicts = {item.key: item.verdict for item in found.unchosen}
-    assert verdicts["gas_membrane"] == "as good"
+    assert verdicts["gas_membrane"] == "alternative law"
     assert verdicts["membrane_plate"] == "ruled out"
     text = "\n".join(describe_findings(found))
     assert "right by chance" in text
@@ -169,21 +169,21 @@ def test_the_gain_is_large_where_something_else_shows_the_cause(found):
     assert set(groups) == set(GROUPS)
     for label in ("displacements", "vibration"):
         assert not groups[label].unobservable
-        assert compute_error_factor(groups[label].after) < 0.5 * compute_error_factor(groups[label].before)
-    # Nothing but forces shows the force's fault: a warmer gas then pushes harder still, and the answer says so.
-    assert set(groups["forces"].lost) & ALIKE
-    assert compute_error_factor(groups["forces"].after) > compute_error_factor(groups["forces"].before)
+        assert compute_error_factor(groups[label].extended) < 0.5 * compute_error_factor(groups[label].nominal)
+    # Only the forces show the error of the force: without them a warmer gas predicts an even larger force.
+    assert set(groups["forces"].unobservable) & ALIKE
+    assert compute_error_factor(groups["forces"].extended) > compute_error_factor(groups["forces"].nominal)
     assert "Only forces show" in "\n".join(describe_predictions(found))
     assert {item.label for item in found.fact_predictions} == {*GROUPS["forces"], *GROUPS["rates"]}
     assert sorted(name for item in found.predictions for name in item.facts) == sorted(MEASURED_IDS)
 
 
 @pytest.mark.parametrize(("group", "name"), [("displacements", "z_tp8_w040"), ("vibration", "dpp_200Hz")])
-def test_what_is_left_out_does_not_leak(found, group, name):
+def test_held_out_facts_do_not_leak(found, group, name):
     facts = dict(load_paper_facts())
     wrong = facts[name]
     facts[name] = replace(wrong, value=7.0 * wrong.value)
-    again = predict_left_out(LITERAL, build_data(facts, LITERAL), group, GROUPS[group], found.named)
+    again = predict_held_out(LITERAL, build_data(facts, LITERAL), group, GROUPS[group], found.named)
     first = next(item for item in found.group_predictions if item.label == group)
     assert again.causes == first.causes
     for fact, before, after in zip(first.facts, first.extended, again.extended, strict=True):
@@ -191,8 +191,8 @@ def test_what_is_left_out_does_not_leak(found, group, name):
 
 
 def test_ranges_map_both_ways_and_exclusions_are_known():
-    for cause in index_causes().values():
-        assert all(other in index_causes() for other in cause.excludes)
+    for cause in CAUSES_BY_KEY.values():
+        assert all(other in CAUSES_BY_KEY for other in cause.excludes)
         assert cause.low < cause.high
         assert cause.compute_fraction(cause.compute_value(0.3)) == pytest.approx(0.3)
 
@@ -200,13 +200,13 @@ def test_ranges_map_both_ways_and_exclusions_are_known():
 def test_the_answer_as_json(found):
     document = json.loads(json.dumps(build_study_answer(found), allow_nan=False))
     assert set(document) == {
-        "nominal",
+        "parameter_set",
         "facts",
-        "not_data",
+        "excluded",
         "chi2",
         "factor",
-        "named_from_aicc",
-        "alike_within_aicc",
+        "aicc_per_cause",
+        "aicc_indistinguishable",
         "causes",
         "candidates",
         "contradictions",
@@ -214,22 +214,22 @@ def test_the_answer_as_json(found):
         "gain",
     }
     assert [item["id"] for item in document["facts"]] == list(MEASURED_IDS)
-    told = {item["cause"] for item in document["causes"]} | {item["cause"] for item in document["candidates"]}
-    assert told == set(index_causes())
+    keys = {item["cause"] for item in document["causes"]} | {item["cause"] for item in document["candidates"]}
+    assert keys == set(CAUSES_BY_KEY)
     for item in document["causes"]:
         assert item["ci95"][0] < item["value"] < item["ci95"][1]
-    assert {item["left_out"] for item in document["gain"]["groups"]} == set(GROUPS)
-    assert document["gain"]["factor_each"]["after"] < document["gain"]["factor_each"]["before"]
+    assert {item["held_out"] for item in document["gain"]["groups"]} == set(GROUPS)
+    assert document["gain"]["factor_each"]["extended"] < document["gain"]["factor_each"]["nominal"]
 
 
 def test_the_command_tells_the_story(found, capsys):
     assert run(["validate", "--diagnose"]) == 0
-    told = capsys.readouterr().out
-    flat = " ".join(told.split())
+    keys = capsys.readouterr().out
+    flat = " ".join(keys.split())
     for line in describe_findings(found):
         assert " ".join(line.split()) in flat
     for row in build_rows(found):
-        assert row[0] in told
+        assert row[0] in keys
 
 
 def test_the_command_prints_one_json_object(found, capsys):
