@@ -20,7 +20,7 @@ from optodrive.physics.terms.gas_membrane import ATMOSPHERE_PA
 AMBIENT_K = AMBIENT_C + ZERO_CELSIUS_K
 SAMPLE_S = 1e-4
 WIDTH_LADDER_S = np.geomspace(1.5e-3, 80e-3, 48)
-"""Pulse widths between which the one that reaches a height is looked for."""
+"""Pulse widths between which the width that reaches a height is interpolated."""
 STEADY_PERIODS = 24
 """Periods after which a train counts as steady."""
 
@@ -50,7 +50,7 @@ class _Responses(NamedTuple):
 
 
 def simulate_outcomes(parameters: ParameterSet) -> dict[str, float]:
-    """Every outcome of `paper.OUTCOMES`, SI (temperatures in °C as the paper has them), by fact."""
+    """Return every outcome of `paper_outcomes.OUTCOMES` by fact, SI, temperatures in °C as in the paper."""
     return (
         _simulate_pulse_outcomes(parameters)
         | _simulate_train_outcomes(parameters)
@@ -90,7 +90,7 @@ def _simulate_pulse_outcomes(parameters: ParameterSet) -> dict[str, float]:
     heights_m = displacement_m[len(single) :]
     absorbed_j = parameters.epsilon.value * FULL_POWER_W * LONG_PULSE_S
     work_j = 0.5 * force_n[0] * displacement_m[0]
-    # The paper had its gas from the force, by the gas law on the whole aperture: so has the model.
+    # The paper derives the gas temperature from the force by the gas law on the whole aperture; so does the model.
     gas_k = force_n[0] * AMBIENT_K / (ATMOSPHERE_PA * pi * load_paper_facts()["cavity_r"].value ** 2)
     outcomes = {
         "T_peak_w020": AMBIENT_C + absorber_k[0],
