@@ -129,7 +129,7 @@ def test_kill_9(make_board, start, tmp_path):
     [
         pytest.param(
             step_of(0.0, "do", "stick_y"),
-            r"calibrate: sensor at .*: y_m: got .* this mirror stands still",
+            r"calibrate: sensor at .*: y_m: got .* this mirror does not move",
             marks=pytest.mark.slow,
         ),
         pytest.param(

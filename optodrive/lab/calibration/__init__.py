@@ -1,1 +1,1 @@
-"""Where codes lead the beam: measured spots to a field, with how sure it is; display metres to codes and back."""
+"""Calibration: measured spots to a scan field with its uncertainty, measured heights to a pixel map."""

@@ -1,9 +1,9 @@
-"""grid.cor: a field as the 65 × 65 corrections that makers of galvo boards use; the variant LMC1COR_1.0.
+"""grid.cor: a field as the 65 × 65 corrections that galvo boards use, variant LMC1COR_1.0.
 
-As public readers of it agree: 22 bytes, the name in UTF-16 little-endian; 2 bytes; 63 doubles, the 44th of them codes
-per millimetre; then 65 × 65 pairs of doubles, dx and dy in codes. Here rows go by y and columns by x, both rising,
-every 1024 codes from 0, and a beam meant for a place is sent to codes = place × scale + 32768, plus what lies between
-the nodes' dx and dy. Whether the software of a given board counts rows so was not tried.
+The format according to public readers: 22 bytes with the name in UTF-16 little-endian; 2 bytes; 63 doubles, the 44th of
+them codes per millimetre; then 65 × 65 pairs of doubles, dx and dy in codes. Here rows go by y and columns by x, both
+increasing, every 1024 codes from 0. A beam for a position is sent to codes = position × scale + 32768, plus dx and dy
+interpolated between the nodes. The row order has not been verified with the software of a given board.
 """
 
 import struct
@@ -25,13 +25,14 @@ NODES_PER_SIDE = 65
 NODE_SPACING_CODES = 1024
 HEADER = struct.Struct("<22s2x63d")
 SCALE_INDEX = 43
+"""Index of the scale, codes per millimetre, among the doubles of the header."""
 FILE_BYTES = HEADER.size + 16 * NODES_PER_SIDE * NODES_PER_SIDE
 RESIDUAL_MAX_CODES = 1.0
-"""A grid that the field's model does not follow to within this is none of mirrors and a lens."""
+"""Largest residual of the field model, codes; a grid beyond it does not describe mirrors and a lens."""
 
 
 def write_correction_grid(path: Path, field: CalibratedField) -> None:
-    """Write a field's corrections, whole or not at all."""
+    """Write a field's corrections atomically."""
     scale = 1e-3 / _m_per_code(field.rad_per_code, field.focal_length_m)
     header_values = [0.0] * 63
     header_values[SCALE_INDEX] = scale
@@ -42,7 +43,7 @@ def write_correction_grid(path: Path, field: CalibratedField) -> None:
 
 
 def compute_corrections(field: CalibratedField) -> FloatArray:
-    """Dx and dy in codes at every node, [65, 65, 2], rows by y."""
+    """Compute dx and dy in codes at every node, [65, 65, 2], rows by y."""
     x_code, y_code = _node_codes()
     code_m = _m_per_code(field.rad_per_code, field.focal_length_m)
     x_to, y_to = field.codes((x_code - CENTRE_CODE) * code_m, (y_code - CENTRE_CODE) * code_m, extrapolate=True)
@@ -50,7 +51,7 @@ def compute_corrections(field: CalibratedField) -> FloatArray:
 
 
 def read_correction_grid(path: Path) -> tuple[float, FloatArray]:
-    """Codes per millimetre, and dx and dy [65, 65, 2]; InputError for another kind of file."""
+    """Read codes per millimetre, and dx and dy [65, 65, 2]; raises InputError for another kind of file."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -64,14 +65,14 @@ def read_correction_grid(path: Path) -> tuple[float, FloatArray]:
     if not np.isfinite(scale) or scale <= 0.0:
         raise InputError(f"{path}: codes per millimetre", scale, "more than 0")
     if not np.all(np.isfinite(corrections)):
-        raise InputError(f"{path}: corrections", "one that is no number", "numbers")
+        raise InputError(f"{path}: corrections", "a value that is not finite", "numbers")
     return scale, np.array(corrections, dtype=np.float64)
 
 
 def fit_correction_grid(path: Path, prior: FieldPrior) -> CalibratedField:
-    """The field nearest to a grid's corrections; InputError where none comes near.
+    """Fit a field to a grid's corrections; raises InputError if no field fits.
 
-    A grid does not say how sure it is: sigma is only how far the field is from it.
+    A grid states no uncertainty: sigma is the largest deviation of the field from it.
     """
     scale, corrections = read_correction_grid(path)
     x_code, y_code = _node_codes()
@@ -84,7 +85,7 @@ def fit_correction_grid(path: Path, prior: FieldPrior) -> CalibratedField:
     fit = fit_field(spots, prior, 0.1 * code_m)
     residual_max_m = np.abs(fit.residual_m).max() if len(spots) else np.inf
     if fit.outlier.any() or residual_max_m > RESIDUAL_MAX_CODES * code_m:
-        found = f"corrections that no mirrors and lens come nearer to than {residual_max_m / code_m:.1f} codes"
+        found = f"corrections from which the best field deviates by {residual_max_m / code_m:.1f} codes"
         raise InputError(str(path), found, f"{RESIDUAL_MAX_CODES:g} code")
     field, sigma_m = fit.field, np.full_like(fit.field.sigma_grid_m, residual_max_m)
     return CalibratedField(
@@ -99,5 +100,5 @@ def _node_codes() -> tuple[FloatArray, FloatArray]:
 
 
 def _m_per_code(rad_per_code: float, focal_length_m: float) -> float:
-    """How far a code leads nominally, m."""
+    """Return the nominal displacement of the beam per code, m."""
     return 2.0 * focal_length_m * rad_per_code

@@ -1,6 +1,6 @@
-"""Spots to a field: the most probable geometry and surface, false detections told apart, and how sure all of it is.
+"""Fit of a field to spots: maximum a posteriori geometry and surface, outliers, and uncertainty.
 
-Unknowns are counted in units of their prior's width: z = 0 is what one expected, and every prior is one.
+Every parameter is in units of its prior's sigma: the prior of z is the standard normal distribution.
 """
 
 from dataclasses import dataclass
@@ -18,25 +18,29 @@ from optodrive.lab.calibration.spots import MeasuredSpots
 GEOMETRY_COUNT = len(FieldGeometry._fields)
 PARAMETER_COUNT = GEOMETRY_COUNT + 2 * TERM_COUNT
 ANNEALING_NOISE_M = (3e-3, 1e-3, 0.3e-3, 0.1e-3, 0.05e-3)
-"""A spot counts for as much as a noise of this width lets it, ever narrower: first all may be wrong, then few are."""
+"""Noise scales of the annealing, m: all spots may be outliers at first, few at the end."""
 GAUSS_NEWTON_STEPS = 4
+"""Gauss-Newton steps per set of weights and scales."""
 OUTER_ITERATIONS = 6
+"""Largest number of iterations over weights and scales."""
 OUTLIER_FRACTION_PRIOR = 0.02
+"""Expected fraction of outliers."""
 OUTLIER_PRIOR_SPOTS = 10.0
-"""The expected share of false detections counts as so many spots seen before."""
+"""Weight of the expected fraction of outliers, in spots."""
 SCALE_FACTORS: list[float] = np.geomspace(1.0 / 8.0, 8.0, 13).tolist()
-"""Noise and surface are looked for at these multiples of what is expected."""
+"""Multiples of the expected noise and surface among which the most probable are selected."""
 NOISE_LOG_SIGMA, SURFACE_LOG_SIGMA = 0.7, 0.5
-"""Natural logarithms by which noise and surface may be off what is expected, one sigma."""
+"""Prior sigma of the natural logarithms of noise and surface."""
 SIGMA_GRID_NODES = 17
+"""Nodes per side of the grid on which the field's sigma is stored."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldFit:
-    """A field and how it came about.
+    """A fitted field with its data and its uncertainty.
 
-    outlier: [n] taken for false; residual_m: [n, 2] measured less fitted; noise_m, surface_m: rms on an axis, fitted
-    covariance: [u, u] of all unknowns in units of `width` [u]
+    outlier: [n] rejected spots; residual_m: [n, 2] measured less fitted; noise_m, surface_m: rms per axis, fitted
+    covariance: [u, u] of all parameters in units of parameter_sigma [u]
     """
 
     field: CalibratedField
@@ -55,18 +59,18 @@ class FieldFit:
 
     @property
     def rms_m(self) -> float:
-        """Root mean square of the residuals' lengths, false detections left out; NaN without spots."""
+        """Root mean square length of the inliers' residuals, m; NaN without spots."""
         inlier_m = self.residual_m[~self.outlier]
         return float(np.sqrt((inlier_m**2).sum(axis=1).mean())) if len(inlier_m) else float("nan")
 
     def jacobian_m(self, x_code: FloatArray, y_code: FloatArray) -> FloatArray:
-        """How places at codes [n] move with each unknown, [2, n, u]."""
+        """Return the derivatives of positions at codes [n] by each parameter, m, [2, n, u]."""
         return _jacobian(self.field.geometry, self.prior, self.parameter_sigma, x_code, y_code)
 
 
 @dataclass(frozen=True)
 class _Scales:
-    """noise_m: of a spot; surface_m: rms of the surface; either on an axis."""
+    """Noise of a spot and rms of the surface, both per axis, m."""
 
     noise_m: float
     surface_m: float
@@ -76,7 +80,10 @@ class _Scales:
 
 
 def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = None) -> FieldFit:
-    """The most probable field of spots, few or many or none; noise_m: of a spot on an axis, fitted where not given."""
+    """Fit the most probable field to any number of spots, also none.
+
+    noise_m: noise of a spot per axis, m; fitted if None.
+    """
     fitter = _FieldFitter(spots, prior, noise_m)
     fitter.anneal()
     for _ in range(OUTER_ITERATIONS):
@@ -91,7 +98,7 @@ def fit_field(spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None = N
 
 
 class _FieldFitter:
-    """z: [u] the unknowns in units of their width; weight: [n] of each spot, 0 to 1."""
+    """State of a fit; z: [u] parameters in units of their sigma; weight: [n] of each spot, 0 to 1."""
 
     def __init__(self, spots: MeasuredSpots, prior: FieldPrior, noise_m: float | None) -> None:
         self.spots, self.prior, self.known_noise_m = spots, prior, noise_m
@@ -121,7 +128,7 @@ class _FieldFitter:
         return (codes - CENTRE_CODE) * self.prior.rad_per_code
 
     def residual_m(self) -> FloatArray:
-        """Measured less fitted, [2, n]."""
+        """Return measured less fitted positions, m, [2, n]."""
         residual: FloatArray = (
             self.measured_m
             - np.stack(beam_position_m(self.geometry, *self.angles_rad()))
@@ -130,7 +137,7 @@ class _FieldFitter:
         return residual
 
     def _normal_equations(self, noise_m: float) -> tuple[FloatArray, FloatArray]:
-        """Of the linearised problem without its prior: [u, u] and [u]."""
+        """Return matrix [u, u] and vector [u] of the linearised problem without its prior."""
         jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, self.spots.x_code, self.spots.y_code)
         weighted = jacobian * (self.weight / noise_m**2)[None, :, None]
         return np.tensordot(weighted, jacobian, ([0, 1], [0, 1])), np.tensordot(
@@ -138,13 +145,13 @@ class _FieldFitter:
         )
 
     def gauss_newton_step(self, noise_m: float) -> None:
-        """One of Gauss and Newton; the problem is so nearly linear that none is too long."""
+        """Take one full Gauss-Newton step; the problem is nearly linear, so that no step overshoots."""
         matrix, vector = self._normal_equations(noise_m)
         step = np.linalg.solve(matrix + np.eye(PARAMETER_COUNT), vector - self.z)
         self.z = np.asarray(self.z + step, dtype=np.float64)
 
     def anneal(self) -> None:
-        """From the nominal geometry, first with all spots under suspicion."""
+        """Fit from the nominal geometry at decreasing noise scales, weighting each spot by its inlier probability."""
         for scale_m in ANNEALING_NOISE_M:
             for _ in range(GAUSS_NEWTON_STEPS):
                 self.weight = self._inlier_probability(scale_m)
@@ -152,19 +159,19 @@ class _FieldFitter:
         self.classify_outliers()
 
     def converge(self) -> None:
-        """To the most probable unknowns for weights and scales as they are."""
+        """Iterate to the most probable parameters at the current weights and scales."""
         for _ in range(GAUSS_NEWTON_STEPS):
             self.gauss_newton_step(self.scales.noise_m)
 
     def _inlier_probability(self, scale_m: float | FloatArray) -> FloatArray:
-        """How probably each spot is a true one, with a noise so wide."""
+        """Return each spot's probability of being an inlier at a noise scale, [n]."""
         distance2 = (self.residual_m() ** 2).sum(axis=0)
         inlier_density = (1.0 - self.outlier_fraction) * np.exp(-0.5 * distance2 / scale_m**2) / (2.0 * pi * scale_m**2)
         probability: FloatArray = inlier_density / (inlier_density + self.outlier_fraction / self.prior.field_area_m2)
         return probability
 
     def classify_outliers(self) -> None:
-        """Each spot true or false, by what is left of it and by how sure the field is there."""
+        """Classify each spot as inlier or outlier from its residual and the field's uncertainty there."""
         scale_m = np.hypot(self.scales.noise_m, self._sigma_m())
         self.weight = (self._inlier_probability(scale_m) > 0.5).astype(np.float64)
         outlier_count = len(self.weight) - self.weight.sum()
@@ -181,7 +188,7 @@ class _FieldFitter:
         return _sigma_m(jacobian, self._covariance())
 
     def estimate_scales(self) -> None:
-        """Noise and surface as the spots make them probable together, whatever the unknowns."""
+        """Select the jointly most probable noise and surface, marginalised over the parameters."""
         matrix, vector = self._normal_equations(1.0)
         residual_m = self.residual_m()
         square, count = float((self.weight * residual_m**2).sum()), 2.0 * float(self.weight.sum())
@@ -189,7 +196,7 @@ class _FieldFitter:
         for noise in SCALE_FACTORS if self.known_noise_m is None else [self.known_noise_m / self.prior.noise_m]:
             for surface in SCALE_FACTORS:
                 scales = _Scales(noise * self.prior.noise_m, surface * self.prior.surface_m)
-                # Unknowns whose prior is wider move the place by as much more.
+                # The Jacobian of a parameter scales with its prior sigma.
                 scale_ratio = scales.parameter_sigma(self.prior) / self.parameter_sigma
                 precision = matrix * np.outer(scale_ratio, scale_ratio) / scales.noise_m**2 + np.eye(PARAMETER_COUNT)
                 z = self.z / scale_ratio
@@ -206,7 +213,7 @@ class _FieldFitter:
         self.scales = chosen
 
     def build_result(self) -> FieldFit:
-        """The fit; its field with its own uncertainty."""
+        """Return the fit, and its field with its uncertainty."""
         covariance, extent = self._covariance(), self.prior.extent
         jacobian = _jacobian(self.geometry, self.prior, self.parameter_sigma, *extent.build_grid(SIGMA_GRID_NODES))
         field = CalibratedField(
@@ -234,7 +241,7 @@ class _FieldFitter:
 def _jacobian(
     geometry: FieldGeometry, prior: FieldPrior, parameter_sigma: FloatArray, x_code: FloatArray, y_code: FloatArray
 ) -> FloatArray:
-    """How places at codes [n] move with each unknown, [2, n, u]."""
+    """Return the derivatives of positions at codes [n] by each parameter, m, [2, n, u]."""
     jacobian = np.zeros((2, len(x_code), PARAMETER_COUNT))
     x_rad, y_rad = ((code - CENTRE_CODE) * prior.rad_per_code for code in (x_code, y_code))
     jacobian[:, :, :GEOMETRY_COUNT] = compute_parameter_derivatives(geometry, prior.sigma, x_rad, y_rad)
@@ -247,7 +254,7 @@ def _jacobian(
 
 
 def _sigma_m(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
-    """One sigma on an axis, of both together, [n]."""
+    """Return one sigma per axis, averaged over both axes, m, [n]."""
     variance = np.einsum("anu,uv,anv->n", jacobian, covariance, jacobian, optimize=True) / 2.0
     sigma_m: FloatArray = np.sqrt(variance)
     return sigma_m

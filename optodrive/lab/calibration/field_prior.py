@@ -1,4 +1,4 @@
-"""What is known of a field before anything is measured: nominal numbers, and how far a workshop may be off them."""
+"""Prior of a field: nominal parameters and their mechanical tolerances."""
 
 from dataclasses import dataclass
 from typing import Self
@@ -11,22 +11,22 @@ from optodrive.device.field_geometry import CENTRE_CODE, CODE_MAX, FieldGeometry
 from optodrive.device.field_surface import Extent
 
 MARGIN_M = 5e-3
-"""A field is made for so much more than the pixels to every side: uncorrected codes miss by millimetres."""
+"""Margin of the field beyond the pixels on every side, m; uncorrected codes miss by millimetres."""
 HALF_EXTENT_MIN_M = 1e-3
-"""Half of a display that is hardly more than a pixel."""
+"""Smallest half extent of a display, m; a single pixel has none."""
 SPOT_NOISE_M = 10e-6
+"""Expected noise of a spot, rms per axis, m; fitted if the spots suffice."""
 SURFACE_RMS_M = 12e-6
-"""What one expects of a spot's noise and of the surface, rms on an axis; both are fitted where spots suffice."""
+"""Expected surface, rms per axis, m; fitted if the spots suffice."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldPrior:
-    """What a fit starts from.
+    """Prior distribution of a field's parameters.
 
-    mean, width: of each parameter of the geometry; extent: the codes to make the field for; pixels: those nominally of
-    the display
-    rad_per_code, focal_length_m: of the configuration; noise_m, surface_m: expected rms on an axis
-    field_m2: the area over which a false detection may lie
+    mean, sigma: of each parameter of the geometry; extent: codes of the field; display_extent: codes of the display
+    rad_per_code, focal_length_m: of the configuration; noise_m, surface_m: expected rms per axis
+    field_area_m2: area over which outliers are uniformly distributed
     """
 
     mean: FieldGeometry
@@ -44,7 +44,7 @@ class FieldPrior:
 
     @classmethod
     def from_config(cls, config: Config) -> Self:
-        """Nominal numbers of a configuration, with the tolerances of an ordinary laboratory."""
+        """Build the prior from a configuration's nominal values and the tolerances of an ordinary laboratory."""
         scanner, layout = config.scanner, build_pixel_layout(config.display)
         focal_m, range_rad = scanner.focal_length_m, scanner.range_rad
         display_m = [max(HALF_EXTENT_MIN_M, float(np.abs(axis).max())) for axis in (layout.x_m, layout.y_m)]

@@ -1,4 +1,4 @@
-"""What a fit says of itself: in numbers, and as two pictures."""
+"""Summary of a field fit: numbers, and two figures as SVG."""
 
 from typing import Any
 
@@ -9,14 +9,14 @@ from optodrive.lab.calibration.field_fit import FieldFit
 
 REGIONS_PER_SIDE = 3
 SAMPLES_PER_SIDE = 9
-"""Places a side at which sigma is looked at: three to each side of a region."""
+"""Samples of sigma per side of the display: three per side of a region."""
 PICTURE_SIDE, PICTURE_MARGIN = 420, 20
 ARROW_FRACTION_MAX = 0.07
-"""Longest arrow, of the picture's side."""
+"""Length of the longest arrow, as a fraction of the figure's side."""
 
 
 def summarize_fit(fit: FieldFit) -> dict[str, Any]:
-    """Figures for people and programs: µm on an axis unless they are lengths; rows counted from 0, as in the spots."""
+    """Return the numbers of a fit: µm per axis unless they are lengths; rows are counted from 0, as in the spots."""
     inlier_m = np.hypot(*fit.residual_m[~fit.outlier].T)
     sigma_um = 1e6 * region_sigma_m(fit)
     return {
@@ -33,7 +33,10 @@ def summarize_fit(fit: FieldFit) -> dict[str, Any]:
 
 
 def region_sigma_m(fit: FieldFit) -> FloatArray:
-    """Sigma, rms over each region of the display, [REGIONS, REGIONS] with the top row first, m."""
+    """Return sigma, rms over each region of the display, m.
+
+    [REGIONS_PER_SIDE, REGIONS_PER_SIDE], the top row first.
+    """
     sigma_m = fit.field.sigma_m(*fit.prior.display_extent.build_grid(SAMPLES_PER_SIDE)).reshape(
         REGIONS_PER_SIDE, SAMPLES_PER_SIDE // REGIONS_PER_SIDE, REGIONS_PER_SIDE, -1
     )
@@ -42,12 +45,12 @@ def region_sigma_m(fit: FieldFit) -> FloatArray:
 
 
 def sigma_rms_m(fit: FieldFit) -> float:
-    """Sigma, rms over the whole display, on an axis, m."""
+    """Return sigma per axis, rms over the whole display, m."""
     return float(np.sqrt((region_sigma_m(fit) ** 2).mean()))
 
 
 def draw_residuals(fit: FieldFit) -> str:
-    """SVG: what the fit leaves of each spot, as arrows where they lie; outliers as crosses."""
+    """Draw the residuals as arrows at their spots, outliers as crosses; returns SVG."""
     x, y = _to_picture(fit, fit.spots.x_code, fit.spots.y_code)
     is_inlier = ~fit.outlier
     longest_m = max(1e-9, float(np.hypot(*fit.residual_m[is_inlier].T).max())) if is_inlier.any() else 1.0
@@ -68,7 +71,7 @@ def draw_residuals(fit: FieldFit) -> str:
 
 
 def draw_sigma_map(fit: FieldFit) -> str:
-    """SVG: one sigma over the field, dark where it is large; each cell tells its number."""
+    """Draw one sigma over the field, dark where it is large, with each cell's number as title; returns SVG."""
     grid_um = 1e6 * fit.field.sigma_grid_m[::-1]
     size = (PICTURE_SIDE - 2 * PICTURE_MARGIN) / len(grid_um)
     low, high = float(grid_um.min()), float(grid_um.max())
@@ -88,7 +91,7 @@ def _draw_caption(text: str) -> str:
 
 
 def _to_picture(fit: FieldFit, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Codes to places in the picture, y up."""
+    """Return positions in the figure for codes, y upwards."""
     half_side = 0.5 * PICTURE_SIDE - PICTURE_MARGIN
     x_share, y_share = fit.field.extent.normalise(x_code, y_code)
     return 0.5 * PICTURE_SIDE + half_side * x_share, 0.5 * PICTURE_SIDE - half_side * y_share

@@ -1,4 +1,4 @@
-"""Where to measure next: where it makes the whole field surest."""
+"""Optimal design: the next spot to measure."""
 
 import numpy as np
 
@@ -6,16 +6,16 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.calibration.field_fit import FieldFit
 
 SAMPLES_PER_SIDE = 9
-"""The display is looked at in so many places a side."""
+"""Samples of the display per side at which the variance is evaluated."""
 
 
 def select_next_spot(fit: FieldFit, candidates: FloatArray) -> int:
-    """The row of candidates [k, 2], x_code and y_code, that most lowers the mean variance over the display."""
+    """Return the row of candidates [k, 2], x_code and y_code, that most reduces the mean variance over the display."""
     display_jacobian = fit.jacobian_m(*fit.prior.display_extent.build_grid(SAMPLES_PER_SIDE))
     parameter_count = display_jacobian.shape[-1]
     display_jacobian = display_jacobian.reshape(-1, parameter_count)
     candidate_jacobian = fit.jacobian_m(candidates[:, 0], candidates[:, 1]).transpose(1, 0, 2)
-    # One more spot takes C Aᵀ (A C Aᵀ + σ²)⁻¹ A C from the covariance C.
+    # One more spot with Jacobian A reduces the covariance C by C Aᵀ (A C Aᵀ + σ²)⁻¹ A C.
     candidate_covariance = candidate_jacobian @ fit.covariance
     cross_covariance = candidate_covariance @ display_jacobian.T
     measurement_covariance = candidate_covariance @ candidate_jacobian.transpose(0, 2, 1) + fit.noise_m**2 * np.eye(2)

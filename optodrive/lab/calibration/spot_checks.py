@@ -1,7 +1,7 @@
-"""What is wrong with spots before a field is fitted to them, named as what it is.
+"""Checks of spots before and after a fit, with the probable cause in the error message.
 
-Measured places are held against nominal ones by the straight map that explains most of them: its scale shows units,
-its directions exchanged or mirrored axes, what it does not explain false detections.
+The affine map with the least median of squares relates measured to commanded positions: its scale shows wrong units,
+its directions show exchanged or mirrored axes, and its residual shows outliers.
 """
 
 from math import degrees
@@ -16,38 +16,44 @@ from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.spots import MeasuredSpots
 
 SPOTS_MIN = 6
+"""Smallest number of spots, and of inliers, for a fit."""
 COLLINEARITY_RATIO_MIN = 0.05
-"""Spots whose extent in one direction is less than this share of the other lie on a line."""
+"""Smallest ratio of the spots' extents in two directions; below it they lie on a line."""
 MOTION_RATIO_MIN = 0.02
-"""A beam that moves less than this share of what was asked does not move."""
+"""Smallest ratio of measured to commanded motion; below it the beam does not move."""
 LMEDS_DRAWS = 500
+"""Random samples of three spots for the least median of squares."""
 AFFINE_RESIDUAL_MAX_M = 3e-3
-"""A straight map through true spots leaves less than this."""
+"""Largest median residual of an affine map through inliers, m."""
 SCALE_TOLERANCE = 0.1
+"""Largest relative deviation of the scale from 1."""
 TURN_MAX_RAD = 0.15
+"""Largest rotation of the display, rad."""
 SHIFT_MAX_M = 10e-3
+"""Largest offset of the beam at both centre codes from the display's middle, m."""
 UNIT_FACTORS = {"millimetres": 1e3, "centimetres": 1e2, "micrometres": 1e6, "inches": 1 / 0.0254}
+"""Units that are mistaken for metres, per metre."""
 AXIS_ERRORS = {
-    (-1, 0, 0, 1): "x mirrored: x_m falls where x_code rises",
-    (1, 0, 0, -1): "y mirrored: y_m falls where y_code rises",
-    (-1, 0, 0, -1): "x and y mirrored: a display turned by half a turn",
+    (-1, 0, 0, 1): "x mirrored: x_m decreases as x_code increases",
+    (1, 0, 0, -1): "y mirrored: y_m decreases as y_code increases",
+    (-1, 0, 0, -1): "x and y mirrored: a display rotated by half a turn",
     (0, 1, 1, 0): "x_m and y_m exchanged: x_m follows y_code, y_m x_code",
-    (0, -1, 1, 0): "a quarter turn: x_m falls where y_code rises",
-    (0, 1, -1, 0): "a quarter turn: y_m falls where x_code rises",
+    (0, -1, 1, 0): "a quarter turn: x_m decreases as y_code increases",
+    (0, 1, -1, 0): "a quarter turn: y_m decreases as x_code increases",
     (0, -1, -1, 0): "x_m and y_m exchanged and both mirrored",
 }
-"""The matrix of places by codes, row by row, and what it means."""
+"""Wrong axes by the sign pattern of the matrix from commanded to measured positions, row by row."""
 
 
 def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
-    """Refuse spots that no field can be fitted to; InputError says why, `where` names the file."""
+    """Check that a field can be fitted to spots; raises InputError with the cause, `where` names the file."""
     if len(spots) < SPOTS_MIN:
         raise InputError(f"{where}: spots", len(spots), f"at least {SPOTS_MIN}")
     codes = np.column_stack([spots.x_code, spots.y_code])
     widths = np.linalg.svd(codes - codes.mean(axis=0), compute_uv=False)
     if widths[0] == 0.0:
         raise InputError(
-            f"{where}: x_code, y_code", codes[0].tolist(), "several places, all spots were asked for at one"
+            f"{where}: x_code, y_code", codes[0].tolist(), "several places, but all spots have the same codes"
         )
     if widths[1] < COLLINEARITY_RATIO_MIN * widths[0]:
         share = f"all on a line, {widths[1] / widths[0]:.1%} as wide as long"
@@ -58,23 +64,23 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
     matrix, shift, residual_m = _fit_affine(commanded_m, measured_m)
     scale = float(np.sqrt(abs(np.linalg.det(matrix))))
     if residual_m > AFFINE_RESIDUAL_MAX_M * max(scale, 1.0):
-        found = f"places that leave {residual_m / max(scale, 1.0) * 1e3:.1f} mm to any straight map"
-        raise InputError(f"{where}: x_m, y_m", found, "spots most of which are true: nearly all look false")
+        found = f"positions {residual_m / max(scale, 1.0) * 1e3:.1f} mm off any affine map"
+        raise InputError(f"{where}: x_m, y_m", found, "valid spots for the most part; nearly all look like outliers")
     _check_scale(where, scale)
     _check_axes(where, matrix / scale)
     if float(np.hypot(*shift)) > SHIFT_MAX_M:
-        found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle"
+        found = f"{shift[0] * 1e3:.1f}, {shift[1] * 1e3:.1f} mm with both mirrors in the middle position"
         raise InputError(
             f"{where}: x_m, y_m", found, f"the display's middle within {SHIFT_MAX_M * 1e3:g} mm of the beam"
         )
 
 
 def check_fit(where: str, fit: FieldFit) -> None:
-    """Refuse a fit that takes half of its spots or more for false, or has too few left."""
+    """Check a fit; raises InputError if half of its spots or more are outliers, or too few are inliers."""
     outlier_count = int(fit.outlier.sum())
     if 2 * outlier_count >= len(fit.spots) or len(fit.spots) - outlier_count < SPOTS_MIN:
-        found = f"{outlier_count} of {len(fit.spots)} spots that no geometry explains"
-        raise InputError(f"{where}: x_m, y_m", found, f"most spots true, and {SPOTS_MIN} of them at least")
+        found = f"{outlier_count} of {len(fit.spots)} spots are outliers"
+        raise InputError(f"{where}: x_m, y_m", found, f"more inliers than outliers, and at least {SPOTS_MIN}")
 
 
 def _check_beam_moves(where: str, commanded_m: FloatArray, measured_m: FloatArray) -> None:
@@ -85,16 +91,16 @@ def _check_beam_moves(where: str, commanded_m: FloatArray, measured_m: FloatArra
     (x_mm, y_mm), (x_commanded_mm, y_commanded_mm) = measured * 1e3, commanded * 1e3
     motion = f"by {x_mm:.3g}, {y_mm:.3g} mm, commanded {x_commanded_mm:.3g}, {y_commanded_mm:.3g}"
     if np.all(is_stationary | (commanded == 0.0)):
-        raise InputError(f"{where}: x_m, y_m", motion, "a beam that moves: all spots were seen at one place")
+        raise InputError(f"{where}: x_m, y_m", motion, "a beam that moves; all spots were measured at one place")
     for axis, name in enumerate("xy"):
         if is_stationary[axis]:
-            raise InputError(f"{where}: {name}_m", motion, f"a beam that moves in {name}: this mirror stands still")
+            raise InputError(f"{where}: {name}_m", motion, f"a beam that moves in {name}; this mirror does not move")
 
 
 def _fit_affine(commanded_m: FloatArray, measured_m: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """The straight map with the least median of what it leaves: [2, 2], shift [2], and what it leaves to half of all.
+    """Fit the affine map with the least median of squares: matrix [2, 2], shift [2], and the median residual.
 
-    Through three spots drawn again and again: false ones among them leave much to the others.
+    The map is the best of those through three randomly drawn spots, as draws with an outlier leave large residuals.
     """
     random = np.random.default_rng(0)
     half = (len(commanded_m) + 4) // 2 - 1
@@ -116,25 +122,26 @@ def _fit_affine(commanded_m: FloatArray, measured_m: FloatArray) -> tuple[FloatA
 def _check_scale(where: str, scale: float) -> None:
     for unit, factor in UNIT_FACTORS.items():
         if abs(scale / factor - 1.0) < SCALE_TOLERANCE:
-            raise InputError(f"{where}: x_m, y_m", f"what looks like {unit}", "metres")
+            raise InputError(f"{where}: x_m, y_m", f"values that look like {unit}", "metres")
     if abs(scale - 1.0) > SCALE_TOLERANCE:
         raise InputError(
             f"{where}: x_m, y_m",
-            f"distances {scale:.3g} × those asked for",
-            f"1 ± {SCALE_TOLERANCE:g}; scanner.focal_length_m and range_rad say what is asked for",
+            f"distances {scale:.3g} × the commanded ones",
+            f"1 ± {SCALE_TOLERANCE:g}; scanner.focal_length_m and range_rad determine the commanded distances",
         )
 
 
 def _check_axes(where: str, directions: FloatArray) -> None:
-    """directions: [2, 2] without scale."""
+    """Check the orientation of the axes and the rotation; directions: [2, 2] without scale."""
     similarity = {signs: float(np.array(signs) @ directions.ravel()) / 2.0 for signs in [*AXIS_ERRORS, (1, 0, 0, 1)]}
     nearest = max(similarity, key=lambda signs: similarity[signs])
     if nearest in AXIS_ERRORS:
-        raise InputError(f"{where}: x_m, y_m", AXIS_ERRORS[nearest], "x_m to follow x_code and y_m y_code, both rising")
+        expected = "x_m that increases with x_code, and y_m with y_code"
+        raise InputError(f"{where}: x_m, y_m", AXIS_ERRORS[nearest], expected)
     turn_rad = float(np.arctan2(directions[1, 0] - directions[0, 1], directions[0, 0] + directions[1, 1]))
     if abs(turn_rad) > TURN_MAX_RAD:
         raise InputError(
             f"{where}: x_m, y_m",
             f"a display turned by {degrees(turn_rad):.1f}°",
-            f"{degrees(TURN_MAX_RAD):.0f}° at most",
+            f"at most {degrees(TURN_MAX_RAD):.0f}°",
         )

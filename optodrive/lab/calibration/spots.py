@@ -1,4 +1,4 @@
-"""Spots: where the beam was sent, and where it was seen."""
+"""Measured spots: codes of the beam and its positions on the display."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ COLUMNS = ("x_code", "y_code", "x_m", "y_m")
 
 @dataclass(frozen=True, eq=False)
 class MeasuredSpots:
-    """Codes of the converter, and where the beam landed on the display, m; all [n]."""
+    """Codes of the converter, and positions of the beam on the display, m; all [n]."""
 
     x_code: FloatArray
     y_code: FloatArray
@@ -31,17 +31,17 @@ class MeasuredSpots:
 
     @classmethod
     def from_table(cls, table: FloatArray) -> Self:
-        """From rows of x_code, y_code, x_m, y_m, [n, 4]."""
+        """Build spots from rows of x_code, y_code, x_m, y_m, [n, 4]."""
         x_code, y_code, x_m, y_m = np.array(table, dtype=np.float64).reshape(-1, 4).T.copy()
         return cls(x_code, y_code, x_m, y_m)
 
     def to_table(self) -> FloatArray:
-        """Rows of x_code, y_code, x_m, y_m, [n, 4]."""
+        """Return rows of x_code, y_code, x_m, y_m, [n, 4]."""
         return np.column_stack([self.x_code, self.y_code, self.x_m, self.y_m])
 
 
 def read_spots(path: Path) -> MeasuredSpots:
-    """Read spots.csv; InputError names file, row, column, value and what was expected."""
+    """Read spots.csv; raises InputError with file, row, column, value and expected value."""
     table = read_columns(path, COLUMNS)
     if len(table) and np.all(np.abs(table[:, :2]) < 1.0) and np.any(table[:, :2]):
         swapped = np.abs(table[:, 2:]).max() > 100.0
@@ -59,5 +59,5 @@ def read_spots(path: Path) -> MeasuredSpots:
 
 
 def write_spots(path: Path, spots: MeasuredSpots) -> None:
-    """Write spots.csv, whole or not at all."""
+    """Write spots.csv atomically."""
     write_columns(path, COLUMNS, spots.to_table(), ("%.17g", "%.17g", "%.9g", "%.9g"))

@@ -1,1 +1,1 @@
-"""Spots by camera: pictures of a grid in the plane of the display, and of the beam on that plane, to metres."""
+"""Spots by camera: pictures of a grid in the display's plane, and of the beam on that plane, to positions in metres."""

@@ -1,4 +1,4 @@
-"""pictures.toml: what the pictures of a folder show, and to which codes the beam was sent in each."""
+"""pictures.toml: description of the pictures in a folder, and the codes of the beam in each."""
 
 import csv
 import re
@@ -19,12 +19,13 @@ VERSION = 1
 DESCRIPTION_FILE = "pictures.toml"
 COLUMNS = ("file", "x_code", "y_code")
 CODES_IN_NAME = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
+"""Both codes at the end of a picture's name."""
 SPOTS_FILE = "spots.csv"
-"""What is measured is kept in this file of the folder."""
+"""File of the folder that receives the measured spots."""
 VIEWS_MIN = 3
-"""From fewer pictures of the grid the camera is not told from its place."""
+"""Smallest number of views of the grid, if more than one, that separates the camera's intrinsics from its pose."""
 PITCH_RANGE_M = (0.2e-3, 0.1)
-"""Distances of a grid that a camera sees as a whole."""
+"""Smallest and largest pitch of a grid that a camera sees completely, m."""
 
 Finite = Annotated[float, Item(allow_inf_nan=False)]
 FinitePair = tuple[Finite, Finite]
@@ -32,7 +33,7 @@ FileName = Annotated[str, Item(min_length=1)]
 
 
 class GridSection(Section):
-    """The grid: rows × columns of inner corners or of dots, pitch_m apart; the first picture has it in the plane."""
+    """The grid: rows × columns of inner corners or of dots, pitch_m apart; its first picture shows it in the plane."""
 
     kind: Literal["chessboard", "circles"]
     rows: Annotated[int, Item(ge=3, le=200)]
@@ -42,11 +43,11 @@ class GridSection(Section):
 
 
 class OriginSection(Section):
-    """How the grid lies on the display, as seen from the front.
+    """Position of the grid on the display, as seen from the front.
 
-    marks_px: in the first picture of the grid about where its first corner is seen, the last of the first row, and the
-    last of the first column; columns and rows of the picture from its upper left
-    first_m: where the first corner lies on the display, from its middle; turn_rad: of the rows, anticlockwise
+    marks_px: approximate image positions, in the first picture, of the grid's first corner, of the last corner of the
+    first row and of the last corner of the first column; column and row from the upper left
+    first_corner_m: position of the first corner from the display's middle; turn_rad: of the rows, anticlockwise
     """
 
     marks_px: tuple[FinitePair, FinitePair, FinitePair]
@@ -63,9 +64,9 @@ class SpotsSection(Section):
     @model_validator(mode="after")
     def _require_exactly_one(self) -> Self:
         if (self.table is None) == (self.pictures is None):
-            raise ValueError("either table or pictures, just one of both")
+            raise ValueError("exactly one of table and pictures")
         if self.table == SPOTS_FILE:
-            raise ValueError(f"another name than {SPOTS_FILE}, in which what is measured is kept")
+            raise ValueError(f"a name other than {SPOTS_FILE}, which receives the measured spots")
         return self
 
 
@@ -80,7 +81,7 @@ class _PicturesFile(Section):
 
 @dataclass(frozen=True)
 class SpotPicture:
-    """A picture of the beam's spot, and the codes it was sent to."""
+    """A picture of the beam's spot, and its codes."""
 
     path: Path
     x_code: float
@@ -89,7 +90,7 @@ class SpotPicture:
 
 @dataclass(frozen=True)
 class PictureFolder:
-    """A folder as described. dark: the plane without the beam, None where no such picture was taken."""
+    """A folder as described by pictures.toml; dark: the plane without the beam, None if there is no such picture."""
 
     path: Path
     grid: GridSection
@@ -100,7 +101,7 @@ class PictureFolder:
 
 
 def read_picture_folder(folder: Path) -> PictureFolder:
-    """Read FOLDER/pictures.toml and what it names; every picture exists. InputError names file, key and value."""
+    """Read FOLDER/pictures.toml and check that every picture exists; raises InputError with file, key and value."""
     path = folder / DESCRIPTION_FILE
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
@@ -110,7 +111,7 @@ def read_picture_folder(folder: Path) -> PictureFolder:
         raise build_input_error(error, str(path), _PicturesFile) from None
     _check_pitch(path, content.grid.pitch_m)
     if 1 < len(content.grid.pictures) < VIEWS_MIN:
-        expected = f"1, or at least {VIEWS_MIN} from which the camera is told from its place"
+        expected = f"1, or at least {VIEWS_MIN}, which the calibration of the camera needs"
         raise InputError(f"{path}: grid.pictures", len(content.grid.pictures), expected)
     views = tuple(_require_picture(folder, name, f"{path}: grid.pictures") for name in content.grid.pictures)
     dark = None if content.dark is None else _require_picture(folder, content.dark, f"{path}: dark")
@@ -143,16 +144,16 @@ def _require_picture(folder: Path, name: str, where: str) -> Path:
 def _list_by_name(folder: Path, path: Path, section: SpotsSection) -> tuple[SpotPicture, ...]:
     where, pattern = f"{path}: spots.pictures", str(section.pictures)
     if Path(pattern).is_absolute() or ".." in Path(pattern).parts:
-        raise InputError(where, pattern, "a pattern of names inside the folder, as spot_*.png")
+        raise InputError(where, pattern, "a pattern of names inside the folder, such as spot_*.png")
     pictures = []
     for picture in sorted(folder.glob(pattern)):
         codes = CODES_IN_NAME.search(picture.name)
         if codes is None:
-            raise InputError(where, picture.name, "a name that ends with both codes, as spot_32768_17404.png")
+            raise InputError(where, picture.name, "a name that ends with both codes, such as spot_32768_17404.png")
         x_code, y_code = (_parse_code(f"{where}: {picture.name}", each) for each in codes.groups())
         pictures.append(SpotPicture(picture, x_code, y_code))
     if not pictures:
-        raise InputError(where, pattern, f"a pattern that pictures in {folder} have")
+        raise InputError(where, pattern, f"a pattern that matches pictures in {folder}")
     return tuple(pictures)
 
 

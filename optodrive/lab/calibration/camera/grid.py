@@ -1,4 +1,4 @@
-"""The corners or dots of a grid in a picture, to a fraction of a pixel, in the order of its rows."""
+"""Detection of a grid's corners or dots in a picture, with subpixel accuracy and in row order."""
 
 from pathlib import Path
 from typing import Any
@@ -11,20 +11,26 @@ from optodrive.lab.calibration.camera.folder import GridSection, OriginSection
 from optodrive.lab.calibration.camera.image import Image, import_opencv
 
 FALLBACK_CORNERS_PER_SIDE = 4
-"""What is looked for where the grid itself is not there: so many corners a side."""
+"""Corners per side of the smaller grid that is searched for if the whole grid is not found."""
 MARK_TOLERANCE = 0.5
-"""A mark lies nearer to its corner than so many of the shorter distances between the marked corners."""
+"""Largest distance of a mark from its corner, as a fraction of the shortest side between marked corners."""
 
 
 def find_grid(path: Path, image: Image, grid: GridSection) -> FloatArray:
-    """Places in the picture, px, [rows, columns, 2]; which corner is first is open. InputError names the picture."""
+    """Find the grid's positions in the picture, px, [rows, columns, 2]; the first corner is ambiguous.
+
+    Raises InputError with the picture.
+    """
     grey = _to_eight_bits(image)
     found = _find_chessboard(path, grey, grid) if grid.kind == "chessboard" else _find_circles(path, grey, grid)
     return found.reshape(grid.rows, grid.columns, 2).astype(np.float64)
 
 
 def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> FloatArray:
-    """The same grid with the corner at the first mark first; InputError for marks elsewhere or a mirrored picture."""
+    """Return the same grid with the corner at the first mark first.
+
+    Raises InputError if a mark is not near a corner or the picture is mirrored.
+    """
     marks = np.array(origin.marks_px)
     corners = np.stack([found[0, 0], found[0, -1], found[-1, -1], found[-1, 0]])
     nearest = [int(np.argmin(np.hypot(*(corners - mark).T))) for mark in marks]
@@ -42,9 +48,9 @@ def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
         raise InputError(
             f"{where}: origin.marks_px",
             "a grid that is mirrored in the picture",
-            "rows to the right and columns down as seen from the front: a flipped picture, or marks exchanged",
+            "rows to the right and columns down, seen from the front: the picture is flipped or marks are exchanged",
         )
-    # Any of the eight orders the grid may have been found in.
+    # The detection may return any of eight orders.
     for flipped in (found, found[::-1], found[:, ::-1], found[::-1, ::-1]):
         for order in (flipped, flipped.transpose(1, 0, 2)):
             ends = order[0, 0], order[0, -1], order[-1, 0]
@@ -57,7 +63,10 @@ def orient_to_marks(where: str, found: FloatArray, origin: OriginSection) -> Flo
 
 
 def grid_corners_m(grid: GridSection, origin: OriginSection) -> FloatArray:
-    """Where corners lie on the display, m, [rows, columns, 2]; rows go to the right, columns down, before the turn."""
+    """Return the corners' positions on the display, m, [rows, columns, 2].
+
+    Rows run to the right and columns down before the rotation by turn_rad.
+    """
     right, down = np.meshgrid(np.arange(grid.columns), np.arange(grid.rows))
     along = grid.pitch_m * np.stack([right, -down], axis=-1)
     cos, sin = np.cos(origin.turn_rad), np.sin(origin.turn_rad)
@@ -73,7 +82,7 @@ def _to_eight_bits(image: Image) -> Any:
 
 def _find_chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
     cv2 = import_opencv()
-    # Found larger than asked for where it is: else a part of it would pass for all of it.
+    # Accept larger grids; otherwise a part of a larger grid would be taken for the whole.
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_LARGER
     size = (grid.columns, grid.rows)
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, size, flags)
@@ -84,13 +93,13 @@ def _find_chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
         raise _not_found_error(path, grid)
     places = np.asarray(corners).reshape(*meta.shape, 2)
     if (meta.shape[0] < meta.shape[1]) != (grid.rows < grid.columns):
-        places = places.transpose(1, 0, 2)  # which way rows run is open as well
+        places = places.transpose(1, 0, 2)  # the direction of rows is ambiguous as well
     rows, columns = places.shape[:2]
     if (rows, columns) != (grid.rows, grid.columns):
         raise InputError(
             f"{path}: corners",
             f"{rows} × {columns}",
-            f"{grid.rows} rows × {grid.columns} columns: inner corners, one fewer than squares, all of them seen",
+            f"{grid.rows} rows × {grid.columns} columns: inner corners, one fewer than squares, all of them visible",
         )
     return places
 
@@ -105,5 +114,5 @@ def _find_circles(path: Path, grey: Any, grid: GridSection) -> FloatArray:
 
 def _not_found_error(path: Path, grid: GridSection) -> InputError:
     features = "inner corners" if grid.kind == "chessboard" else "dots"
-    expected = f"a {grid.kind} of {grid.rows} rows × {grid.columns} columns of {features}, seen as a whole"
+    expected = f"a {grid.kind} of {grid.rows} rows × {grid.columns} columns of {features}, completely visible"
     return InputError(str(path), "no such grid in the picture", expected)

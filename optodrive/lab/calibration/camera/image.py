@@ -1,4 +1,4 @@
-"""Pictures as arrays, by OpenCV, which only an extra installs."""
+"""Read pictures as arrays with OpenCV, which only an extra installs."""
 
 from pathlib import Path
 from typing import Any
@@ -11,14 +11,15 @@ from optodrive.lab.calibration.camera.folder import PictureFolder
 
 Image = NDArray[np.uint8] | NDArray[np.uint16]
 MEDIAN_PICTURES_MAX = 15
-"""The plane without the beam is the median of so many pictures of spots, each of which lies elsewhere."""
+"""Largest number of spot pictures whose median is the background; each spot lies elsewhere."""
 MEDIAN_PICTURES_MIN = 3
+"""Smallest number of spot pictures whose median is the background."""
 MEDIAN_BLOCK_ROWS = 200
-"""Rows a median is taken of at a time."""
+"""Rows per block of the median."""
 
 
 def import_opencv() -> Any:
-    """The library; InputError where it is not there."""
+    """Import OpenCV; raises InputError (missing_extra) if it is not installed."""
     try:
         import cv2
     except ImportError:
@@ -27,13 +28,16 @@ def import_opencv() -> Any:
 
 
 def read_image(path: Path) -> Image:
-    """[rows, columns], 8 or 16 bits; of a picture in colour the blue part, in which the beam and its saturation are."""
+    """Read a picture as [rows, columns], 8 or 16 bits; of a colour picture the blue channel, which holds the beam.
+
+    Raises InputError if OpenCV cannot read it.
+    """
     cv2 = import_opencv()
     try:
         raw = np.frombuffer(path.read_bytes(), dtype=np.uint8)
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable picture") from None
-    # Turned by no mark in the file: marks_px are counted in the picture as the camera took it.
+    # Ignore the orientation tag: marks_px refer to the picture as the camera stored it.
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(raw, flags) if len(raw) else None
@@ -55,7 +59,7 @@ class PictureReader:
         self._depth = first.dtype
 
     def __call__(self, path: Path) -> Image:
-        """Read one; InputError where it has another size than the first, or other bits."""
+        """Read a picture; raises InputError if its size or depth differs from the first."""
         image = read_image(path)
         if image.shape != (self.rows, self.columns):
             size = f"{image.shape[1]} × {image.shape[0]} pixels"
@@ -65,12 +69,12 @@ class PictureReader:
         return image
 
     def read_background(self, pictures: PictureFolder) -> Image:
-        """The plane without the beam: the dark picture, or else the median of pictures of spots."""
+        """Return the plane without the beam: the dark picture, or the median of pictures of spots."""
         if pictures.dark is not None:
             return self(pictures.dark)
         if len(pictures.spot_pictures) < MEDIAN_PICTURES_MIN:
             found = f"{len(pictures.spot_pictures)} spots"
-            raise InputError(f"{pictures.path}: dark", None, f"a picture without the beam, beside only {found}")
+            raise InputError(f"{pictures.path}: dark", None, f"a picture without the beam, required with only {found}")
         chosen = np.unique(np.linspace(0, len(pictures.spot_pictures) - 1, MEDIAN_PICTURES_MAX).astype(int))
         stack = np.stack([self(pictures.spot_pictures[at].path) for at in chosen])
         background: Image = np.empty_like(stack[0])

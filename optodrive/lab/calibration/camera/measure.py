@@ -1,4 +1,4 @@
-"""A folder of pictures to spots in metres, with how sure they are and what is to be said of them."""
+"""Measure a folder of pictures: spots in metres, their uncertainty and quality flags."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,15 +15,16 @@ from optodrive.lab.calibration.camera.spot import DetectedSpot, find_spot
 from optodrive.lab.calibration.spots import MeasuredSpots
 
 CORNER_RESIDUAL_MAX_PX = 0.5
-"""A grid that is even and flat leaves less than this to the fit, rms on an axis."""
+"""Largest rms residual per axis of an even and flat grid, px."""
 
 
 @dataclass(frozen=True, eq=False)
 class CameraMeasurement:
-    """Spots as pictures show them.
+    """Spots measured from pictures.
 
-    names: of the pictures, in the order of the spots; sigma_m: of each on an axis, [n]; scale_m: of a pixel
-    where most spots are; saturated, outside: which spots have a saturated core, lie outside the grid, [n]
+    names: of the pictures, in the order of the spots; sigma_m: of each spot per axis, [n]
+    is_saturated, is_outside: spots with a saturated core, spots outside the grid, [n]
+    pixel_scale_m: median size of an image pixel at the spots, m
     """
 
     spots: MeasuredSpots
@@ -40,7 +41,7 @@ class CameraMeasurement:
 
 
 def measure_folder(folder: Path) -> CameraMeasurement:
-    """Measure every spot of a folder; InputError names the picture and what is wrong in it."""
+    """Measure every spot of a folder; raises InputError with the picture and its defect."""
     pictures = read_picture_folder(folder)
     reader = PictureReader(pictures)
     plane = _fit_grid_plane(pictures, reader)
@@ -57,7 +58,9 @@ def _fit_grid_plane(pictures: PictureFolder, reader: PictureReader) -> DisplayPl
     if plane.residual_px > CORNER_RESIDUAL_MAX_PX:
         found = f"corners {plane.residual_px:.2f} px off an even, flat grid, rms"
         raise InputError(
-            str(pictures.grid_views[0]), found, f"{CORNER_RESIDUAL_MAX_PX:g} px at most: is it flat, and sharp?"
+            str(pictures.grid_views[0]),
+            found,
+            f"at most {CORNER_RESIDUAL_MAX_PX:g} px: check that the grid is flat and in focus",
         )
     return plane
 
@@ -65,7 +68,7 @@ def _fit_grid_plane(pictures: PictureFolder, reader: PictureReader) -> DisplayPl
 def _locate_spots(pictures: PictureFolder, plane: DisplayPlane, detected: list[DetectedSpot]) -> CameraMeasurement:
     centre_px = np.array([each.centre_px for each in detected]).reshape(-1, 2)
     places_m = plane.position_m(centre_px)
-    # The square root of the mean square over both axes.
+    # Root mean square over both axes.
     scale_m = np.sqrt((plane.jacobian_m(centre_px) ** 2).sum(axis=(1, 2)) / 2.0)
     sigma_m = np.hypot(scale_m * [each.sigma_px for each in detected], plane.sigma_m(centre_px))
     codes = np.array([(each.x_code, each.y_code) for each in pictures.spot_pictures]).reshape(-1, 2)

@@ -1,7 +1,7 @@
-"""Where on the display a place in the picture is: a plane in perspective, seen through a lens that bends.
+"""Map from image positions to the display: a plane in perspective, seen through a lens with distortion.
 
-One picture of the grid gives both: bent about a centre by a rational law of the radius, then a homography. Several
-give the camera first, by OpenCV; what that leaves in the plane's own picture is fitted the same way.
+One view of the grid determines a rational radial distortion about a centre, followed by a homography. Several views
+first calibrate the camera with OpenCV; the residual distortion of the first view is fitted in the same way.
 """
 
 from dataclasses import dataclass
@@ -13,19 +13,23 @@ from optodrive.core.types.arrays import BoolArray, FloatArray, freeze_arrays
 from optodrive.lab.calibration.camera.image import import_opencv
 
 DISTORTION_PRIOR_SIGMA = (0.03, 0.03, 0.3, 0.3, 0.3)
-"""Before anything is measured: the centre, and terms of the radius, both in half diagonals; one sigma."""
+"""Prior sigma of the distortion centre and of the radial coefficients, in half diagonals."""
 CORNER_NOISE_PX = 0.05
+"""Expected noise of a corner, px."""
 GAUSS_NEWTON_STEPS = 12
 DERIVATIVE_STEP = 1e-6
+"""Step of the central differences."""
 
 
 @dataclass(frozen=True, eq=False)
 class DisplayPlane:
-    """Picture to display.
+    """Map from image positions to positions on the display.
 
-    middle_px, half_px: what places are counted from and in; camera: matrix and distortion by OpenCV, None from one view
-    middle_m, half_m: the same of the display; values: centre [2], bend [3], homography [8]; covariance: of them
-    left_px: rms of what corners of the grid are off on an axis; low_m, high_m: what the grid spans
+    centre_px, half_diagonal_px: origin and unit of normalised image positions; camera: OpenCV matrix and distortion,
+    None from one view
+    centre_m, half_diagonal_m: the same of the display; parameters: centre [2], distortion [3], homography [8];
+    covariance: of the parameters
+    residual_px: rms residual of the grid's corners per axis; grid_min_m, grid_max_m: extent of the grid
     """
 
     centre_px: FloatArray
@@ -43,22 +47,22 @@ class DisplayPlane:
         freeze_arrays(self)
 
     def position_m(self, image_px: FloatArray) -> FloatArray:
-        """Where places in the picture [n, 2] are on the display, m, [n, 2]."""
+        """Return the positions on the display of image positions [n, 2], m, [n, 2]."""
         return self.centre_m + self.half_diagonal_m * _map_to_display(self._normalize(image_px), self.parameters)
 
     def jacobian_m(self, image_px: FloatArray) -> FloatArray:
-        """Metres a pixel at places [n, 2]: [n, 2 of metres, 2 of pixels]."""
+        """Return the derivatives of positions by image positions [n, 2], m per px, [n, 2 of metres, 2 of pixels]."""
         steps = [self.position_m(image_px + 0.5 * step) - self.position_m(image_px - 0.5 * step) for step in np.eye(2)]
         return np.stack(steps, axis=-1)
 
     def sigma_m(self, image_px: FloatArray) -> FloatArray:
-        """How sure the plane itself is at places [n, 2], one sigma on an axis, m, [n]."""
+        """Return one sigma per axis of the map itself at image positions [n, 2], m, [n]."""
         jacobian = _jacobian(self._normalize(image_px), self.parameters)
         variance = np.einsum("nau,uv,nav->n", jacobian, self.covariance, jacobian) / 2.0
         return np.asarray(self.half_diagonal_m * np.sqrt(variance), dtype=np.float64)
 
     def is_inside_grid(self, positions_m: FloatArray, margin_m: float) -> BoolArray:
-        """Of places [n, 2], which lie within the grid or no farther from it than margin_m, [n]."""
+        """Return which positions [n, 2] lie within the grid plus margin_m, [n]."""
         within = (positions_m > self.grid_min_m - margin_m) & (positions_m < self.grid_max_m + margin_m)
         return np.asarray(within.all(axis=1), dtype=np.bool_)
 
@@ -67,9 +71,9 @@ class DisplayPlane:
 
 
 def fit_plane(views_px: list[FloatArray], corners_m: FloatArray, pitch_m: float, size: tuple[int, int]) -> DisplayPlane:
-    """From the grid in pictures, each [rows, columns, 2] px, the first of them in the display's plane.
+    """Fit the map to views of the grid, each [rows, columns, 2] px, the first of them in the display's plane.
 
-    marks_m: where its corners lie there, m, likewise; size: columns and rows of the pictures
+    corners_m: positions of the corners in the plane, m, [rows, columns, 2]; size: columns and rows of the pictures
     """
     centre_px, half_diagonal_px = 0.5 * (np.array(size) - 1.0), 0.5 * float(np.hypot(*size))
     camera, camera_residual_px = _calibrate_camera(views_px, pitch_m, size) if len(views_px) > 1 else (None, 0.0)
@@ -98,7 +102,10 @@ def fit_plane(views_px: list[FloatArray], corners_m: FloatArray, pitch_m: float,
 def _fit_parameters(
     normalized: FloatArray, targets: FloatArray, parameters: FloatArray, half_diagonal_px: float
 ) -> tuple[Any, Any, float]:
-    """Gauss and Newton; noise as found, as on the picture's scale at the grid's middle."""
+    """Fit by Gauss-Newton.
+
+    Returns parameters, covariance at the fitted noise, and the rms residual on the image's scale.
+    """
     prior_sigma = np.concatenate([DISTORTION_PRIOR_SIGMA, np.full(8, np.inf)])
     matrix = np.append(parameters[5:], 1.0).reshape(3, 3)
     scale = np.sqrt(
@@ -121,7 +128,7 @@ def _fit_parameters(
 
 
 def _map_to_display(normalized: FloatArray, parameters: FloatArray) -> FloatArray:
-    """[n, 2] of the picture to [n, 2] of the display, both about their middles."""
+    """Map normalised image positions [n, 2] to normalised display positions [n, 2]."""
     from_centre = normalized - parameters[:2]
     square = (from_centre**2).sum(axis=1, keepdims=True)
     undistorted = (
@@ -134,7 +141,7 @@ def _map_to_display(normalized: FloatArray, parameters: FloatArray) -> FloatArra
 
 
 def _jacobian(normalized: FloatArray, parameters: FloatArray) -> FloatArray:
-    """[n, 2, values]."""
+    """Return the derivatives of the map by its parameters, [n, 2, parameters]."""
     steps = DERIVATIVE_STEP * np.eye(len(parameters))
     differences = [
         _map_to_display(normalized, parameters + step) - _map_to_display(normalized, parameters - step)
@@ -146,7 +153,7 @@ def _jacobian(normalized: FloatArray, parameters: FloatArray) -> FloatArray:
 def _calibrate_camera(
     views_px: list[FloatArray], pitch_m: float, size: tuple[int, int]
 ) -> tuple[tuple[FloatArray, FloatArray], float]:
-    """Matrix [3, 3] and distortion of the camera, from the grid seen from several sides; rms left on an axis, px."""
+    """Calibrate the camera from several views: matrix [3, 3] and distortion, and the rms residual per axis, px."""
     rows, columns = views_px[0].shape[:2]
     right, down = np.meshgrid(np.arange(columns), np.arange(rows))
     board = (pitch_m * np.stack([right, down, 0 * right], axis=-1).reshape(-1, 3)).astype(np.float32)
@@ -159,7 +166,7 @@ def _calibrate_camera(
 
 
 def _undistort(image_px: FloatArray, camera: tuple[FloatArray, FloatArray] | None) -> FloatArray:
-    """Where a lens that bends nothing would show them, px, [n, 2]."""
+    """Return the image positions that an undistorted lens would show, px, [n, 2]."""
     if camera is None or not len(image_px):
         return image_px
     matrix, distortion = camera

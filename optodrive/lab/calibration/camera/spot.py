@@ -1,4 +1,4 @@
-"""The beam's spot in a picture: which blob it is, its centre to a fraction of a pixel, and how sure that is."""
+"""Detection of the beam's spot in a picture: selection of its blob, subpixel centre and uncertainty."""
 
 from typing import Any, NamedTuple
 
@@ -9,30 +9,38 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.calibration.camera.image import Image, import_opencv
 
 SMOOTHING_SIGMA_PX = 1.5
+"""Sigma of the smoothing before detection, px."""
 DETECTION_SNR_MIN = 8.0
-"""A blob stands out of the smoothed noise by so many of its sigmas."""
+"""Smallest ratio of a blob's brightness to the smoothed noise."""
 BLOB_THRESHOLD_FRACTION = 0.2
-"""A blob is what is brighter than this share of the brightest."""
+"""Threshold of a blob, as a fraction of the largest brightness."""
 BLOB_AREA_MIN_PX = 4
+"""Smallest area of a blob, px."""
 RIVAL_FRACTION_MAX = 0.5
-"""A second blob with this share of the spot's light could be the spot."""
+"""Largest light of a second blob, as a fraction of the spot's; a brighter one could be the spot."""
 CORE_MOMENT = 0.5 * np.log(2.0)
-"""Second moment of the disk within which a bell is brighter than half its peak, in units of the bell's own."""
+"""Second moment of a Gaussian's core above half its peak, in units of the Gaussian's own."""
 WINDOW_SIGMA_MIN_PX = 0.8
+"""Smallest sigma of the window, px."""
 CENTROID_ITERATIONS_MAX = 60
 CENTROID_TOLERANCE_PX = 1e-4
+"""Step of the centre at which the iteration ends, px."""
 WINDOW_EXTENT_SIGMAS = 4.0
-"""The spot is looked at as far as so many widths of the window."""
+"""Half width of the evaluated area, in sigmas of the window."""
 PATTERN_CONTRAST_MAX, PATTERN_NOISE_FACTOR_MAX = 0.5, 10.0
-"""Plain paper without the beam varies less, as a share of its brightness or in noises."""
+"""Largest variation of a plain background, as a fraction of its brightness and as a multiple of the noise."""
 SATURATED_PIXELS_MIN = 5
-"""So many pixels that are all as bright as the brightest are saturated: light at random does not do that."""
+"""Smallest number of equally bright pixels at the maximum that indicates saturation."""
 QUANTIZATION_RMS_COUNTS = 0.3
-"""Rms of rounding to whole counts."""
+"""Rms error of rounding to whole counts."""
 
 
 class DetectedSpot(NamedTuple):
-    """A spot: centre, px, [2]; one sigma on an axis, px; pixels that are saturated; the next brightest's share."""
+    """A spot in a picture.
+
+    centre_px: [2]; sigma_px: one sigma per axis; saturated_pixels: their number; rival_fraction: light of the next
+    brightest blob, as a fraction of the spot's
+    """
 
     centre_px: FloatArray
     sigma_px: float
@@ -41,17 +49,20 @@ class DetectedSpot(NamedTuple):
 
 
 def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
-    """The one spot in a picture; `without`: the same without the beam. InputError names the picture."""
+    """Find the one spot in a picture; background: the same picture without the beam.
+
+    Raises InputError with the picture if there is no single, complete spot on a plain background.
+    """
     cv2 = import_opencv()
     light = picture.astype(np.float32) - background.astype(np.float32)
     light -= np.median(light[::3, ::3])
     noise = max(QUANTIZATION_RMS_COUNTS, 1.4826 * float(np.median(np.abs(light[::3, ::3]))))
-    # A median first: single pixels that are always bright are no spots.
+    # The median removes hot pixels.
     smooth = cv2.GaussianBlur(cv2.medianBlur(light, 3), (0, 0), SMOOTHING_SIGMA_PX)
     smooth_noise = max(1.4826 * float(np.median(np.abs(smooth[::3, ::3]))), 0.2 * noise)
     brightest = float(smooth.max())
     if brightest < DETECTION_SNR_MIN * smooth_noise:
-        found = f"nothing brighter than {brightest:.1f} counts over the plane without the beam"
+        found = f"nothing brighter than {brightest:.1f} counts above the background"
         raise InputError(
             where,
             found,
@@ -66,14 +77,14 @@ def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
     if rival_fraction > RIVAL_FRACTION_MAX:
         x, y = centres_px[spot]
         x2, y2 = centres_px[order[1]]
-        found = f"two spots alike, at {x:.0f} {y:.0f} and {x2:.0f} {y2:.0f} px, {rival_fraction:.0%} as bright"
+        found = f"two similar spots, at {x:.0f} {y:.0f} and {x2:.0f} {y2:.0f} px, {rival_fraction:.0%} as bright"
         raise InputError(where, found, f"one spot; a reflection has at most {RIVAL_FRACTION_MAX:.0%} of its light")
     window = _fit_window(labels == spot + 1, smooth)
     _check_edge(where, centres_px[spot], window, light.shape)
     _check_background(where, centres_px[spot], window, background, noise)
     centre_px, noise_sigma_px = _compute_centroid(light, noise, centres_px[spot], window)
     wide_px, wide_sigma_px = _compute_centroid(light, noise, centre_px, 2.0 * window)
-    # What a wider window moves, and noise does not explain: a shape that is not even, or light from elsewhere.
+    # A shift in a wider window beyond the noise indicates an asymmetric spot or stray light.
     asymmetry_px2 = max(0.0, float(((wide_px - centre_px) ** 2).mean()) - wide_sigma_px**2)
     return DetectedSpot(
         centre_px,
@@ -84,7 +95,7 @@ def find_spot(where: str, picture: Image, background: Image) -> DetectedSpot:
 
 
 def _find_blobs(smooth: Any, light: Any, level: float) -> tuple[Any, FloatArray, FloatArray]:
-    """Labels [rows, columns], then of each blob from label 1 its light, none where it is small, and middle [n, 2]."""
+    """Return labels [rows, columns], and each blob's light (0 if it is small) and centre [n, 2], from label 1."""
     count, labels, statistics, centres_px = import_opencv().connectedComponentsWithStats(
         (smooth > level).astype(np.uint8)
     )
@@ -93,9 +104,9 @@ def _find_blobs(smooth: Any, light: Any, level: float) -> tuple[Any, FloatArray,
 
 
 def _fit_window(blob: Any, smooth: Any) -> FloatArray:
-    """Second moments of the light of a blob as its core says, px², [2, 2], never narrower than a pixel or so.
+    """Return the second moments of a blob's light from its core, px², [2, 2], with a minimum width.
 
-    The core is what is brighter than half: a reflection that touches the spot is weaker and does not widen it.
+    The core is the region above half the peak: a reflection that touches the spot is weaker and does not widen it.
     """
     within = np.where(blob, smooth, 0.0)
     peak = np.unravel_index(int(np.argmax(within)), within.shape)
@@ -111,12 +122,12 @@ def _check_edge(where: str, centre_px: FloatArray, window: FloatArray, shape: tu
     extent_px = 2.0 * np.sqrt(np.diag(window))
     if np.any(centre_px < extent_px) or np.any(centre_px > np.array(shape[::-1]) - 1.0 - extent_px):
         raise InputError(
-            where, f"a spot at {centre_px[0]:.0f} {centre_px[1]:.0f} px, cut by the picture's edge", "all of it"
+            where, f"a spot at {centre_px[0]:.0f} {centre_px[1]:.0f} px, cut by the picture's edge", "the whole spot"
         )
 
 
 def _check_background(where: str, centre_px: FloatArray, window: FloatArray, background: Image, noise: float) -> None:
-    """Refuse a spot on a pattern: what is black sends no light back and draws the centre aside unseen."""
+    """Refuse a spot on a pattern, as dark areas reflect less and bias the centre."""
     extent_px = int(np.ceil(2.0 * np.sqrt(np.linalg.eigvalsh(window)[-1])))
     x, y = np.rint(centre_px).astype(int)
     dark, bright = np.percentile(
@@ -124,13 +135,13 @@ def _check_background(where: str, centre_px: FloatArray, window: FloatArray, bac
     )
     if bright - dark > max(PATTERN_CONTRAST_MAX * bright, PATTERN_NOISE_FACTOR_MAX * noise):
         found = f"a spot at {x} {y} px on a pattern of {dark:.0f} to {bright:.0f} counts"
-        raise InputError(where, found, "plain paper under it: the grid taken away")
+        raise InputError(where, found, "plain paper behind it, without the grid")
 
 
 def _compute_centroid(light: Any, noise: float, start: FloatArray, window: FloatArray) -> tuple[FloatArray, float]:
-    """Centre of the light under a bell-shaped window that follows it, px, and one sigma by noise on an axis.
+    """Return the centre of the light under a Gaussian window that follows it, px, and one sigma per axis by noise.
 
-    A window that is even about the centre is as good with a saturated core, which is even too.
+    A window symmetric about the centre is unbiased with a saturated core, which is symmetric as well.
     """
     inverse = np.linalg.inv(window)
     centre_px = np.array(start, dtype=np.float64)
@@ -149,7 +160,7 @@ def _compute_centroid(light: Any, noise: float, start: FloatArray, window: Float
         total = float((weight * clean).sum())
         if total <= 0.0:
             return np.array(start, dtype=np.float64), float("inf")
-        # Under a window as wide as the light the first moment is half of the way to the centre.
+        # With a window as wide as the spot, the first moment is half of the distance to the centre.
         step = 2.0 * np.einsum("yx,yxa->a", weight * clean, offset_px) / total
         centre_px = centre_px + np.clip(step, -extent_px, extent_px)
         if np.abs(step).max() < CENTROID_TOLERANCE_PX:

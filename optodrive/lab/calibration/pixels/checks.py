@@ -1,4 +1,4 @@
-"""What is wrong with a whole display's heights, named as what it is."""
+"""Check of a whole display's responses, with the probable cause in the error message."""
 
 import numpy as np
 
@@ -14,12 +14,13 @@ UNIT_FACTORS = {
     "inches": 1.0 / 0.0254,
     "inches taken for millimetres, or the other way round": 25.4,
 }
+"""Units that are mistaken for metres, per metre."""
 UNIT_TOLERANCE = 1.2
-"""Gains of a whole display are so near to 1, either way, that a unit shows."""
+"""Largest ratio, either way, of a display's typical gain to a unit's factor."""
 
 
 def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics: Optics) -> None:
-    """Refuse a display of which nothing responds, or all of which does so in another unit or upside down."""
+    """Check that a display responds in metres and upwards; raises InputError with the probable cause."""
     means = []
     for responses in by_pixel.values():
         aim_m = np.array([[item.aim_x_m for item in responses], [item.aim_y_m for item in responses]])
@@ -30,10 +31,11 @@ def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics
             means.append(weighted_mean(value, sigma))
     if not means:
         found = f"heights of {len(by_pixel)} pixels under light aimed at them"
-        raise InputError(f"{where}: displacement_m", found, "some: pulses on the pixel measured, aim_x_m and aim_y_m 0")
+        expected = "at least one run with pulses on the measured pixel and aim_x_m = aim_y_m = 0"
+        raise InputError(f"{where}: displacement_m", found, expected)
     mean, sigma = np.array(means).T
     significant = mean[np.abs(mean) > SIGNIFICANCE_SIGMAS * sigma]
-    # Dead pixels say nothing of the unit: the upper half of those that answer does.
+    # Dead pixels do not show the unit; the upper half of the responding pixels does.
     size = float(np.median(np.sort(np.abs(significant))[len(significant) // 2 :])) if len(significant) else 0.0
     typical = float(np.median(significant[np.abs(significant) >= 0.5 * size])) if len(significant) else 0.0
     place, unit = f"{where}: displacement_m", _guess_unit(abs(typical))
@@ -43,7 +45,7 @@ def check_responses(where: str, by_pixel: dict[int, list[PixelResponse]], optics
         raise InputError(place, found, "a pixel that responds, and heights in metres")
     found = f"{typical:.3g} × the model's heights at {len(means)} pixels"
     if typical < 0.0:
-        raise InputError(place, found, f"upwards counted as more{hint}")
+        raise InputError(place, found, f"heights that increase upwards{hint}")
     if typical > GAIN_MAX:
         raise InputError(place, found, f"metres, and the model of this display{hint}")
 

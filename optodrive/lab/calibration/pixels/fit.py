@@ -1,8 +1,7 @@
-"""Responses to one pixel's gain and offset.
+"""Fit of one pixel's gain and offset to its responses.
 
-The focus is taken as an evenly lit rectangle, as everywhere here: what of it lies on the absorber falls straight from
-all to nothing while it crosses an edge. Which response belongs to which offset is therefore known only where the beam
-was aimed across the edges, on both sides.
+The focus is modelled as a uniform rectangle: the fraction on the absorber decreases linearly from one to zero while the
+focus crosses an edge. An offset is therefore determined only along an axis on which aims cross both edges.
 """
 
 from dataclasses import dataclass
@@ -16,20 +15,22 @@ from optodrive.device.pixel_map import DEAD, GAIN_MAX, GAIN_MIN, MEASURED, NOT_M
 from optodrive.lab.calibration.pixels.response import PixelResponse
 
 SIGNIFICANCE_SIGMAS = 3.0
-"""So many sigmas make a response surely less, or more, than something."""
+"""Sigmas by which a significant response differs from a value."""
 GAIN_SIGMA_MAX = 0.1
+"""Largest sigma of a usable gain."""
 OFFSET_SIGMA_MAX_M = 1e-4
-"""What is known less well is not used."""
+"""Largest sigma of a usable offset, m."""
 EDGE_FRACTION_MIN = 0.02
-"""An aim is across an edge where so much of the focus lies on it, and so much beside it, at the least."""
+"""Smallest fractions of the focus on and off the absorber for an aim that crosses an edge."""
 REDUCED_CHI2_MAX = 2.0
-"""Responses that are off by more than so many times their variance are less sure than they say."""
+"""Reduced chi-square above which the sigmas are enlarged."""
 GRID_OFFSETS = 41
+"""Offsets per axis of the initial grid search."""
 GAUSS_NEWTON_STEPS = 12
 
 
 class PixelEstimate(NamedTuple):
-    """One pixel as found. Sigmas are NaN where nothing was."""
+    """Estimate of one pixel; sigmas are NaN if not determined."""
 
     state: str
     gain: float
@@ -43,7 +44,7 @@ NO_ESTIMATE = PixelEstimate(NOT_MEASURED, 1.0, np.nan, (0.0, 0.0), (np.nan, np.n
 
 @dataclass(frozen=True)
 class Optics:
-    """Half-widths of absorber and focus, and the farthest offset believed, x and y, m."""
+    """Half widths of absorber and focus, and the largest plausible offset, x and y, m."""
 
     absorber_half_m: tuple[float, float]
     focus_half_m: tuple[float, float]
@@ -51,7 +52,7 @@ class Optics:
 
     @classmethod
     def from_config(cls, config: Config) -> "Optics":
-        """Those of a configuration."""
+        """Build the optics of a configuration."""
         display, laser = config.display, config.laser
         return cls(
             (display.absorber_width_m / 2.0, display.absorber_height_m / 2.0),
@@ -60,19 +61,19 @@ class Optics:
         )
 
     def absorbed_fraction(self, axis: int, offset_m: FloatArray) -> FloatArray:
-        """How much of the focus lies on the absorber, its middle off_m from the absorber's; any shape."""
+        """Return the fraction of the focus on the absorber at an offset between their centres; any shape."""
         focus_half_m = self.focus_half_m[axis]
         overlap_m = self.absorber_half_m[axis] + focus_half_m - np.abs(offset_m)
         return np.asarray(np.clip(overlap_m / (2.0 * focus_half_m), 0.0, 1.0), dtype=np.float64)
 
     def slope_per_m(self, axis: int, offset_m: FloatArray) -> FloatArray:
-        """How that changes with off_m."""
+        """Return the derivative of the absorbed fraction by the offset, 1/m."""
         fraction = self.absorbed_fraction(axis, offset_m)
         is_on_edge = (fraction > 0.0) & (fraction < 1.0)
         return np.where(is_on_edge, -np.sign(offset_m) / (2.0 * self.focus_half_m[axis]), 0.0)
 
     def search_range_m(self, axis: int) -> float:
-        """Offsets are looked for so far either way: beyond it hardly any focus is left on the absorber."""
+        """Return the largest searched offset, m; beyond it hardly any of the focus is on the absorber."""
         return min(self.offset_max_m[axis], self.absorber_half_m[axis] + 0.6 * self.focus_half_m[axis])
 
 
@@ -89,7 +90,7 @@ class _ResponseTable:
 
 
 def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
-    """What responses of one pixel, to any aims, say of it."""
+    """Fit gain and offset of one pixel to its responses at any aims."""
     if not responses:
         return NO_ESTIMATE
     table = _ResponseTable(
@@ -101,7 +102,7 @@ def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
         return NO_ESTIMATE._replace(state=DEAD)
     is_offset_free = [_crosses_both_edges(table.aim_m[axis], optics, axis) for axis in range(2)]
     for axis in range(2):
-        if not is_offset_free[axis]:  # nobody knows how much of the focus an aim near one edge leaves on the absorber
+        if not is_offset_free[axis]:  # the absorbed fraction of an aim near only one edge is unknown
             table = table.select(optics.absorbed_fraction(axis, table.aim_m[axis]) == 1.0)
     if not len(table.ratio):
         return NO_ESTIMATE
@@ -121,20 +122,20 @@ def fit_pixel(responses: list[PixelResponse], optics: Optics) -> PixelEstimate:
 
 
 def select_centred(aim_m: FloatArray, optics: Optics) -> BoolArray:
-    """Aims [2, k] with the whole focus nominally on the absorber; without any, those with half of it."""
+    """Return which aims [2, k] have the whole focus nominally on the absorber; if none, those with at least half."""
     fraction = optics.absorbed_fraction(0, aim_m[0]) * optics.absorbed_fraction(1, aim_m[1])
     is_whole = fraction > 1.0 - EDGE_FRACTION_MIN
     return np.asarray(is_whole if is_whole.any() else fraction >= 0.5, dtype=np.bool_)
 
 
 def weighted_mean(value: FloatArray, sigma: FloatArray) -> tuple[float, float]:
-    """Weighted mean and its sigma."""
+    """Return the weighted mean and its sigma."""
     weight = 1.0 / sigma**2
     return float((weight * value).sum() / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def is_dead(ratio: FloatArray, sigma: FloatArray, is_centred: BoolArray) -> bool:
-    """Whether a pixel surely responds to no aim, though some were on it."""
+    """Return whether a pixel has no significant response although some aims were centred."""
     if not is_centred.any():
         return False
     mean, mean_sigma = weighted_mean(ratio[is_centred], sigma[is_centred])
@@ -143,13 +144,14 @@ def is_dead(ratio: FloatArray, sigma: FloatArray, is_centred: BoolArray) -> bool
 
 
 def _crosses_both_edges(aim_m: FloatArray, optics: Optics, axis: int) -> bool:
+    """Return whether aims cross both edges of an axis."""
     fraction = optics.absorbed_fraction(axis, aim_m)
     edge = (fraction > EDGE_FRACTION_MIN) & (fraction < 1.0 - EDGE_FRACTION_MIN)
     return bool(np.any(edge & (aim_m > 0)) and np.any(edge & (aim_m < 0)))
 
 
 def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[bool]) -> tuple[float, FloatArray]:
-    """Gain and offset of the best of many offsets."""
+    """Return gain and offset with the smallest chi-square on a grid of offsets."""
     offsets_m = [
         np.linspace(-1.0, 1.0, GRID_OFFSETS) * optics.search_range_m(axis) if is_offset_free[axis] else np.zeros(1)
         for axis in range(2)
@@ -168,7 +170,7 @@ def _search_offsets(table: _ResponseTable, optics: Optics, is_offset_free: list[
 def _model_response(
     table: _ResponseTable, optics: Optics, gain: float, offset_m: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Responses [k], and their derivatives by gain and both offsets [k, 3]."""
+    """Return the responses [k], and their derivatives by gain and both offsets [k, 3]."""
     x_off_m, y_off_m = table.aim_m - offset_m[:, None]
     x_fraction, y_fraction = optics.absorbed_fraction(0, x_off_m), optics.absorbed_fraction(1, y_off_m)
     by_x = -gain * optics.slope_per_m(0, x_off_m) * y_fraction
@@ -183,7 +185,7 @@ def _compute_chi2(table: _ResponseTable, optics: Optics, gain: float, offset_m: 
 def _refine(
     table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
 ) -> tuple[float, FloatArray]:
-    """Gauss and Newton from the best place tried; a step that makes it worse is halved."""
+    """Refine by Gauss-Newton from the grid's best offset; a step that increases chi-square is halved."""
     columns = np.array([True, *is_offset_free])
     best_chi2 = _compute_chi2(table, optics, gain, offset_m)
     for _ in range(GAUSS_NEWTON_STEPS):
@@ -206,7 +208,7 @@ def _refine(
 def _standard_errors(
     table: _ResponseTable, optics: Optics, is_offset_free: list[bool], gain: float, offset_m: FloatArray
 ) -> FloatArray:
-    """Standard uncertainties of gain and offsets, [3]; larger where the responses disagree more than they should."""
+    """Return the standard errors of gain and offsets, [3], enlarged if the residuals exceed the stated sigmas."""
     columns = np.array([True, *is_offset_free])
     scaled = _model_response(table, optics, gain, offset_m)[1][:, columns] / table.sigma[:, None]
     sigma = np.full(3, np.inf)

@@ -1,4 +1,4 @@
-"""Runs of any number of recordings to a map of the display's pixels, and what is to be said of it."""
+"""Fit of a display's pixel map to the runs of any number of recordings, and its statistics."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,7 +17,7 @@ from optodrive.lab.calibration.pixels.response import PixelResponse, PredictHeig
 
 @dataclass
 class PixelMapFitter:
-    """What runs show, gathered run by run. predict: as the model of this display has it."""
+    """Collects the responses of runs and fits the pixel map; predict: heights by the model of this display."""
 
     config: Config
     predict: PredictHeights
@@ -28,7 +28,7 @@ class PixelMapFitter:
         self._optics, self._pixel_count = Optics.from_config(self.config), len(build_pixel_layout(self.config.display))
 
     def add_run(self, where: str, run: Run) -> None:
-        """Take a run in; InputError for a pixel that the display does not have, or an aim that is none."""
+        """Add a run; raises InputError for an unknown pixel or an invalid aim."""
         pitch_m = self.config.display.pitch_m
         for signal in run.signals.values():
             if not 0 <= signal.pixel < self._pixel_count:
@@ -40,7 +40,7 @@ class PixelMapFitter:
             self.by_pixel.setdefault(response.pixel, []).append(response)
 
     def fit(self, where: str, model: str) -> PixelMap:
-        """The map; InputError where the heights are those of no display of this model."""
+        """Return the map; raises InputError if the heights do not match a display of this model."""
         check_responses(where, self.by_pixel, self._optics)
         estimates = [fit_pixel(self.by_pixel.get(pixel, []), self._optics) for pixel in range(self._pixel_count)]
         offset_m = np.array([found.offset_m for found in estimates]).T.copy()
@@ -58,7 +58,7 @@ class PixelMapFitter:
 
 
 def compute_stats(pixel_map: PixelMap, runs: int) -> dict[str, Any]:
-    """Counts, extremes and each pixel, for --json."""
+    """Return counts, extremes and each pixel's values, for --json."""
     measured = np.flatnonzero(pixel_map.state == MEASURED)
     gain = pixel_map.gain[measured]
     return {

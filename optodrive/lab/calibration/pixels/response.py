@@ -1,4 +1,4 @@
-"""One run's answer: how high a pixel stood, against what the model says of just these pulses."""
+"""Response of a run: ratio of a pixel's measured heights to the model's prediction for its pulses."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,19 +13,24 @@ SIGNAL = "displacement_m"
 PredictHeights = Callable[[FloatArray, int, FloatArray], FloatArray]
 """Heights of a pixel, m, at times [m] under pulses [n, 4]."""
 SAMPLES_MIN = 8
+"""Smallest number of samples of a response."""
 CLIPPING_ITERATIONS_MAX = 5
+"""Largest number of iterations of outlier rejection."""
 CLIPPING_SIGMAS = 5.0
-"""A sample so many sigmas off the rest is left out."""
+"""Residual in sigmas above which a sample is rejected."""
 MAD_TO_SIGMA = 1.4826
-"""Sigma over the median distance, of normal noise."""
+"""Sigma per median absolute deviation of a normal distribution."""
 RELATIVE_SIGMA_MIN = 1e-4
-"""No response is believed better than this."""
+"""Smallest relative sigma of a response."""
 PREDICTED_RANGE_MIN_M = 1e-7
-"""A run whose pulses lift the model's pixel by less says nothing of its gain."""
+"""Smallest range of predicted heights, m; a run below it does not determine the gain."""
 
 
 class PixelResponse(NamedTuple):
-    """value: measured over predicted, one standard uncertainty sigma; aim: where the beam was sent, from the middle."""
+    """Response of a pixel in one run.
+
+    ratio: measured over predicted height, with one standard error sigma; aim: beam position from the pixel's middle
+    """
 
     pixel: int
     aim_x_m: float
@@ -37,9 +42,9 @@ class PixelResponse(NamedTuple):
 def compute_response(
     where: str, run: Run, predict: PredictHeights, aim_max_m: tuple[float, float]
 ) -> PixelResponse | None:
-    """The response that a run shows; None without heights, pulses on the pixel, or enough samples.
+    """Return the response of a run, or None without heights, pulses on the pixel, or enough samples.
 
-    InputError for an aim that is no number, or farther off than aim_most_m.
+    Raises InputError for an aim that is not a number or beyond aim_max_m.
     """
     x_m, y_m = (_read_aim_m(where, run, axis, most_m) for axis, most_m in zip("xy", aim_max_m, strict=True))
     signal = run.signals.get(SIGNAL)
@@ -56,7 +61,7 @@ def compute_response(
 
 
 def _fit_ratio(predicted_m: FloatArray, measured_m: FloatArray) -> tuple[float, float] | None:
-    """The factor on a shape, beside an unknown zero of the instrument, and its sigma; without samples far off."""
+    """Return the ratio to a prediction and its sigma, with an unknown instrument offset and outliers rejected."""
     is_inlier = np.ones(len(measured_m), dtype=np.bool_)
     design = np.column_stack([predicted_m, np.ones(len(predicted_m))])
     for _ in range(CLIPPING_ITERATIONS_MAX):
@@ -80,6 +85,6 @@ def _read_aim_m(where: str, run: Run, axis: str, aim_max_m: float) -> float:
     key = f"aim_{axis}_m"
     aim_m = run.attributes.get(key, 0.0)
     if isinstance(aim_m, str) or not abs(aim_m) <= aim_max_m:
-        expected = f"a number of metres from the pixel's middle, {aim_max_m:.6g} either way at most"
+        expected = f"a number of metres from the pixel's middle, at most ±{aim_max_m:.6g}"
         raise InputError(f"{where}: /runs/{run.name}: {key}", aim_m, expected)
     return float(aim_m)

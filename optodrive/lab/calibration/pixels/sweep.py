@@ -1,7 +1,7 @@
-"""What to play so that every pixel's gain and offset can be told: one pulse a pixel, at a few aims.
+"""Pulses that determine every pixel's gain and offset: one pulse per pixel at each of a few aims.
 
-Across an edge part of the focus misses the absorber, which no limiter counts with: it falls on the wall, or on what
-lies there. Those pulses are so faint that even black acrylic would stay below the wall's cap.
+Across an edge, part of the focus misses the absorber and falls on the wall, which the limiter does not model. Those
+pulses are weak enough to keep even black acrylic below the wall's cap.
 """
 
 from typing import NamedTuple
@@ -13,19 +13,19 @@ from optodrive.device.config import Config, build_pixel_layout
 from optodrive.lab.calibration.pixels.fit import Optics
 
 EDGE_FRACTIONS = (0.7, 0.3)
-"""How much of the focus is nominally left on the absorber where the beam is aimed across an edge."""
+"""Nominal fractions of the focus on the absorber for aims across an edge."""
 ENERGY_FRACTION = 0.1
-"""Of the largest pulse allowed, for pulses on the middle."""
+"""Fraction of the largest allowed pulse energy, for pulses on the middle."""
 WALL_HEADROOM_FRACTION = 0.8
-"""Of the room below limits.wall_max_c, for pulses part of which miss the absorber."""
+"""Fraction of the headroom below limits.wall_max_c, for pulses that partly miss the absorber."""
 ACRYLIC_EFFUSIVITY_W_S05_PER_M2_K = (0.19 * 1.75e6) ** 0.5
 """Thermal effusivity of acrylic: 0.19 W/(m K), and 1.75 MJ/(m³ K), Table S4."""
 GATE_OFF_S = 0.05
-"""From a pulse's end to the next pulse on any pixel: the gas and absorber are cold again after a few of them."""
+"""Time from a pulse's end to the next pulse on any pixel, s; gas and absorber are cold after a few of them."""
 
 
 class Aim(NamedTuple):
-    """Where the beam is sent from each pixel's middle, m; name: of its files."""
+    """Position of the beam from each pixel's middle, m; name: of its files."""
 
     name: str
     x_m: float
@@ -33,7 +33,7 @@ class Aim(NamedTuple):
 
 
 def list_aims(config: Config) -> list[Aim]:
-    """The middle, and two places across each edge."""
+    """Return the middle, and two aims across each edge."""
     optics = Optics.from_config(config)
     edge_offsets_m = [
         [optics.absorber_half_m[axis] + (1.0 - 2.0 * share) * optics.focus_half_m[axis] for share in EDGE_FRACTIONS]
@@ -47,7 +47,7 @@ def list_aims(config: Config) -> list[Aim]:
 
 
 def compute_pulse(config: Config, aim: Aim) -> tuple[float, float]:
-    """Width, s, and power, W, of the pulses of an aim: short ones on the middle, faint ones across an edge."""
+    """Return width, s, and power, W, of an aim's pulses: short ones on the middle, weak ones across an edge."""
     laser, limits = config.laser, config.limits
     if aim.x_m == aim.y_m == 0.0:
         energy_j = ENERGY_FRACTION * limits.pulse_energy_max_j
@@ -59,9 +59,10 @@ def compute_pulse(config: Config, aim: Aim) -> tuple[float, float]:
 
 
 def edge_power_max_w(config: Config, width_s: float) -> float:
-    """The power at which a wall that takes in all the light stays below its cap, W; room √t / e of a half-space.
+    """Return the power at which a wall that absorbs all the light stays below its cap, W.
 
-    Mean and ripple of the PWM are added: both grow as the root of how long they last.
+    The surface of a half-space rises with √t over its effusivity. The rises by the mean power and by the ripple of the
+    PWM are added; each grows with the square root of its duration.
     """
     laser, limits = config.laser, config.limits
     headroom_k = WALL_HEADROOM_FRACTION * (limits.wall_max_c - config.ambient_c)
@@ -76,7 +77,7 @@ def edge_power_max_w(config: Config, width_s: float) -> float:
 
 
 def build_sweep(config: Config, aim: Aim) -> tuple[PulseTrain, ...]:
-    """One pulse a pixel; no two beside each other follow one another."""
+    """Build one pulse per pixel in an order without successive neighbours."""
     layout, (width_s, power_w) = build_pixel_layout(config.display), compute_pulse(config, aim)
     order = np.lexsort((layout.column, layout.row, layout.column % 2, layout.row % 2))
     slot_s = width_s + GATE_OFF_S

@@ -108,7 +108,7 @@ def interpolate_grid(scale, moved, x_m, y_m):
         (lambda raw: raw[:-8], "size: got 68120, expected 68128 bytes"),
         (lambda raw: b"JCZ_COR_2_1" + raw[11:], "LMC1COR_1.0"),
         (lambda raw: raw[:368] + bytes(8) + raw[376:], "codes per millimetre: got 0.0"),
-        (lambda raw: raw[:528] + raw[528:560] * 2112 + raw[-16:], "no mirrors and lens come nearer"),
+        (lambda raw: raw[:528] + raw[528:560] * 2112 + raw[-16:], "from which the best field deviates"),
     ],
 )
 def test_a_grid_that_is_none_is_refused(folder, capsys, spoil, named):
@@ -125,7 +125,7 @@ def test_a_grid_that_is_none_is_refused(folder, capsys, spoil, named):
 WRONG = {
     "mirrored": ([], lambda t: t * [1, 1, -1, 1], "x mirrored"),
     "inches": ([], lambda t: t / [1, 1, 0.0254, 0.0254], "inches"),
-    "still": ([], lambda t: np.column_stack([t[:, :2], 0.0 * t[:, 2:]]), "seen at one place"),
+    "still": ([], lambda t: np.column_stack([t[:, :2], 0.0 * t[:, 2:]]), "measured at one place"),
     "few": ([], lambda t: t[:4], "at least 6"),
     "half false": ([], lambda t: np.vstack([t[:40], t[40:100, [0, 1, 3, 2]]]), "x_m, y_m"),
     "other display": (["--config", "display-9999"], lambda t: t, "--config"),

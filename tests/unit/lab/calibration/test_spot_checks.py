@@ -31,12 +31,12 @@ WRONG_TABLES = {
     "millimetres": lambda t: t * [1, 1, 1e3, 1e3],
     "micrometres": lambda t: t * [1, 1, 1e6, 1e6],
     "distances (2|1.99)": lambda t: t * [1, 1, 2, 2],
-    "all spots were seen at one place": lambda t: collapse_to_one_place(t, 1e-5),
-    "this mirror stands still": lambda t: np.column_stack([t[:, :2], np.full(len(t), 1e-3), t[:, 3]]),
+    "all spots were measured at one place": lambda t: collapse_to_one_place(t, 1e-5),
+    "this mirror does not move": lambda t: np.column_stack([t[:, :2], np.full(len(t), 1e-3), t[:, 3]]),
     "on a line": lambda t: t[:, [0, 0, 2, 2]],
     "several places": lambda t: np.column_stack([np.full((len(t), 2), 3e4), t[:, 2:]]),
     "at least 6": lambda t: t[:5],
-    "nearly all look false": lambda t: np.column_stack(
+    "nearly all look like outliers": lambda t: np.column_stack(
         [t[:, :2], np.random.default_rng(2).uniform(-0.036, 0.036, (len(t), 2))]
     ),
     "turned by": lambda t: np.column_stack([t[:, :2], t[:, 2:] @ [[0.9, 0.44], [-0.44, 0.9]]]),

@@ -101,8 +101,11 @@ def test_pixels_that_are_always_bright_and_a_change_of_the_room_light_are_no_spo
 
 REFUSED = {
     "none": (0.0 * X, "it: got 'nothing brighter than"),
-    "alike": (200.0 * (draw_blob((80, 80)) + 0.9 * draw_blob((200, 150))), "two spots alike, at 80 80 and 200 150 px"),
-    "both saturated": (900.0 * (draw_blob((80, 80)) + draw_blob((200, 150))), "two spots alike"),
+    "alike": (
+        200.0 * (draw_blob((80, 80)) + 0.9 * draw_blob((200, 150))),
+        "two similar spots, at 80 80 and 200 150 px",
+    ),
+    "both saturated": (900.0 * (draw_blob((80, 80)) + draw_blob((200, 150))), "two similar spots"),
     "cut": (200.0 * draw_blob((1.0, 120.0)), "cut by the picture's edge"),
 }
 
