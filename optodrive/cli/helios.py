@@ -206,8 +206,8 @@ def _summarise_playback(
         "energy_j": proven.energy_j,
         "energy_planned_j": float(plan.energy_j.sum()),
         "predicted_max_um": m_to_um(float(response.displacement_m.max())) if len(pulses) else 0.0,
-        "holes": playback.underruns,
-        "hole_s": playback.underrun_s,
+        "underruns": playback.underruns,
+        "underrun_s": playback.underrun_s,
     }
 
 
@@ -217,8 +217,8 @@ def _format_playback(playback: dict[str, Any]) -> list[str]:
         f"light            {playback['energy_j']:.4f} J of {playback['energy_planned_j']:.4f} J planned",
         f"tallest so       {playback['predicted_max_um']:.1f} µm predicted of the light sent",
     ]
-    if playback["holes"]:
+    if playback["underruns"]:
         lines.append(
-            f"holes            {playback['holes']}, dark for {playback['hole_s'] * 1e3:.1f} ms at least in all"
+            f"underruns        {playback['underruns']}, at least {playback['underrun_s'] * 1e3:.1f} ms in total"
         )
     return lines

@@ -1,4 +1,4 @@
-"""A Helios on the bench: configuration, emulated board, driver, and plans for it."""
+"""Test bench of the Helios DAC: configuration, emulated DAC, driver and plans."""
 
 from functools import cache
 
@@ -15,8 +15,8 @@ from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 
 
-def config_of(name="display-16", **board):
-    """A shipped configuration with a Helios."""
+def build_config(name="display-16", **board):
+    """Return a shipped configuration with a Helios DAC."""
     table = load_config(name).model_dump()
     table["board"] |= {"transport": "helios", "interlock_watched": True} | board
     table["scanner"]["half_range_codes"] = 2047
@@ -24,30 +24,30 @@ def config_of(name="display-16", **board):
 
 
 @cache
-def display_of(name="display-16", points_per_s=40_000):
-    return DisplayModel.from_config(config_of(name, points_per_s=points_per_s))
+def build_display(name="display-16", points_per_s=40_000):
+    return DisplayModel.from_config(build_config(name, points_per_s=points_per_s))
 
 
-def frame_of(display, height_m=20e-6, duration_s=1.0):
+def build_frame(display, height_m=20e-6, duration_s=1.0):
     return FrameSequence((TactileFrame("f", 0.0, duration_s, np.full(len(display.pixels), height_m)),))
 
 
-def train_of(width_s=0.02, gap_s=0.02, power_w=1.0, pixel=5, duration_s=0.3):
+def build_train(width_s=0.02, gap_s=0.02, power_w=1.0, pixel=5, duration_s=0.3):
     return FrameSequence(trains=(PulseTrain(pixel, 0.0, duration_s, width_s, gap_s, power_w),))
 
 
-def proven_of(display, sequence):
-    """The plan and its proven frames."""
+def build_verified(display, sequence):
+    """Return a plan and its verified frames."""
     heat, budget = display.build_cold_state()
     plan = plan_sequence(display, sequence, heat, budget).plan
     return plan, encode_verified(plan, PointScale.from_config(display.config), budget, display.budget)
 
 
 class Bench:
-    """Driver and emulated board, not yet open."""
+    """Unopened driver with its emulated DAC."""
 
     def __init__(self, board=None, **device):
         self.clock = ManualClock()
         self.emulated = EmulatedHelios(self.clock, **device)
         self.device = self.emulated.device
-        self.helios = Helios(board or config_of().board, self.clock, self.emulated)
+        self.helios = Helios(board or build_config().board, self.clock, self.emulated)

@@ -1,6 +1,6 @@
-"""A Helios as a backend of pyusb: the real pyusb and the real driver talk to it, in virtual time.
+"""Emulated Helios DAC as a pyusb backend, in virtual time, for the real pyusb and the real driver.
 
-Written from the board's published firmware and this sheet of facts, not from the driver: frames are parsed here anew.
+It is written from the published firmware, independently of the driver, and parses frames with its own code.
 """
 
 import errno
@@ -13,9 +13,9 @@ import usb.core
 
 CLOCK_HZ = 112_000_000
 BYTES_PER_S = 64 * 19 * 1000
-"""Bulk at full speed: at most nineteen packets of 64 bytes in a frame of 1 ms."""
+"""Full-speed bulk transfers: at most 19 packets of 64 bytes per 1 ms frame."""
 COMMAND_S = 1e-3
-"""Interrupt endpoints are served once in a frame of 1 ms."""
+"""Interrupt endpoints are served once per 1 ms frame."""
 STOP_WINDOW = CLOCK_HZ // 10
 FRAME_BYTES_MAX = 4096 * 7 + 5
 INT_OUT, INT_IN, BULK_OUT = 0x06, 0x83, 0x02
@@ -23,12 +23,12 @@ CENTRE = (0x800, 0x800)
 
 
 class HostDeadError(BaseException):
-    """The host was killed: nothing it does reaches the board any more."""
+    """The host was killed. None of its actions reach the DAC."""
 
 
 @dataclass(frozen=True)
 class Output:
-    """What the outputs show from a time on: codes, channels, shutter, power."""
+    """State of the outputs from at_s on: codes, channels, shutter and power."""
 
     at_s: float
     x: int
@@ -39,7 +39,7 @@ class Output:
 
 
 class Device:
-    """The board: sans USB, told what arrives; time in ticks of its own clock."""
+    """The DAC without USB. It receives data by method calls; time is in ticks of its clock."""
 
     def __init__(self, name="Helios 1163021877", version=6):
         self.name, self.version = name, version
@@ -138,7 +138,7 @@ class Device:
             self._stop()
 
     def unplug(self):
-        """It lives on the bus' power: without it, nothing shines."""
+        """Cut the bus power, which ends all emission."""
         self.powered = self.connected = self.playing = self.shutter = False
         self.due = self.stop_until = None
         self.colour = (0, 0, 0, 0)
@@ -168,11 +168,11 @@ class Device:
             self._blank()
 
     def _answer(self, data):
-        if self.answer is None:  # else a transfer runs already, and the new answer is lost
+        if self.answer is None:  # during a pending transfer a new answer is lost
             self.answer = data
 
     def packet(self, data):
-        """One packet of a bulk transfer; a short one, or a full buffer, ends the transfer."""
+        """Receive one packet of a bulk transfer. A short packet or a full buffer ends the transfer."""
         self.partial += data
         if len(data) == 64 and len(self.partial) < FRAME_BYTES_MAX:
             return
@@ -194,10 +194,10 @@ class Device:
         else:
             self.queued = frame, repeat, rate
 
-    # --- what the laser did ---
+    # --- emission ---
 
     def light(self):
-        """(from_s, to_s, x, y, level) of each stretch of light, whatever the shutter; the last may go on until now."""
+        """Return (from_s, to_s, x, y, level) of each emission, regardless of the shutter; the last may end now."""
         stretches = []
         for output, after in zip(self.log, [*self.log[1:], None], strict=True):
             if any(output.colour):
@@ -206,15 +206,18 @@ class Device:
         return stretches
 
     def dark_from_s(self):
-        """When the last light ended; 0 if there was none."""
+        """Return the end of the last emission, 0 without any."""
         return max((until_s for _, until_s, *_ in self.light()), default=0.0)
 
 
 class EmulatedHelios(usb.backend.IBackend):
-    """pyusb's backend with a Helios behind it. clock: a ManualClock that transfers move; faults are set as attributes.
+    """pyusb backend with an emulated DAC. clock: a ManualClock that transfers advance.
 
-    deaf: answers missed; busy: "not ready" answers; garbage: answers given instead; refused: commands not taken;
-    dies_at_s: the host is killed; unplugged_at_s: in the middle of whatever goes on.
+    Attributes inject faults:
+    deaf, busy: number of answers to lose, and of "not ready" answers
+    garbage: answers to return instead
+    refused: number of commands to refuse
+    dies_at_s, unplugged_at_s: time at which the host is killed, and at which the cable is unplugged
     """
 
     def __init__(self, clock, others=(), **device):
@@ -234,7 +237,7 @@ class EmulatedHelios(usb.backend.IBackend):
     # --- time and faults ---
 
     def _now(self):
-        """Catch up with the clock; raises what has happened to host or cable meanwhile."""
+        """Advance the DAC to the clock. Raise the injected failure of host or cable."""
         now_s = self.clock.now_s()
         if now_s >= self.unplugged_at_s and self.device.powered:
             self.device.advance(round(self.unplugged_at_s * CLOCK_HZ))
@@ -246,7 +249,7 @@ class EmulatedHelios(usb.backend.IBackend):
             raise usb.core.USBError("No such device (it may have been disconnected)", errno=errno.ENODEV)
 
     def pass_time(self, duration_s):
-        """Time with nobody calling; the board goes on."""
+        """Let time pass without calls of the host."""
         self.dies_at_s, dies_at_s = float("inf"), self.dies_at_s
         self.clock.sleep(duration_s)
         try:

@@ -1,4 +1,4 @@
-"""Every fact known of the board, against the emulated one, through pyusb and nothing of this package's driver."""
+"""Facts about the DAC, checked on the emulated one through pyusb, without this package's driver."""
 
 import struct
 
@@ -11,7 +11,7 @@ from optodrive.core.clock import ManualClock
 
 
 class Raw:
-    """pyusb's device, claimed and enabled, with commands by number."""
+    """pyusb device, claimed and enabled, with commands by number."""
 
     def __init__(self, enable=True):
         self.clock = ManualClock()
@@ -39,7 +39,7 @@ class Raw:
         self.emulated.pass_time(duration_s)
 
 
-def lit(count, x=100, y=200, level=9):
+def emission(count, x=100, y=200, level=9):
     return [(x, y, level)] * count
 
 
@@ -81,7 +81,7 @@ def test_an_answer_nobody_reads_keeps_the_next_from_coming():
 @pytest.mark.parametrize("rate", [7, 20_000, 33_333, 40_000, 65_535])
 def test_the_rate_is_rounded_to_the_clock(rate):
     raw = Raw()
-    raw.frame([*lit(3), (100, 200, 0)], rate)
+    raw.frame([*emission(3), (100, 200, 0)], rate)
     raw.wait(1.0)
     (stretch,) = raw.board.light()
     assert stretch[1] - stretch[0] == pytest.approx(3 * (112_000_000 // rate + 1) / CLOCK_HZ, abs=1e-9)
@@ -90,7 +90,7 @@ def test_the_rate_is_rounded_to_the_clock(rate):
 @pytest.mark.parametrize(("rate", "taken"), [(0, 7), (6, 7)])
 def test_a_rate_out_of_range_is_clamped(rate, taken):
     raw = Raw()
-    raw.frame(lit(2), rate)
+    raw.frame(emission(2), rate)
     assert raw.board.ticks == 112_000_000 // taken + 1
 
 
@@ -104,7 +104,7 @@ def test_points_are_codes_of_twelve_bits_and_channels_of_eight():
 
 def test_played_once_it_ends_dark_and_stays_where_it_was():
     raw = Raw()
-    raw.frame(lit(50))
+    raw.frame(emission(50))
     raw.wait(1.0)
     ((begin, end, *_),) = raw.board.light()
     assert end - begin == pytest.approx(50 * 11_201 / CLOCK_HZ)
@@ -114,20 +114,20 @@ def test_played_once_it_ends_dark_and_stays_where_it_was():
 
 def test_without_play_once_the_last_frame_repeats_for_ever():
     raw = Raw()
-    raw.frame(lit(50), rate=1000, flags=0)
+    raw.frame(emission(50), rate=1000, flags=0)
     raw.wait(60.0)
     assert raw.board.colour == (9, 9, 9, 9)
 
 
 def test_two_buffers_and_no_more():
     raw = Raw()
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     assert raw.ask(3, 0) == b"\x83\x01"  # one plays, the next may come
-    raw.frame(lit(500, level=8))
+    raw.frame(emission(500, level=8))
     assert raw.ask(3, 0) == b"\x83\x00"  # one waits
     began_s = raw.clock.now_s()
     with pytest.raises(usb.core.USBTimeoutError):
-        raw.frame(lit(500, level=7), timeout=5)
+        raw.frame(emission(500, level=7), timeout=5)
     assert raw.clock.now_s() == pytest.approx(began_s + 0.005)
     raw.wait(0.05)
     assert raw.ask(3, 0) == b"\x83\x01"
@@ -139,9 +139,9 @@ def test_two_buffers_and_no_more():
 
 def test_start_at_once_cuts_what_plays():
     raw = Raw()
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.wait(0.01)
-    raw.frame(lit(5, level=7), flags=3)
+    raw.frame(emission(5, level=7), flags=3)
     raw.wait(1.0)
     first, second = raw.board.light()
     assert first[1] - first[0] < 0.02
@@ -151,7 +151,7 @@ def test_start_at_once_cuts_what_plays():
 def test_a_full_frame_takes_as_long_as_full_speed_allows():
     raw = Raw()
     began_s = raw.clock.now_s()
-    raw.frame(lit(4094))
+    raw.frame(emission(4094))
     assert raw.clock.now_s() - began_s == pytest.approx((4094 * 7 + 5) / BYTES_PER_S)
     full_s = (4095 * 7 + 5) / BYTES_PER_S
     assert full_s == pytest.approx(23.6e-3, rel=2e-3)
@@ -161,14 +161,14 @@ def test_a_full_frame_takes_as_long_as_full_speed_allows():
 def test_a_whole_number_of_packets_stalls(count):
     raw = Raw()
     assert (7 * count + 5) % 64 == 0
-    raw.frame(lit(count))
+    raw.frame(emission(count))
     raw.wait(1.0)
     assert not raw.board.light()
-    raw.frame(lit(10))  # ends the transfer, which now fits no frame
+    raw.frame(emission(10))  # ends the transfer, which now fits no frame
     raw.wait(1.0)
     assert not raw.board.light()
     assert raw.ask(3, 0) == b"\x83\x01"  # polling takes bulk transfers up again
-    raw.frame(lit(10))
+    raw.frame(emission(10))
     raw.wait(1.0)
     assert len(raw.board.light()) == 1
 
@@ -177,9 +177,9 @@ def test_a_frame_that_contradicts_itself_is_dropped_until_the_next_poll():
     raw = Raw()
     raw.usb.write(0x02, bytes(70) + struct.pack("<HHB", 1000, 11, 2), 100)
     with pytest.raises(usb.core.USBTimeoutError):
-        raw.frame(lit(10))
+        raw.frame(emission(10))
     raw.ask(3, 0)
-    raw.frame(lit(10))
+    raw.frame(emission(10))
     raw.wait(1.0)
     assert len(raw.board.light()) == 1
 
@@ -187,26 +187,26 @@ def test_a_frame_that_contradicts_itself_is_dropped_until_the_next_poll():
 def test_stop_blanks_at_once_drops_frames_for_a_while_and_leaves_the_shutter():
     raw = Raw()
     raw.say(2, 1)
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.wait(0.01)
     assert any(raw.board.colour)
     raw.say(1, 0)
     assert not any(raw.board.colour)
     stopped_s = raw.clock.now_s()
     assert raw.board.shutter
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.wait(0.05)
     assert not any(raw.board.colour)
     raw.wait(0.1 - (raw.clock.now_s() - stopped_s) + 1e-4)
     assert raw.board.position == (0x800, 0x800)
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.wait(0.01)
     assert any(raw.board.colour)
 
 
 def test_an_alternate_setting_without_endpoints_stops_it():
     raw = Raw()
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.wait(0.01)
     raw.usb.set_interface_altsetting(0, 0)
     assert not any(raw.board.colour)
@@ -215,10 +215,10 @@ def test_an_alternate_setting_without_endpoints_stops_it():
 def test_unplugged_it_has_no_power():
     raw = Raw()
     raw.say(2, 1)
-    raw.frame(lit(500))
+    raw.frame(emission(500))
     raw.emulated.unplugged_at_s = raw.clock.now_s() + 0.01
     with pytest.raises(usb.core.USBError, match="No such device"):
-        raw.frame(lit(4000), timeout=100)
+        raw.frame(emission(4000), timeout=100)
     assert not any(raw.board.colour)
     assert not raw.board.shutter
     assert raw.board.dark_from_s() == pytest.approx(raw.emulated.unplugged_at_s)

@@ -1,4 +1,4 @@
-"""`optodrive helios`: the command line, through the real pyusb, on the emulated board, in virtual time."""
+"""`optodrive helios` on the emulated DAC, through the real pyusb, in virtual time."""
 
 import json
 import signal
@@ -6,7 +6,7 @@ import signal
 import pytest
 import usb.backend.libusb1
 
-from helios.bench import Bench, display_of, frame_of, train_of
+from helios.bench import Bench, build_display, build_frame, build_train
 from helios.emulated import HostDeadError
 from optodrive.cli import helios as helios_cli
 from optodrive.cli.main import run
@@ -15,11 +15,11 @@ from optodrive.device.config import locate_shipped
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
 DAY_S = 1.7e9
-LONG = train_of(width_s=0.04, gap_s=0.004, power_w=2.0, duration_s=1.0)
+LONG = build_train(width_s=0.04, gap_s=0.004, power_w=2.0, duration_s=1.0)
 
 
 class Desk:
-    """A folder with a configuration and frames, and the emulated board where pyusb looks for libusb."""
+    """Folder with a configuration and frames, and the emulated DAC in place of libusb."""
 
     def __init__(self, folder, monkeypatch):
         self.folder, self.bench = folder, Bench()
@@ -29,7 +29,7 @@ class Desk:
         monkeypatch.setattr("optodrive.core.clock.MonotonicClock", lambda: self.clock)
         monkeypatch.setattr(helios_cli, "time_of_day", lambda: DAY_S + self.clock.now_s())
         self.frames = folder / "frames.json"
-        self.ask(frame_of(display_of()))
+        self.ask(build_frame(build_display()))
 
     def ask(self, sequence):
         self.frames.write_text(json.dumps(sequence_to_json(sequence)))
@@ -50,7 +50,7 @@ def desk(tmp_path, monkeypatch):
     return Desk(tmp_path, monkeypatch)
 
 
-def test_info_tells_who_it_is_and_whether_it_may_emit(desk, capsys):
+def test_info_reports_identity_and_permission_to_emit(desk, capsys):
     assert run(["helios", "info", *desk.config(), "--json"]) == 0
     assert json.loads(capsys.readouterr().out) == {
         "name": "Helios 1163021877",
@@ -62,18 +62,18 @@ def test_info_tells_who_it_is_and_whether_it_may_emit(desk, capsys):
     assert "may emit         no" in capsys.readouterr().out
 
 
-def test_play_says_what_left_and_the_laser_did_it(desk, capsys):
+def test_play_reports_what_the_laser_emitted(desk, capsys):
     assert desk.play("--json") == 0
-    figures = json.loads(capsys.readouterr().out)
+    report = json.loads(capsys.readouterr().out)
     light = desk.bench.device.light()
-    told = figures["helios"]
-    assert len(light) >= figures["pulses"] > 0
+    playback = report["helios"]
+    assert len(light) >= report["pulses"] > 0
     shone_j = sum((end_s - begin_s) * level / 255 * 2.45 for begin_s, end_s, _, _, level in light)
-    assert told["energy_j"] == pytest.approx(shone_j, rel=1e-6)
-    assert 0.9 * told["energy_planned_j"] < told["energy_j"] <= told["energy_planned_j"]
-    assert told["predicted_max_um"] < figures["predicted_max_um"]
-    assert (told["holes"], told["frames"]) == (0, desk.bench.device.frames_played)
-    assert told["points_per_s"] == pytest.approx(39_985.72, abs=0.01)
+    assert playback["energy_j"] == pytest.approx(shone_j, rel=1e-6)
+    assert 0.9 * playback["energy_planned_j"] < playback["energy_j"] <= playback["energy_planned_j"]
+    assert playback["predicted_max_um"] < report["predicted_max_um"]
+    assert (playback["underruns"], playback["frames"]) == (0, desk.bench.device.frames_played)
+    assert playback["points_per_s"] == pytest.approx(39_985.72, abs=0.01)
     assert not desk.bench.device.shutter
     assert not desk.bench.emulated.claimed
     assert desk.play() == 0
@@ -81,7 +81,7 @@ def test_play_says_what_left_and_the_laser_did_it(desk, capsys):
 
 
 @pytest.mark.parametrize("after", ["at once", "killed"])
-def test_a_play_knows_what_the_one_before_left(desk, capsys, after):
+def test_a_play_accounts_for_the_heat_of_the_previous_one(desk, capsys, after):
     desk.ask(LONG)
     assert desk.play("--json") == 0
     first = json.loads(capsys.readouterr().out)
@@ -96,7 +96,7 @@ def test_a_play_knows_what_the_one_before_left(desk, capsys, after):
     assert again["energy_j"] < first["energy_j"]
 
 
-def test_without_a_watched_interlock_one_line_and_no_light(desk, capsys):
+def test_without_an_external_interlock_one_line_and_no_emission(desk, capsys):
     assert run(["helios", "play", str(desk.frames), *desk.config("false")]) == 2
     error = capsys.readouterr().err
     assert error.startswith("optodrive: board.interlock_watched: got False, expected true")
@@ -104,13 +104,13 @@ def test_without_a_watched_interlock_one_line_and_no_light(desk, capsys):
     assert not desk.bench.emulated.commands
 
 
-def test_a_converter_of_another_width_is_refused(desk, capsys):
+def test_another_converter_width_is_rejected(desk, capsys):
     assert run(["helios", "play", str(desk.frames), *desk.config(steps=32767)]) == 2
     assert "scanner.half_range_codes 32767 must be 2047" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", helios_cli.TERMINATING_SIGNALS)
-def test_a_signal_ends_the_light_by_a_stop(desk, capsys, number):
+def test_a_signal_ends_emission_by_a_stop(desk, capsys, number):
     desk.ask(LONG)
     emulated, sent = desk.bench.emulated, []
     write = emulated.bulk_write
@@ -119,7 +119,7 @@ def test_a_signal_ends_the_light_by_a_stop(desk, capsys, number):
         sent.append(emulated.clock.now_s())
         if len(sent) == 3:
             signal.raise_signal(number)
-            signal.raise_signal(number)  # and once more, in a hurry
+            signal.raise_signal(number)  # a second one before the first is handled
         return write(*transfer)
 
     emulated.bulk_write = write_and_signal
@@ -133,7 +133,7 @@ def test_a_signal_ends_the_light_by_a_stop(desk, capsys, number):
     assert signal.getsignal(number) is before
 
 
-def test_unplugged_in_mid_play_is_one_line_and_dark(desk, capsys):
+def test_unplugging_during_playback_is_one_line_and_ends_emission(desk, capsys):
     desk.ask(LONG)
     desk.bench.emulated.unplugged_at_s = desk.clock.now_s() + 0.8
     assert desk.play() == LinkError.exit_status
@@ -145,7 +145,7 @@ def test_unplugged_in_mid_play_is_one_line_and_dark(desk, capsys):
     assert not desk.bench.device.shutter
 
 
-def test_a_memory_that_cannot_be_kept_ends_it_before_the_light(desk, capsys, monkeypatch):
+def test_a_budget_file_that_cannot_be_written_prevents_emission(desk, capsys, monkeypatch):
     blocked = desk.folder / "blocked"
     blocked.write_text("")
     monkeypatch.setenv("XDG_STATE_HOME", str(blocked))
@@ -154,12 +154,12 @@ def test_a_memory_that_cannot_be_kept_ends_it_before_the_light(desk, capsys, mon
     assert not desk.bench.device.light()
 
 
-def test_no_helios_is_one_line(desk, capsys):
+def test_a_missing_helios_is_one_line(desk, capsys):
     desk.bench.emulated.unplugged_at_s = 0.0
     assert desk.play() == 2
     assert capsys.readouterr().err == ("optodrive: board: got '1209:e500', expected a connected USB device\n")
 
 
-def test_a_daemon_on_a_helios_is_refused(desk, capsys):
+def test_a_daemon_on_a_helios_is_rejected(desk, capsys):
     assert run(["serve", *desk.config()]) == 2
     assert "the daemon cannot use a Helios, see `optodrive helios play`" in capsys.readouterr().err

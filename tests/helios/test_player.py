@@ -1,9 +1,9 @@
-"""Plans played on the emulated board: what the laser did, and that every way out ends dark."""
+"""Plans played on the emulated DAC: the emission, and the stop on every kind of exit."""
 
 import numpy as np
 import pytest
 
-from helios.bench import Bench, config_of, display_of, frame_of, proven_of, train_of
+from helios.bench import Bench, build_config, build_display, build_frame, build_train, build_verified
 from helios.emulated import HostDeadError
 from optodrive.core.errors import InputError, LinkError
 from optodrive.link.helios import player as player_module
@@ -12,117 +12,119 @@ from optodrive.link.helios.frames import HOST_LOSS_EMISSION_MAX_S, POINT_BYTES
 from optodrive.link.helios.player import play
 
 
-def light_of(bench, since_s=0.0):
+def list_emissions(bench, since_s=0.0):
     return [stretch for stretch in bench.device.light() if stretch[0] >= since_s]
 
 
 @pytest.mark.parametrize("rate", [20_000, 40_000, 50_000])
 @pytest.mark.parametrize("name", ["display-16", "display-437"])
-def test_what_shines_is_what_was_proven(name, rate):
-    display = display_of(name, rate)
-    sequence = frame_of(display) if name == "display-16" else frame_of(display, 5e-6, 2.0)
-    plan, proven = proven_of(display, sequence)
+def test_the_emission_is_the_verified_one(name, rate):
+    display = build_display(name, rate)
+    sequence = build_frame(display) if name == "display-16" else build_frame(display, 5e-6, 2.0)
+    plan, verified = build_verified(display, sequence)
     bench = Bench(display.config.board)
     with bench.helios as helios:
-        played = play(helios, proven, bench.clock)
-    light, scale = light_of(bench), PointScale.from_config(display.config)
+        played = play(helios, verified, bench.clock)
+    light, scale = list_emissions(bench), PointScale.from_config(display.config)
     assert played.underruns == 0
-    assert played.frames == len(proven.frames) == bench.device.frames_played
-    assert len(light) == len(proven.pulses)
+    assert played.frames == len(verified.frames) == bench.device.frames_played
+    assert len(light) == len(verified.pulses)
     start_s = np.array([stretch[0] for stretch in light])
     width_s = np.array([stretch[1] - stretch[0] for stretch in light])
-    assert start_s - start_s[0] == pytest.approx(proven.pulses.start_s - proven.pulses.start_s[0], abs=1e-8)
-    assert width_s == pytest.approx(proven.pulses.width_s, abs=1e-8)
-    assert np.array([(x - 2048) * scale.rad_per_code for _, _, x, _, _ in light]) == pytest.approx(proven.pulses.x_rad)
-    assert [level / 255 * scale.full_power_w for *_, level in light] == pytest.approx(proven.pulses.power_w)
-    assert len(set(proven.row.tolist())) == len(plan)
+    assert start_s - start_s[0] == pytest.approx(verified.pulses.start_s - verified.pulses.start_s[0], abs=1e-8)
+    assert width_s == pytest.approx(verified.pulses.width_s, abs=1e-8)
+    assert np.array([(x - 2048) * scale.rad_per_code for _, _, x, _, _ in light]) == pytest.approx(
+        verified.pulses.x_rad
+    )
+    assert [level / 255 * scale.full_power_w for *_, level in light] == pytest.approx(verified.pulses.power_w)
+    assert len(set(verified.row.tolist())) == len(plan)
 
 
-def test_the_shutter_opens_for_the_light_and_closes_after_it():
-    display = display_of()
-    _, proven = proven_of(display, frame_of(display))
+def test_the_shutter_is_open_only_during_playback():
+    display = build_display()
+    _, verified = build_verified(display, build_frame(display))
     bench = Bench()
     with bench.helios as helios:
-        play(helios, proven, bench.clock)
+        play(helios, verified, bench.clock)
         assert not bench.device.shutter
     opened = [output.at_s for output in bench.device.log if output.shutter]
-    light = light_of(bench)
+    light = list_emissions(bench)
     assert opened[0] < light[0][0]
     assert all(output.shutter for output in bench.device.log if any(output.colour))
 
 
-def test_the_first_frame_begins_with_the_mirrors_in_the_middle():
-    display = display_of()
-    _, proven = proven_of(display, frame_of(display))
+def test_the_first_frame_starts_with_centred_mirrors():
+    display = build_display()
+    _, verified = build_verified(display, build_frame(display))
     bench = Bench()
     bench.device.position = (1, 1)
     with bench.helios as helios:
         bench.emulated.pass_time(0.0)
         assert bench.device.position == (0x800, 0x800)
-        play(helios, proven, bench.clock)
+        play(helios, verified, bench.clock)
 
 
 def playing(display=None, sequence=None, **faults):
-    display = display or display_of()
-    _, proven = proven_of(display, sequence or train_of(width_s=0.04, gap_s=0.004, duration_s=1.0))
+    display = display or build_display()
+    _, verified = build_verified(display, sequence or build_train(width_s=0.04, gap_s=0.004, duration_s=1.0))
     bench = Bench(display.config.board)
     bench.helios.open()
-    return bench, proven
+    return bench, verified
 
 
 @pytest.mark.parametrize("after_s", np.linspace(0.13, 0.9, 12))
-def test_a_host_that_is_killed_leaves_dark_within_the_bound(after_s):
-    bench, proven = playing()
+def test_emission_ends_within_the_bound_after_the_host_was_killed(after_s):
+    bench, verified = playing()
     killed_s = bench.clock.now_s() + after_s
     bench.emulated.dies_at_s = killed_s
     with pytest.raises(HostDeadError):
-        play(bench.helios, proven, bench.clock)
+        play(bench.helios, verified, bench.clock)
     bench.emulated.pass_time(60.0)
     assert bench.device.dark_from_s() <= killed_s + HOST_LOSS_EMISSION_MAX_S
     assert not any(bench.device.colour)
 
 
-def test_the_bound_is_not_idle():
-    """The latest light after a kill comes near the bound."""
+def test_the_bound_is_tight():
+    """The latest emission after a kill reaches 70 % of the bound."""
     worst_s = 0.0
     for after_s in np.linspace(0.2, 0.3, 25):
-        bench, proven = playing(sequence=train_of(width_s=0.05, gap_s=0.001, duration_s=0.5, power_w=0.1))
+        bench, verified = playing(sequence=build_train(width_s=0.05, gap_s=0.001, duration_s=0.5, power_w=0.1))
         bench.emulated.dies_at_s = killed_s = bench.clock.now_s() + after_s
         with pytest.raises(HostDeadError):
-            play(bench.helios, proven, bench.clock)
+            play(bench.helios, verified, bench.clock)
         bench.emulated.pass_time(1.0)
         worst_s = max(worst_s, bench.device.dark_from_s() - killed_s)
     assert 0.7 * HOST_LOSS_EMISSION_MAX_S < worst_s <= HOST_LOSS_EMISSION_MAX_S
 
 
-def test_a_mutant_that_forgets_play_once_is_seen_to_shine_for_ever():
-    """What the rule is for: the same kill, with play-once struck out behind the driver's back."""
-    bench, proven = playing()
+def test_a_mutant_without_play_once_emits_forever():
+    """Purpose of the rule: the same kill with the play-once flag removed below the driver."""
+    bench, verified = playing()
     bench.emulated.bulk_write, write = (
         lambda handle, ep, intf, data, timeout: write(handle, ep, intf, bytes(data)[:-1] + b"\0", timeout),
         bench.emulated.bulk_write,
     )
     bench.emulated.dies_at_s = killed_s = bench.clock.now_s() + 0.3
     with pytest.raises(HostDeadError):
-        play(bench.helios, proven, bench.clock)
+        play(bench.helios, verified, bench.clock)
     bench.emulated.pass_time(5.0)
     assert bench.device.dark_from_s() > killed_s + 4.0
 
 
 @pytest.mark.parametrize("after_s", [0.0, 0.12, 0.3, 0.3123, 0.5])
-def test_unplugged_it_ends_at_once_and_is_told(after_s):
-    bench, proven = playing()
+def test_unplugging_ends_emission_at_once_and_is_reported(after_s):
+    bench, verified = playing()
     bench.emulated.unplugged_at_s = pulled_s = bench.clock.now_s() + after_s
     with pytest.raises(LinkError, match="unplugged"):
-        play(bench.helios, proven, bench.clock)
+        play(bench.helios, verified, bench.clock)
     assert bench.device.dark_from_s() <= pulled_s + 1e-6
-    with pytest.raises(LinkError, match="may not have heard"):
+    with pytest.raises(LinkError, match="may not have received"):
         bench.helios.close()
     assert not bench.device.shutter
 
 
-def test_unplugged_in_the_middle_of_a_transfer():
-    bench, proven = playing()
+def test_unplugging_during_a_transfer():
+    bench, verified = playing()
     calls = []
 
     def pull(share):
@@ -131,13 +133,13 @@ def test_unplugged_in_the_middle_of_a_transfer():
             bench.emulated.unplugged_at_s = bench.clock.now_s() + 0.0015  # a status takes 2 ms, a frame 5
 
     with pytest.raises(LinkError, match="unplugged"):
-        play(bench.helios, proven, bench.clock, pull)
+        play(bench.helios, verified, bench.clock, pull)
     assert bench.device.dark_from_s() <= bench.emulated.unplugged_at_s + 1e-6
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, SystemExit, RuntimeError, InputError])
-def test_what_the_caller_raises_ends_the_light(error):
-    bench, proven = playing()
+def test_an_exception_of_the_progress_callback_ends_emission(error):
+    bench, verified = playing()
     raised = []
 
     def leave(_share):
@@ -146,33 +148,33 @@ def test_what_the_caller_raises_ends_the_light(error):
             raise error("x", 1, "y") if error is InputError else error
 
     with pytest.raises(error):
-        play(bench.helios, proven, bench.clock, leave)
+        play(bench.helios, verified, bench.clock, leave)
     assert bench.device.dark_from_s() <= raised[0] + 0.002
     assert not bench.device.shutter
 
 
-def test_without_an_interlock_not_even_the_shutter_moves():
-    display = display_of()
-    _, proven = proven_of(display, frame_of(display))
-    bench = Bench(config_of(interlock_watched=False).board)
+def test_without_an_interlock_the_shutter_stays_closed():
+    display = build_display()
+    _, verified = build_verified(display, build_frame(display))
+    bench = Bench(build_config(interlock_watched=False).board)
     with bench.helios as helios, pytest.raises(InputError, match="interlock_watched: got False, expected true"):
-        play(helios, proven, bench.clock)
-    assert not light_of(bench)
+        play(helios, verified, bench.clock)
+    assert not list_emissions(bench)
     assert not any(output.shutter for output in bench.device.log)
 
 
-def test_a_board_that_is_never_ready_is_given_up_dark():
-    bench, proven = playing()
+def test_a_dac_that_is_never_ready_is_stopped():
+    bench, verified = playing()
     bench.emulated.busy = 10_000
     with pytest.raises(LinkError, match=r"not ready for a frame within 0\.5 s"):
-        play(bench.helios, proven, bench.clock)
-    assert not light_of(bench)
+        play(bench.helios, verified, bench.clock)
+    assert not list_emissions(bench)
     assert not bench.device.shutter
 
 
 @pytest.mark.parametrize("fault", ["deaf", "busy", "garbage"])
-def test_a_stretch_of_bad_answers_makes_holes_that_are_dark_and_told(fault):
-    bench, proven = playing()
+def test_bad_answers_cause_underruns_without_emission_that_are_reported(fault):
+    bench, verified = playing()
     quiet = {"deaf": 5, "busy": 60, "garbage": 8}[fault]
     done = []
 
@@ -184,27 +186,27 @@ def test_a_stretch_of_bad_answers_makes_holes_that_are_dark_and_told(fault):
             else:
                 setattr(bench.emulated, fault, quiet)
 
-    played = play(bench.helios, proven, bench.clock, disturb)
+    played = play(bench.helios, verified, bench.clock, disturb)
     assert played.underruns >= 1
     assert played.underrun_s > 0.0
-    light = light_of(bench)
+    light = list_emissions(bench)
     width_s = sum(end_s - begin_s for begin_s, end_s, *_ in light)
-    assert width_s == pytest.approx(proven.pulses.width_s.sum(), abs=1e-6)
-    assert bench.device.starved == played.underruns + 1  # and the end
+    assert width_s == pytest.approx(verified.pulses.width_s.sum(), abs=1e-6)
+    assert bench.device.starved == played.underruns + 1  # one more at the end
 
 
-def test_a_frame_that_is_not_taken_whole_ends_it():
-    bench, proven = playing()
+def test_a_partially_accepted_frame_ends_playback():
+    bench, verified = playing()
     bench.emulated.bulk_write = lambda handle, ep, intf, data, timeout: len(data) - POINT_BYTES
     with pytest.raises(LinkError, match="bytes"):
-        play(bench.helios, proven, bench.clock)
+        play(bench.helios, verified, bench.clock)
     assert not bench.device.shutter
 
 
 def test_progress_is_told_from_nothing_to_all():
-    bench, proven = playing()
+    bench, verified = playing()
     shares = []
-    play(bench.helios, proven, bench.clock, shares.append)
+    play(bench.helios, verified, bench.clock, shares.append)
     assert shares[0] == 0.0
     assert shares[-1] == 1.0
     assert shares == sorted(shares)

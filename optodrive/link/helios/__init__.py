@@ -1,1 +1,1 @@
-"""A Helios laser DAC: its bytes, the board itself, the proof of a plan in its bytes, and the player."""
+"""Helios laser DAC: encoding, USB driver, verification and playback."""

@@ -1,7 +1,7 @@
-"""A Helios laser DAC over pyusb: version, name, status, shutter, stop, frames.
+"""Driver of a Helios laser DAC over pyusb: version, name, status, shutter, stop and frames.
 
-Its command that erases the firmware is not here, and never shall be. It has no interlock and no time-out for a silent
-host: see docs/how-to/use-a-helios-dac.md for what that means.
+The driver omits the command that erases the firmware on purpose. The DAC has neither an interlock nor a watchdog for
+the host: docs/how-to/use-a-helios-dac.md describes the consequences.
 """
 
 from contextlib import suppress
@@ -23,25 +23,27 @@ COMMAND_ENDPOINT, ANSWER_ENDPOINT, FRAME_ENDPOINT = 0x06, 0x83, 0x02
 ANSWER_BYTES = 32
 STOP, SHUTTER, STATUS, VERSION, NAME, HOST_VERSION = 1, 2, 3, 4, 5, 7
 PROTOCOL_VERSION = 11
-"""The protocol this driver speaks, as the maker's own host software numbers it."""
+"""Protocol version of this driver, in the numbering of the manufacturer's host software."""
 READY = b"\x83\x01"
 ENABLE_DELAY_S = 0.1
 STOP_DELAY_S = 0.11
-"""The board drops frames for 100 ms after a stop."""
+"""The DAC drops frames for 100 ms after a stop."""
 COMMAND_TIMEOUT_S = ANSWER_TIMEOUT_S = 0.032
 DRAIN_TIMEOUT_S = 0.005
 DRAIN_READS_MAX = 16
 QUERY_TRIES, ANSWER_TRIES = 2, 3
-"""A question is asked so often, and its answer waited for so often."""
+"""Number of times that a query is sent, and that its answer is awaited each time."""
 STOP_TRIES = 3
 FRAME_TIMEOUT_S = 0.1
-"""More than the USB needs for the longest frame."""
+"""Longer than the USB transfer of the longest frame."""
 
 
 class Helios:
-    """One board. Once open it is dark; closed, or left by whatever way, it was stopped and its shutter closed.
+    """One Helios DAC.
 
-    backend: pyusb's, None for libusb.
+    open() and close(), and leaving the context for any reason, stop it and close its shutter.
+    version, name: firmware version and name, known after open()
+    backend: of pyusb, None for libusb
     """
 
     def __init__(self, board: BoardSection, clock: Clock, backend: Any = None) -> None:
@@ -54,14 +56,14 @@ class Helios:
         self._answer_pending = False
 
     def __enter__(self) -> Self:
-        """Open it."""
+        """Open the DAC."""
         self.open()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Stop it, close its shutter, give it back; an error on the way here is not covered by one of closing."""
+        """Close the DAC. An error of closing does not replace an error of the block."""
         if error is None:
             self.close()
         else:
@@ -69,7 +71,10 @@ class Helios:
                 self.close()
 
     def open(self) -> None:
-        """Claim it, ask who it is, make it dark; InputError where it is not the configured one, else LinkError."""
+        """Claim, identify and stop the DAC.
+
+        Raise InputError if it is not the configured one, LinkError if the link fails.
+        """
         self._device = find_device(VENDOR_ID, PRODUCT_ID, backend=self._backend)
         try:
             self._identify()
@@ -89,11 +94,11 @@ class Helios:
         self._command(HOST_VERSION, PROTOCOL_VERSION)
         self.name = self._query(NAME, 1).split(b"\0")[0].decode("ascii", "replace")
         if self.board.uid and self.board.uid != self.name:
-            raise InputError("board.uid", self.name, f"{self.board.uid}, the Helios configured", "board")
+            raise InputError("board.uid", self.name, f"{self.board.uid}, the configured Helios", "board")
         self.stop()
 
     def close(self) -> None:
-        """Stop it, close its shutter, give it back; LinkError where it could not be told. Does nothing when closed."""
+        """Stop and release the DAC. Raise LinkError if it may not have received the stop. Do nothing if closed."""
         if self._device is None:
             return
         try:
@@ -103,7 +108,7 @@ class Helios:
 
     def _release(self) -> None:
         device, self._device = self._device, None
-        with suppress(usb.core.USBError):  # an alternate setting without endpoints stops it as well
+        with suppress(usb.core.USBError):  # the alternate setting without endpoints also stops it
             device.set_interface_altsetting(INTERFACE, 0)
         with suppress(usb.core.USBError):
             usb.util.dispose_resources(device)
@@ -111,12 +116,15 @@ class Helios:
     # --- commands -----------------------------------------------------------------------------------------------
 
     def stop(self) -> None:
-        """Stop, shutter closed, and the stop's time waited for; LinkError where it could not be told either of them."""
+        """Stop playback, close the shutter and wait until the DAC accepts frames again.
+
+        Raise LinkError if it may not have received one of the commands.
+        """
         failures = [self._command_with_retries(STOP, 0), self._command_with_retries(SHUTTER, 0)]
         for failure in failures:
             if failure is not None:
-                bound = f"it plays at most {HOST_LOSS_EMISSION_MAX_S * 1e3:g} ms more"
-                raise LinkError(f"the Helios may not have heard to stop and close its shutter, {bound}: {failure}")
+                bound = f"it plays for at most {HOST_LOSS_EMISSION_MAX_S * 1e3:g} ms more"
+                raise LinkError(f"the Helios may not have received the stop and shutter commands, {bound}: {failure}")
         self._clock.sleep(STOP_DELAY_S)
 
     def _command_with_retries(self, command: int, value: int) -> LinkError | None:
@@ -131,12 +139,12 @@ class Helios:
         return failure
 
     def open_shutter(self) -> None:
-        """Open the shutter; InputError unless the configuration says that an interlock watches."""
+        """Open the shutter. Raise InputError unless the configuration declares an external interlock."""
         self.require_interlock()
         self._command(SHUTTER, 1)
 
     def is_ready(self) -> bool:
-        """Whether it takes another frame; no answer, and any but the one that says so, is no."""
+        """Return whether the DAC accepts another frame. A missing or unexpected answer counts as not ready."""
         if self._answer_pending:
             self._drain()
         self._command(STATUS, 0)
@@ -148,32 +156,35 @@ class Helios:
         return answer == READY
 
     def send(self, frame: HeliosFrame) -> None:
-        """Send one frame, which must only be done when it is ready; InputError unless an interlock watches.
+        """Send one frame. The DAC must be ready.
 
-        LocalProtocolError for a frame that could leave the light on, LinkError where it is not taken whole.
+        Raise InputError unless the configuration declares an external interlock, LocalProtocolError for a frame that
+        could leave the laser on, and LinkError if the DAC does not accept the whole frame.
         """
         self.require_interlock()
         HeliosFrame.from_bytes(frame.data)
         written_bytes = self._write(FRAME_ENDPOINT, frame.data, FRAME_TIMEOUT_S)
         if written_bytes != len(frame.data):
-            raise LinkError(f"link to the Helios lost: it took {written_bytes} of a frame's {len(frame.data)} bytes")
+            raise LinkError(
+                f"link to the Helios lost: it accepted {written_bytes} of a frame's {len(frame.data)} bytes"
+            )
 
     def require_interlock(self) -> None:
-        """Raise InputError unless the configuration says that an external interlock watches."""
+        """Raise InputError unless the configuration declares an external interlock."""
         if self.board.transport != "helios" or not self.board.interlock_watched:
             raise InputError(
                 "board.interlock_watched",
                 self.board.interlock_watched,
-                'true, with transport "helios": it has no interlock of its own, say so once another cuts the laser',
+                'true, with transport "helios": it has no interlock, so an external one must cut the laser',
             )
 
     # --- transfers ----------------------------------------------------------------------------------------------
 
     def _command(self, command: int, value: int) -> None:
         if command not in (STOP, SHUTTER, STATUS, VERSION, NAME, HOST_VERSION):
-            raise LocalProtocolError(f"command {command:#04x} is none that this driver sends")
+            raise LocalProtocolError(f"command {command:#04x} is not one that this driver sends")
         if self._write(COMMAND_ENDPOINT, bytes([command, value]), COMMAND_TIMEOUT_S) != 2:
-            raise LinkError("link to the Helios lost: it took half a command")
+            raise LinkError("link to the Helios lost: it accepted half a command")
 
     def _write(self, endpoint: int, data: bytes, timeout_s: float) -> int:
         if self._device is None:
@@ -185,7 +196,7 @@ class Helios:
         return written_bytes
 
     def _read_answer(self, timeout_s: float = ANSWER_TIMEOUT_S) -> bytes:
-        """One answer; USBTimeoutError without one, LinkError where the link fails."""
+        """Return one answer. Raise USBTimeoutError without an answer, LinkError if the link fails."""
         try:
             return bytes(self._device.read(ANSWER_ENDPOINT, ANSWER_BYTES, timeout_ms(timeout_s)))
         except usb.core.USBTimeoutError:
@@ -194,7 +205,7 @@ class Helios:
             raise build_lost_error("the Helios", error) from None
 
     def _query(self, command: int, min_bytes: int) -> bytes:
-        """What it answers to a question, less the first byte, which must name it; LinkError without an answer."""
+        """Return the answer to a query without its first byte, which names the query. Raise LinkError without one."""
         for _ in range(QUERY_TRIES):
             self._command(command, 0)
             for _ in range(ANSWER_TRIES):
@@ -202,10 +213,10 @@ class Helios:
                     answer = self._read_answer()
                     if answer[:1] == bytes([0x80 | command]) and len(answer) > min_bytes:
                         return answer[1:]
-        raise LinkError(f"the Helios does not answer question {command}: unplug it and plug it in again")
+        raise LinkError(f"the Helios does not answer query {command}: unplug it and plug it in again")
 
     def _drain(self) -> None:
-        """Forget answers to questions that nobody waits for any more."""
+        """Discard answers to earlier queries."""
         with suppress(usb.core.USBTimeoutError):
             for _ in range(DRAIN_READS_MAX):
                 self._read_answer(DRAIN_TIMEOUT_S)

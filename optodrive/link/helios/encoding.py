@@ -1,7 +1,7 @@
-"""Limited plans to a Helios' points at a fixed rate, and the very bytes back to SI, for the proof before emission.
+"""Encoding of limited plans to Helios frames, and decoding of the frame bytes for verification before emission.
 
-A point is lit only if all of it lies within the plan's pulse: light comes no sooner, ends no later, and is no stronger
-than planned. Mirrors are sent on with the first point after a pulse, so they have at least the time planned.
+A point emits only if its whole duration lies within the plan's pulse: emission starts no earlier, ends no later and is
+no stronger than planned. The first point after a pulse moves the mirrors on, so they have at least the planned time.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,12 +30,15 @@ DAC = BipolarDac(12)
 LEVEL_MAX = 255
 TICKS_PER_US = CLOCK_HZ // 1_000_000
 TRAILING_POINTS = 2
-"""Dark points after a plan: one ends its last frame, the other lets that be a point shorter."""
+"""Blank points after a plan: one ends its last frame, the other permits that frame to be one point shorter."""
 
 
 @dataclass(frozen=True)
 class PointScale:
-    """How SI becomes codes, levels and points. points_per_s: as asked for; the board's own rate is a little lower."""
+    """Scale factors between SI units and codes, levels and points.
+
+    points_per_s: requested rate; the actual rate of the DAC is slightly lower
+    """
 
     rad_per_code: float
     full_power_w: float
@@ -43,29 +46,29 @@ class PointScale:
 
     @classmethod
     def from_config(cls, config: Config) -> "PointScale":
-        """Codes span the scanner's whole range, level 255 is the laser's full power."""
+        """Derive the scale. The codes span the whole range of the scanner, level 255 is the laser's full power."""
         rad_per_code = config.scanner.range_rad / HELIOS_HALF_RANGE_CODES
         return cls(rad_per_code, config.laser.max_power_w, config.board.points_per_s)
 
     @property
     def point_s(self) -> float:
-        """The time from one point to the next as the board keeps it, s."""
+        """Actual duration of a point, s."""
         return point_ticks(self.points_per_s) / CLOCK_HZ
 
     def to_codes(self, angle_rad: FloatArray) -> IntArray:
-        """Mirror angle to codes; LocalProtocolError beyond the converter's range. Any shape."""
+        """Return the codes of mirror angles, any shape. Raise LocalProtocolError beyond the DAC's range."""
         return DAC.to_codes(angle_rad, self.rad_per_code)
 
     def to_angles_rad(self, codes: IntArray) -> FloatArray:
-        """Codes to mirror angle, rad. Any shape."""
+        """Return the mirror angles of codes, rad, any shape."""
         return DAC.to_angles_rad(codes, self.rad_per_code)
 
 
 @dataclass(frozen=True, eq=False)
 class PointPulses:
-    """Pulses read back from frames, times from the first point, without holes between frames; all [n].
+    """Pulses decoded from frames, all [n]. Times count from the first point and assume no gaps between frames.
 
-    A pulse that a frame's end cuts is two.
+    A pulse across the end of a frame appears as two pulses.
     """
 
     start_s: FloatArray
@@ -82,7 +85,11 @@ class PointPulses:
 
 
 def encode(plan: LimitedPlan, scale: PointScale) -> tuple[HeliosFrame, ...]:
-    """Frames for a plan; power is rounded down, each frame ends dark, within a pulse if there is no other place."""
+    """Encode a plan to frames.
+
+    Power is rounded down. Every frame ends with a blank point, which interrupts a pulse if necessary. Raise
+    LocalProtocolError if pulses overlap or exceed the power range.
+    """
     points = _encode_points(plan, scale)
     return tuple(
         HeliosFrame.from_points(points[first:last], scale.points_per_s) for first, last in _split_frames(points, scale)
@@ -90,7 +97,7 @@ def encode(plan: LimitedPlan, scale: PointScale) -> tuple[HeliosFrame, ...]:
 
 
 def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
-    """All points of a plan, [n, 7]: the first begins with the plan."""
+    """Return all points of a plan, [n, 7], from the plan's zero."""
     ticks = point_ticks(scale.points_per_s)
     start = np.rint(plan.start_s * 1e6).astype(np.int64) * TICKS_PER_US
     end = start + np.rint(plan.width_s * 1e6).astype(np.int64) * TICKS_PER_US
@@ -100,8 +107,8 @@ def _encode_points(plan: LimitedPlan, scale: PointScale) -> PointTable:
     if len(plan) and not 0 <= level.min() <= level.max() <= LEVEL_MAX:
         raise LocalProtocolError(f"levels {level.min()} to {level.max()} leave the range 0 to {LEVEL_MAX}")
     first, last = -(-start // ticks), end // ticks
-    last[:-1] -= last[:-1] == first[1:]  # a dark point between any two, by which they are told apart
-    emitting = (level > 0) & (last > first)  # the mirrors do not go where there is no light
+    last[:-1] -= last[:-1] == first[1:]  # a blank point separates adjacent pulses
+    emitting = (level > 0) & (last > first)  # the mirrors skip pulses without emission
     first, last, level = first[emitting], last[emitting], level[emitting]
     x, y = scale.to_codes(plan.x_rad[emitting]), scale.to_codes(plan.y_rad[emitting])
     before = np.concatenate([[0], last[:-1]])[: len(last)]
@@ -125,7 +132,7 @@ def _pack_points(x: IntArray, y: IntArray, level: IntArray) -> PointTable:
 
 
 def _split_frames(points: PointTable, scale: PointScale) -> Iterator[tuple[int, int]]:
-    """Where frames begin and end; a point that ends a frame within a pulse is darkened."""
+    """Yield first and last index of every frame. Blank the last point of a frame that ends within a pulse."""
     points_max, first = min(POINTS_MAX, int(FRAME_MAX_S / scale.point_s)), 0
     while first < len(points):
         longest = min(first + points_max, len(points))
@@ -138,7 +145,7 @@ def _split_frames(points: PointTable, scale: PointScale) -> Iterator[tuple[int, 
 
 
 def _find_gate_off_end(points: PointTable, first: int, longest: int) -> int | None:
-    """The latest end of a frame after a dark point, in the later half of what it may hold; None without one."""
+    """Return the latest frame end behind a blank point, in the second half of the longest frame; None without one."""
     min_end = first + (longest - first) // 2
     for last in (min_end + 1 + np.flatnonzero(points[min_end:longest, 6] == 0))[::-1].tolist():
         if not is_whole_packets(last - first):
@@ -147,7 +154,10 @@ def _find_gate_off_end(points: PointTable, first: int, longest: int) -> int | No
 
 
 def decode(frames: Sequence[bytes], scale: PointScale) -> PointPulses:
-    """Read pulses back from the bytes of frames in order; the brightest channel counts. LocalProtocolError if bad."""
+    """Decode the bytes of consecutive frames. The brightest channel counts.
+
+    Raise LocalProtocolError for invalid frames.
+    """
     tables, ticks = [], []
     for data in frames:
         table, points_per_s = parse_points(data)

@@ -1,4 +1,4 @@
-"""What a display still holds of earlier plays, kept in a file: each play is a process of its own."""
+"""Persistent budget state of a display between plays, because each play is a separate process."""
 
 import os
 import re
@@ -18,23 +18,23 @@ FORMAT = "optodrive-helios-memory"
 VERSION = 1
 REMOVE_WHEN_COLD = "remove it once the display has cooled"
 ZERO_OFFSET_S = 1.0
-"""Kept before the first light, a plan's zero is put so much later: it counts as warmer, never as colder."""
+"""Shift of a plan's zero when it is saved before emission, so that the stored state is never too cold."""
 
 
 class HeatMemory:
-    """The limiter's budget after the last play on one Helios, by the time of day."""
+    """File with the limiter's budget state after the last play on one Helios, in Unix time."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     @classmethod
     def for_device(cls, name: str) -> Self:
-        """The memory of the Helios of this name, in the user's folder for what programs keep."""
+        """Return the memory of the Helios of this name, in the user's state folder."""
         folder = Path(os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state") / "optodrive"
         return cls(folder / f"{re.sub('[^0-9A-Za-z]+', '-', name)}.npz")
 
     def save(self, budget: BudgetState, zero_s: float) -> None:
-        """Remember a budget whose time line begins at zero_s, the time of day; InputError where that fails."""
+        """Save a budget state whose zero is Unix time zero_s. Raise InputError if the file cannot be written."""
         try:
             self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -44,9 +44,10 @@ class HeatMemory:
             np.savez(file, format=FORMAT, version=VERSION, zero_s=zero_s, **columns)
 
     def load(self, now_s: float, cold: BudgetState) -> BudgetState:
-        """The budget on a time line that begins now; `fresh` where nothing was ever played.
+        """Load the budget state with its zero at now_s, or return `cold` if nothing was saved.
 
-        at_s above 0: earlier pulses may last so much longer. InputError where the file does not tell what is needed.
+        A positive at_s means that earlier pulses may still last for this time. Raise InputError if the file is
+        unreadable or belongs to another display or version.
         """
         if not self.path.exists():
             return cold
@@ -67,6 +68,6 @@ class HeatMemory:
             raise InputError(f"{self.path}: pixels", len(budget.rise_k), expected)
         if now_s < float(arrays["zero_s"]) - ZERO_OFFSET_S:
             raise InputError(
-                "the time of day", now_s, f"a time after the last play, as {self.path} has it; {REMOVE_WHEN_COLD}"
+                "the time of day", now_s, f"a time after the last play according to {self.path}; {REMOVE_WHEN_COLD}"
             )
         return shift_state(budget, float(arrays["zero_s"]) - now_s)

@@ -1,4 +1,4 @@
-"""Proven frames to a Helios, one after the other, each when the board is ready for it; dark whatever ends it."""
+"""Playback of verified frames on a Helios. The DAC is stopped however playback ends."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -12,16 +12,17 @@ from optodrive.link.helios.verification import VerifiedFrames
 
 POLL_INTERVAL_S = 0.001
 READY_TIMEOUT_S = 0.5
-"""A board that is not ready for so long, with frames of a twentieth of that, is not well."""
+"""Maximum time for the DAC to become ready, 20 times the longest frame."""
 
 ProgressCallback = Callable[[float], None]
 
 
 @dataclass(frozen=True)
 class PlaybackReport:
-    """What was sent. holes: how often the board had nothing to play between two frames; hole_s: for how long at least.
+    """Report of a playback.
 
-    In a hole it is dark, and all that follows comes so much later.
+    underruns, underrun_s: number and minimum total duration of gaps between frames; nothing is emitted in a gap, and
+    everything after it is late
     """
 
     frames: int
@@ -32,18 +33,19 @@ class PlaybackReport:
 def play(
     helios: Helios, verified: VerifiedFrames, clock: Clock, on_progress: ProgressCallback = lambda _share: None
 ) -> PlaybackReport:
-    """Play frames on a display that is as cool as the plan takes it to be; blocks until the light has ended.
+    """Play frames on a display in the thermal state that the plan assumes. Block until emission has ended.
 
-    tick: told the share sent, often, also while the board is not ready; what it raises ends the light. Raises
-    InputError without an interlock, LinkError where the board fails; whatever it is, the board is stopped first.
+    on_progress: called often with the sent fraction; an exception that it raises ends the playback
+    Raise InputError without an interlock and LinkError if the DAC fails. The DAC is stopped before any exception
+    propagates.
     """
     helios.require_interlock()
     try:
-        helios.stop()  # and with that its mirrors in the middle, where every plan begins
+        helios.stop()  # also centres the mirrors, where every plan starts
         helios.open_shutter()
         report = _send_frames(helios, verified.frames, clock, on_progress)
     except BaseException:
-        with suppress(LinkError):  # what went wrong first is told; leaving the board tries once more
+        with suppress(LinkError):  # the first error propagates; closing the DAC stops it again
             helios.stop()
         raise
     helios.stop()

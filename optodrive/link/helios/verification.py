@@ -1,4 +1,4 @@
-"""Proof before emission: the very bytes, decoded, light nothing but the plan and pass no cap."""
+"""Verification before emission: the decoded frame bytes emit only what the plan permits and exceed no cap."""
 
 from dataclasses import dataclass
 
@@ -18,7 +18,11 @@ POWER_TOLERANCE = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class VerifiedFrames:
-    """Frames that may be played; only `prove` makes them. pulses [n] as decoded, row [n] of the plan's pulses."""
+    """Frames that may be played, built by encode_verified().
+
+    pulses: [n] decoded pulses
+    row: [n] plan row of each
+    """
 
     frames: tuple[HeliosFrame, ...]
     pulses: PointPulses
@@ -26,17 +30,17 @@ class VerifiedFrames:
 
     @property
     def duration_s(self) -> float:
-        """How long they play without a hole, s."""
+        """Playing time without gaps, s."""
         return sum(frame.duration_s for frame in self.frames)
 
     @property
     def energy_j(self) -> float:
-        """Incident energy of the light, J."""
+        """Incident optical energy, J."""
         return float(self.pulses.power_w @ self.pulses.width_s)
 
 
 def encode_verified(plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget) -> VerifiedFrames:
-    """Encode a plan, which was limited from `state`, and prove its bytes; LocalProtocolError where they fail."""
+    """Encode a plan that was limited from `state` and verify its bytes. Raise LocalProtocolError if they fail."""
     frames = encode(plan, scale)
     pulses, row = verify_frames([frame.data for frame in frames], plan, scale, state, budget)
     return VerifiedFrames(frames, pulses, row)
@@ -45,9 +49,10 @@ def encode_verified(plan: LimitedPlan, scale: PointScale, state: BudgetState, bu
 def verify_frames(
     frames: list[bytes], plan: LimitedPlan, scale: PointScale, state: BudgetState, budget: Budget
 ) -> tuple[PointPulses, IntArray]:
-    """Pulses of frames, and the plan's pulse [n] that each is part of; LocalProtocolError for light beyond the plan's.
+    """Return the pulses of frames and the plan row [n] of each.
 
-    That is: sooner, later, stronger, elsewhere, in a frame that may not leave, or above a cap.
+    Raise LocalProtocolError if an emission is earlier, later, stronger or elsewhere than planned, if a frame is unsafe,
+    or if the pulses exceed a cap.
     """
     for data in frames:
         HeliosFrame.from_bytes(data)

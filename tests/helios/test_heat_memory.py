@@ -1,11 +1,11 @@
-"""What is kept of earlier plays."""
+"""Persistent budget state between plays."""
 
 from dataclasses import fields, replace
 
 import numpy as np
 import pytest
 
-from helios.bench import display_of, train_of
+from helios.bench import build_display, build_train
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
 from optodrive.link.helios.heat_memory import ZERO_OFFSET_S, HeatMemory
@@ -22,23 +22,23 @@ def memory(tmp_path, monkeypatch):
 
 
 def after_a_play():
-    display = display_of()
+    display = build_display()
     heat, budget = display.build_cold_state()
     return display, plan_sequence(
-        display, train_of(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0), heat, budget
+        display, build_train(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0), heat, budget
     ).budget
 
 
-def test_it_lies_where_programs_keep_things(memory, tmp_path):
+def test_the_file_lies_in_the_state_folder(memory, tmp_path):
     assert memory.path == tmp_path / "optodrive" / "Helios-12-3.npz"
 
 
-def test_nothing_played_is_at_rest(memory):
+def test_without_a_play_the_state_is_cold(memory):
     fresh = cold_state(16)
     assert memory.load(DAY_S, fresh) is fresh
 
 
-def test_a_budget_comes_back_on_the_time_line_that_begins_now(memory):
+def test_a_loaded_budget_counts_time_from_now(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S)
     back = memory.load(DAY_S + 100.0, cold_state(16))
@@ -50,26 +50,26 @@ def test_a_budget_comes_back_on_the_time_line_that_begins_now(memory):
         assert after == pytest.approx(before - moved, abs=1e-6)
 
 
-def test_played_again_at_once_less_is_allowed_than_from_rest(memory):
+def test_an_immediate_second_play_may_emit_less_than_a_cold_one(memory):
     display, budget = after_a_play()
     memory.save(budget, DAY_S)
-    sequence = train_of(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0)
+    sequence = build_train(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0)
     energies = []
     for later_s in (budget.at_s, 3600.0):
         recalled = memory.load(DAY_S + later_s, cold_state(16))
         energies.append(plan_sequence(display, sequence, display.build_cold_state()[0], recalled).plan.energy_j.sum())
-    from_rest = plan_sequence(display, sequence, *display.build_cold_state()).plan.energy_j.sum()
-    assert energies[0] < 0.9 * from_rest
-    assert energies[1] == pytest.approx(from_rest)
+    from_cold = plan_sequence(display, sequence, *display.build_cold_state()).plan.energy_j.sum()
+    assert energies[0] < 0.9 * from_cold
+    assert energies[1] == pytest.approx(from_cold)
 
 
-def test_a_killed_play_may_still_be_on(memory):
+def test_a_killed_play_may_still_emit(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S + ZERO_OFFSET_S)
     assert memory.load(DAY_S + 0.1, cold_state(16)).at_s == pytest.approx(budget.at_s + ZERO_OFFSET_S - 0.1, abs=1e-6)
 
 
-def test_what_does_not_tell_is_refused_by_name(memory):
+def test_an_unusable_file_is_rejected_by_name(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S)
     with pytest.raises(InputError, match=r"Helios-12-3\.npz: pixels: got 16, expected 437"):

@@ -1,14 +1,14 @@
-"""The driver against the emulated board, through the real pyusb."""
+"""Driver against the emulated DAC through the real pyusb."""
 
 import errno
 
 import pytest
 
-from helios.bench import Bench, config_of
+from helios.bench import Bench, build_config
 from helios.emulated import EmulatedHelios, HostDeadError
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError, LocalProtocolError
-from optodrive.link.helios import dac as board_module
+from optodrive.link.helios import dac as dac_module
 from optodrive.link.helios.dac import Helios
 from optodrive.link.helios.frames import HeliosFrame
 from optodrive.link.transport.usb_device import find_device
@@ -22,38 +22,38 @@ def frame(points=100, rate=40_000, level=0):
     return HeliosFrame.from_points(table, rate)
 
 
-def test_opened_it_is_known_and_dark():
+def test_open_identifies_and_stops_the_dac():
     bench = Bench(name="Helios 77", version=6)
     with bench.helios as helios:
         assert (helios.version, helios.name) == (6, "Helios 77")
-        assert bench.device.host_version == board_module.PROTOCOL_VERSION
+        assert bench.device.host_version == dac_module.PROTOCOL_VERSION
         assert not bench.device.shutter
-        assert bench.clock.now_s() >= board_module.ENABLE_DELAY_S + board_module.STOP_DELAY_S
+        assert bench.clock.now_s() >= dac_module.ENABLE_DELAY_S + dac_module.STOP_DELAY_S
     assert bench.emulated.alternate == 0
 
 
-def test_a_stale_answer_is_drained_before_the_questions():
+def test_open_discards_a_stale_answer_before_its_queries():
     bench = Bench()
     bench.device.answer = b"\x83\x01"
     with bench.helios as helios:
         assert helios.version == 6
 
 
-def test_the_version_is_asked_twice_and_waited_for_three_times_each():
+def test_the_version_is_queried_twice_with_three_reads_each():
     bench = Bench()
-    bench.emulated.deaf = 5  # the answer is there, and five reads miss it
+    bench.emulated.deaf = 5  # five reads lose the answer
     with bench.helios as helios:
         assert helios.version == 6
     bench = Bench()
     bench.emulated.deaf = 6
-    with pytest.raises(LinkError, match="does not answer question 4"):
+    with pytest.raises(LinkError, match="does not answer query 4"):
         bench.helios.open()
     assert bench.emulated.commands.count(b"\x04\x00") == 2
     assert not bench.emulated.claimed
 
 
-def test_another_helios_than_the_configured_one_is_refused():
-    bench = Bench(config_of(uid="Helios 1").board, name="Helios 2")
+def test_another_helios_than_the_configured_one_is_rejected():
+    bench = Bench(build_config(uid="Helios 1").board, name="Helios 2")
     with pytest.raises(InputError, match=r"board\.uid: got 'Helios 2', expected Helios 1"):
         bench.helios.open()
     assert not bench.device.shutter
@@ -64,7 +64,7 @@ def test_another_helios_than_the_configured_one_is_refused():
     ("others", "plugged", "words"),
     [(("helios two",), True, "2 times 1209:e500"), ((), False, "connected"), (((1, 2),), True, None)],
 )
-def test_it_must_be_there_and_the_only_one(others, plugged, words):
+def test_there_must_be_exactly_one_device(others, plugged, words):
     emulated = EmulatedHelios(ManualClock(), others=others)
     if not plugged:
         emulated.unplugged_at_s = 0.0
@@ -75,7 +75,7 @@ def test_it_must_be_there_and_the_only_one(others, plugged, words):
         find_device(0x1209, 0xE500, backend=emulated)
 
 
-def test_without_permission_it_says_so():
+def test_missing_permission_is_reported():
     bench = Bench()
     bench.emulated.open_errno = errno.EACCES
     with pytest.raises(InputError, match="udev rule"):
@@ -103,20 +103,20 @@ def test_only_one_answer_means_ready(answers, ready):
         assert helios.is_ready() is True
 
 
-def test_no_answer_is_not_ready_and_a_late_one_is_not_taken_for_the_next():
+def test_a_missing_answer_is_not_ready_and_a_late_one_is_discarded():
     bench = Bench()
     with bench.helios as helios:
         helios.open_shutter()
         bench.emulated.deaf = 1
-        assert helios.is_ready() is False  # the answer "ready" is still on its way
+        assert helios.is_ready() is False  # the answer "ready" is still in transit
         helios.send(frame(900))
         helios.send(frame(900))
-        assert helios.is_ready() is False  # now a frame waits: the late answer would lie
+        assert helios.is_ready() is False  # a frame is queued now, so the late answer is outdated
 
 
 @pytest.mark.parametrize("board", [{"interlock_watched": False}, {"transport": "simulated"}])
-def test_without_a_watched_interlock_nothing_is_emitted(board):
-    config = config_of().board.model_copy(update=board)
+def test_without_an_external_interlock_nothing_is_emitted(board):
+    config = build_config().board.model_copy(update=board)
     bench = Bench(config)
     with bench.helios as helios:
         with pytest.raises(InputError, match=r"board\.interlock_watched: got"):
@@ -127,7 +127,7 @@ def test_without_a_watched_interlock_nothing_is_emitted(board):
     assert not any(output.shutter for output in bench.device.log)
 
 
-def test_no_frame_leaves_that_was_not_checked():
+def test_send_validates_the_frame():
     bench = Bench()
     whole = frame()
     with bench.helios as helios, pytest.raises(LocalProtocolError, match="play once"):
@@ -138,7 +138,7 @@ def test_no_frame_leaves_that_was_not_checked():
 @pytest.mark.parametrize("command", [0xDE, 0x06, 0x00, 0xFF])
 def test_a_command_that_writes_to_flash_is_never_sent(command):
     bench = Bench()
-    with bench.helios as helios, pytest.raises(LocalProtocolError, match="none that this driver sends"):
+    with bench.helios as helios, pytest.raises(LocalProtocolError, match="not one that this driver sends"):
         helios._command(command, 0)
     assert not bench.device.erased
     assert all(sent[0] in (1, 2, 3, 4, 5, 7) for sent in bench.emulated.commands)
@@ -149,7 +149,7 @@ class OddError(Exception):
 
 
 @pytest.mark.parametrize("error", [OddError, KeyboardInterrupt, SystemExit, LinkError])
-def test_left_by_any_exception_it_is_stopped_and_shut(error):
+def test_any_exception_stops_the_dac_and_closes_the_shutter(error):
     bench = Bench()
 
     def use():
@@ -163,12 +163,12 @@ def test_left_by_any_exception_it_is_stopped_and_shut(error):
         use()
     light = bench.device.light()
     assert light
-    assert bench.device.dark_from_s() < bench.clock.now_s() - board_module.STOP_DELAY_S + 0.01
+    assert bench.device.dark_from_s() < bench.clock.now_s() - dac_module.STOP_DELAY_S + 0.01
     assert not bench.device.shutter
     assert bench.device.colour == (0, 0, 0, 0)
 
 
-def test_a_stop_that_is_not_heard_at_once_is_said_again():
+def test_a_refused_stop_is_repeated():
     bench = Bench()
     with bench.helios as helios:
         helios.open_shutter()
@@ -176,32 +176,32 @@ def test_a_stop_that_is_not_heard_at_once_is_said_again():
     assert not bench.device.shutter
 
 
-def test_a_stop_that_is_not_heard_at_all_is_told_and_the_board_let_go():
+def test_a_failed_stop_is_reported_and_the_device_released():
     bench = Bench()
     helios = bench.helios
     helios.open()
     helios.open_shutter()
     helios.send(frame(900, level=200))
     bench.emulated.refused = 100
-    with pytest.raises(LinkError, match="may not have heard to stop"):
+    with pytest.raises(LinkError, match="may not have received the stop"):
         helios.close()
     assert not bench.device.connected  # the alternate setting without endpoints stopped it
     assert not bench.emulated.claimed
 
 
-def test_an_unplugged_board_is_told_and_closes_without_a_fuss():
+def test_an_unplugged_device_is_reported_and_can_be_closed():
     bench = Bench()
     bench.helios.open()
     bench.emulated.unplugged_at_s = bench.clock.now_s()
     with pytest.raises(LinkError, match="unplugged"):
         bench.helios.is_ready()
-    with pytest.raises(LinkError, match="may not have heard"):
+    with pytest.raises(LinkError, match="may not have received"):
         bench.helios.close()
     with pytest.raises(LinkError, match="not open"):
         bench.helios.is_ready()
 
 
-def test_a_dead_host_leaves_the_shutter_as_it_was_and_a_new_one_closes_it():
+def test_a_killed_host_leaves_the_shutter_open_and_the_next_one_closes_it():
     bench = Bench()
     bench.helios.open()
     bench.helios.open_shutter()
@@ -210,5 +210,5 @@ def test_a_dead_host_leaves_the_shutter_as_it_was_and_a_new_one_closes_it():
         bench.helios.is_ready()
     bench.emulated.dies_at_s = float("inf")
     assert bench.device.shutter
-    with Helios(config_of().board, bench.clock, bench.emulated):
+    with Helios(build_config().board, bench.clock, bench.emulated):
         assert not bench.device.shutter

@@ -1,4 +1,4 @@
-"""Plans as points and back: light within the plan's pulses, energy within the stated error, mirrors no later."""
+"""Encoding to points and decoding: emission within the planned pulses, bounded energy loss, early mirror moves."""
 
 import struct
 from dataclasses import replace
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from helios.bench import display_of, frame_of, proven_of, train_of
+from helios.bench import build_display, build_frame, build_train, build_verified
 from optodrive.core.errors import LocalProtocolError
 from optodrive.core.types.plans import EMPTY_PLAN
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
@@ -18,9 +18,9 @@ from optodrive.link.helios.verification import verify_frames
 from optodrive.planning.limiter.limiter import limit
 
 
-@pytest.mark.parametrize(("asked", "true"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])
-def test_the_rate_is_the_boards(asked, true):
-    assert 112e6 / point_ticks(asked) == pytest.approx(true, abs=0.01)
+@pytest.mark.parametrize(("requested", "actual"), [(20_000, 19_996.43), (40_000, 39_985.72), (50_000, 49_977.69)])
+def test_the_rate_is_rounded_by_the_dac(requested, actual):
+    assert 112e6 / point_ticks(requested) == pytest.approx(actual, abs=0.01)
 
 
 def test_which_frames_fill_whole_packets():
@@ -49,10 +49,10 @@ def sequences(draw):
 
 @settings(max_examples=60)
 @given(sequences(), st.sampled_from([20_000, 33_333, 40_000, 50_000]))
-def test_light_lies_within_the_plan_and_loses_no_more_than_stated(sequence, rate):
-    display = display_of(points_per_s=rate)
-    plan, proven = proven_of(display, sequence)
-    scale, pulses, row = PointScale.from_config(display.config), proven.pulses, proven.row
+def test_emission_lies_within_the_plan_and_the_energy_loss_is_bounded(sequence, rate):
+    display = build_display(points_per_s=rate)
+    plan, verified = build_verified(display, sequence)
+    scale, pulses, row = PointScale.from_config(display.config), verified.pulses, verified.row
     end_s, plan_end_s = pulses.start_s + pulses.width_s, plan.start_s + plan.width_s
     assert (pulses.start_s >= plan.start_s[row] - 1e-9).all()
     assert (end_s <= plan_end_s[row] + 1e-9).all()
@@ -64,23 +64,23 @@ def test_light_lies_within_the_plan_and_loses_no_more_than_stated(sequence, rate
         parts = row == index
         assert pulses.start_s[parts].min() < plan.start_s[index] + scale.point_s
         assert end_s[parts].max() > plan_end_s[index] - (2 + parts.sum() + touching[index]) * scale.point_s
-        lit_s = pulses.width_s[parts].sum()
-        assert lit_s > plan.width_s[index] - (1 + parts.sum() + touching[index]) * scale.point_s - 1e-9
+        on_s = pulses.width_s[parts].sum()
+        assert on_s > plan.width_s[index] - (1 + parts.sum() + touching[index]) * scale.point_s - 1e-9
         assert pulses.power_w[parts].min() > plan.power_w[index] - scale.full_power_w / 255
-    for frame in proven.frames:
-        points, asked = parse_points(frame.data)
+    for frame in verified.frames:
+        points, points_per_s = parse_points(frame.data)
         assert frame.data[-1] == 2
         assert not points[-1, 3:].any()
-        assert asked == rate
+        assert points_per_s == rate
         assert not is_whole_packets(len(points))
         assert frame.duration_s <= FRAME_MAX_S
 
 
 @settings(max_examples=60)
 @given(st.data())
-def test_plans_that_the_limiter_trimmed_are_proven_too(data):
-    """Full power, far too often, on several pixels: no cap refuses as whole points what it left."""
-    display = display_of(points_per_s=data.draw(st.sampled_from([20_000, 40_000, 50_000])))
+def test_plans_trimmed_by_the_limiter_pass_verification(data):
+    """Overloaded trains on several pixels: quantisation to whole points exceeds no cap of the trimmed plan."""
+    display = build_display(points_per_s=data.draw(st.sampled_from([20_000, 40_000, 50_000])))
     pixels = data.draw(st.lists(st.integers(0, 15), min_size=1, max_size=5, unique=True))
     trains = tuple(
         PulseTrain(
@@ -93,50 +93,50 @@ def test_plans_that_the_limiter_trimmed_are_proven_too(data):
         )
         for pixel in pixels
     )
-    plan, proven = proven_of(display, FrameSequence(trains=trains))
-    assert proven.energy_j <= plan.energy_j.sum()
+    plan, verified = build_verified(display, FrameSequence(trains=trains))
+    assert verified.energy_j <= plan.energy_j.sum()
 
 
 AT_THE_CAP = tuple(
     PulseTrain(pixel, at_s, 0.6, 2e-4, gap_s, 2.45) for pixel, at_s, gap_s in ((12, 0.013, 1e-3), (11, 0.009, 2e-4))
 )
-"""So many moves that the mirrors' cap takes pulses away."""
+"""Trains with so many moves that the galvo cap removes pulses."""
 
 
-def test_a_plan_right_at_the_mirrors_cap_is_proven():
-    display = display_of()
-    plan, proven = proven_of(display, FrameSequence(trains=AT_THE_CAP))
+def test_a_plan_at_the_galvo_cap_passes_verification():
+    display = build_display()
+    plan, verified = build_verified(display, FrameSequence(trains=AT_THE_CAP))
     assert (plan.reason == "galvo_acceleration").sum() > 10
-    assert len(set(proven.row.tolist())) == np.count_nonzero(plan.power_w)
+    assert len(set(verified.row.tolist())) == np.count_nonzero(plan.power_w)
 
 
-def test_without_what_whole_points_add_to_the_moves_that_plan_is_refused():
-    """The mutant: planned as if mirrors left when planned, the proof finds them above their cap."""
-    display = display_of()
+def test_without_the_interval_shrink_of_points_that_plan_is_rejected():
+    """Mutant: a budget that ignores the shift of the mirror moves; verification finds the galvo cap exceeded."""
+    display = build_display()
     exact = display.budget._replace(galvo=display.budget.galvo._replace(interval_shrink_s=0.0))
     with pytest.raises(LocalProtocolError, match="galvo_acceleration"):
-        proven_of(replace(display, budget=exact), FrameSequence(trains=AT_THE_CAP))
+        build_verified(replace(display, budget=exact), FrameSequence(trains=AT_THE_CAP))
 
 
 @settings(max_examples=60)
 @given(sequences(), st.sampled_from([20_000, 33_333, 40_000, 50_000]))
-def test_times_come_no_nearer_than_the_budget_counts(sequence, rate):
-    display = display_of(points_per_s=rate)
-    plan, proven = proven_of(display, sequence)
-    early_s, pulses, row = display.budget.galvo.interval_shrink_s, proven.pulses, proven.row
+def test_intervals_shrink_by_no_more_than_the_budget_assumes(sequence, rate):
+    display = build_display(points_per_s=rate)
+    plan, verified = build_verified(display, sequence)
+    shrink_s, pulses, row = display.budget.galvo.interval_shrink_s, verified.pulses, verified.row
     begins, ends = np.unique(row, return_index=True)[1], len(row) - 1 - np.unique(row[::-1], return_index=True)[1]
     late_s = pulses.start_s[begins] - plan.start_s[row[begins]]
-    sooner_s = (plan.start_s + plan.width_s)[row[ends]] - (pulses.start_s + pulses.width_s)[ends]
-    assert late_s.max(initial=0.0) + sooner_s.max(initial=0.0) <= early_s + 1e-9
+    early_s = (plan.start_s + plan.width_s)[row[ends]] - (pulses.start_s + pulses.width_s)[ends]
+    assert late_s.max(initial=0.0) + early_s.max(initial=0.0) <= shrink_s + 1e-9
 
 
-def test_mirrors_leave_with_the_first_point_after_a_pulse():
-    display = display_of()
-    plan, proven = proven_of(display, frame_of(display))
+def test_mirrors_move_with_the_first_point_after_a_pulse():
+    display = build_display()
+    plan, verified = build_verified(display, build_frame(display))
     scale = PointScale.from_config(display.config)
-    points = np.concatenate([parse_points(frame.data)[0] for frame in proven.frames]).astype(int)
-    x, y, lit = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2], points[:, 6] > 0
-    ends = np.flatnonzero(lit[:-1] & ~lit[1:]) + 1
+    points = np.concatenate([parse_points(frame.data)[0] for frame in verified.frames]).astype(int)
+    x, y, emitting = points[:, 0] << 4 | points[:, 1] >> 4, (points[:, 1] & 15) << 8 | points[:, 2], points[:, 6] > 0
+    ends = np.flatnonzero(emitting[:-1] & ~emitting[1:]) + 1
     ends = ends[x[ends] != x[ends - 1]]
     codes = scale.to_codes(plan.x_rad), scale.to_codes(plan.y_rad)
     for end in ends:
@@ -145,67 +145,67 @@ def test_mirrors_leave_with_the_first_point_after_a_pulse():
         assert end * scale.point_s <= plan.start_s[index - 1] + plan.width_s[index - 1] + 1e-9
 
 
-def test_a_long_pulse_is_cut_by_the_ends_of_frames_and_counts_as_one():
-    display = display_of()
-    plan, proven = proven_of(display, train_of(width_s=0.05, gap_s=0.2, duration_s=0.2))
+def test_a_long_pulse_is_split_at_frame_ends_and_counts_as_one():
+    display = build_display()
+    plan, verified = build_verified(display, build_train(width_s=0.05, gap_s=0.2, duration_s=0.2))
     assert len(plan) == 1
-    assert 2 <= len(proven.pulses) <= 4
-    lost = 1 - proven.energy_j / plan.energy_j.sum()
-    assert 0 < lost < 0.015
+    assert 2 <= len(verified.pulses) <= 4
+    loss = 1 - verified.energy_j / plan.energy_j.sum()
+    assert 0 < loss < 0.015
 
 
-def test_pulses_without_a_gap_stay_apart():
-    """Two trains of one pulse each on one pixel, the second at once after the first."""
-    display = display_of()
+def test_adjacent_pulses_stay_separate():
+    """Two single-pulse trains on one pixel, the second immediately after the first."""
+    display = build_display()
     trains = tuple(PulseTrain(5, at_s, 0.002, 0.002, 0.0, 1.0) for at_s in (0.0, 0.002))
-    plan, proven = proven_of(display, FrameSequence(trains=trains))
+    plan, verified = build_verified(display, FrameSequence(trains=trains))
     assert plan.start_s[1] == pytest.approx(plan.start_s[0] + plan.width_s[0])
-    assert proven.row.tolist() == [0, 1]
-    assert (plan.width_s - proven.pulses.width_s < 3 * PointScale.from_config(display.config).point_s).all()
+    assert verified.row.tolist() == [0, 1]
+    assert (plan.width_s - verified.pulses.width_s < 3 * PointScale.from_config(display.config).point_s).all()
 
 
-def test_a_plan_without_pulses_is_dark():
-    display = display_of()
+def test_a_plan_without_pulses_emits_nothing():
+    display = build_display()
     plan, _ = limit(EMPTY_PLAN, display.build_cold_state()[1], display.budget)
     frames = encode(plan, PointScale.from_config(display.config))
     assert len(decode([frame.data for frame in frames], PointScale.from_config(display.config))) == 0
-    lit = HeliosFrame.from_bytes(LIT * 2 + DARK + GOOD)
+    frame = HeliosFrame.from_bytes(EMITTING * 2 + BLANK + GOOD)
     with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
         verify_frames(
-            [lit.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
+            [frame.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
         )
 
 
-def test_a_long_rest_is_all_dark_frames():
-    display = display_of()
+def test_a_long_pause_consists_of_blank_frames():
+    display = build_display()
     sequence = FrameSequence(trains=(PulseTrain(0, 0.0, 1.5, 1e-3, 1.0, 1.0),))
-    _, proven = proven_of(display, sequence)
-    assert len(proven.pulses) == 2
-    assert proven.pulses.start_s[1] - proven.pulses.start_s[0] == pytest.approx(1.001, abs=26e-6)
+    _, verified = build_verified(display, sequence)
+    assert len(verified.pulses) == 2
+    assert verified.pulses.start_s[1] - verified.pulses.start_s[0] == pytest.approx(1.001, abs=26e-6)
 
 
 GOOD = struct.pack("<HHB", 40_000, 3, 2)
-LIT, DARK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
+EMITTING, BLANK = b"\x80\x08\x00" + b"\x01" * 4, b"\x80\x08\x00" + bytes(4)
 
 
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (LIT * 2 + DARK + struct.pack("<HHB", 40_000, 3, 0), "play once"),
-        (LIT * 2 + DARK + struct.pack("<HHB", 40_000, 3, 3), "flags 3"),
-        (LIT * 3 + GOOD, "last point is not dark"),
-        (LIT * 2 + b"\x80\x08\x00\x01\0\0\0" + GOOD, "last point is not dark"),
-        (DARK * 2 + GOOD, "for 3 points"),
-        (DARK * 1200 + struct.pack("<HHB", 40_000, 1200, 2), "longest allowed"),
-        (DARK * 3 + struct.pack("<HHB", 7, 3, 2), "longest allowed"),
-        (DARK * 3 + struct.pack("<HHB", 6, 3, 2), "takes 7 to 65535"),
-        (DARK * 45 + struct.pack("<HHB", 40_000, 45, 2), "fills whole packets"),
-        (DARK * 4096 + struct.pack("<HHB", 65_535, 4096, 2), "at most 4095"),
+        (EMITTING * 2 + BLANK + struct.pack("<HHB", 40_000, 3, 0), "play once"),
+        (EMITTING * 2 + BLANK + struct.pack("<HHB", 40_000, 3, 3), "flags 3"),
+        (EMITTING * 3 + GOOD, "last point is not blank"),
+        (EMITTING * 2 + b"\x80\x08\x00\x01\0\0\0" + GOOD, "last point is not blank"),
+        (BLANK * 2 + GOOD, "for 3 points"),
+        (BLANK * 1200 + struct.pack("<HHB", 40_000, 1200, 2), "the maximum is"),
+        (BLANK * 3 + struct.pack("<HHB", 7, 3, 2), "the maximum is"),
+        (BLANK * 3 + struct.pack("<HHB", 6, 3, 2), "accepts 7 to 65535"),
+        (BLANK * 45 + struct.pack("<HHB", 40_000, 45, 2), "fills whole packets"),
+        (BLANK * 4096 + struct.pack("<HHB", 65_535, 4096, 2), "at most 4095"),
         (struct.pack("<HHB", 40_000, 0, 2), "holds no point"),
         (b"", "holds no point"),
     ],
 )
-def test_frames_that_may_not_leave(data, words):
+def test_unsafe_frames_are_rejected(data, words):
     with pytest.raises(LocalProtocolError, match=words):
         HeliosFrame.from_bytes(data)
 
@@ -214,7 +214,7 @@ def _brighter(points):
     points[points[:, 6] > 0, 5] += 1  # one channel of four is enough
 
 
-def _sooner(points):
+def _earlier(points):
     first = int(np.flatnonzero(points[:, 6])[0])
     points[first - 1] = points[first]
 
@@ -224,7 +224,7 @@ def _later(points):
     points[last + 1] = points[last]
 
 
-def _aside(points):
+def _shift(points):
     points[points[:, 6] > 0, 2] ^= 1
 
 
@@ -232,15 +232,15 @@ def _elsewhere(points):
     points[np.flatnonzero(points[:, 6])[0] + 1, 0] ^= 0x80
 
 
-MUTANTS = [_brighter, _sooner, _later, _aside, _elsewhere]
+MUTANTS = [_brighter, _earlier, _later, _shift, _elsewhere]
 
 
 @pytest.mark.parametrize("mutant", MUTANTS)
-def test_mutants_of_the_bytes_are_caught_before_they_leave(mutant):
-    display = display_of()
+def test_mutants_of_the_bytes_fail_verification(mutant):
+    display = build_display()
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
-    plan, proven = proven_of(display, frame_of(display))
-    frames = [frame.data for frame in proven.frames]
+    plan, verified = build_verified(display, build_frame(display))
+    frames = [frame.data for frame in verified.frames]
     verify_frames(frames, plan, scale, budget, display.budget)
     number = next(index for index, data in enumerate(frames) if parse_points(data)[0][:-3, 6].any())
     points = parse_points(frames[number])[0].copy()
@@ -250,21 +250,21 @@ def test_mutants_of_the_bytes_are_caught_before_they_leave(mutant):
         verify_frames(frames, plan, scale, budget, display.budget)
 
 
-def test_a_plan_that_no_limiter_saw_is_caught_by_the_budget():
-    display = display_of()
+def test_an_unlimited_plan_fails_verification():
+    display = build_display()
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
-    plan, _ = proven_of(display, train_of(width_s=0.04, gap_s=0.002, power_w=1.0, duration_s=0.5))
+    plan, _ = build_verified(display, build_train(width_s=0.04, gap_s=0.002, power_w=1.0, duration_s=0.5))
     hot = replace(plan, power_w=np.full(len(plan), scale.full_power_w))
     frames = [frame.data for frame in encode(hot, scale)]
     with pytest.raises(LocalProtocolError, match="passes a cap"):
         verify_frames(frames, hot, scale, budget, display.budget)
 
 
-def test_a_board_that_plays_faster_than_thought_is_caught():
-    """A mutant of the rate: bytes that say 50 kHz for points laid out at 40 kHz."""
-    display = display_of()
+def test_a_wrong_rate_fails_verification():
+    """Mutant: frames at 50 kHz with points for 40 kHz."""
+    display = build_display()
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
-    plan, proven = proven_of(display, frame_of(display))
-    frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in proven.frames]
+    plan, verified = build_verified(display, build_frame(display))
+    frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in verified.frames]
     with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
         verify_frames(frames, plan, scale, budget, display.budget)
