@@ -98,7 +98,6 @@ def test_a_term_without_the_one_it_builds_on_is_refused():
 
 def test_every_module_of_the_package_is_a_term():
     terms = discover_terms()
-    assert len(terms) == 22
     for key, term in terms.items():
         assert term.key == key
         assert term.label
