@@ -32,7 +32,7 @@ from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.scheduler import Scheduler
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from reference.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
+from reference_models.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
 
 RUNS = 7
 

@@ -22,7 +22,7 @@ from optodrive.planning.scheduler import scheduler
 from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
-from reference.nominal_pixel import height_um
+from reference_models.nominal_pixel import height_um
 
 PIXELS = (200, 201, 222, 221)
 SECONDS, CYCLES = 0.6, 12

@@ -1,1 +1,1 @@
-"""The pixel and the display in equations: closed forms, parameter sets with their sources."""
+"""Physics of a pixel and of a display: closed forms, terms beyond them, parameter sets with their sources."""

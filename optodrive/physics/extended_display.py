@@ -1,6 +1,6 @@
-"""A whole display with terms, event by event: what `DisplayHeat` is to the nominal pixel, in compiled steps.
+"""Thermal state of a display whose pixels have terms: `NominalThermalState` with a compiled integrator.
 
-The terms are taken as a recording left them: ageing at the whole of its dose, a drifting room where it is stated.
+Terms act as a recording leaves them: ageing at its full dose, a drifting room at its stated temperature.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,13 +34,13 @@ from optodrive.physics.term_kernels import STATE_COUNT
 from optodrive.physics.terms import discover_terms
 
 BATCH = 128
-"""Pulses or pixels between two ticks: a tenth of a second on a slow machine."""
+"""Pulses or pixels between two calls of on_progress: a tenth of a second on a slow machine."""
 
 
 class ExtendedThermalState:
-    """The heat of every pixel of a display; mutable. Pixels carry their own time, all on one time line.
+    """Mutable thermal state of every pixel, see `ThermalState`.
 
-    values: term → parameter → SI value; only terms with kernels have an effect here.
+    values: term → parameter → SI value; terms without kernels have no effect. full_w: full power of the laser.
     """
 
     def __init__(
@@ -66,11 +66,11 @@ class ExtendedThermalState:
         self._snapshot_cache: SnapshotCache | None = None
 
     def copy(self) -> "ExtendedThermalState":
-        """An independent copy."""
+        """Return an independent copy."""
         return self.copy_shifted(0.0)
 
     def copy_shifted(self, offset_s: float) -> "ExtendedThermalState":
-        """A copy on a time line whose zero lies offset_s earlier."""
+        """Return a copy whose times are offset_s later, on a time line whose zero is offset_s earlier."""
         twin = ExtendedThermalState.__new__(ExtendedThermalState)
         vars(twin).update(vars(self))
         twin._at_s = self._at_s + offset_s
@@ -86,10 +86,10 @@ class ExtendedThermalState:
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Light pixels one after the other; all [n], pulses in order of time, power the mean incident one.
+        """Apply pulses in order of time, all [n], power_w the mean incident power; return their peaks.
 
-        tick is called again and again meanwhile. ValueError for a pulse that starts before its pixel's last event, or
-        that of one beside it where they exchange heat; those before it have been.
+        on_progress is called once per batch. Raises ValueError for a pulse that starts before the last event of its
+        pixel or of a thermally coupled neighbour; the pulses before it remain applied.
         """
         columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
         peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
@@ -118,85 +118,88 @@ class ExtendedThermalState:
         min_periods: int = 1,
         peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
-        """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
+        """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
 
-        It has least_periods at least, as far as the drive allows; a target beyond the longest pulse gets that one.
-        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
-        ValueError for a time before the pixel's last event.
+        Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
+        pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
+        after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
         """
         if start_s < self._at_s[pixel] - TIME_ROUNDING_S:
             raise self._time_order_error(pixel, start_s)
         context, one = self._context.copy(), self.pixels.elements[pixel]
         context[ILLUMINATED_PIXEL], context[IS_TARGET] = pixel, 1.0
-        room, lit = np.zeros((8, STATE_COUNT)), np.zeros((drive.max_periods + 1, STATE_COUNT))
-        room[0] = self._states[pixel]
-        dark_s, wait_s = float(self._off_s[pixel]), max(0.0, float(start_s - self._at_s[pixel]))
-        advance_states(one, self._active, context, True, room, 0.0, dark_s, wait_s)
+        work, on_states = np.zeros((8, STATE_COUNT)), np.zeros((drive.max_periods + 1, STATE_COUNT))
+        work[0] = self._states[pixel]
+        off_s, wait_s = float(self._off_s[pixel]), max(0.0, float(start_s - self._at_s[pixel]))
+        advance_states(one, self._active, context, True, work, 0.0, off_s, wait_s)
         span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
         periods, duty = find_shortest_pulse(
-            one, self._active, context, room, lit, dark_s + wait_s, target_m, *span, peak_after_s
+            one, self._active, context, work, on_states, off_s + wait_s, target_m, *span, peak_after_s
         )
         return (periods, duty) if periods else None
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
-        """The largest displacement that one pulse can reach from rest, [p]."""
+        """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
         affected = {discover_terms()[key].affected_pixel(values) for key, values in self._values.items()}
         kinds = [(pixel, index if index in affected else None) for index, pixel in enumerate(self.pixels.elements)]
         width_s = drive.max_periods * drive.period_s
-        reach: dict[tuple[Pixel, int | None], float] = {}
+        by_kind: dict[tuple[Pixel, int | None], float] = {}
         for index, kind in enumerate(kinds):
-            if kind not in reach:
-                fresh = self.copy_shifted(0.0)
-                fresh._states[:], fresh._at_s[:] = 0.0, 0.0
+            if kind not in by_kind:
+                cold = self.copy_shifted(0.0)
+                cold._states[:], cold._at_s[:] = 0.0, 0.0
                 one = (np.array([index]), np.zeros(1), np.array([width_s]), np.array([drive.max_power_w]))
-                reach[kind] = float(fresh.apply_pulses(*one).displacement_m[0])
-        return np.array([reach[kind] for kind in kinds])
+                by_kind[kind] = float(cold.apply_pulses(*one).displacement_m[0])
+        return np.array([by_kind[kind] for kind in kinds])
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
+        """Return the displacement of a pixel, m, at increasing times t_s [m]; the state does not change.
 
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
+        pixel's last event.
         """
-        felt = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])])
-        first_s = min(float(t_s[0]), float(felt[0, 0]) if len(felt) else np.inf)
+        acting = np.array(pulses[np.isin(pulses[:, 3], [pixel, *self._neighbours[pixel].tolist()])])
+        first_s = min(float(t_s[0]), float(acting[0, 0]) if len(acting) else np.inf)
         if first_s < self._at_s[pixel] - TIME_ROUNDING_S:
             raise self._time_order_error(pixel, first_s)
         last = (float(self._at_s[pixel]), float(self._off_s[pixel]), self._states[pixel].copy())
-        height_m = np.zeros(len(t_s))
+        displacement_m = np.zeros(len(t_s))
         one = self.pixels.elements[pixel]
-        simulate_displacement(one, self._active, self._context.copy(), pixel, *last, felt, np.array(t_s), height_m)
-        return height_m
+        simulate_displacement(
+            one, self._active, self._context.copy(), pixel, *last, acting, np.array(t_s), displacement_m
+        )
+        return displacement_m
 
     def state_at(self, at_s: float) -> DisplayState:
-        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's.
+        """Return every pixel at one time, with the gate off since its last event, or at that event if it is later.
 
-        Asked again and again for later times it goes on from the last answer: a display is stepped through but once.
+        Calls at successive times continue from the previous result, so each interval is integrated only once.
         """
         if self._snapshot_cache is None:
             self._snapshot_cache = SnapshotCache.from_states(self._states)
-        seen = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        state = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
         display = (self._columns, self._at_s, self._off_s, self._states)
-        compute_snapshot(*display, self._active, self._context, self._snapshot_cache, float(at_s), *seen)
-        return seen
+        compute_snapshot(*display, self._active, self._context, self._snapshot_cache, float(at_s), *state)
+        return state
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """What instruments show of some pixels from rest at times t_s [m], increasing.
+        """Return the measured traces of some pixels from the cold state at increasing times t_s [m].
 
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError where the display is not at rest.
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError if the display is not cold.
         """
         if self._states.any():
-            raise ValueError("a display with terms is traced from rest only")
-        # What lifts the membrane does not act back on the gas: without it the membrane shows the gas's own rise.
-        bare = {key: own for key, own in self._values.items() if not discover_terms()[key].moves_membrane}
+            raise ValueError("a display with terms is traced from the cold state only")
+        # Membrane terms do not act back on the gas: without them, the displacement is proportional to the gas's rise.
+        gas_terms = {key: values for key, values in self._values.items() if not discover_terms()[key].moves_membrane}
         ambient_k, full_w = float(self._context[AMBIENT_K]), float(self._context[FULL_W])
         columns = []
         for index in pixels:
-            own = pulses[np.isin(pulses[:, 3], [index, *self._neighbours[index].tolist()])]
-            scene = PixelExperiment(own, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
+            acting = pulses[np.isin(pulses[:, 3], [index, *self._neighbours[index].tolist()])]
+            experiment = PixelExperiment(acting, index, ambient_k, (t_s, t_s, t_s), dose_before=1.0, full_w=full_w)
             one = self.pixels.elements[index]
-            absorber_k, displacement_m, force_n = simulate_signals(scene, one, self._active)
-            # Of a dead membrane nothing could be read.
-            gas_k = simulate_signals(scene, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(bare))[1]
+            absorber_k, displacement_m, force_n = simulate_signals(experiment, one, self._active)
+            # κ = 1, because a dead pixel's κ is 0.
+            gas_k = simulate_signals(experiment, one._replace(kappa_m_per_k=1.0), ActiveTerms.from_values(gas_terms))[1]
             columns.append((absorber_k, gas_k, displacement_m, force_n))
         signals = (np.stack(signal, axis=1) for signal in zip(*columns, strict=True))
         return PixelTrace(t_s, np.array(pixels, dtype=np.int64), *signals)

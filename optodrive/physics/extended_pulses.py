@@ -1,6 +1,6 @@
-"""Stepped pixels: what a pulse brings, what the dark after it does, and which pulse reaches a height.
+"""Pulses on pixels with terms: the states after them, their peaks, and the pulse that reaches a displacement.
 
-Kernels over `forward.step`; `ExtendedHeat` is their face.
+Kernels over `pixel_ode.step`; `ExtendedThermalState` is their interface.
 """
 
 import numpy as np
@@ -13,12 +13,13 @@ from optodrive.physics.pixel_ode import ActiveTerms, interpolate_states, next_st
 from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
 
 DISPLACEMENT_SIGNAL = 1
-"""Number of the signal in `forward.outputs`."""
+"""Number of the signal in `pixel_ode.output_signal`."""
 DECAYED_SHARE, DECAYED_TIME_CONSTANTS = 0.7, 8.0
-"""In the dark a membrane below this share of its largest displacement so many gas time constants later is past it."""
+"""The peak after gate off is over once the displacement is below this share of it, after this many gas lags."""
 COLD_K = 1e-6
+"""Largest rise of a pixel that counts as cold."""
 PEAK_TOLERANCE = 1e-5
-"""A peak this close to its target, relative, is there."""
+"""Relative distance of a peak from its target that is accepted."""
 
 
 @kernel
@@ -32,13 +33,13 @@ def advance_states(
     since_edge_s: float,
     duration_s: float,
 ) -> tuple[float, float]:
-    """Advance the states room[0] by for_s under the context's power; the most the membrane and the absorber do.
+    """Advance the states work[0] by duration_s at the context's power; return the peaks meanwhile.
 
-    since_s: time since the light last changed; displacement in m, absorber in K.
+    since_edge_s: time since the last gate edge. The peaks are those of displacement, m, and absorber rise, K.
     """
     peak_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
     peak_k = work[0, ABSORBER]
-    done_s, fresh = 0.0, True
+    done_s, after_edge = 0.0, True
     while done_s < duration_s:
         if c[POWER_W] == 0.0 and np.abs(work[0]).max() < COLD_K:
             work[0] = 0.0
@@ -47,7 +48,7 @@ def advance_states(
         last = done_s + 1.3 * h_s >= duration_s
         if last:
             h_s = duration_s - done_s
-        step(pixel, active, c, is_target, fresh, at_s + done_s, since_edge_s + done_s, h_s, work)
+        step(pixel, active, c, is_target, after_edge, at_s + done_s, since_edge_s + done_s, h_s, work)
         begin_m = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
         end_m = output_signal(pixel, active, work[2], c, DISPLACEMENT_SIGNAL)
         interpolate_states(active.state_rows, work, 0.0, h_s, 0.5 * h_s)
@@ -56,14 +57,14 @@ def advance_states(
         peak_k = max(peak_k, work[2, ABSORBER])
         work[0] = work[2]
         work[1] = work[3]
-        fresh = False
+        after_edge = False
         done_s = duration_s if last else done_s + h_s
     return peak_m, peak_k
 
 
 @kernel
 def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
-    """Top of the parabola through three points, where it lies between them; else the middle one."""
+    """Return the vertex of the parabola through three points if it is a maximum between them, else the middle one."""
     bend = begin_m - 2.0 * middle_m + end_m
     half = 0.5 * (end_m - begin_m)
     if bend >= 0.0 or abs(half) > -bend:
@@ -75,19 +76,19 @@ def _vertex_m(begin_m: float, middle_m: float, end_m: float) -> float:
 def _peak_after_off_m(
     pixel: Pixel, active: ActiveTerms, c: FloatArray, work: FloatArray, since_edge_s: float, peak_after_s: float
 ) -> float:
-    """The most the membrane does in the dark, from_s after the states room[0] or later; the states move."""
+    """Return the peak displacement, m, from peak_after_s after the states work[0] on; the gate is off."""
     c[POWER_W] = 0.0
     if peak_after_s > 0.0:
         advance_states(pixel, active, c, True, work, 0.0, since_edge_s, peak_after_s)
         since_edge_s += peak_after_s
     peak_m, done_s = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL), 0.0
-    piece_s = pixel.tau_g_s
+    interval_s = pixel.tau_g_s
     while True:
-        here_m = advance_states(pixel, active, c, True, work, done_s, since_edge_s + done_s, piece_s)[0]
-        peak_m = max(peak_m, here_m)
-        done_s += piece_s
-        settled = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
-        if settled and output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL) <= DECAYED_SHARE * peak_m:
+        interval_m = advance_states(pixel, active, c, True, work, done_s, since_edge_s + done_s, interval_s)[0]
+        peak_m = max(peak_m, interval_m)
+        done_s += interval_s
+        has_decayed = done_s > DECAYED_TIME_CONSTANTS * pixel.tau_g_s
+        if has_decayed and output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL) <= DECAYED_SHARE * peak_m:
             break
     return peak_m
 
@@ -111,38 +112,38 @@ def apply_pulses(
     begin: int,
     end: int,
 ) -> int:
-    """Heat by the pulses begin to end, fill in their peaks [n]; the first that came too early, or end.
+    """Apply the pulses begin to end and fill in their peaks [n]; return the first that is out of order, or end.
 
-    columns: [p, 6] the fields of `Pixel`; at_s, dark_s, states: [p], [p], [p, STATES] the last event, how long it had
-    been dark before it, and the states then; beside: [p, k] pixels that feel this one's light, −1 for none;
-    last: [p] each pixel's last pulse so far, −1 for none.
+    columns: [p, 6] the fields of `Pixel`; at_s, off_s, states: [p], [p], [p, STATE_COUNT] time of the last event,
+    time since gate off at that event, and the states then; neighbours: [p, k] pixels that the light on a pixel also
+    heats, −1 for none; last_pulse: [p] row of each pixel's last pulse so far, −1 for none
     """
-    room, c = np.zeros((8, states.shape[1])), context.copy()
+    work, c = np.zeros((8, states.shape[1])), context.copy()
     for row in range(begin, end):
         for side in range(-1, neighbours.shape[1]):
             i = pixel[row] if side < 0 else neighbours[pixel[row], side]
             if i >= 0 and start_s[row] - at_s[i] < -TIME_ROUNDING_S:
                 return row
         for side in range(-1, neighbours.shape[1]):
-            own = side < 0
-            i = pixel[row] if own else neighbours[pixel[row], side]
+            is_target = side < 0
+            i = pixel[row] if is_target else neighbours[pixel[row], side]
             if i < 0:
                 continue
             one, wait_s = pixel_at(columns, i), max(0.0, start_s[row] - at_s[i])
-            room[0] = states[i]
-            c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, pixel[row], 1.0 if own else 0.0
-            glow_m, _ = advance_states(one, active, c, own, room, 0.0, off_s[i], wait_s)
+            work[0] = states[i]
+            c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, pixel[row], 1.0 if is_target else 0.0
+            off_peak_m, _ = advance_states(one, active, c, is_target, work, 0.0, off_s[i], wait_s)
             if last_pulse[i] >= 0:
-                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], glow_m)
-            before_k = room[0, ABSORBER]
+                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
+            before_k = work[0, ABSORBER]
             c[POWER_W] = power_w[row]
-            lit_m, lit_k = advance_states(one, active, c, own, room, 0.0, 0.0, width_s[row])
-            if own:
+            on_peak_m, on_peak_k = advance_states(one, active, c, is_target, work, 0.0, 0.0, width_s[row])
+            if is_target:
                 last_pulse[i] = row
-                peak_k[row] = max(before_k, lit_k)
+                peak_k[row] = max(before_k, on_peak_k)
             if last_pulse[i] >= 0:
-                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], lit_m)
-            states[i] = room[0]
+                peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], on_peak_m)
+            states[i] = work[0]
             at_s[i], off_s[i] = start_s[row] + width_s[row], 0.0
     return end
 
@@ -158,14 +159,14 @@ def add_peaks_after_off(
     end: int,
     peak_m: FloatArray,
 ) -> None:
-    """What the last pulses of the pixels begin to end still bring in the dark after them."""
-    room, c = np.zeros((8, states.shape[1])), context.copy()
+    """Raise the peaks of the last pulses of the pixels begin to end by what follows after gate off."""
+    work, c = np.zeros((8, states.shape[1])), context.copy()
     for i in range(begin, end):
         if last_pulse[i] >= 0:
-            room[0] = states[i]
+            work[0] = states[i]
             c[ILLUMINATED_PIXEL], c[IS_TARGET] = i, 1.0
-            glow_m = _peak_after_off_m(pixel_at(columns, i), active, c, room, 0.0, 0.0)
-            peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], glow_m)
+            off_peak_m = _peak_after_off_m(pixel_at(columns, i), active, c, work, 0.0, 0.0)
+            peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
 
 
 @kernel
@@ -181,32 +182,32 @@ def simulate_displacement(
     t_s: FloatArray,
     displacement_m: FloatArray,
 ) -> None:
-    """Fill in the displacement of pixel `index` at t_s [m], under pulses [n, 4] on it and beside it.
+    """Fill in the displacement of pixel `index` at t_s [m], under pulses [n, 4] on it and on its neighbours.
 
-    at_s, dark_s, state: its last event, how long it had been dark before it, and the states then; state is written.
+    at_s, off_s, state: time of the last event, time since gate off at that event, and the states then
     """
-    room = np.zeros((8, len(state)))
-    room[0] = state
-    now_s, since_s, row = at_s, off_s, 0
+    work = np.zeros((8, len(state)))
+    work[0] = state
+    now_s, since_edge_s, row = at_s, off_s, 0
     for edge in range(2 * len(pulses) + 1):
-        pulse, lit, own = edge // 2, edge % 2 == 1, True
+        pulse, gate_on, is_target = edge // 2, edge % 2 == 1, True
         c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, index, 1.0
         until_s = np.inf
         if pulse < len(pulses):
-            own = pulses[pulse, 3] == index
-            c[ILLUMINATED_PIXEL], c[IS_TARGET] = pulses[pulse, 3], 1.0 if own else 0.0
-            until_s = pulses[pulse, 0] + (pulses[pulse, 1] if lit else 0.0)
-            c[POWER_W] = pulses[pulse, 2] if lit else 0.0
+            is_target = pulses[pulse, 3] == index
+            c[ILLUMINATED_PIXEL], c[IS_TARGET] = pulses[pulse, 3], 1.0 if is_target else 0.0
+            until_s = pulses[pulse, 0] + (pulses[pulse, 1] if gate_on else 0.0)
+            c[POWER_W] = pulses[pulse, 2] if gate_on else 0.0
         while row < len(t_s) and t_s[row] <= until_s:
-            for_s = max(0.0, t_s[row] - now_s)
-            advance_states(pixel, active, c, own, room, 0.0, since_s, for_s)
-            now_s, since_s = now_s + for_s, since_s + for_s
-            displacement_m[row] = output_signal(pixel, active, room[0], c, DISPLACEMENT_SIGNAL)
+            duration_s = max(0.0, t_s[row] - now_s)
+            advance_states(pixel, active, c, is_target, work, 0.0, since_edge_s, duration_s)
+            now_s, since_edge_s = now_s + duration_s, since_edge_s + duration_s
+            displacement_m[row] = output_signal(pixel, active, work[0], c, DISPLACEMENT_SIGNAL)
             row += 1
         if row == len(t_s):
             break
-        advance_states(pixel, active, c, own, room, 0.0, since_s, max(0.0, until_s - now_s))
-        now_s, since_s = max(now_s, until_s), 0.0
+        advance_states(pixel, active, c, is_target, work, 0.0, since_edge_s, max(0.0, until_s - now_s))
+        now_s, since_edge_s = max(now_s, until_s), 0.0
 
 
 @kernel
@@ -219,6 +220,7 @@ def _peak_after_state_m(
     since_edge_s: float,
     peak_after_s: float,
 ) -> float:
+    """Return `_peak_after_off_m` from `state`, which stays as it is."""
     work[0] = state
     return _peak_after_off_m(pixel, active, c, work, since_edge_s, peak_after_s)
 
@@ -238,9 +240,9 @@ def find_shortest_pulse(
     max_periods: int,
     peak_after_s: float,
 ) -> tuple[int, float]:
-    """As pulse_for_peak, from the states room[0]; no periods where no pulse is needed.
+    """Solve as `ExtendedThermalState.solve_pulse`, from the states work[0]; 0 periods if no pulse is needed.
 
-    lit: [max_periods + 1, STATES] room for the states after each period at full power: one path holds all widths.
+    on_states: [max_periods + 1, STATE_COUNT], work space for the states after each period at full power
     """
     on_states[0] = work[0]
     if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
@@ -257,8 +259,8 @@ def find_shortest_pulse(
     low = min_periods - 1
     while high - low > 1:
         middle = (low + high) // 2
-        dark_from_s = max(0.0, peak_after_s - middle * period_s)
-        if _peak_after_state_m(pixel, active, c, work, on_states[middle], 0.0, dark_from_s) >= target_m:
+        after_off_s = max(0.0, peak_after_s - middle * period_s)
+        if _peak_after_state_m(pixel, active, c, work, on_states[middle], 0.0, after_off_s) >= target_m:
             high = middle
         else:
             low = middle
@@ -277,26 +279,26 @@ def _solve_duty(
     width_s: float,
     peak_after_s: float,
 ) -> float:
-    """The duty at which a pulse's peak is goal_m, by the Illinois form of false position; 1 where none is."""
+    """Return the duty at which a pulse's peak is target_m, by the Illinois method; 1 if none is."""
     low, high = 0.0, 1.0
-    short_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
-    over_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
-    if over_m <= 0.0:
+    low_error_m = _peak_after_state_m(pixel, active, c, work, state, 0.0, peak_after_s) - target_m
+    high_error_m = _pulse_peak_m(pixel, active, c, work, state, max_power_w, width_s, peak_after_s) - target_m
+    if high_error_m <= 0.0:
         return 1.0
-    kept = 0
+    retained_side = 0
     for _ in range(30):
-        duty = (low * over_m - high * short_m) / (over_m - short_m)
-        miss_m = _pulse_peak_m(pixel, active, c, work, state, duty * max_power_w, width_s, peak_after_s) - target_m
-        if abs(miss_m) <= PEAK_TOLERANCE * target_m:
+        duty = (low * high_error_m - high * low_error_m) / (high_error_m - low_error_m)
+        error_m = _pulse_peak_m(pixel, active, c, work, state, duty * max_power_w, width_s, peak_after_s) - target_m
+        if abs(error_m) <= PEAK_TOLERANCE * target_m:
             return duty
-        if miss_m > 0.0:
-            high, over_m = duty, miss_m
-            short_m *= 0.5 if kept > 0 else 1.0
-            kept = 1
+        if error_m > 0.0:
+            high, high_error_m = duty, error_m
+            low_error_m *= 0.5 if retained_side > 0 else 1.0
+            retained_side = 1
         else:
-            low, short_m = duty, miss_m
-            over_m *= 0.5 if kept < 0 else 1.0
-            kept = -1
+            low, low_error_m = duty, error_m
+            high_error_m *= 0.5 if retained_side < 0 else 1.0
+            retained_side = -1
     return high
 
 
@@ -311,8 +313,9 @@ def _pulse_peak_m(
     width_s: float,
     peak_after_s: float,
 ) -> float:
+    """Return the peak displacement, m, of a pulse from `state`, counted from peak_after_s after its start."""
     work[0] = state
     c[POWER_W] = power_w
-    lit_m = advance_states(pixel, active, c, True, work, 0.0, 0.0, width_s)[0]
-    dark_m = _peak_after_off_m(pixel, active, c, work, 0.0, max(0.0, peak_after_s - width_s))
-    return max(lit_m, dark_m) if peak_after_s <= 0.0 else dark_m
+    on_peak_m = advance_states(pixel, active, c, True, work, 0.0, 0.0, width_s)[0]
+    off_peak_m = _peak_after_off_m(pixel, active, c, work, 0.0, max(0.0, peak_after_s - width_s))
+    return max(on_peak_m, off_peak_m) if peak_after_s <= 0.0 else off_peak_m

@@ -1,4 +1,4 @@
-"""A whole display, event by event: each pixel is advanced only when something is asked of it."""
+"""Thermal state of a display of nominal pixels, in closed form, each advanced only at its own events."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -13,16 +13,17 @@ from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 from optodrive.physics.pulse_for_height import DriveRange, find_shortest_pulse, max_displacement_m
 
 TIME_ROUNDING_S = 1e-9
+"""Overlap of two events that counts as rounding of their times."""
 
 
 def ignore_progress() -> None:
-    """Done while something takes its time, where nobody asked for more."""
+    """Do nothing; the default progress callback."""
 
 
 class PulsePeaks(NamedTuple):
-    """The most each pulse [n] brings its pixel to, from its start to the pixel's next pulse, or for ever.
+    """Peaks that each pulse [n] causes on its pixel, from its start to the pixel's next pulse, if there is one.
 
-    displacement_m: membrane; absorber_k: absorber over ambient, which is its rise at one end of the pulse.
+    displacement_m: of the membrane; absorber_k: rise of the absorber above ambient, reached at an end of the pulse.
     """
 
     displacement_m: FloatArray
@@ -30,7 +31,7 @@ class PulsePeaks(NamedTuple):
 
 
 class DisplayState(NamedTuple):
-    """A display at one time. displacement_m: membrane; absorber_k: absorber over ambient; both [p]."""
+    """State of every pixel [p] at one time: displacement of the membrane, rise of the absorber above ambient."""
 
     displacement_m: FloatArray
     absorber_k: FloatArray
@@ -39,9 +40,10 @@ class DisplayState(NamedTuple):
 def build_kernel_columns(
     pixels: int, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
 ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray]:
-    """Pulses [n] as a kernel takes them, which does not look where it writes: IndexError for no pixel of `pixels`.
+    """Return the columns of pulses [n] as copies of one type and memory layout, which kernels require.
 
-    Copies, because a kernel is compiled for one layout and one writability of its arrays.
+    pixels: number of pixels. Raises IndexError for a pixel out of range, because kernels do not check bounds, and
+    ValueError for columns of unequal length.
     """
     index = np.array(pixel, dtype=np.int64)
     if len(index) and not 0 <= index.min() <= index.max() < pixels:
@@ -52,7 +54,7 @@ def build_kernel_columns(
 
 
 class NominalThermalState:
-    """The heat of every pixel of a display; mutable. Pixels carry their own time, all on one time line."""
+    """Mutable thermal state of every pixel, see `ThermalState`."""
 
     def __init__(self, pixels: PixelArray, at_s: float = 0.0) -> None:
         self.pixels = pixels
@@ -62,11 +64,11 @@ class NominalThermalState:
         self._gamma_k = np.zeros(len(pixels))
 
     def copy(self) -> "NominalThermalState":
-        """An independent copy."""
+        """Return an independent copy."""
         return self.copy_shifted(0.0)
 
     def copy_shifted(self, offset_s: float) -> "NominalThermalState":
-        """A copy on a time line whose zero lies offset_s earlier."""
+        """Return a copy whose times are offset_s later, on a time line whose zero is offset_s earlier."""
         twin = NominalThermalState.__new__(NominalThermalState)
         twin.pixels, twin._columns = self.pixels, self._columns
         twin._at_s = self._at_s + offset_s
@@ -75,17 +77,20 @@ class NominalThermalState:
         return twin
 
     def rises_k(self, pixel: int, at_s: float) -> tuple[float, float]:
-        """Absorber and gas rise, K, of a pixel left dark until at_s; ValueError for a time before its last event."""
-        dark_s = at_s - self._at_s[pixel]
-        if dark_s < -TIME_ROUNDING_S:
+        """Return absorber and gas rise of a pixel, K, with the gate off until at_s.
+
+        Raises ValueError for a time before the pixel's last event.
+        """
+        off_s = at_s - self._at_s[pixel]
+        if off_s < -TIME_ROUNDING_S:
             raise self._time_order_error(pixel, at_s)
-        return advance(self.pixels.elements[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, dark_s))
+        return advance(self.pixels.elements[pixel], self._theta_k[pixel], self._gamma_k[pixel], 0.0, max(0.0, off_s))
 
     def _time_order_error(self, pixel: int, at_s: float) -> ValueError:
         return ValueError(f"pixel {pixel} was advanced to {self._at_s[pixel]} s, {at_s} s lies before it")
 
     def apply_pulse(self, pixel: int, start_s: float, width_s: float, power_w: float) -> None:
-        """Light a pixel from start_s for width_s at the mean incident power power_w."""
+        """Apply one pulse of mean incident power power_w."""
         self.apply_pulses(np.array([pixel]), np.array([start_s]), np.array([width_s]), np.array([power_w]))
 
     def apply_pulses(
@@ -96,10 +101,10 @@ class NominalThermalState:
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Light pixels one after the other; all [n], pulses of a pixel in order of time, power the mean incident one.
+        """Apply pulses, all [n], those of each pixel in order of time; power_w is the mean incident power.
 
-        tick is not needed here: a million pulses take a fifth of a second.
-        ValueError for a pulse that starts before its pixel's last event; those before it have been.
+        Returns their peaks. on_progress is not called: a million pulses take a fifth of a second. Raises ValueError for
+        a pulse that starts before its pixel's last event; the pulses before it remain applied.
         """
         columns = build_kernel_columns(len(self.pixels), pixel, start_s, width_s, power_w)
         peaks = PulsePeaks(np.zeros(len(pixel)), np.zeros(len(pixel)))
@@ -117,11 +122,11 @@ class NominalThermalState:
         min_periods: int = 1,
         peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
-        """PWM periods and duty of the shortest pulse at at_s whose peak is target_m; None where none is needed.
+        """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
 
-        It has least_periods at least, as far as the drive allows; a target beyond the longest pulse gets that one.
-        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
-        ValueError for a time before the pixel's last event.
+        Returns None if the residual heat already reaches the target, and the longest pulse if none reaches it. The
+        pulse has at least min_periods, within the drive's range. peak_after_s: the peak counts only from this time
+        after the pulse's start, and not before its end. Raises ValueError for a time before the pixel's last event.
         """
         if not 0 <= pixel < len(self._at_s):
             raise IndexError(f"pixel {pixel} of {len(self._at_s)}")
@@ -133,47 +138,51 @@ class NominalThermalState:
         return (periods, duty) if periods else None
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
-        """The largest displacement that one pulse can reach from rest, [p]."""
-        reach = {pixel: max_displacement_m(pixel, drive) for pixel in set(self.pixels.elements)}
-        return np.array([reach[pixel] for pixel in self.pixels.elements])
+        """Return the largest displacement that one pulse can reach on each cold pixel, m, [p]."""
+        by_pixel = {pixel: max_displacement_m(pixel, drive) for pixel in set(self.pixels.elements)}
+        return np.array([by_pixel[pixel] for pixel in self.pixels.elements])
 
     def peak_m(self, pixel: int, within_s: float = float("inf")) -> float:
-        """Largest displacement, m, of a pixel from its last event on, within_s seconds at most."""
+        """Return the peak displacement of a pixel, m, within within_s after its last event."""
         parameters = self.pixels.elements[pixel]
         peak_k, _ = cooling_peak(parameters, self._theta_k[pixel], self._gamma_k[pixel], within_s)
         return parameters.kappa_m_per_k * peak_k
 
     def simulate_rises_k(self, pixel: int, pulses: FloatArray, t_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Absorber and gas rise, K, each [m], of a pixel at times t_s [m], increasing; the heat stays as it is.
+        """Return absorber and gas rise of a pixel, K, each [m], at increasing times t_s [m]; the state does not change.
 
-        pulses: [n, 3] start_s, width_s, power_w in order; ValueError for one, or a time, before the last event.
+        pulses: [n, 3] start_s, width_s, power_w in order. Raises ValueError for a pulse or a time before the pixel's
+        last event.
         """
         events_s = np.concatenate([[self._at_s[pixel]], pulses[:, 0] + pulses[:, 1]])
-        for asked_s, after_s in ((pulses[:, 0], events_s[:-1]), (t_s[:1], events_s[:1])):
-            early = np.flatnonzero(asked_s < after_s[: len(asked_s)] - TIME_ROUNDING_S)
+        for requested_s, after_s in ((pulses[:, 0], events_s[:-1]), (t_s[:1], events_s[:1])):
+            early = np.flatnonzero(requested_s < after_s[: len(requested_s)] - TIME_ROUNDING_S)
             if len(early):
-                raise ValueError(f"pixel {pixel} at {asked_s[early[0]]} s: its last event is at {after_s[early[0]]} s")
+                raise ValueError(
+                    f"pixel {pixel} at {requested_s[early[0]]} s: its last event is at {after_s[early[0]]} s"
+                )
         absorber_k, gas_k = np.zeros(len(t_s)), np.zeros(len(t_s))
         start = self._at_s[pixel], self._theta_k[pixel], self._gamma_k[pixel]
         _sample_rises(self.pixels.elements[pixel], *start, np.array(pulses), np.array(t_s), absorber_k, gas_k)
         return absorber_k, gas_k
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Displacement of a pixel at times t_s [m], increasing, from the heat there is, which stays as it is.
+        """Return the displacement of a pixel, m, at increasing times t_s [m]; the state does not change.
 
-        pulses: [n, 4] start_s, width_s, power_w, pixel in order; ValueError for one, or a time, before the last event.
+        pulses: [n, 4] start_s, width_s, power_w, pixel in order. Raises ValueError for a pulse or a time before the
+        pixel's last event.
         """
         gas_k = self.simulate_rises_k(pixel, pulses[pulses[:, 3] == pixel, :3], t_s)[1]
         return self.pixels.elements[pixel].kappa_m_per_k * gas_k
 
     def state_at(self, at_s: float) -> DisplayState:
-        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's."""
-        seen = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
-        _compute_snapshot(self._columns, self._at_s, self._theta_k, self._gamma_k, float(at_s), *seen)
-        return seen
+        """Return every pixel at one time, with the gate off since its last event, or at that event if it is later."""
+        state = DisplayState(np.zeros(len(self.pixels)), np.zeros(len(self.pixels)))
+        _compute_snapshot(self._columns, self._at_s, self._theta_k, self._gamma_k, float(at_s), *state)
+        return state
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """Exact values of some pixels at times t_s [m], increasing.
+        """Return the exact traces of some pixels at increasing times t_s [m].
 
         pulses: [n, 4] start_s, width_s, power_w, pixel in order, after each pixel's last event.
         """
@@ -205,22 +214,22 @@ def _apply_pulses(
     peak_m: FloatArray,
     peak_k: FloatArray,
 ) -> int:
-    """Heat by the pulses [n], fill in their peaks [n]; the number of pulses that did not come too early.
+    """Apply pulses [n] and fill in their peaks [n]; return the number of pulses before the first one out of order.
 
-    columns: [p, 6] the fields of `Pixel`; at_s, theta_k, gamma_k: [p] the last event and the rises then.
+    columns: [p, 6] the fields of `Pixel`; at_s, theta_k, gamma_k: [p] time of the last event and the rises then
     """
     last = np.full(len(at_s), -1)
     for row in range(len(pixel)):
         i = pixel[row]
         one = pixel_at(columns, i)
-        dark_s = start_s[row] - at_s[i]
-        if dark_s < -TIME_ROUNDING_S:
+        off_s = start_s[row] - at_s[i]
+        if off_s < -TIME_ROUNDING_S:
             return row
-        dark_s = max(0.0, dark_s)
+        off_s = max(0.0, off_s)
         if last[i] >= 0:
-            glow_k = cooling_peak(one, theta_k[i], gamma_k[i], dark_s)[0]
-            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
-        absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, dark_s)
+            off_peak_k = cooling_peak(one, theta_k[i], gamma_k[i], off_s)[0]
+            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * off_peak_k)
+        absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, off_s)
         peak_m[row] = one.kappa_m_per_k * gas_peak(one, absorber_k, gas_k, power_w[row], width_s[row])[0]
         theta_k[i], gamma_k[i] = advance(one, absorber_k, gas_k, power_w[row], width_s[row])
         peak_k[row] = max(absorber_k, theta_k[i])
@@ -229,8 +238,8 @@ def _apply_pulses(
     for i in range(len(at_s)):
         if last[i] >= 0:
             one = pixel_at(columns, i)
-            glow_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
-            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * glow_k)
+            off_peak_k = cooling_peak(one, theta_k[i], gamma_k[i], np.inf)[0]
+            peak_m[last[i]] = max(peak_m[last[i]], one.kappa_m_per_k * off_peak_k)
     return len(pixel)
 
 
@@ -244,7 +253,7 @@ def _compute_snapshot(
     displacement_m: FloatArray,
     absorber_k: FloatArray,
 ) -> None:
-    """Fill in every pixel [p] at now_s, left dark since its last event."""
+    """Fill in displacement and absorber rise of every pixel [p] at now_s, with the gate off since its last event."""
     for i in range(len(at_s)):
         one = pixel_at(columns, i)
         absorber_k[i], gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, now_s - at_s[i]))
@@ -266,23 +275,23 @@ def _solve_pulse_at(
     max_periods: int,
     peak_after_s: float,
 ) -> tuple[int, float]:
-    """As pulse_for_peak; no periods where no pulse is needed, fewer where at_s is too early.
+    """Solve as `solve_pulse`; 0 periods if no pulse is needed, -1 if start_s is before the pixel's last event.
 
-    In one kernel, because each call from Python costs as much as what it does.
+    It is one kernel because a call from Python costs as much as the computation.
     """
-    one, dark_s = pixel_at(columns, i), start_s - last_s[i]
-    if dark_s < -TIME_ROUNDING_S:
+    one, off_s = pixel_at(columns, i), start_s - last_s[i]
+    if off_s < -TIME_ROUNDING_S:
         return -1, 0.0
-    absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, dark_s))
-    goal_k = target_m / one.kappa_m_per_k
+    absorber_k, gas_k = advance(one, theta_k[i], gamma_k[i], 0.0, max(0.0, off_s))
+    target_k = target_m / one.kappa_m_per_k
     return find_shortest_pulse(
-        one, absorber_k, gas_k, goal_k, max_power_w, period_s, min_periods, max_periods, peak_after_s
+        one, absorber_k, gas_k, target_k, max_power_w, period_s, min_periods, max_periods, peak_after_s
     )
 
 
 @kernel
 def pixel_at(columns: FloatArray, i: int) -> Pixel:
-    """A row of [p, 6], the fields of `Pixel`."""
+    """Return row i of columns [p, 6], the fields of `Pixel`."""
     one = columns[i]
     return Pixel(one[0], one[1], one[2], one[3], one[4], one[5])
 
@@ -298,19 +307,19 @@ def _sample_rises(
     absorber_k: FloatArray,
     gas_k: FloatArray,
 ) -> None:
-    """Fill in the rises of a pixel at t_s [m], through its pulses [n, 3], from those at its last event, end_s."""
+    """Fill in the rises of a pixel at t_s [m] through its pulses [n, 3], from its rises at its last event, end_s."""
     begin_s, power_w, begin_theta_k, begin_gamma_k = end_s, 0.0, theta_k, gamma_k
     upcoming = 0
     for row in range(len(t_s)):
         while upcoming < len(pulses) and t_s[row] >= pulses[upcoming, 0]:
-            dark_s = max(0.0, pulses[upcoming, 0] - end_s)
-            begin_theta_k, begin_gamma_k = advance(one, theta_k, gamma_k, 0.0, dark_s)
+            off_s = max(0.0, pulses[upcoming, 0] - end_s)
+            begin_theta_k, begin_gamma_k = advance(one, theta_k, gamma_k, 0.0, off_s)
             begin_s, power_w = pulses[upcoming, 0], pulses[upcoming, 2]
             theta_k, gamma_k = advance(one, begin_theta_k, begin_gamma_k, power_w, pulses[upcoming, 1])
             end_s = begin_s + pulses[upcoming, 1]
             upcoming += 1
         if t_s[row] < end_s:
-            lit_s = max(0.0, t_s[row] - begin_s)
-            absorber_k[row], gas_k[row] = advance(one, begin_theta_k, begin_gamma_k, power_w, lit_s)
+            on_s = max(0.0, t_s[row] - begin_s)
+            absorber_k[row], gas_k[row] = advance(one, begin_theta_k, begin_gamma_k, power_w, on_s)
         else:
             absorber_k[row], gas_k[row] = advance(one, theta_k, gamma_k, 0.0, t_s[row] - end_s)

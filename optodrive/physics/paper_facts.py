@@ -1,4 +1,4 @@
-"""The paper's numbers, one row a fact, as shipped in configs/paper_facts.csv."""
+"""Numbers of the paper, as shipped in configs/paper_facts.csv, one row per fact."""
 
 import csv
 from dataclasses import dataclass
@@ -8,14 +8,14 @@ from typing import Literal, cast
 from optodrive.device.config import locate_shipped
 
 AMBIENT_C = 20.0
-"""Ambient of the paper's single-pixel runs: 527 °C at a rise of 507 K."""
+"""Ambient temperature of the paper's single-pixel runs: 527 °C at a rise of 507 K."""
 
 
 @dataclass(frozen=True)
 class PaperFact:
-    """One number of the paper: relation '=' for a value, '<' for an upper bound; uncertainty None where it gives none.
+    """One number of the paper, SI but for temperatures, which are in °C.
 
-    Units are SI; temperatures in °C as the paper has them.
+    relation: '=' for a value, '<' for an upper bound; uncertainty: None if the paper gives none
     """
 
     id: str
@@ -28,21 +28,21 @@ class PaperFact:
     where: str
 
     def ratio(self, model: float) -> float | None:
-        """Model over measured, of temperatures by their rises; None for a bound, which has no ratio."""
+        """Return model over measured value, for temperatures by their rises, or None for a bound."""
         if self.relation == "<":
             return None
         zero = AMBIENT_C if self.unit == "°C" else 0.0
         return (model - zero) / (self.value - zero)
 
     def is_contradicted(self, model: float, tolerance: float) -> bool:
-        """Whether a model lies off by more than tolerance (1 = as much as the fact itself), or above a bound."""
+        """Return whether a model deviates by more than tolerance, relative to the fact, or exceeds a bound."""
         ratio = self.ratio(model)
         return model > self.value if ratio is None else abs(ratio - 1.0) > tolerance
 
 
 @cache
 def load_paper_facts() -> dict[str, PaperFact]:
-    """Every fact by its id, in the file's order."""
+    """Return every fact by its id, in the order of the file."""
     with locate_shipped("paper_facts.csv").open(encoding="utf-8", newline="") as file:
         return {row["id"]: _parse_fact(row) for row in csv.DictReader(file)}
 

@@ -1,4 +1,4 @@
-"""Parameter sets: one file a source, each value with its unit, uncertainty and source."""
+"""Parameter sets: one file per set, each value with its unit, uncertainty and source."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -30,11 +30,11 @@ PARAMETER_UNITS = {
     "R": "K/W",
     "C": "J/K",
 }
-"""The unit each parameter's value must be in."""
+"""Required unit of each parameter."""
 
 
 class Parameter(BaseModel):
-    """One number: value, unit, standard uncertainty (absent where the source gives none) and source."""
+    """One number with its unit, its standard uncertainty, if the source gives one, and its source."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
     value: float
@@ -44,13 +44,14 @@ class Parameter(BaseModel):
 
 
 class NonNegativeParameter(Parameter):
-    """A number that cannot be negative."""
+    """A parameter that cannot be negative."""
 
     value: Annotated[float, Field(ge=0)]
 
 
 class _SiUnits(BaseModel):
-    # A value in another unit would be read as SI without a word.
+    """A model that refuses values in other units than those of `PARAMETER_UNITS`."""
+
     @model_validator(mode="after")
     def _check_units(self) -> Self:
         for name, unit in PARAMETER_UNITS.items():
@@ -65,7 +66,7 @@ class _SiUnits(BaseModel):
 
 
 class Bridge(_SiUnits):
-    """Thermal parameters of the absorber at one bridge width (a row of Table S3)."""
+    """Thermal parameters of the absorber at one bridge width, a row of Table S3."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
     width_m: Annotated[float, Field(gt=0)]
@@ -74,10 +75,10 @@ class Bridge(_SiUnits):
 
 
 class ParameterSet(_SiUnits):
-    """A named set of pixel parameters; `claims` says what it stands for and what it does not.
+    """A named set of pixel parameters; `claims` states what the set is valid for.
 
-    terms: what is added to the nominal pixel, by the keys of `optodrive.physics.terms`, and each term's parameters.
-    The limiter counts with all of them; planner_terms: those that heights are planned with.
+    terms: parameters of the terms that extend the nominal pixel, by the keys of `optodrive.physics.terms`. The limiter
+    accounts for all of them; planner_terms: those that the planner simulates heights with.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -96,11 +97,11 @@ class ParameterSet(_SiUnits):
     planner_terms: tuple[str, ...] = ()
 
     def term_values(self, key: str) -> dict[str, float]:
-        """A term's parameters, SI, by name."""
+        """Return a term's parameters by name, SI."""
         return {name: item.value for name, item in self.terms[key].items()}
 
     def build_pixel(self, bridge_width_m: float) -> Pixel:
-        """The pixel of a bridge width: its row of Table S3, or R = a / w and the mean C between rows."""
+        """Return the pixel of a bridge width: its row of Table S3, else R = a / w and the mean C."""
         row = next((b for b in self.bridge if abs(b.width_m - bridge_width_m) < 1e-6), None)
         return Pixel(
             r_k_per_w=row.R.value if row else self.R_width_product.value / bridge_width_m,
@@ -114,7 +115,7 @@ class ParameterSet(_SiUnits):
 
 @dataclass(frozen=True, eq=False)
 class PixelArray:
-    """The nominal parameters of every pixel of a display, each [p]; names and units as in `Pixel`."""
+    """Nominal parameters of every pixel of a display, each [p]; names and units as in `Pixel`."""
 
     r_k_per_w: FloatArray
     c_j_per_k: FloatArray
@@ -131,18 +132,18 @@ class PixelArray:
 
     @classmethod
     def uniform(cls, pixel: Pixel, count: int) -> "PixelArray":
-        """The same pixel `count` times."""
+        """Return `count` equal pixels."""
         return cls(*(np.full(count, getattr(pixel, name)) for name in cls.__dataclass_fields__))
 
     @cached_property
     def elements(self) -> tuple[Pixel, ...]:
-        """The parameters pixel by pixel: [p] of `Pixel`."""
+        """Parameters pixel by pixel, [p] of `Pixel`."""
         columns = (getattr(self, name).tolist() for name in self.__dataclass_fields__)
         return tuple(Pixel(*row) for row in zip(*columns, strict=True))
 
 
 def load_parameters(name: str | Path) -> ParameterSet:
-    """A parameter set by its shipped name or from a file; raises InputError with one line."""
+    """Load a parameter set by its shipped name or from a file; raises InputError for invalid content."""
     path = Path(name)
     if path.suffix != ".toml":
         known = sorted(p.stem for p in locate_shipped("parameters").glob("*.toml"))
@@ -168,7 +169,7 @@ def load_parameters(name: str | Path) -> ParameterSet:
 
 
 def _check_term(where: str, key: str, values: dict[str, Parameter]) -> None:
-    """A term must be known and have each of its parameters, in its unit and plausible range, and no other."""
+    """Raise InputError unless a term is known and has exactly its parameters, in unit and plausible range."""
     for item in find_term(where, key, values).parameters:
         given = values[item.name]
         if given.unit != item.unit:
@@ -178,29 +179,29 @@ def _check_term(where: str, key: str, values: dict[str, Parameter]) -> None:
 
 
 def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:
-    """A set that names a base is the base with the set's own entries over it, its terms beside the base's."""
+    """Return the table merged over the set that it names as its base; terms are merged by key."""
     check_format(path, table, FORMAT, VERSION)
     base = table.pop("base", None)
     if base is None:
         return table
-    below = locate_shipped("parameters", f"{base}.toml")
-    if not below.is_file():
+    base_path = locate_shipped("parameters", f"{base}.toml")
+    if not base_path.is_file():
         raise InputError(f"{path}: base", base, "the name of a shipped parameter set")
-    under = _merge_base(below, read_toml(below))
-    terms = {**under.get("terms", {}), **table.get("terms", {})}
-    return {**under, **table, "terms": terms}
+    base_table = _merge_base(base_path, read_toml(base_path))
+    terms = {**base_table.get("terms", {}), **table.get("terms", {})}
+    return {**base_table, **table, "terms": terms}
 
 
 def build_display_pixels(config: Config, parameters: ParameterSet) -> PixelArray:
-    """The parameters of every pixel of a configured display; its map's gains lift membranes, never the heat.
+    """Return the parameters of every pixel of a configured display; the pixel map's gains scale κ alone.
 
-    Raises InputError as `map_of`, or for gains that are against another parameter set.
+    Raises InputError as `load_pixel_map`, and for gains relative to another parameter set.
     """
-    pixel, known = parameters.build_pixel(config.display.bridge_width_m), load_pixel_map(config)
+    pixel, pixel_map = parameters.build_pixel(config.display.bridge_width_m), load_pixel_map(config)
     pixels = PixelArray.uniform(pixel, len(build_pixel_layout(config.display)))
-    if known is None:
+    if pixel_map is None:
         return pixels
-    if known.model not in ("", parameters.name):
-        expected = f"'{parameters.name}', the one planned with: calibrate again from the recordings"
-        raise InputError(f"{config.display.pixel_map}: model.parameters", known.model, expected)
-    return replace(pixels, kappa_m_per_k=pixels.kappa_m_per_k * known.displacement_factor)
+    if pixel_map.model not in ("", parameters.name):
+        expected = f"'{parameters.name}', the set that heights are planned with: calibrate again from the recordings"
+        raise InputError(f"{config.display.pixel_map}: model.parameters", pixel_map.model, expected)
+    return replace(pixels, kappa_m_per_k=pixels.kappa_m_per_k * pixel_map.displacement_factor)

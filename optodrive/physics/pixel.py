@@ -1,12 +1,11 @@
-"""The nominal pixel in closed form, exact for piecewise-constant power.
+"""Closed form of the nominal pixel, exact for piecewise-constant power.
 
     C dθ/dt   = ε P − θ/R        θ absorber rise, K      (the paper's Text S1, uncoupled form)
     τ_g dγ/dt = θ/2 − γ          γ gas rise, K
     z = κ γ,  F = φ γ
 
 Everything is written with a = 1/(RC), b = 1/τ_g and the divided difference
-D(t) = (e^(−at) − e^(−bt)) / (b − a), which stays exact as τ_g → RC. All functions are kernels: they take floats, and
-other kernels call them at no cost.
+D(t) = (e^(−at) − e^(−bt)) / (b − a), which stays exact as τ_g → RC. All functions are kernels.
 """
 
 from math import exp, expm1, log1p
@@ -19,9 +18,9 @@ GAS_FRACTION = 0.5
 
 
 class Pixel(NamedTuple):
-    """The nominal parameters of one pixel.
+    """Nominal parameters of one pixel.
 
-    r_k_per_w: absorber to wall; c_j_per_k: absorber heat capacity; epsilon: share of incident light turned into heat;
+    r_k_per_w: absorber to wall; c_j_per_k: absorber heat capacity; epsilon: absorbed fraction of incident light;
     tau_g_s: gas lag; kappa_m_per_k: displacement, and phi_n_per_k: blocked force, per kelvin of gas rise.
     """
 
@@ -40,9 +39,9 @@ class Pixel(NamedTuple):
 
 @kernel
 def divided_difference(a: float, b: float, t_s: float) -> float:
-    """(e^(−a t) − e^(−b t)) / (b − a), s; t e^(−a t) where a = b."""
+    """Return (e^(−a t) − e^(−b t)) / (b − a), s, which is t e^(−a t) for a = b."""
     if b < a:
-        a, b = b, a  # it is symmetric, and e^(+x) would overflow after seconds of dark
+        a, b = b, a  # the expression is symmetric, and e^(+x) would overflow after seconds of gate off
     x = (b - a) * t_s
     if x < 1e-9:
         return t_s * exp(-a * t_s) * (1.0 - 0.5 * x)
@@ -51,7 +50,7 @@ def divided_difference(a: float, b: float, t_s: float) -> float:
 
 @kernel
 def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: float) -> tuple[float, float]:
-    """Absorber and gas rise (K) after `t_s` seconds at constant incident power (W)."""
+    """Return absorber and gas rise, K, after `t_s` at constant incident power, W."""
     a, b = 1.0 / (pixel.r_k_per_w * pixel.c_j_per_k), 1.0 / pixel.tau_g_s
     steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
     excess_k = theta_k - steady_k
@@ -67,17 +66,17 @@ def advance(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, t_s: f
 
 @kernel
 def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, within_s: float) -> tuple[float, float]:
-    """Largest gas rise (K), and its time (s), within `within_s` seconds at constant incident power.
+    """Return the peak gas rise, K, and its time, s, within `within_s` at constant incident power.
 
-    With the rises taken from their steady values, θ' and γ', the gas turns where θ'/2 = γ', at
-    t = log1p((b − a) u)/(b − a) with u = (1 − 2γ'/θ')/a; that is a maximum where the absorber cools, θ' > 0.
+    With θ' and γ' the rises relative to their steady values, the gas rise has its extremum where θ'/2 = γ', at
+    t = log1p((b − a) u)/(b − a) with u = (1 − 2γ'/θ')/a. It is a maximum if the absorber cools, θ' > 0.
     """
     a, b = 1.0 / (pixel.r_k_per_w * pixel.c_j_per_k), 1.0 / pixel.tau_g_s
     steady_k = pixel.epsilon * power_w * pixel.r_k_per_w
     drive_k = GAS_FRACTION * (theta_k - steady_k)
     lag_k = gamma_k - GAS_FRACTION * steady_k
     turn_s = within_s
-    if lag_k >= drive_k >= 0.0:  # falling towards a target that does not rise
+    if lag_k >= drive_k >= 0.0:  # the gas falls towards a value that does not rise
         return gamma_k, 0.0
     if drive_k > 0.0:
         u_s = (1.0 - lag_k / drive_k) / a
@@ -95,7 +94,7 @@ def gas_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, withi
 
 @kernel
 def cooling_peak(pixel: Pixel, theta_k: float, gamma_k: float, within_s: float = float("inf")) -> tuple[float, float]:
-    """Largest gas rise (K), and its time (s), in the dark."""
+    """Return the peak gas rise, K, and its time, s, with the gate off."""
     if theta_k <= 0.0:
         return gamma_k, 0.0
     return gas_peak(pixel, theta_k, gamma_k, 0.0, within_s)

@@ -1,7 +1,7 @@
-"""One pixel with any terms along one run, compiled: from pulses to what instruments show.
+"""Ordinary differential equations of one pixel with terms, compiled: from pulses to recorded signals.
 
-Classical Runge–Kutta between the edges of the light, in steps that grow from each edge; samples by cubic Hermite
-interpolation. Errors stay below 1e-5 of a rise.
+Classical Runge–Kutta between gate edges, with steps that grow from each edge; samples by cubic Hermite interpolation.
+Errors stay below 1e-5 of a rise for a gas that is faster than the absorber.
 """
 
 from collections.abc import Mapping
@@ -39,13 +39,13 @@ from optodrive.physics.term_kernels import CHAINS, FOLLOWER_ROW, MAX_PARAMETERS,
 from optodrive.physics.terms import discover_terms
 
 FIRST_STEP, FIRST_STEP_FAST_S = 0.15, 1e-5
-"""First step after an edge, in gas time constants; and where a term moves more quickly than the gas."""
+"""First step after a gate edge, in gas time constants; and in seconds, if a term is faster than the gas."""
 STEP_GROWTH = 0.2
-"""After an edge a step may be so much of the time since then longer."""
+"""Growth of the step per time since the gate edge."""
 MAX_STEP_EARLY, MAX_STEP_LATE, LATE_AFTER = 0.35, 1.2, 12.0
-"""Longest step in gas time constants, before and after so many of them from an edge."""
+"""Largest step before and after LATE_AFTER since a gate edge, all in gas time constants."""
 MAX_STEP_S = 6e-3
-"""Steps beyond 2.78 of the shortest time of a term (2.5 ms) would not be stable."""
+"""Stability limit: 2.78 times the shortest time constant of a term, 2.5 ms, less a margin."""
 
 (
     optical_power,
@@ -65,12 +65,12 @@ MAX_STEP_S = 6e-3
 
 @dataclass(frozen=True, eq=False)
 class PixelExperiment:
-    """One run as seen from one pixel.
+    """One run as one pixel experiences it.
 
-    pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam; t_s: samples of temperature, displacement
-    and force, increasing; dose_before: what earlier runs gave this pixel, as a share of the most that any pixel had in
-    the recording; dose_per_j; session, session_per_s: the run's time in the session, −1 to 1; full_w: the laser's full
-    power
+    pulses: [n, 4] start_s, width_s, power_w, pixel, in order, on one beam; t_s: increasing sample times of temperature,
+    displacement and force; dose_before: dose of earlier runs on this pixel, relative to the largest dose of any pixel
+    in the recording; dose_per_j: relative dose per incident energy; session_time, session_time_per_s: start of the run
+    and rate of the session's time, which runs from −1 to 1; full_w: full power of the laser
     """
 
     pulses: FloatArray
@@ -84,15 +84,16 @@ class PixelExperiment:
     full_w: float = 2.45
 
     def __post_init__(self) -> None:
-        # Kernels are compiled for one layout of their arrays.
+        # Kernels are compiled for one memory layout.
         object.__setattr__(self, "pulses", np.array(self.pulses, dtype=np.float64).reshape(-1, 4))
         object.__setattr__(self, "t_s", tuple(np.array(times, dtype=np.float64) for times in self.t_s))
 
 
 class ActiveTerms(NamedTuple):
-    """Terms that are on, [terms], and their parameters, [terms, VALUES]; rows: of the states that move.
+    """A set of terms as kernels take it.
 
-    quick: whether a term moves more quickly than the gas.
+    on: [terms], 1 for an active term; values: [terms, MAX_PARAMETERS] their parameters; state_rows: rows of the state
+    vector that move; is_fast: whether a term is faster than the gas
     """
 
     on: IntArray
@@ -102,13 +103,13 @@ class ActiveTerms(NamedTuple):
 
     @classmethod
     def from_values(cls, values: Mapping[str, TermValues]) -> "ActiveTerms":
-        """From term → parameter → SI value; terms without kernels have no effect here."""
+        """Return the set for term → parameter → SI value; terms without kernels have no effect."""
         on, v = np.zeros(len(TERMS), dtype=np.int64), np.zeros((len(TERMS), MAX_PARAMETERS))
         rows = [ABSORBER, GAS, NEIGHBOUR]
-        for key, own in values.items():
+        for key, term_values in values.items():
             row, term = TERM_ROW[key], discover_terms()[key]
             on[row] = 1
-            v[row, : len(own)] = [own[item.name] for item in term.parameters]
+            v[row, : len(term_values)] = [term_values[item.name] for item in term.parameters]
             rows += [*term.states, *range(FOLLOWER_ROW[row], FOLLOWER_ROW[row] + len(term.followers))]
         return cls(on, v, np.array(rows), any(discover_terms()[key].is_fast for key in values))
 
@@ -119,7 +120,10 @@ def simulate_signals(
     active: ActiveTerms,
     clock_delay_s: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Temperature rise shown, K, displacement, m, and force, N, at the scene's samples; clocks late by late_s."""
+    """Return measured temperature rise, K, displacement, m, and force, N, at the experiment's sample times.
+
+    clock_delay_s: delay of the clock of each signal, s
+    """
     out = (np.zeros(len(experiment.t_s[0])), np.zeros(len(experiment.t_s[1])), np.zeros(len(experiment.t_s[2])))
     context = np.zeros(CONTEXT_SIZE)
     context[FULL_W], context[AMBIENT_K], context[ILLUMINATED_PIXEL] = (
@@ -147,23 +151,23 @@ def simulate_signals(
 def evaluate_rates(
     pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, is_target: bool, dy: FloatArray
 ) -> None:
-    """dy/dt [STATES] under the command in the context; own: the light is on this pixel, else on one beside it."""
+    """Write dy/dt [STATE_COUNT] for the context's command; is_target: the light is on this pixel, not beside it."""
     on, v = active.on, active.values
-    lit_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else 0.0
+    light_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else 0.0
     wall_k = wall_rise(on, v, y, c, y[WALL])
     c[FAR_END_K] = wall_k
     c[BRIDGE_FLOW_W] = (y[ABSORBER] - wall_k) / bridge_resistance(on, v, y, c, pixel.r_k_per_w)
-    into_w = (pixel.epsilon * lit_w if is_target else 0.0) - c[BRIDGE_FLOW_W] - heat_loss(on, v, y, c, 0.0)
+    into_w = (pixel.epsilon * light_w if is_target else 0.0) - c[BRIDGE_FLOW_W] - heat_loss(on, v, y, c, 0.0)
     dy[ABSORBER] = into_w / heat_capacity(on, v, y, c, pixel.c_j_per_k)
     dy[GAS] = (0.5 * (y[ABSORBER] + wall_k) - y[GAS]) / pixel.tau_g_s
-    beside_w = (0.0 if is_target else pixel.epsilon * lit_w) - y[NEIGHBOUR] / pixel.r_k_per_w
-    dy[NEIGHBOUR] = beside_w / pixel.c_j_per_k
+    neighbour_w = (0.0 if is_target else pixel.epsilon * light_w) - y[NEIGHBOUR] / pixel.r_k_per_w
+    dy[NEIGHBOUR] = neighbour_w / pixel.c_j_per_k
     rates(on, v, y, c, dy)
 
 
 @kernel
 def _lagged_reading_k(before_k: float, from_k: float, slope: float, to_k: float, tau_s: float, h_s: float) -> float:
-    """A first-order lag after h_s, exactly, of a parabola from from_k with a slope to to_k."""
+    """Return the exact first-order lag, after h_s, of a parabola from from_k, with a slope there, to to_k."""
     bend = (to_k - from_k - slope * h_s) / h_s**2
     at_start = from_k - slope * tau_s + 2.0 * bend * tau_s**2
     at_end = at_start + (slope - 2.0 * bend * tau_s) * h_s + bend * h_s**2
@@ -182,27 +186,28 @@ def step(
     h_s: float,
     work: FloatArray,
 ) -> None:
-    """One step of Runge–Kutta: room [8, STATES] holds y and dy/dt at its start (0, 1), and at its end (2, 3).
+    """Take one Runge–Kutta step of h_s.
 
-    fresh: the light has changed, dy/dt at the start is not known yet.
+    work: [8, STATE_COUNT], rows 0 and 1 hold y and dy/dt at the start, 2 and 3 those at the end; after_edge: dy/dt at
+    the start is not known yet, because the light has changed
     """
     y, y1 = work[0], work[2]
-    k1, k2, k3, k4, part = work[1], work[4], work[5], work[6], work[7]
+    k1, k2, k3, k4, stage = work[1], work[4], work[5], work[6], work[7]
     c[TIME_S], c[SINCE_EDGE_S] = at_s, since_edge_s
     if after_edge:
         evaluate_rates(pixel, active, y, c, is_target, k1)
     rows = active.state_rows
     c[TIME_S], c[SINCE_EDGE_S] = at_s + 0.5 * h_s, since_edge_s + 0.5 * h_s
     for row in rows:
-        part[row] = y[row] + 0.5 * h_s * k1[row]
-    evaluate_rates(pixel, active, part, c, is_target, k2)
+        stage[row] = y[row] + 0.5 * h_s * k1[row]
+    evaluate_rates(pixel, active, stage, c, is_target, k2)
     for row in rows:
-        part[row] = y[row] + 0.5 * h_s * k2[row]
-    evaluate_rates(pixel, active, part, c, is_target, k3)
+        stage[row] = y[row] + 0.5 * h_s * k2[row]
+    evaluate_rates(pixel, active, stage, c, is_target, k3)
     c[TIME_S], c[SINCE_EDGE_S] = at_s + h_s, since_edge_s + h_s
     for row in rows:
-        part[row] = y[row] + h_s * k3[row]
-    evaluate_rates(pixel, active, part, c, is_target, k4)
+        stage[row] = y[row] + h_s * k3[row]
+    evaluate_rates(pixel, active, stage, c, is_target, k4)
     for row in rows:
         y1[row] = y[row] + h_s / 6.0 * (k1[row] + 2.0 * k2[row] + 2.0 * k3[row] + k4[row])
     evaluate_rates(pixel, active, y1, c, is_target, work[3])
@@ -216,18 +221,18 @@ def step(
 
 @kernel
 def next_step_s(pixel: Pixel, active: ActiveTerms, since_edge_s: float) -> float:
-    """How long the next step may be, so long after the light changed."""
-    most = MAX_STEP_LATE if since_edge_s > LATE_AFTER * pixel.tau_g_s else MAX_STEP_EARLY
+    """Return the length of the step that begins since_edge_s after a gate edge, s."""
+    max_step = MAX_STEP_LATE if since_edge_s > LATE_AFTER * pixel.tau_g_s else MAX_STEP_EARLY
     return min(
         MAX_STEP_S,
         STEP_GROWTH * since_edge_s + (FIRST_STEP_FAST_S if active.is_fast else FIRST_STEP * pixel.tau_g_s),
-        most * pixel.tau_g_s,
+        max_step * pixel.tau_g_s,
     )
 
 
 @kernel
 def interpolate_states(rows: IntArray, work: FloatArray, at_s: float, h_s: float, sample_s: float) -> None:
-    """States at a time within the step, into row 7."""
+    """Write the states at sample_s, within the step from at_s, to row 7 of work."""
     u = (sample_s - at_s) / h_s
     rest = 1.0 - u
     for row in rows:
@@ -241,7 +246,7 @@ def interpolate_states(rows: IntArray, work: FloatArray, at_s: float, h_s: float
 
 @kernel
 def output_signal(pixel: Pixel, active: ActiveTerms, y: FloatArray, c: FloatArray, signal: int) -> float:
-    """One signal of states: temperature rise shown, displacement, force."""
+    """Return one signal: 0 the measured temperature rise, K, 1 displacement, m, 2 force, N."""
     if signal == 0:
         return float(sensor_reading(active.on, active.values, y, c, y[SENSOR]))
     if signal == 1:
@@ -266,6 +271,7 @@ def _fill_samples(
     index: int,
     out: FloatArray,
 ) -> int:
+    """Write the samples within the step from at_s to `out`, from `index` on; return the index of the next sample."""
     while index < len(t_s) and t_s[index] - clock_delay_s <= at_s + h_s:
         sample_s = max(at_s, t_s[index] - clock_delay_s)
         interpolate_states(active.state_rows, work, at_s, h_s, sample_s)
@@ -278,7 +284,7 @@ def _fill_samples(
 @kernel
 def _simulate(
     pulses: FloatArray,
-    number: int,
+    index: int,
     t_s: tuple[FloatArray, FloatArray, FloatArray],
     clock_delay_s: tuple[float, float, float],
     span: tuple[float, float, float, float],
@@ -288,48 +294,49 @@ def _simulate(
     work: FloatArray,
     out: tuple[FloatArray, FloatArray, FloatArray],
 ) -> None:
+    """Integrate pixel `index` from its cold state through the pulses and write its signals to `out` at t_s."""
     until_s = 0.0
     for signal in range(3):
         if len(t_s[signal]):
             until_s = max(until_s, t_s[signal][-1] - clock_delay_s[signal])
-    index = np.zeros(3, dtype=np.int64)
+    samples = np.zeros(3, dtype=np.int64)
     now_s, edge_s, row, dose = 0.0, 0.0, 0, span[0]
-    shining, own, fresh = False, True, True
+    gate_on, is_target, after_edge = False, True, True
     while now_s < until_s or now_s == 0.0:
-        if row < len(pulses) and not shining and pulses[row, 0] <= now_s:
-            shining, edge_s, fresh = True, now_s, True
-            c[POWER_W], c[ILLUMINATED_PIXEL], own = pulses[row, 2], pulses[row, 3], pulses[row, 3] == number
-            c[IS_TARGET] = 1.0 if own else 0.0
+        if row < len(pulses) and not gate_on and pulses[row, 0] <= now_s:
+            gate_on, edge_s, after_edge = True, now_s, True
+            c[POWER_W], c[ILLUMINATED_PIXEL], is_target = pulses[row, 2], pulses[row, 3], pulses[row, 3] == index
+            c[IS_TARGET] = 1.0 if is_target else 0.0
         end_s = until_s + 1e-3
-        if shining:
+        if gate_on:
             end_s = pulses[row, 0] + pulses[row, 1]
         elif row < len(pulses):
             end_s = pulses[row, 0]
-        since_s = now_s - edge_s
-        h_s = next_step_s(pixel, active, since_s)
-        last = now_s + 1.3 * h_s >= end_s
-        if last:
+        since_edge_s = now_s - edge_s
+        h_s = next_step_s(pixel, active, since_edge_s)
+        reaches_edge = now_s + 1.3 * h_s >= end_s
+        if reaches_edge:
             h_s = end_s - now_s
         if h_s > 0.0:
             c[DOSE] = dose
-            step(pixel, active, c, own, fresh, now_s, since_s, h_s, work)
-            index[0] = _fill_samples(
-                pixel, active, c, work, now_s, h_s, t_s[0], clock_delay_s[0], span, 0, index[0], out[0]
+            step(pixel, active, c, is_target, after_edge, now_s, since_edge_s, h_s, work)
+            samples[0] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[0], clock_delay_s[0], span, 0, samples[0], out[0]
             )
-            index[1] = _fill_samples(
-                pixel, active, c, work, now_s, h_s, t_s[1], clock_delay_s[1], span, 1, index[1], out[1]
+            samples[1] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[1], clock_delay_s[1], span, 1, samples[1], out[1]
             )
-            index[2] = _fill_samples(
-                pixel, active, c, work, now_s, h_s, t_s[2], clock_delay_s[2], span, 2, index[2], out[2]
+            samples[2] = _fill_samples(
+                pixel, active, c, work, now_s, h_s, t_s[2], clock_delay_s[2], span, 2, samples[2], out[2]
             )
             dose += c[IS_TARGET] * c[POWER_W] * h_s * span[1]
-            fresh = False
+            after_edge = False
             for state in active.state_rows:
                 work[0, state], work[1, state] = work[2, state], work[3, state]
             work[0, SENSOR], work[1, SENSOR] = work[2, SENSOR], work[3, SENSOR]
-        now_s = end_s if last else now_s + h_s
-        if last:
-            edge_s, fresh = now_s, True
-            if shining:
-                shining, row = False, row + 1
+        now_s = end_s if reaches_edge else now_s + h_s
+        if reaches_edge:
+            edge_s, after_edge = now_s, True
+            if gate_on:
+                gate_on, row = False, row + 1
                 c[POWER_W] = 0.0

@@ -1,4 +1,4 @@
-"""Target height to pulse, for the nominal pixel: whole PWM periods at full power, the remainder made up by duty."""
+"""Pulse that reaches a target displacement on the nominal pixel: the fewest whole PWM periods, fine-tuned by duty."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from optodrive.physics.pixel import Pixel, advance, cooling_peak, gas_peak
 
 @dataclass(frozen=True)
 class DriveRange:
-    """What one pulse can be: full power, the PWM period that widths are multiples of, and how many at most."""
+    """Range of one pulse: full power, the PWM period of which its width is a multiple, and the largest multiple."""
 
     max_power_w: float
     period_s: float
@@ -16,33 +16,33 @@ class DriveRange:
 
     @classmethod
     def from_laser(cls, max_power_w: float, pwm_hz: float, width_max_s: float) -> "DriveRange":
-        """The range for a laser (W, Hz) and the longest pulse allowed (s)."""
+        """Return the range for a laser's power, W, and PWM frequency, Hz, and the longest pulse allowed, s."""
         return cls(max_power_w, 1.0 / pwm_hz, int(width_max_s * pwm_hz + 1e-9))
 
 
 @kernel
 def pulse_peak(pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, width_s: float) -> tuple[float, float]:
-    """Largest gas rise, K, after the start of a pulse on a pixel with these rises; its time from the start, s."""
-    lit_k, lit_s = gas_peak(pixel, theta_k, gamma_k, power_w, width_s)
+    """Return the peak gas rise, K, after the start of a pulse on a pixel with these rises, and its time, s."""
+    on_k, on_s = gas_peak(pixel, theta_k, gamma_k, power_w, width_s)
     theta_end_k, gamma_end_k = advance(pixel, theta_k, gamma_k, power_w, width_s)
-    dark_k, dark_s = cooling_peak(pixel, theta_end_k, gamma_end_k)
-    return (lit_k, lit_s) if lit_k > dark_k else (dark_k, width_s + dark_s)
+    off_k, off_s = cooling_peak(pixel, theta_end_k, gamma_end_k)
+    return (on_k, on_s) if on_k > off_k else (off_k, width_s + off_s)
 
 
 @kernel
 def _peak_after(
     pixel: Pixel, theta_k: float, gamma_k: float, power_w: float, width_s: float, peak_after_s: float
 ) -> tuple[float, float]:
-    """As pulse_peak, counted only from from_s after the pulse's start on: all of it, or what follows its end."""
+    """Return `pulse_peak`, or for peak_after_s > 0 the peak from that time and from the pulse's end on."""
     if peak_after_s <= 0.0:
         return pulse_peak(pixel, theta_k, gamma_k, power_w, width_s)
-    lit = advance(pixel, theta_k, gamma_k, power_w, width_s)
-    dark_k, dark_s = cooling_peak(pixel, *advance(pixel, lit[0], lit[1], 0.0, max(0.0, peak_after_s - width_s)))
-    return dark_k, max(width_s, peak_after_s) + dark_s
+    at_off = advance(pixel, theta_k, gamma_k, power_w, width_s)
+    off_k, off_s = cooling_peak(pixel, *advance(pixel, at_off[0], at_off[1], 0.0, max(0.0, peak_after_s - width_s)))
+    return off_k, max(width_s, peak_after_s) + off_s
 
 
 def max_displacement_m(pixel: Pixel, drive: DriveRange) -> float:
-    """The largest displacement one pulse can reach from rest, m."""
+    """Return the largest displacement that one pulse can reach on a cold pixel, m."""
     return pixel.kappa_m_per_k * pulse_peak(pixel, 0.0, 0.0, drive.max_power_w, drive.max_periods * drive.period_s)[0]
 
 
@@ -58,11 +58,11 @@ def find_shortest_pulse(
     max_periods: int,
     peak_after_s: float,
 ) -> tuple[int, float]:
-    """PWM periods and duty of the shortest pulse whose peak gas rise is goal_k, given the heat still there.
+    """Return PWM periods and duty of the shortest pulse whose peak gas rise is target_k, from the residual rises.
 
-    The pulse has least_periods at least, but never more than max_periods. from_s: the peak counts only from so long
-    after the pulse's start on, beyond its end. No periods where the heat there reaches the goal by itself. A goal
-    beyond the longest pulse gets the longest pulse.
+    The pulse has min_periods to max_periods. peak_after_s: the peak counts only from this time after the pulse's start,
+    and not before its end. Returns 0 periods if the residual heat already reaches the target, and the longest pulse if
+    none reaches it.
     """
     if _peak_after(pixel, theta_k, gamma_k, 0.0, 0.0, peak_after_s)[0] >= target_k:
         return 0, 0.0
@@ -86,8 +86,11 @@ def _solve_duty(
     max_power_w: float,
     peak_after_s: float,
 ) -> float:
-    # The peak is a maximum over time of functions linear in duty, hence convex in duty: Newton from duty 1 falls
-    # monotonically onto the root, and its slope is the gas response to full power at the time of the peak.
+    """Return the duty at which the pulse's peak gas rise is target_k, by Newton's method.
+
+    The peak is a maximum over time of functions linear in duty, hence convex in duty: Newton's method from duty 1
+    decreases monotonically to the root. The slope is the gas's response to full power at the time of the peak.
+    """
     full_theta_k, full_gamma_k = advance(pixel, 0.0, 0.0, max_power_w, width_s)
     duty = 1.0
     for _ in range(20):

@@ -1,4 +1,4 @@
-"""A display of stepped pixels at one time after the other, each look going on from the one before. Kernels."""
+"""State of a display with terms at successive times, continued from the previous snapshot."""
 
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER
 
 
 class SnapshotCache(NamedTuple):
-    """How far each pixel was looked at: states [p, STATES] at at_s [p], reckoned from its event at from_s [p]."""
+    """States [p, STATE_COUNT] of the pixels at at_s [p], computed from each pixel's event at event_s [p]."""
 
     at_s: FloatArray
     event_s: FloatArray
@@ -21,7 +21,7 @@ class SnapshotCache(NamedTuple):
 
     @classmethod
     def from_states(cls, states: FloatArray) -> "SnapshotCache":
-        """A view of a display that was not looked at yet."""
+        """Return an empty cache for states [p, STATE_COUNT]."""
         return cls(np.full(len(states), np.nan), np.full(len(states), np.nan), np.zeros_like(states))
 
 
@@ -38,22 +38,22 @@ def compute_snapshot(
     displacement_m: FloatArray,
     absorber_k: FloatArray,
 ) -> None:
-    """Fill in every pixel [p] at now_s, left dark since its last event, and note in the view how far it was followed.
+    """Fill in displacement and absorber rise of every pixel [p] at now_s, with the gate off since its last event.
 
-    columns, at_s, dark_s, states: as `pulses.walk` has them.
+    columns, at_s, off_s, states: as in `extended_pulses.apply_pulses`. The cache is updated.
     """
-    room, c = np.zeros((8, states.shape[1])), context.copy()
+    work, c = np.zeros((8, states.shape[1])), context.copy()
     c[POWER_W], c[IS_TARGET] = 0.0, 1.0
     for i in range(len(at_s)):
-        # A new event, or a look back: from the event on.
+        # After a new event, or for an earlier time, the cached states are no start: begin at the event.
         if cache.event_s[i] != at_s[i] or now_s < cache.at_s[i]:
             cache.event_s[i] = cache.at_s[i] = at_s[i]
             cache.states[i] = states[i]
         one, wait_s = pixel_at(columns, i), max(0.0, now_s - cache.at_s[i])
         c[ILLUMINATED_PIXEL] = i
-        room[0] = cache.states[i]
-        advance_states(one, active, c, True, room, 0.0, off_s[i] + cache.at_s[i] - at_s[i], wait_s)
-        cache.states[i] = room[0]
+        work[0] = cache.states[i]
+        advance_states(one, active, c, True, work, 0.0, off_s[i] + cache.at_s[i] - at_s[i], wait_s)
+        cache.states[i] = work[0]
         cache.at_s[i] += wait_s
-        displacement_m[i] = output_signal(one, active, room[0], c, DISPLACEMENT_SIGNAL)
-        absorber_k[i] = room[0, ABSORBER]
+        displacement_m[i] = output_signal(one, active, work[0], c, DISPLACEMENT_SIGNAL)
+        absorber_k[i] = work[0, ABSORBER]

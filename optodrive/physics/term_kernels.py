@@ -1,7 +1,7 @@
-"""All terms' kernels, one chain a hook, as a module that numba can compile and keep.
+"""Chains of all terms' kernels, one function per hook, in a generated module.
 
-A chain calls, in order of their keys, the kernels of those terms that are on. It is written out as source because
-numba keeps machine code only of functions that stand in a file.
+A chain calls the kernels of the active terms in the order of their keys. The module is written to a source file because
+numba caches machine code only of functions that a file defines.
 """
 
 import sys
@@ -23,7 +23,11 @@ RateChain = Callable[[IntArray, FloatArray, FloatArray, FloatArray, FloatArray],
 
 
 class HookChains(NamedTuple):
-    """One function a hook: (on, v, y, c, x), on [terms], v [terms, VALUES]; x passes through the terms that are on."""
+    """One function per hook of `Kernels`, called as (on, v, y, c, x).
+
+    on: [terms], 1 for an active term; v: [terms, MAX_PARAMETERS]; y: states; c: context. x passes through the kernels
+    of the active terms.
+    """
 
     optical_power: HookChain
     heat_capacity: HookChain
@@ -40,12 +44,12 @@ class HookChains(NamedTuple):
 
 
 TERMS: tuple[Term, ...] = tuple(discover_terms()[key] for key in sorted(discover_terms()))
-"""Every term, in the order of `on` and `v`."""
+"""Every term, in the order of the rows of `on` and `v`."""
 MAX_PARAMETERS = max(len(term.parameters) for term in TERMS)
 TERM_ROW = {term.key: row for row, term in enumerate(TERMS)}
 STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
-"""Row of each term's first follower."""
+"""Row of each term's first follower in the state vector."""
 
 
 def _generate_source() -> str:

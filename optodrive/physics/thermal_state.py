@@ -1,4 +1,4 @@
-"""The heat of a display, as planner, daemon and simulation see it: of nominal pixels, or of pixels with terms."""
+"""Thermal state of a display, the common interface of nominal pixels and of pixels with terms."""
 
 from collections.abc import Callable
 from typing import Protocol, Self
@@ -14,15 +14,15 @@ from optodrive.physics.pulse_for_height import DriveRange
 
 
 class ThermalState(Protocol):
-    """Mutable; pixels carry their own time, all on one time line. See `DisplayHeat`."""
+    """Mutable thermal state of every pixel; each pixel has its own time of last event, on one common time line."""
 
     pixels: PixelArray
 
     def copy(self) -> Self:
-        """An independent copy."""
+        """Return an independent copy."""
 
     def copy_shifted(self, offset_s: float) -> Self:
-        """A copy on a time line whose zero lies offset_s earlier."""
+        """Return a copy whose times are offset_s later, on a time line whose zero is offset_s earlier."""
 
     def apply_pulses(
         self,
@@ -32,7 +32,7 @@ class ThermalState(Protocol):
         power_w: FloatArray,
         on_progress: Callable[[], None] = ignore_progress,
     ) -> PulsePeaks:
-        """Light pixels one after the other, all [n]; what each pulse brings its pixel to. tick: called meanwhile."""
+        """Apply pulses [n] in order of time and return the peaks that they cause; on_progress is called meanwhile."""
 
     def solve_pulse(
         self,
@@ -43,35 +43,36 @@ class ThermalState(Protocol):
         min_periods: int = 1,
         peak_after_s: float = 0.0,
     ) -> tuple[int, float] | None:
-        """PWM periods, at least so many, and duty of the shortest pulse whose peak is target_m; None: none is needed.
+        """Return PWM periods and duty of the shortest pulse at start_s whose peak displacement is target_m.
 
-        from_s: the peak counts only from so long after the pulse's start on, beyond its end.
+        Returns None if the residual heat already reaches the target. peak_after_s: the peak counts only from this time
+        after the pulse's start, and not before its end.
         """
 
     def max_displacement_m(self, drive: DriveRange) -> FloatArray:
-        """The largest displacement that one pulse can reach from rest, [p]."""
+        """Return the largest displacement that one pulse can reach on each cold pixel, [p]."""
 
     def simulate_displacement_m(self, pulses: FloatArray, pixel: int, t_s: FloatArray) -> FloatArray:
-        """Displacement of a pixel at times t_s [m] under pulses [n, 4], from the heat there is, which stays."""
+        """Return the displacement of a pixel at t_s [m] under pulses [n, 4]; the state does not change."""
 
     def state_at(self, at_s: float) -> DisplayState:
-        """Every pixel at one time, in the dark since its last event; a time before that event counts as the event's."""
+        """Return every pixel at one time, with the gate off since its last event, or at that event if it is later."""
 
     def simulate_traces(self, pulses: FloatArray, pixels: list[int], t_s: FloatArray) -> PixelTrace:
-        """What some pixels do at times t_s [m] under pulses [n, 4]: start_s, width_s, power_w, pixel."""
+        """Return the traces of some pixels at t_s [m] under pulses [n, 4] start_s, width_s, power_w, pixel."""
 
 
 def build_cold_state(config: Config, parameters: ParameterSet, pixels: PixelArray | None = None) -> ThermalState:
-    """A configured display that nobody has lit, with the terms that the parameter set plans with.
+    """Return the cold state of a configured display with the parameter set's planner terms.
 
-    pixels: in place of those that the configuration and the set say.
+    pixels: replaces the pixels of the configuration and the parameter set.
     """
     if pixels is None:
         pixels = build_display_pixels(config, parameters)
     values = {key: parameters.term_values(key) for key in parameters.planner_terms}
     if not values:
         return NominalThermalState(pixels)
-    # The stepped pixel is compiled code of its own, which nobody needs without terms.
+    # Imported late: loading the kernels of the pixel with terms takes time that nominal displays do not need.
     from optodrive.physics.extended_display import ExtendedThermalState
 
     ambient_k = config.ambient_c + ZERO_CELSIUS_K

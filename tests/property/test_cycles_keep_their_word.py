@@ -12,7 +12,7 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain
 from optodrive.device.config import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
-from reference.nominal_pixel import height_um
+from reference_models.nominal_pixel import height_um
 
 PIXELS = (25, 26, 47, 46)
 SETTLE_S = 0.35

@@ -11,7 +11,14 @@ from optodrive.planning.budget_setup import build_nominal_model
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import cold_state, limit
 from optodrive.planning.limiter.worst_case import Uncertainty, build_heat_bound
-from reference.thermal_display import NO_CAPS, build_plan, build_true_display, galvo_peak, upper_factors, window_peak_w
+from reference_models.thermal_display import (
+    NO_CAPS,
+    build_plan,
+    build_true_display,
+    galvo_peak,
+    upper_factors,
+    window_peak_w,
+)
 
 
 def hammer(span_s, width_s=0.010, rest_s=5.2e-4, pixel=0):

@@ -11,7 +11,7 @@ from optodrive.core.errors import InputError
 from optodrive.planning.limiter.budget import Budget, GalvoModel
 from optodrive.planning.limiter.limiter import cold_state, commit_until, limit, shift_state
 from optodrive.planning.limiter.worst_case import build_heat_bound
-from reference.thermal_display import (
+from reference_models.thermal_display import (
     KINDS,
     NO_CAPS,
     build_plan,

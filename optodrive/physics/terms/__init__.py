@@ -1,4 +1,4 @@
-"""Physical effects beyond the nominal pixel, one file each; a new file here is a new term, nothing else changes."""
+"""Physical effects beyond the nominal pixel, one module per term; a new module is a new term without other edits."""
 
 from collections.abc import Collection
 from functools import cache
@@ -11,29 +11,33 @@ from optodrive.physics.term import Term
 
 @cache
 def discover_terms() -> dict[str, Term]:
-    """Every term by its key: each module of this package holds one, named TERM."""
+    """Return every term by its key; each module of this package defines one as `TERM`."""
     modules = (import_module(f"{__name__}.{item.name}") for item in iter_modules(__path__))
     terms: list[Term] = [module.TERM for module in modules]
     return {term.key: term for term in terms}
 
 
 def find_term(where: str, key: str, given: Collection[str]) -> Term:
-    """The term of a key, given parameters by these names; InputError unless they are its own, all of them."""
+    """Return the term of a key whose parameters are given by name.
+
+    where: place of the term in its file, for the message. Raises InputError for an unknown term, an unknown parameter
+    and a missing parameter.
+    """
     if key not in discover_terms():
         raise InputError(where, key, f"a known term, {suggest_nearest(key, sorted(discover_terms()))}")
     term, names = discover_terms()[key], set(given)
-    wanted = [item.name for item in term.parameters]
-    for name in sorted(names.difference(wanted)):
-        raise InputError(f"{where}.{name}", name, f"a parameter of it, {suggest_nearest(name, sorted(wanted))}")
-    for name in wanted:
+    expected = [item.name for item in term.parameters]
+    for name in sorted(names.difference(expected)):
+        raise InputError(f"{where}.{name}", name, f"a parameter of the term, {suggest_nearest(name, sorted(expected))}")
+    for name in expected:
         if name not in names:
-            raise InputError(f"{where}.{name}", None, "this parameter to be there")
+            raise InputError(f"{where}.{name}", None, "a value for this parameter")
     return term
 
 
 def check_requirements(where: str, keys: Collection[str]) -> None:
-    """InputError where a known term lacks one that it builds on."""
+    """Raise InputError if one of these known terms lacks another one that it builds on."""
     for key in keys:
-        for need in discover_terms()[key].requires:
-            if need not in keys:
-                raise InputError(f"{where}.{key}", f"without {need}", f"terms.{need} beside it")
+        for required in discover_terms()[key].requires:
+            if required not in keys:
+                raise InputError(f"{where}.{key}", f"without {required}", f"terms.{required} beside it")

@@ -9,7 +9,7 @@ from optodrive.device.neighbours import Neighbours
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import PixelArray, load_parameters
 from optodrive.physics.pixel import Pixel
-from reference.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
+from reference_models.coupled_display import CoupledDisplay, Modes, WallParameters, build_conductances_w_per_k
 
 PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
 WALLS = WallParameters(20.0, 0.06, 430.0, 300.0)

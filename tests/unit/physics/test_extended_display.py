@@ -207,7 +207,7 @@ def test_traces_are_taken_from_rest_and_show_every_pixel_asked_for():
     nominal = NominalThermalState(ARRAY).simulate_traces(pulses, [5, 0], t_s)
     assert traced.gas_k == pytest.approx(nominal.gas_k, rel=1e-3, abs=1e-3)
     heat.apply_pulses(*columns)
-    with pytest.raises(ValueError, match="from rest"):
+    with pytest.raises(ValueError, match="from the cold state"):
         heat.simulate_traces(pulses, [5], t_s)
 
 

@@ -14,7 +14,7 @@ from optodrive.planning.limiter.galvo_load import (
     move_energy,
     ringing_envelope_factor,
 )
-from reference.thermal_display import _coil
+from reference_models.thermal_display import _coil
 
 SERVO = GalvoModel(
     omega_rad_per_s=2 * np.pi * 1700,

@@ -21,7 +21,7 @@ from optodrive.planning.limiter.worst_case import (
     build_heat_bound,
     specht_ratio,
 )
-from reference.thermal_display import NO_CAPS
+from reference_models.thermal_display import NO_CAPS
 
 CERTAIN = Uncertainty(*[0.0] * len(Uncertainty.__dataclass_fields__))
 MODEL = NominalThermalModel(
