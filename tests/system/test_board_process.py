@@ -43,7 +43,7 @@ class Host:
         for message in messages:
             seq = self.seq if message.SEQUENCED else 0
             self.seq = (self.seq + message.SEQUENCED) % 256
-            self.port.write(encode_frame(Frame(message.TYPE, seq, self.session, message.body())))
+            self.port.write(encode_frame(Frame(message.TYPE, seq, self.session, message.encode_body())))
 
     def hear(self):
         for frame in self.decoder.feed(self.port.read(4096)):

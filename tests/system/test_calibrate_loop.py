@@ -44,7 +44,7 @@ def session_spots(out):
     ("geometry", "more"),
     [
         pytest.param(0, (), marks=pytest.mark.slow),
-        (1, ("--false-share", "0.1")),
+        (1, ("--outlier-share", "0.1")),
         pytest.param(2, ("--no-readback",), marks=pytest.mark.slow),
     ],
 )

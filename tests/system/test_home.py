@@ -40,7 +40,7 @@ def test_in_the_dark(make_board, start):
 
 
 def test_with_a_spot_and_no_position_outputs(make_board, start):
-    board = make_board(sensor=("--no-readback", "--false-share", "0.1"))
+    board = make_board(sensor=("--no-readback", "--outlier-share", "0.1"))
     status, out, errors = start(board, "home", "--spot-power-mw", "5").ended()
     assert status == 0, errors
     assert "no position outputs: not checked" in out

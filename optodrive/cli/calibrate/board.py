@@ -81,7 +81,7 @@ def calibrate_on_board(config: str | None, out: Path, request: BoardCalibrationR
 
 def delete_session(out: Path) -> None:
     """Delete the session of an output file, so that the next calibration starts without spots."""
-    from optodrive.lab.commissioning.session_file import session_path_for
+    from optodrive.lab.commissioning.calibration_session import session_path_for
 
     session_path_for(out).unlink(missing_ok=True)
 
@@ -95,9 +95,9 @@ def measure_on_board(config: str | None, out: Path, request: BoardCalibrationReq
     from optodrive.cli.board_access import open_board
     from optodrive.core.clock import MonotonicClock
     from optodrive.lab.calibration.field_prior import FieldPrior
+    from optodrive.lab.commissioning.calibration_session import CalibrationSession
     from optodrive.lab.commissioning.exclusive_board import check_spot_power
     from optodrive.lab.commissioning.measurement_loop import MeasurementLoop, fit_and_warm_up
-    from optodrive.lab.commissioning.session_file import CalibrationSession
     from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
     from optodrive.lab.commissioning.worker_process import WorkerProcess
 

@@ -18,9 +18,9 @@ from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.next_spot import select_next_spot
 from optodrive.lab.calibration.spot_checks import check_fit, check_spots
 from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.commissioning.calibration_session import CalibrationSession, SpotRow, save_text
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.predicted_error import predicted_rms_m
-from optodrive.lab.commissioning.session_file import CalibrationSession, SpotRow, save_text
 from optodrive.lab.commissioning.worker_process import WorkerProcess
 
 WORKER_TIMEOUT_S = 30.0

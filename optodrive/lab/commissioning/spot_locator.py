@@ -11,9 +11,9 @@ from optodrive.core.units import um_to_m
 from optodrive.device.config import build_pixel_layout
 from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.lab.calibration.spots import MeasuredSpots
+from optodrive.lab.commissioning.calibration_session import SpotRow
 from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
 from optodrive.lab.commissioning.predicted_error import build_code_grid
-from optodrive.lab.commissioning.session_file import SpotRow
 from optodrive.lab.commissioning.spot_reader import SpotReader
 
 GRID_SIDE = 11

@@ -1,1 +1,1 @@
-"""A board and a display that run here: bytes in, pulses and measurements out."""
+"""Simulated board and display: bytes in, pulses and measurements out."""

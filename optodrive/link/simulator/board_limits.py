@@ -1,4 +1,4 @@
-"""A board's limits: its own, read from a file, and those a host tightened them to."""
+"""The limits of a simulated board: read from a file, and tightened by a host."""
 
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -34,7 +34,7 @@ LOWER_LIMITS = ("x_min", "y_min", "settle_us", "settle_ns_per_code", "rest_us")
 
 
 def tighten(current: Limits, requested: Limits) -> Limits:
-    """The tighter of both, field by field; the board's power is its own."""
+    """Return the tighter value of each field; full_power_uw stays as it is."""
     tighter = {name: min(getattr(current, name), getattr(requested, name)) for name in UPPER_LIMITS}
     tighter |= {name: max(getattr(current, name), getattr(requested, name)) for name in LOWER_LIMITS}
     return replace(current, **tighter)
@@ -42,7 +42,7 @@ def tighten(current: Limits, requested: Limits) -> Limits:
 
 @dataclass(frozen=True)
 class BoardSettings:
-    """What a simulated board is: limits, identity, the grid of cells that its spot guards watch."""
+    """Settings of a simulated board: its own limits, its identity, and the cell size of its spot guards in codes."""
 
     limits: Limits = DEFAULT_LIMITS
     uid: str = "73696d756c61746564303031"
@@ -52,7 +52,10 @@ class BoardSettings:
 
 
 def load_settings(path: Path) -> BoardSettings:
-    """Settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge."""
+    """Load settings from a TOML file: any field of the limits, and uid, cell_codes, queue_points, key_edge.
+
+    Raise InputError for an unknown key or a value out of range.
+    """
     table = read_toml(path)
     known = [*SETTING_RANGES, "uid", "key_edge"]
     for name, value in table.items():

@@ -1,297 +1,25 @@
-"""The simulated board as a process of its own on a pseudo-terminal.
+"""The simulated board as a process on a pseudo-terminal.
 
 python -m optodrive.link.simulator.board_process --pty LINK [--log FILE] [--limits FILE] [--script FILE] [--baud N]
-    [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--false-share N] [--no-readback]]
+    [--sensor LINK [--geometry SEED] [--config FILE] [--sensor-noise-um N] [--outlier-share N] [--no-readback]]
 """
 
 import argparse
-import json
-import os
-import select
 import signal
 import sys
-import time
-from collections.abc import Callable, Mapping
-from contextlib import suppress
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from optodrive.core.clock import request_realtime_scheduling
 from optodrive.core.errors import InputError
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings, load_settings
-from optodrive.link.simulator.faulty_link import FaultyLink
-from optodrive.link.simulator.pseudo_terminal import check_link_path, open_pty
-from optodrive.link.simulator.script import SENSOR_ACTIONS, ScriptStep, load_script
+from optodrive.link.simulator.pseudo_terminal import check_link_path
+from optodrive.link.simulator.pty_board import NO_ACTIONS, BackendFactory, PtyBoard, ScriptActions
+from optodrive.link.simulator.script import load_script
 from optodrive.link.simulator.sensor_options import add_sensor_options, build_optics
 
-if TYPE_CHECKING:
-    from optodrive.link.simulator.bench import SimulatedOptics
-
-LOOP_WAIT_MAX_S = 0.005
-LATE_LOOP_US = 2_000
-"""A turn that begins so long after its time was kept from the processor."""
-BITS_PER_BYTE = 10
 BAUD_MIN = 300
-BURST_BYTES = 64
-READ_MAX = 4096
-
-
-class LineRate:
-    """Lets bytes pass at a serial line's rate."""
-
-    def __init__(self, baud: int) -> None:
-        self._bytes_per_s = baud / BITS_PER_BYTE
-        self._tokens = float(BURST_BYTES)
-        self._updated_s = 0.0
-
-    def available_bytes(self, now_s: float) -> int:
-        """How many bytes may pass now."""
-        # A late turn may catch up on what the line would have carried meanwhile, up to a whole read.
-        self._tokens = min(READ_MAX, self._tokens + (now_s - self._updated_s) * self._bytes_per_s)
-        self._updated_s = now_s
-        return int(self._tokens)
-
-    def consume(self, count: int) -> None:
-        """Count bytes that passed."""
-        self._tokens -= count
-
-    def cap_credit(self) -> None:
-        """Nothing waits to pass: a line saves nothing up."""
-        self._tokens = min(self._tokens, BURST_BYTES)
-
-
-class BoardBackend(Protocol):
-    """What stands behind the pty: the simulated board, or a real core elsewhere. Times in µs since the start."""
-
-    def advance(self, now_us: int) -> None:
-        """Do everything that falls due up to now."""
-
-    def receive(self, data: bytes, now_us: int) -> None:
-        """Take bytes that arrived at now_us."""
-
-    def bytes_to_send(self) -> bytes:
-        """Bytes for the host since the last call."""
-
-    def on_link_lost(self, now_us: int) -> None:
-        """The host's end closed."""
-
-    def set_input(self, name: str, value: bool, now_us: int) -> None:
-        """An input changes."""
-
-    def reset(self, now_us: int) -> None:
-        """Power lost and back."""
-
-    def next_event_us(self) -> int | None:
-        """When it must be looked at next, None for whenever."""
-
-
-BackendFactory = Callable[[BoardSettings, Callable[[dict[str, Any]], None]], BoardBackend]
-ScriptActions = Mapping[str, Callable[[Any], None]]
-"""What a script may do to this core and to no other, by name."""
-NO_ACTIONS: ScriptActions = {}
-
-
-class PtyBoard:
-    """A core between a pty and the real clock; failure: why it ended by itself, '' where it did not."""
-
-    def __init__(
-        self,
-        link: Path,
-        log: BinaryIO | None,
-        settings: BoardSettings,
-        script: list[ScriptStep],
-        baud: int,
-        exit_when_closed_s: float | None,
-        build_core: BackendFactory = BoardCore,
-        actions: ScriptActions = NO_ACTIONS,
-        optics: "SimulatedOptics | None" = None,
-    ) -> None:
-        self.failure = ""
-        self._actions = actions
-        self._optics = optics
-        self._link_path = link
-        self._log_file = log
-        self._script = [step for step in script if not step.from_first_pulse]
-        self._steps_from_first_pulse = [step for step in script if step.from_first_pulse]
-        self._exit_when_closed_s = exit_when_closed_s
-        self._started_s = time.monotonic()
-        self._running = True
-        self._core = build_core(settings, self._log)
-        self._faults = FaultyLink()
-        self._input_rate, self._output_rate = LineRate(baud), LineRate(baud)
-        self._output = b""
-        self._is_open = False
-        self._was_open = False
-        self._closed_since_s = 0.0
-        self._master = -1
-        self._due_us = 0
-        self._open_pty()
-
-    def _open_pty(self) -> None:
-        self._master = open_pty(self._link_path)
-
-    def _log(self, event: dict[str, Any]) -> None:
-        if self._optics is not None:
-            self._optics.on_log_event(event)
-        if self._steps_from_first_pulse and event["event"] == "gate":
-            self._schedule_from_first_pulse(event["t_us"] * 1e-6)
-        if self._log_file is None:
-            return
-        try:
-            self._log_file.write(json.dumps(event).encode() + b"\n")
-        except OSError as error:
-            self._log_file = None
-            self.failure = f"the log cannot be written ({error.strerror}); without its witness the board ends dark"
-            self.stop()
-
-    def _now_s(self) -> float:
-        return time.monotonic() - self._started_s
-
-    def stop(self, *_: object) -> None:
-        """End after this turn."""
-        self._running = False
-
-    def run(self) -> None:
-        """Serve until stopped, then go dark."""
-        try:
-            while self._running:
-                self._run_once()
-        finally:
-            self._core.on_link_lost(self._now_us())
-            self._link_path.unlink(missing_ok=True)
-            if self._optics is not None:
-                self._optics.close()
-
-    def _now_us(self) -> int:
-        return int(self._now_s() * 1e6)
-
-    def _run_once(self) -> None:
-        if self._is_open and self._now_us() - self._due_us > LATE_LOOP_US:
-            # This process ran late, not the board that it stands for: what lies there came bit by bit meanwhile.
-            self._read(self._due_us)
-        self._run_due_steps()
-        self._core.advance(self._now_us())
-        self._update_port_state()
-        if self._is_open:
-            self._read(self._now_us())
-            self._core.advance(self._now_us())
-            self._write()
-        else:
-            self._core.bytes_to_send()
-            self._output = b""
-        if self._optics is not None:
-            self._optics.answer_requests(self._now_us())
-        self._wait()
-
-    def _wait(self) -> None:
-        now_us, due_us = self._now_us(), self._core.next_event_us()
-        wait_s = LOOP_WAIT_MAX_S if due_us is None else min(LOOP_WAIT_MAX_S, max(0.0, (due_us - now_us) * 1e-6))
-        if self._script:
-            wait_s = min(wait_s, max(0.0, self._script[0].at_s - self._now_s()))
-        self._due_us = now_us + round(wait_s * 1e6)
-        if not self._is_open:
-            time.sleep(max(wait_s, 0.001))
-        elif self._input_rate.available_bytes(self._now_s()) < 1:
-            time.sleep(0.0005)
-        else:
-            select.select([self._master], [self._master] if self._output else [], [], wait_s)
-
-    def _update_port_state(self) -> None:
-        poller = select.poll()
-        poller.register(self._master, select.POLLIN)
-        hung_up = any(flags & select.POLLHUP for _, flags in poller.poll(0))
-        if self._is_open and hung_up:
-            self._drain_input()
-            self._on_port_closed(self._now_us())
-        elif not self._is_open and not hung_up:
-            self._log({"t_us": self._now_us(), "event": "port", "open": True})
-            self._was_open = True
-        self._is_open = not hung_up
-        closed_for_s = self._now_s() - self._closed_since_s
-        if (
-            self._exit_when_closed_s is not None
-            and self._was_open
-            and not self._is_open
-            and closed_for_s > self._exit_when_closed_s
-        ):
-            self._running = False
-
-    def _on_port_closed(self, now_us: int) -> None:
-        self._log({"t_us": now_us, "event": "port", "open": False})
-        self._core.on_link_lost(now_us)
-        self._closed_since_s = self._now_s()
-        self._is_open = False
-
-    def _read(self, since_us: int) -> None:
-        """Take what lies there as if it had come evenly from since_us until now."""
-        allowed = self._input_rate.available_bytes(self._now_s())
-        if allowed < 1:
-            return
-        try:
-            data = os.read(self._master, allowed)
-        except (BlockingIOError, OSError):
-            self._input_rate.cap_credit()
-            return  # nothing there, or the host has just closed: the next look at the port tells
-        self._input_rate.consume(len(data))
-        if len(data) < allowed:
-            self._input_rate.cap_credit()
-        data, late_us = self._faults.transmit(data), self._now_us() - since_us
-        part_count = max(1, late_us // LATE_LOOP_US)
-        for k in range(part_count):
-            part = data[len(data) * k // part_count : len(data) * (k + 1) // part_count]
-            self._core.receive(part, since_us + late_us * (k + 1) // part_count)
-
-    def _drain_input(self) -> None:
-        """Take what a host wrote before it closed, so that no later host finds it in the line."""
-        with suppress(OSError):  # empty, or the other end's EIO
-            while data := os.read(self._master, READ_MAX):
-                self._core.receive(self._faults.transmit(data), self._now_us())
-
-    def _write(self) -> None:
-        self._output += self._faults.transmit(self._core.bytes_to_send())
-        allowed = min(self._output_rate.available_bytes(self._now_s()), len(self._output))
-        if not self._output:
-            self._output_rate.cap_credit()
-        if allowed < 1:
-            return
-        try:
-            written = os.write(self._master, self._output[:allowed])
-        except (BlockingIOError, OSError):
-            return
-        self._output_rate.consume(written)
-        self._output = self._output[written:]
-
-    def _schedule_from_first_pulse(self, first_pulse_s: float) -> None:
-        self._script += [replace(step, at_s=first_pulse_s + step.at_s) for step in self._steps_from_first_pulse]
-        self._script.sort(key=lambda step: step.at_s)
-        self._steps_from_first_pulse = []
-
-    def _run_due_steps(self) -> None:
-        while self._script and self._script[0].at_s <= self._now_s():
-            self._run_step(self._script.pop(0))
-
-    def _run_step(self, step: ScriptStep) -> None:
-        now_us = min(self._now_us(), int(step.at_s * 1e6))  # it happened when the script says, not when we looked
-        if step.kind == "set":
-            self._core.set_input(step.name, step.value, now_us)
-        elif step.name == "reset":
-            self._core.reset(now_us)
-        elif step.name == "repair":
-            self._faults.repair()
-        elif step.name == "close":
-            self._on_port_closed(now_us)
-            os.close(self._master)
-            self._open_pty()
-        elif step.name in self._actions:
-            self._actions[step.name](self._core)
-        elif step.name in SENSOR_ACTIONS:
-            if self._optics is not None:
-                self._optics.inject_fault(step.name, now_us)
-        else:
-            self._faults.inject_fault(step.name, step.rate)
 
 
 def _check_options(options: argparse.Namespace) -> None:
@@ -303,17 +31,22 @@ def _check_options(options: argparse.Namespace) -> None:
 def main(
     arguments: list[str] | None = None, build_core: BackendFactory = BoardCore, actions: ScriptActions = NO_ACTIONS
 ) -> int:
-    """Run a board until SIGTERM or SIGINT."""
+    """Run a board until SIGTERM or SIGINT; return the exit status."""
     parser = argparse.ArgumentParser(
-        prog="optodrive.link.simulator.board_process", description="A simulated board on a pty."
+        prog="optodrive.link.simulator.board_process", description="Simulated board on a pty."
     )
-    parser.add_argument("--pty", type=Path, required=True, metavar="LINK", help="link this name to the pty")
-    parser.add_argument("--log", type=Path, help="JSON lines: gate edges, states, faults, pulses")
-    parser.add_argument("--limits", type=Path, help="TOML: the board's own limits")
-    parser.add_argument("--script", type=Path, help="TOML: what happens to it, and when")
-    parser.add_argument("--baud", type=int, default=1_000_000, help="pace of the serial line")
-    parser.add_argument("--exit-when-closed", type=float, metavar="SECONDS", help="end when no host has it open")
-    parser.add_argument("--seed", type=int, help="make the same nonces every time, so that a session can be replayed")
+    parser.add_argument("--pty", type=Path, required=True, metavar="LINK", help="link to create to the pty")
+    parser.add_argument("--log", type=Path, help="JSON lines of gate edges, states, faults and pulses")
+    parser.add_argument("--limits", type=Path, help="TOML file of the board's own limits")
+    parser.add_argument("--script", type=Path, help="TOML file of timed steps")
+    parser.add_argument("--baud", type=int, default=1_000_000, help="rate of the serial line")
+    parser.add_argument(
+        "--exit-when-closed",
+        type=float,
+        metavar="SECONDS",
+        help="exit when no host has had the port open for this time",
+    )
+    parser.add_argument("--seed", type=int, help="seed of the nonces, for a session that can be replayed")
     add_sensor_options(parser)
     options = parser.parse_args(arguments)
     try:
@@ -330,12 +63,12 @@ def main(
         return 2
     simulated = build_core is BoardCore
     if simulated:
-        build_core = partial(BoardCore, seed=options.seed, mirror_sink=optics.mirrors.move_to if optics else None)
+        build_core = partial(BoardCore, seed=options.seed, mirror_sink=optics.galvos.move_to if optics else None)
     board = PtyBoard(
         options.pty, log, settings, script, options.baud, options.exit_when_closed, build_core, actions, optics
     )
     if simulated:
-        request_realtime_scheduling()  # a real board waits for none; before an emulator's, it would starve what it serves
+        request_realtime_scheduling()  # not for an emulator, which this process would starve
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
     board.run()

@@ -1,10 +1,10 @@
-"""A link that can break down and be repaired: what arrives is dropped, flipped or never read."""
+"""A link with injectable faults: lost bytes, flipped bits, or no bytes at all."""
 
 import random
 
 
 class FaultyLink:
-    """Damages bytes on their way; rates are per byte."""
+    """Transmits bytes with faults; rates are per byte."""
 
     def __init__(self, seed: int | None = None) -> None:
         self._random = random.Random(seed)
@@ -13,7 +13,7 @@ class FaultyLink:
         self.hung = False
 
     def inject_fault(self, kind: str, rate: float = 0.0) -> None:
-        """`drop_bytes` or `flip_bits` at a rate, or `hang`: nothing passes."""
+        """Inject a fault: `drop_bytes` or `flip_bits` at a rate, or `hang`, which loses all bytes."""
         if kind == "hang":
             self.hung = True
         elif kind == "drop_bytes":
@@ -24,12 +24,12 @@ class FaultyLink:
             raise ValueError(kind)
 
     def repair(self) -> None:
-        """All well again."""
+        """Remove all faults."""
         self.drop_rate = self.flip_rate = 0.0
         self.hung = False
 
     def transmit(self, data: bytes) -> bytes:
-        """What arrives of data."""
+        """Return the bytes that arrive when data is sent."""
         if self.hung:
             return b""
         if not self.drop_rate and not self.flip_rate:

@@ -1,4 +1,4 @@
-"""The simulated mirrors: where they stand at a time, and what their position outputs say of it."""
+"""Simulated galvos: mirror angles over time, and the position outputs of the driver."""
 
 from math import cos, exp, sin, sqrt
 from typing import NamedTuple
@@ -12,20 +12,20 @@ from optodrive.device.servo import Servo
 CENTRE_CODE = HALF_RANGE_CODES + 1
 OUTPUT_NOISE_RAD = 1e-5
 MOVE_HISTORY_S = 0.5
-"""A move so long ago is over."""
+"""A move this old has settled."""
 
 
 class GalvoMove(NamedTuple):
-    """From at_s on, by so many radians on each axis."""
+    """A commanded move: its time, and the displacement of x and y."""
 
     at_s: float
     displacement_rad: tuple[float, float]
 
 
 class SimulatedGalvos:
-    """Two mirrors that follow codes as the configured servo does; angles are the servo's own, nominal.
+    """Two mirrors that follow codes with the configured servo; angles are nominal, in rad.
 
-    Moves that overlap are added up: between two moves that is not quite the servo, when they are over it is.
+    Overlapping moves are superposed. The slew limit makes this inexact while they overlap; the end positions are exact.
     """
 
     def __init__(self, config: Config, seed: int | np.random.SeedSequence) -> None:
@@ -39,7 +39,7 @@ class SimulatedGalvos:
         self.readback_inverted = False
 
     def move_to(self, x_code: int, y_code: int, at_us: int) -> None:
-        """The board sends them somewhere else."""
+        """Command both mirrors to codes at a time."""
         target_rad = (x_code - CENTRE_CODE) * self._code_rad, (y_code - CENTRE_CODE) * self._code_rad
         if target_rad == self._target_rad:
             return
@@ -51,11 +51,11 @@ class SimulatedGalvos:
         self._moves.append(GalvoMove(at_s, (x_rad, y_rad)))
 
     def stick(self, axis: int, at_us: int) -> None:
-        """A mirror stays where it is, whatever it is told."""
+        """Block the mirror of an axis at its present angle."""
         self._stuck_rad[axis] = self.angles_rad(at_us)[axis]
 
     def angles_rad(self, at_us: int) -> tuple[float, float]:
-        """Where they stand, rad from their middle."""
+        """Return the angles of x and y from the centre, rad."""
         return self._angle_rad(0, at_us * 1e-6), self._angle_rad(1, at_us * 1e-6)
 
     def _angle_rad(self, axis: int, at_s: float) -> float:
@@ -67,19 +67,19 @@ class SimulatedGalvos:
         return self._base_rad[axis] + moved
 
     def codes(self, at_us: int) -> tuple[float, float]:
-        """The codes at which they would rest where they stand."""
+        """Return the codes of x and y whose steady-state angles are the present ones."""
         x_rad, y_rad = self.angles_rad(at_us)
         return CENTRE_CODE + x_rad / self._code_rad, CENTRE_CODE + y_rad / self._code_rad
 
     def position_output_rad(self, at_us: int) -> tuple[float, float]:
-        """What the position outputs say, with their noise."""
+        """Return the noisy position outputs of x and y, rad."""
         sign = -1.0 if self.readback_inverted else 1.0
         x_rad, y_rad = sign * np.array(self.angles_rad(at_us)) + OUTPUT_NOISE_RAD * self._random.standard_normal(2)
         return float(x_rad), float(y_rad)
 
 
 def _move_response_rad(servo: Servo, displacement_rad: float, elapsed_s: float) -> float:
-    """How far a mirror has come of a move that was commanded later_s ago: the answer to a ramp at the slew limit."""
+    """Return a move's displacement elapsed_s after its command, rad: the response to a ramp at the slew limit."""
     since_s = elapsed_s - servo.delay
     ramp_s = abs(displacement_rad) / servo.slew
     response_s = _ramp_response_s(servo, since_s) - _ramp_response_s(servo, since_s - ramp_s)
@@ -87,7 +87,7 @@ def _move_response_rad(servo: Servo, displacement_rad: float, elapsed_s: float) 
 
 
 def _ramp_response_s(servo: Servo, since_s: float) -> float:
-    """A second-order servo's answer to a ramp of slope one, s."""
+    """Return the response of the second-order servo to a ramp of slope one, s."""
     if since_s <= 0.0:
         return 0.0
     omega = 2.0 * np.pi * servo.frequency

@@ -1,4 +1,4 @@
-"""What the board watches before it opens the gate: on time, mean power, energy per cell (B4 to B6). Integers only."""
+"""Guards before the gate opens: gate-on time, mean power and energy per cell (B4 to B6), in integers only."""
 
 from collections import deque
 
@@ -8,11 +8,11 @@ WINDOW_US = 1_000_000
 DUTY_FULL = 65535
 
 Cell = tuple[int, int, int]
-"""Which of the four grids, column, row."""
+"""Index of the grid (0 to 3), column, row."""
 
 
 class EmissionGuards:
-    """The accounts of one board; times in µs."""
+    """Accounts of gate-on time, mean power and energy of one board; times in µs."""
 
     def __init__(self, cell_codes: int) -> None:
         self._cell_codes = cell_codes
@@ -22,10 +22,10 @@ class EmissionGuards:
         self._recent_duty_us = 0
 
     def find_cells(self, x: int, y: int) -> list[Cell]:
-        """The cells of a position, one in each of four grids half a cell apart.
+        """Return the cells of a position, one in each of four grids offset by half a cell.
 
-        Two positions less than half a cell apart share a cell in at least one grid, so no border hides one from the
-        other; two that are a whole cell apart share none.
+        Two positions less than half a cell apart share a cell in at least one grid, so no cell border separates them
+        in all grids; two positions a whole cell apart share none.
         """
         size = self._cell_codes
         half = size // 2
@@ -35,7 +35,7 @@ class EmissionGuards:
         ]
 
     def check_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> str:
-        """The fault that this pulse would be, '' where it may fire."""
+        """Return the fault that a pulse causes, '' if the guards permit it."""
         cells = self.find_cells(x, y)
         if max(self.on_time_us(limits, cell, start_us) for cell in cells) + on_us > limits.max_on_us:
             return "ON_TIME"
@@ -47,7 +47,7 @@ class EmissionGuards:
         return ""
 
     def record_pulse(self, limits: Limits, x: int, y: int, start_us: int, on_us: int, duty: int) -> None:
-        """Count a pulse."""
+        """Add a pulse to the accounts."""
         energy = energy_uj(limits, on_us, duty)
         for cell in self.find_cells(x, y):
             self._on_time[cell] = self.on_time_us(limits, cell, start_us) + on_us, start_us + on_us
@@ -56,21 +56,21 @@ class EmissionGuards:
         self._recent_duty_us += on_us * duty
 
     def on_time_us(self, limits: Limits, cell: Cell, at_us: int) -> int:
-        """Light a cell had without a rest up to at_us."""
+        """Return the gate-on time of a cell since its last rest, at at_us."""
         on_us, ended_us = self._on_time.get(cell, (0, -WINDOW_US))
         return 0 if at_us - ended_us >= limits.rest_us else on_us
 
     def bucket_uj(self, limits: Limits, cell: Cell, at_us: int) -> int:
-        """Level of a cell's leaky bucket."""
+        """Return the level of a cell's leaky bucket, µJ."""
         level_uj, since_us = self._bucket.get(cell, (0, 0))
         return max(0, level_uj - (at_us - since_us) * limits.spot_leak_uw // 1_000_000)
 
     def max_window_duty_us(self, start_us: int, on_us: int, duty: int) -> int:
-        """Most gate-on time × duty that any second would hold with this pulse, µs × duty code."""
+        """Return the maximum of gate-on time × duty over any second that contains this pulse, µs × duty code."""
         while self._recent_pulses and sum(self._recent_pulses[0][:2]) <= start_us - WINDOW_US:
             _, old_on_us, old_duty = self._recent_pulses.popleft()
             self._recent_duty_us -= old_on_us * old_duty
-        # The sum of a second grows until the pulse ends, or a brighter old pulse begins to leave the second.
+        # The sum over a sliding second peaks where the pulse ends, or where an older pulse begins to leave the second.
         window_ends_us = [start_us + on_us]
         for old_start_us, _, _ in self._recent_pulses:
             if old_start_us + WINDOW_US >= start_us + on_us:
@@ -85,7 +85,7 @@ class EmissionGuards:
             start_us,
             on_us,
             duty,
-        ) in self._recent_pulses:  # oldest first: only the front of the line has left the second
+        ) in self._recent_pulses:  # oldest first: only the first pulses have left the second
             if start_us >= begin_us:
                 break
             expired_duty_us += min(on_us, begin_us - start_us) * duty
@@ -93,5 +93,5 @@ class EmissionGuards:
 
 
 def energy_uj(limits: Limits, on_us: int, duty: int) -> int:
-    """Energy of a pulse, µJ, rounded up."""
+    """Return the energy of a pulse, µJ, rounded up."""
     return -(-on_us * duty * limits.full_power_uw // (DUTY_FULL * 1_000_000))

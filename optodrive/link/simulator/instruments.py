@@ -1,4 +1,4 @@
-"""Instruments: what a thermal camera, an interferometer and a load cell read from a trace, with their noise."""
+"""Simulated instruments: thermal camera, interferometer and load cell, with their noise."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, PixelTrace, Run, Signal
 
 INSTRUMENT_SIGMA = {"absorber_temperature_K": 1.0, "displacement_m": 0.25e-6, "force_N": 0.1e-3}
-"""Stated noise of each instrument, one standard deviation."""
+"""Standard deviation of each instrument's noise."""
 
 
 def measure(
@@ -18,9 +18,10 @@ def measure(
     seed: int | np.random.Generator,
     aim_m: FloatArray | None = None,
 ) -> Measurement:
-    """One run a pixel of the trace, named after it. noise: how many times its stated noise each instrument adds.
+    """Measure a trace: one run per pixel, named after it. noise: factor on each instrument's noise.
 
-    aim_m: [2, display's pixels] where the beam was sent, from each pixel's middle; None for the middle itself
+    pulses: [n, 4] as in a recording
+    aim_m: [2, pixels of the display] beam aim relative to each pixel's centre, m; None for the centre
     """
     rng = np.random.default_rng(seed)
     runs = []

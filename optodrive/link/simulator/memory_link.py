@@ -1,14 +1,14 @@
-"""A transport without wires or waiting: the host reaches a simulated board in its own process, in virtual time."""
+"""In-memory transport to a simulated board in the same process, in virtual time."""
 
 from optodrive.core.clock import ManualClock
 from optodrive.link.simulator.board_core import BoardCore
 
 EXCHANGE_MIN_S = 1e-4
-"""What an exchange takes at least, so that time always moves."""
+"""Minimum duration of an exchange, so that virtual time always advances."""
 
 
 class MemoryLink:
-    """Joins a host that waits on `read` to a `BoardCore`; reading moves the clock."""
+    """Connects a host to a `BoardCore`; `read` advances the clock."""
 
     name = "simulated board, virtual time"
 
@@ -17,25 +17,25 @@ class MemoryLink:
         self._clock = clock
 
     def open(self) -> None:
-        """Nothing to open."""
+        """Do nothing: the link is always open."""
 
     def close(self) -> None:
-        """The board hears that the host has gone."""
+        """Report the loss of the link to the board."""
         self._core.on_link_lost(self._now_us())
 
     def release(self) -> None:
-        """Nothing was started."""
+        """Close the link."""
         self.close()
 
     def _now_us(self) -> int:
         return round(self._clock.now_s() * 1e6)
 
     def write(self, data: bytes) -> None:
-        """Bytes arrive at once."""
+        """Pass bytes to the board without delay."""
         self._core.receive(data, self._now_us())
 
     def read(self, timeout_s: float) -> bytes:
-        """What the board has sent; time passes until it has, at most timeout_s."""
+        """Return the bytes that the board has sent, after at most timeout_s of virtual time."""
         self._clock.sleep(EXCHANGE_MIN_S)
         self._core.advance(self._now_us())
         data = self._core.bytes_to_send()

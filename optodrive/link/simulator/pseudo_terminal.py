@@ -1,4 +1,4 @@
-"""A pseudo-terminal that stands for a serial port, under a name of its own."""
+"""A pseudo-terminal in place of a serial port, under a stable name."""
 
 import os
 import tty
@@ -8,7 +8,7 @@ from optodrive.core.errors import InputError
 
 
 def check_link_path(option: str, link: Path) -> None:
-    """InputError, naming the option, where a link cannot be put."""
+    """Raise InputError, naming the option, if the link cannot be created."""
     if not link.parent.is_dir():
         raise InputError(option, str(link), "a name in a folder that exists")
     if link.exists() and not link.is_symlink():
@@ -16,7 +16,7 @@ def check_link_path(option: str, link: Path) -> None:
 
 
 def open_pty(link: Path) -> int:
-    """The instrument's end, not blocking; link: the name that the host opens, put in place at once."""
+    """Open a pty and return the descriptor of its instrument end, non-blocking. link: name that the host opens."""
     master, slave = os.openpty()
     tty.setraw(slave)
     os.set_blocking(master, False)
@@ -24,5 +24,5 @@ def open_pty(link: Path) -> int:
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(os.ttyname(slave))
     temporary.replace(link)
-    os.close(slave)  # from here on a hang-up means that no host has the port open
+    os.close(slave)  # from now on a hang-up means that no host has the port open
     return master

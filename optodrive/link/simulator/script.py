@@ -1,4 +1,4 @@
-"""What happens to a simulated board at given times: inputs change, it is reset, its link breaks down.
+"""Scripts of a simulated board: input changes, resets and link faults at given times.
 
 [[step]]
 at_s = 1.5
@@ -10,8 +10,8 @@ at_s = 2.0
 do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close"
 rate = 0.01
 
-With from = "light" beside it, at_s counts from the first light. With --sensor also: "stick_x", "stick_y",
-"invert_readback", "blind_sensor", "unplug_sensor".
+With from = "light", at_s counts from the first pulse. With --sensor also: "stick_x", "stick_y", "invert_readback",
+"blind_sensor", "unplug_sensor".
 """
 
 from collections.abc import Collection
@@ -25,15 +25,15 @@ from optodrive.core.files import read_toml
 from optodrive.link.protocol.messages import INPUTS
 
 SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")
-"""What happens to mirrors and spot sensor."""
+"""Faults of mirrors and spot sensor."""
 ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSOR_ACTIONS)
 
 
 @dataclass(frozen=True)
 class ScriptStep:
-    """One thing that happens. kind: "set" or "do"; name: the input or the action.
+    """One step. kind: "set" or "do"; name: the input or the action.
 
-    from_light: at_s counts from the first light, else from the start
+    from_first_pulse: at_s counts from the first pulse, else from the start
     """
 
     at_s: float
@@ -45,7 +45,10 @@ class ScriptStep:
 
 
 def load_script(path: Path, extra_actions: Collection[str] = ()) -> list[ScriptStep]:
-    """The steps of a script file in order of time; InputError for what it cannot mean. more: actions beside ACTIONS."""
+    """Load the steps of a script file, sorted by time. extra_actions: actions permitted besides ACTIONS.
+
+    Raise InputError for an unknown key, name or value.
+    """
     table = read_toml(path)
     entries = table.pop("step", [])
     for name in table:

@@ -1,4 +1,4 @@
-"""The simulated spot sensor, an instrument of its own that sees where the beam lands: lines as SENSOR.md says."""
+"""Simulated spot sensor: reports where the beam lands, by the lines of SENSOR.md."""
 
 from collections import deque
 from typing import NamedTuple
@@ -11,15 +11,15 @@ from optodrive.link.simulator.galvos import SimulatedGalvos
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
 PULSE_MEMORY_US = 500_000
-"""Light longer ago than this is forgotten."""
+"""A pulse older than this no longer counts."""
 SPOT_ENERGY_MIN_J = 10e-6
-"""Less light than this is no spot."""
+"""Minimum energy of a spot."""
 FIELD_MARGIN_M = 6e-3
-"""The sensor sees so far beyond the outermost pixels."""
+"""Margin of the field of view beyond the outermost pixels."""
 
 
 class DetectedPulse(NamedTuple):
-    """Light that fell on the sensor until at_us."""
+    """A pulse on the sensor that ended at at_us."""
 
     at_us: int
     x_m: float
@@ -28,9 +28,9 @@ class DetectedPulse(NamedTuple):
 
 
 class SimulatedSpotSensor:
-    """Sees pulses by the truth's geometry, with noise, and now and then something else: a reflection anywhere.
+    """Detects pulses with noise at their ground-truth position, and a share of outliers anywhere in the field.
 
-    blind: it is covered; outputs: whether the galvo driver's position outputs are wired to it.
+    blind: whether the sensor is covered; has_position_outputs: whether it reads the galvo driver's position outputs
     """
 
     def __init__(
@@ -55,13 +55,13 @@ class SimulatedSpotSensor:
         self.blind = False
 
     def record_pulse(self, start_us: int, end_us: int, energy_j: float) -> None:
-        """A pulse ended; it landed where the mirrors stood in its middle."""
+        """Record a pulse at the mirror angles of its mid-time."""
         x_m, y_m = self._geometry.position_m(*self._galvos.codes((start_us + end_us) // 2))
         if abs(float(x_m)) <= self._half_field_m[0] and abs(float(y_m)) <= self._half_field_m[1] and not self.blind:
             self._pulses.append(DetectedPulse(end_us, float(x_m), float(y_m), energy_j))
 
     def answer(self, request: str, now_us: int) -> str:
-        """The line that answers a line."""
+        """Return the line that answers a request line."""
         if request == "spot":
             return self._answer_spot(now_us)
         if request == "mirrors":
@@ -72,7 +72,7 @@ class SimulatedSpotSensor:
         return "error unknown request"
 
     def _answer_spot(self, now_us: int) -> str:
-        """The middle of all light since the last answer; what was told is forgotten."""
+        """Answer with the energy-weighted centroid of the pulses since the last answer, and clear them."""
         pulses = [pulse for pulse in self._pulses if pulse.at_us >= now_us - PULSE_MEMORY_US]
         self._pulses.clear()
         energy_j = sum(glimpse.energy_j for glimpse in pulses)

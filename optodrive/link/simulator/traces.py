@@ -1,4 +1,4 @@
-"""What the display does when pulses are executed: exact traces of the pixels that are looked at."""
+"""Exact traces of selected pixels of the display under executed pulses."""
 
 import numpy as np
 
@@ -7,13 +7,13 @@ from optodrive.core.types.plans import ExecutedPulses
 from optodrive.physics.thermal_state import ThermalState
 
 TRACE_TAIL_S = 0.2
-"""A trace goes on this long after the last pulse."""
+"""Duration of a trace after the last pulse."""
 TRACE_LEAD_S = 0.02
-"""A trace of a pixel's own pulses begins so long before the first of them."""
+"""Duration of a pixel's trace before its first pulse."""
 
 
 def compute_traces(cold_state: ThermalState, executed: ExecutedPulses, pixels: list[int], dt_s: float) -> PixelTrace:
-    """Traces from rest, sampled every dt_s from the plan's zero to a while after the last pulse."""
+    """Compute the traces of pixels from the cold state, every dt_s until a fixed tail after the plan."""
     end_s = float(executed.start_s[-1] + executed.width_s[-1]) if len(executed) else 0.0
     t_s = np.arange(0.0, end_s + TRACE_TAIL_S, dt_s)
     pulses = np.column_stack([executed.start_s, executed.width_s, executed.power_w, executed.pixel])
@@ -23,7 +23,7 @@ def compute_traces(cold_state: ThermalState, executed: ExecutedPulses, pixels: l
 def compute_pixel_trace(
     cold_state: ThermalState, executed: ExecutedPulses, pixel: int, dt_s: float, after_s: float
 ) -> PixelTrace:
-    """One pixel from rest, from a little before its own first pulse to after_s beyond the last, every dt_s."""
+    """Compute one pixel's trace from the cold state, every dt_s until after_s after its last pulse."""
     is_pixel = executed.pixel == pixel
     if not is_pixel.any():
         return cold_state.simulate_traces(np.zeros((0, 4)), [pixel], np.arange(0.0, after_s, dt_s))

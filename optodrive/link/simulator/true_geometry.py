@@ -1,7 +1,7 @@
-"""Where the beam of a simulated display really lands: two mirrors, a lens and a board, traced ray by ray.
+"""Ground-truth beam geometry of a simulated display: ray tracing over two mirrors, a lens and the display plane.
 
-No calibration sees this. The laser runs along +x to mirror x, which stands `mirrors_apart_m` from mirror y along +y and
-turns about z; mirror y turns about x and sends the beam along +z through the lens to the board.
+Calibrations have no access to it. The laser runs along +x to mirror x, which is `mirror_spacing_m` from mirror y along
++y and rotates about z; mirror y rotates about x and deflects the beam along +z through the lens to the display.
 """
 
 from dataclasses import dataclass
@@ -15,21 +15,23 @@ from optodrive.device.config import HALF_RANGE_CODES, Config, build_pixel_layout
 
 CENTRE_CODE = HALF_RANGE_CODES + 1
 HALF_FIELD_MIN_M = 0.01
-"""Half of the field on which deviations are drawn where a display has hardly any size."""
+"""Minimum half-width of the field over which the deviations are scaled."""
 WAVE_COUNT = 3
 MAX_ERROR_RANGE_M = (0.5e-3, 3.0e-3)
-"""A geometry is drawn again until the farthest miss of an uncorrected beam on the display lies between these."""
+"""Range of the maximum error of the uncorrected beam over the display; sampling repeats until it is met."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruthGeometry:
-    """One geometry. Pairs and arrays [2] are x and y.
+    """One geometry. Arrays [2] hold x and y.
 
-    nominal_rad_per_code, range_rad: the converter's; gain, offset_rad, cross, cubic: command to standing mirror angle,
+    nominal_rad_per_code, range_rad: of the DAC; gain, offset_rad, cross, cubic: command to steady mirror angle,
     cross from the other axis, cubic relative at the end of the range
-    lens_m: f1, f3, f5 of r = f1 θ + f3 θ³ + f5 θ⁵; focal_length_m: where its focal plane is; lens_at_m: from mirror y
-    board_at_m: the board's origin in the focal plane; board_axes: [3, 3] rows its x, y and normal
-    wave_rad, wave_phase, wave_m: [2, WAVES, 2], [2, WAVES], [2, WAVES] cosines over mirror angles that no part explains
+    lens_coefficients_m: f1, f3, f5 of r = f1 θ + f3 θ³ + f5 θ⁵; focal_length_m: distance of its focal plane
+    lens_position_m: distance from mirror y; display_origin_m: the display's origin in the focal plane
+    display_axes: [3, 3], rows are its x, y and normal
+    wave_rad, wave_phase, wave_m: [2, WAVE_COUNT, 2], [2, WAVE_COUNT], [2, WAVE_COUNT] unmodelled deviation as cosines
+    over the mirror angles
     """
 
     nominal_rad_per_code: float
@@ -53,7 +55,7 @@ class GroundTruthGeometry:
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:
-        """A geometry within a workshop's tolerances of what the configuration says; the same for the same seed."""
+        """Sample a geometry within assembly tolerances of the configuration; reproducible by seed."""
         random = np.random.default_rng(seed)
         layout = build_pixel_layout(config.display)
         twice_f_m = 2.0 * config.scanner.focal_length_m
@@ -65,7 +67,7 @@ class GroundTruthGeometry:
             max_error_m = float(np.hypot(x_m - layout.x_m, y_m - layout.y_m).max())
             if MAX_ERROR_RANGE_M[0] <= max_error_m <= MAX_ERROR_RANGE_M[1]:
                 return geometry
-        raise AssertionError(f"no geometry of seed {seed} misses by {MAX_ERROR_RANGE_M} m")
+        raise AssertionError(f"no geometry of seed {seed} has a maximum error within {MAX_ERROR_RANGE_M} m")
 
     @classmethod
     def _sample_once(cls, random: np.random.Generator, config: Config) -> Self:
@@ -77,7 +79,7 @@ class GroundTruthGeometry:
         rotation, tilt_x, tilt_y = np.radians(random.uniform(-1.0, 1.0, 3))
         orientation = _rotation_matrix(2, rotation) @ _rotation_matrix(0, tilt_x) @ _rotation_matrix(1, tilt_y)
         angle = random.uniform(0.0, 2.0 * np.pi, (2, WAVE_COUNT))
-        # One to two lengths of the field a wave.
+        # One to two field lengths per wave.
         waves_per_field = random.uniform(0.5, 1.0, (2, WAVE_COUNT))
         half_rad = half_field_m / (2.0 * scanner.focal_length_m)
         weights = random.uniform(0.3, 1.0, (2, WAVE_COUNT))
@@ -102,7 +104,7 @@ class GroundTruthGeometry:
         )
 
     def mirror_angles_rad(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Mechanical angles at which the mirrors stand for codes, whole or not; any shape."""
+        """Return the steady mechanical mirror angles of codes, integer or not; any shape."""
         codes = np.array(np.broadcast_arrays(x_code, y_code), dtype=np.float64) - CENTRE_CODE
         command_rad = codes * self.nominal_rad_per_code
         gain, offset_rad, cross, cubic = (
@@ -114,7 +116,7 @@ class GroundTruthGeometry:
         return x_rad, y_rad
 
     def landing_point_m(self, x_rad: ArrayLike, y_rad: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Where on the board, in its own axes, the beam lands while the mirrors stand at these angles; any shape."""
+        """Return the beam's landing point in the display's axes for mirror angles, m; any shape."""
         mirror_rad = np.array(np.broadcast_arrays(x_rad, y_rad), dtype=np.float64)
         start, direction = self._trace_mirrors(*mirror_rad)
         at_lens = start + direction * ((self.lens_position_m - start[2]) / direction[2])
@@ -138,7 +140,7 @@ class GroundTruthGeometry:
         return x_m + dx_m, y_m + dy_m
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Where on the board the beam lands for codes, whole or not; any shape, float64."""
+        """Return the beam's landing point on the display for codes, integer or not, m; any shape, float64."""
         return self.landing_point_m(*self.mirror_angles_rad(x_code, y_code))
 
     @property
@@ -146,7 +148,7 @@ class GroundTruthGeometry:
         return self.lens_position_m + self.focal_length_m
 
     def _trace_mirrors(self, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A point [3, ...] on mirror y and the direction [3, ...] in which the beam leaves it."""
+        """Return a point [3, ...] on mirror y and the direction [3, ...] of the beam after it."""
         zero = np.zeros_like(x_rad)
         x_angle, y_angle = 0.25 * np.pi + x_rad, 0.25 * np.pi - y_rad
         x_normal = np.stack([-np.cos(x_angle), -np.sin(x_angle), zero])
@@ -158,7 +160,7 @@ class GroundTruthGeometry:
         return first + intermediate * length, _reflect(intermediate, y_normal)
 
     def _deviation_m(self, mirror_rad: FloatArray) -> FloatArray:
-        """What no part explains, [2, ...]."""
+        """Return the unmodelled deviation, [2, ...], m."""
         phase = np.tensordot(self.wave_rad, mirror_rad, 1)
         shape = (2, WAVE_COUNT, *[1] * (mirror_rad.ndim - 1))
         waves = self.wave_m.reshape(shape) * np.cos(phase + self.wave_phase.reshape(shape))
@@ -167,13 +169,13 @@ class GroundTruthGeometry:
 
 
 def _reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
-    """Directions after a plane mirror, both [3, ...]; normals of length one."""
+    """Reflect directions at plane mirrors; directions and unit normals are [3, ...]."""
     mirrored: FloatArray = direction - 2.0 * (direction * normal).sum(axis=0) * normal
     return mirrored
 
 
 def _rotation_matrix(axis: int, angle_rad: float) -> FloatArray:
-    """Rotation about an axis, [3, 3]."""
+    """Return the rotation matrix about an axis, [3, 3]."""
     first, second = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
     matrix[first, first] = matrix[second, second] = np.cos(angle_rad)

@@ -1,6 +1,6 @@
-"""What each pixel of a simulated display really is: how high it stands, where its absorber lies, and whether it lives.
+"""Ground truth of the pixels of a simulated display: displacement gain, absorber position, and dead pixels.
 
-No calibration sees this. Light that misses the absorber is lost here; in a real display it warms the wall.
+Calibrations have no access to it. Light beside the absorber is lost here; in a real display it heats the wall.
 """
 
 from dataclasses import dataclass, replace
@@ -18,12 +18,15 @@ GAIN_SIGMA, GAIN_RANGE = 0.15, (0.6, 1.5)
 OFFSET_SIGMA_M, OFFSET_MAX_M = 60e-6, 150e-6
 DEAD_SHARE = 0.04
 DEAD_GAIN_MAX = 0.04
-"""What is left of a dead pixel's displacement, at the most."""
+"""Maximum displacement gain of a dead pixel."""
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruthPixels:
-    """All [p]. lift: displacement over the model's; x_m, y_m: the absorber's middle from the pixel's; dead: indices."""
+    """Pixel deviations from the model.
+
+    displacement_gain: [p] relative to the model; x_m, y_m: [p] absorber centre from the pixel's centre; dead: indices
+    """
 
     displacement_gain: FloatArray
     x_m: FloatArray
@@ -35,7 +38,7 @@ class GroundTruthPixels:
 
     @classmethod
     def sample(cls, seed: int, config: Config) -> Self:
-        """Pixels within a workshop's tolerances, one of 25 dead and one at least; the same for the same seed."""
+        """Sample pixels within manufacturing tolerances, 4 % dead but at least one; reproducible by seed."""
         random, count = np.random.default_rng([seed, 0x9135]), len(build_pixel_layout(config.display))
         displacement_gain = np.clip(np.exp(GAIN_SIGMA * random.standard_normal(count)), *GAIN_RANGE)
         x_m, y_m = np.clip(OFFSET_SIGMA_M * random.standard_normal((2, count)), -OFFSET_MAX_M, OFFSET_MAX_M)
@@ -45,11 +48,11 @@ class GroundTruthPixels:
         return cls(displacement_gain, x_m, y_m, dead)
 
     def apply_to(self, nominal: PixelArray) -> PixelArray:
-        """The display's pixels as they are."""
+        """Return the nominal pixels with the ground-truth displacement gains."""
         return replace(nominal, kappa_m_per_k=nominal.kappa_m_per_k * self.displacement_gain)
 
     def attenuate(self, executed: ExecutedPulses, config: Config) -> ExecutedPulses:
-        """What was executed, with the mean power that falls on each pixel's absorber."""
+        """Return the executed pulses with the mean power on each pixel's absorber."""
         display, laser, pixel_map = config.display, config.laser, load_pixel_map(config)
         share = np.ones(len(self.displacement_gain))
         for axis, side in (("x", "width"), ("y", "height")):

@@ -1,4 +1,4 @@
-"""A plan on the simulated board in virtual time: the real session, the real bytes, the board's own report."""
+"""Execution of a plan on the simulated board in virtual time, through the real session and protocol."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,10 @@ START_LEAD_S = 0.05
 def execute(
     display: DisplayModel, prepared: PlannedSequence, on_progress: Callable[[float], None] | None = None
 ) -> ExecutedPulses:
-    """Arm a fresh simulated board, stream the plan, give what the board says it did."""
+    """Arm a new simulated board, stream the plan, and return the pulses that the board reports.
+
+    Raise BoardFaultError if the board disarms or enters FAULT.
+    """
     clock = ManualClock(1.0)
     core = BoardCore(seed=1)
     session = BoardSession(MemoryLink(core, clock), clock, BoardRequirements.from_config(display.config))

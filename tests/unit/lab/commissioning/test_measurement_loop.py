@@ -7,7 +7,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.core.errors import InputError, OptodriveError, RefusedError
-from optodrive.lab.commissioning.session_file import CalibrationSession, SpotRow, save_text, session_path_for
+from optodrive.lab.commissioning.calibration_session import CalibrationSession, SpotRow, save_text, session_path_for
 from optodrive.lab.commissioning.spot_reader import robust_mean
 from optodrive.lab.commissioning.spot_sensor_client import SpotReading
 from optodrive.lab.commissioning.worker_process import WorkerProcess

@@ -14,10 +14,10 @@ CODES = (CENTRE_CODE + 9000, CENTRE_CODE - 4000)
 SETTLED_US = 100_000
 
 
-def looking(noise_m=10e-6, false_share=0.0, outputs=True):
+def looking(noise_m=10e-6, outlier_share=0.0, outputs=True):
     mirrors = SimulatedGalvos(CONFIG, seed=1)
     mirrors.move_to(*CODES, 0)
-    return SimulatedSpotSensor(CONFIG, TRUTH, mirrors, noise_m, false_share, outputs, seed=2), mirrors
+    return SimulatedSpotSensor(CONFIG, TRUTH, mirrors, noise_m, outlier_share, outputs, seed=2), mirrors
 
 
 def shine(sensor, at_us=SETTLED_US, energy_j=1e-4):
@@ -41,7 +41,7 @@ def test_it_sees_where_the_truth_says_with_its_noise():
 
 
 def test_nothing_in_the_dark_and_nothing_twice():
-    sensor, _ = looking(false_share=1.0)
+    sensor, _ = looking(outlier_share=1.0)
     assert sensor.answer("spot", 0) == "spot none"
     assert shine(sensor) != "spot none"
     assert sensor.answer("spot", SETTLED_US + 20_001) == "spot none"
@@ -60,7 +60,7 @@ def test_too_little_light_a_cover_and_a_spot_outside_are_none():
 
 
 def test_false_detections_lie_anywhere_and_are_as_many_as_asked():
-    sensor, _ = looking(false_share=0.2)
+    sensor, _ = looking(outlier_share=0.2)
     lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k))[:2] for k in range(1000)])
     away = np.hypot(*(lines - 1e6 * np.array(TRUTH.position_m(*CODES))).T) > 100.0
     assert away.mean() == pytest.approx(0.2, abs=0.04)

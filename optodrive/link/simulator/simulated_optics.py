@@ -1,4 +1,4 @@
-"""What stands around a simulated board: mirrors, a geometry nobody is told, and the spot sensor on its own port."""
+"""The optics of a simulated board: galvos, a ground-truth geometry, and the spot sensor on its own port."""
 
 import os
 from contextlib import suppress
@@ -19,7 +19,7 @@ LINE_MAX = 64
 
 
 class SimulatedOptics:
-    """The sensor's process side: it follows the board's log, and answers on its own pty."""
+    """Galvos and spot sensor that follow the board's log; the sensor answers on its own pty."""
 
     def __init__(
         self,
@@ -31,11 +31,11 @@ class SimulatedOptics:
         outlier_share: float = 0.02,
         has_position_outputs: bool = True,
     ) -> None:
-        mirrors_seed, sensor_seed = np.random.SeedSequence(seed).spawn(2)  # apart from what the truth is drawn from
-        self.mirrors = SimulatedGalvos(config, mirrors_seed)
+        galvos_seed, sensor_seed = np.random.SeedSequence(seed).spawn(2)  # independent of the geometry
+        self.galvos = SimulatedGalvos(config, galvos_seed)
         truth = GroundTruthGeometry.sample(seed, config)
         self._sensor = SimulatedSpotSensor(
-            config, truth, self.mirrors, noise_m, outlier_share, has_position_outputs, sensor_seed
+            config, truth, self.galvos, noise_m, outlier_share, has_position_outputs, sensor_seed
         )
         self._full_w = settings.limits.full_power_uw * 1e-6
         self._link = link
@@ -43,16 +43,16 @@ class SimulatedOptics:
         self._master: int | None = open_pty(link)
 
     def on_log_event(self, event: dict[str, Any]) -> None:
-        """Take over what the board logs."""
+        """Apply an event of the board's log."""
         if event["event"] == "pulse":
             width_s = (event["off_us"] - event["on_us"]) * 1e-6
             self._sensor.record_pulse(event["on_us"], event["off_us"], event["duty"] / 65535 * self._full_w * width_s)
 
     def answer_requests(self, now_us: int) -> None:
-        """Answer what was asked."""
+        """Answer the requests that have arrived."""
         if self._master is None:
             return
-        with suppress(OSError):  # nothing there, or no host has the port open
+        with suppress(OSError):  # empty, or no host has the port open
             self._buffer += os.read(self._master, READ_MAX)
         *lines, self._buffer = self._buffer.split(b"\n")
         self._buffer = self._buffer[-LINE_MAX:]
@@ -62,11 +62,11 @@ class SimulatedOptics:
                 os.write(self._master, answer.encode("ascii") + b"\n")
 
     def inject_fault(self, kind: str, at_us: int) -> None:
-        """`stick_x`, `stick_y`, `invert_readback`, `blind_sensor`, `unplug_sensor`."""
+        """Inject a fault: `stick_x`, `stick_y`, `invert_readback`, `blind_sensor` or `unplug_sensor`."""
         if kind in ("stick_x", "stick_y"):
-            self.mirrors.stick("xy".index(kind[-1]), at_us)
+            self.galvos.stick("xy".index(kind[-1]), at_us)
         elif kind == "invert_readback":
-            self.mirrors.readback_inverted = True
+            self.galvos.readback_inverted = True
         elif kind == "blind_sensor":
             self._sensor.blind = True
         elif kind == "unplug_sensor":
@@ -75,7 +75,7 @@ class SimulatedOptics:
             raise ValueError(kind)
 
     def close(self) -> None:
-        """The port vanishes."""
+        """Close and remove the port."""
         if self._master is not None:
             os.close(self._master)
             self._master = None
