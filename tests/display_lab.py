@@ -1,4 +1,4 @@
-"""A recording of many pixels by the small lab: each pixel has its own runs, and some have something hidden."""
+"""A recording of many pixels by the small lab: each pixel has runs of its own and may have hidden terms."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ from optodrive.core.types.measurements import Measurement
 
 
 def display_lab(hidden, seed=0, **design):
-    """hidden: pixel → terms; design: as lab has it."""
+    """Record a display; hidden: pixel → terms; design: as lab takes it."""
     runs = []
     for pixel, terms in hidden.items():
         for run in lab(seed + pixel, terms, **design).runs:

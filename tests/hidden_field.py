@@ -1,4 +1,4 @@
-"""Spots of hidden geometries, and how far a field made from them is off over the whole display."""
+"""Spots of hidden geometries, and the error of a field fitted to them over the whole display."""
 
 import numpy as np
 
@@ -18,18 +18,18 @@ NOISE_M = 10e-6
 
 
 def grid_codes(side):
-    """A square grid over the display, uncorrected codes, [side², 2]."""
+    """Return a square grid over the display, uncorrected codes, [side², 2]."""
     at = np.rint(CENTRE_CODE + np.linspace(-HALF_M, HALF_M, side) / CODE_M)
     return np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
 
 
 def random_codes(random, count):
-    """Anywhere on the display, [count, 2]."""
+    """Return random codes over the display, [count, 2]."""
     return np.rint(CENTRE_CODE + random.uniform(-HALF_M, HALF_M, (count, 2)) / CODE_M)
 
 
 def measure_spots(truth, codes, random, outlier_fraction=0.02, noise_m=NOISE_M):
-    """Spots as a sensor sees them, and which are false: anywhere on the display."""
+    """Return spots as a sensor measures them, and which are outliers, distributed over the display."""
     places = np.column_stack(truth.position_m(codes[:, 0], codes[:, 1]))
     places = places + noise_m * random.standard_normal(places.shape)
     is_outlier = random.random(len(codes)) < outlier_fraction
@@ -38,14 +38,14 @@ def measure_spots(truth, codes, random, outlier_fraction=0.02, noise_m=NOISE_M):
 
 
 def field_errors_m(truth: GroundTruthGeometry, field, count=1500):
-    """How far off the beam lands where the field sends it, anywhere on the display's square, [2, count]; codes too."""
+    """Return the beam's error at random targets over the display's square, [2, count], and their codes."""
     target_m = np.random.default_rng(99).uniform(-HALF_M, HALF_M, (2, count))
     codes = field.codes(*target_m)
     return np.array(truth.position_m(*codes)) - target_m, codes
 
 
 def calibrate_hidden_field(path, seed=0, side=17):
-    """Calibrate a hidden geometry as a user would and write its field; the geometry, and a configuration with it."""
+    """Calibrate a hidden geometry as a user would and write its field; return the geometry and the configuration."""
     truth = GroundTruthGeometry.sample(seed, CONFIG)
     spots, _ = measure_spots(truth, grid_codes(side), np.random.default_rng([seed, side]))
     write_field(path, fit_field(spots, PRIOR))
@@ -53,7 +53,7 @@ def calibrate_hidden_field(path, seed=0, side=17):
 
 
 def config_with_field(path, config=CONFIG, **scanner):
-    """The configuration with a field."""
+    """Return the configuration with a field."""
     table = config.model_dump()
     table["scanner"] |= {"field": str(path)} | scanner
     return Config.model_validate(table)

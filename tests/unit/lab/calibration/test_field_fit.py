@@ -1,4 +1,4 @@
-"""Done when: geometries nobody tuned on (tuning used seeds from 1000), noise 10 µm on an axis, 2 % false detections."""
+"""Accuracy of the fit on geometries not used for tuning (seeds from 1000), 10 µm noise per axis, 2 % outliers."""
 
 from functools import cache
 
@@ -16,7 +16,7 @@ GEOMETRIES = range(10)
 
 @cache
 def fit_geometries(side, outlier_fraction=0.02):
-    """For each geometry: misses in metres [2, k], the sigma stated there [k], the fit, which spots were false."""
+    """Return for each geometry: errors in metres [2, k], the stated sigma there [k], the fit, and the true outliers."""
     out = []
     for seed in GEOMETRIES:
         truth = GroundTruthGeometry.sample(seed, CONFIG)
@@ -44,7 +44,7 @@ def test_from_289_spots_5_um_rms_and_25_um_at_most():
 
 
 def test_from_25_spots_10_um_rms():
-    """On an axis, as noise is given, for each geometry; in length for all of them together."""
+    """Per axis, as noise is given, for each geometry; in length for all of them together."""
     results = fit_geometries(5)
     for miss_m, *_ in results:
         assert axis_rms_m(miss_m) <= 10e-6
@@ -57,25 +57,25 @@ def test_from_9_spots_25_um_rms():
 
 
 @pytest.mark.parametrize("side", [17, 5, 3])
-def test_two_stated_sigmas_cover_the_truth_as_often_as_they_should(side):
+def test_two_stated_sigmas_cover_the_truth_with_nominal_frequency(side):
     covered = [np.abs(miss_m) <= 2.0 * sigma_m for miss_m, sigma_m, *_ in fit_geometries(side)]
     assert 0.90 <= np.mean(covered) <= 0.98
 
 
-def test_false_detections_are_found_and_true_ones_kept():
+def test_outliers_are_rejected_and_inliers_kept():
     for share in (0.02, 0.2):
         for *_, fit, false in fit_geometries(17, share):
             assert np.array_equal(fit.outlier, false)
 
 
-def test_with_a_fifth_of_289_false_the_field_is_still_as_good():
+def test_a_fifth_of_outliers_among_289_spots_does_not_degrade_the_field():
     for miss_m, *_ in fit_geometries(17, 0.2):
         assert axis_rms_m(miss_m) <= 5e-6
         assert lengths_m(miss_m).max() <= 25e-6
 
 
-def test_without_rejection_false_detections_would_spoil_it():
-    """The mutant: every spot believed."""
+def test_without_rejection_outliers_would_spoil_the_field():
+    """Mutant: every spot is accepted."""
     truth = GroundTruthGeometry.sample(0, CONFIG)
     spots, false = measure_spots(truth, grid_codes(17), np.random.default_rng(3))
     assert false.any()
@@ -83,7 +83,7 @@ def test_without_rejection_false_detections_would_spoil_it():
     assert lengths_m(field_errors_m(truth, believed.field)[0]).max() > 25e-6
 
 
-def test_noise_is_found_out():
+def test_the_noise_is_estimated():
     for noise_m in (3e-6, 10e-6, 30e-6):
         truth = GroundTruthGeometry.sample(1, CONFIG)
         spots, _ = measure_spots(truth, grid_codes(17), np.random.default_rng(5), noise_m=noise_m)
@@ -91,14 +91,14 @@ def test_noise_is_found_out():
 
 
 @pytest.mark.slow
-def test_spots_anywhere_do_as_well_where_there_are_many():
+def test_many_random_spots_are_as_good_as_a_grid():
     for seed in GEOMETRIES:
         truth, random = GroundTruthGeometry.sample(seed, CONFIG), np.random.default_rng([seed, 1])
         spots, _ = measure_spots(truth, random_codes(random, 289), random)
         assert axis_rms_m(field_errors_m(truth, fit_field(spots, PRIOR).field)[0]) <= 5e-6
 
 
-def test_from_nothing_the_nominal_field_and_a_sigma_of_millimetres():
+def test_without_spots_the_field_is_nominal_with_a_sigma_of_millimetres():
     fit = fit_field(MeasuredSpots.from_table(np.zeros((0, 4))), PRIOR)
     x_m, y_m = fit.field.position_m(32768.0 + 5000.0, 32768.0)
     assert x_m == pytest.approx(5000 * 2 * PRIOR.focal_length_m * PRIOR.rad_per_code, rel=0.01)
@@ -106,13 +106,13 @@ def test_from_nothing_the_nominal_field_and_a_sigma_of_millimetres():
     assert 1e-3 < fit.field.sigma_m(32768.0, 32768.0) < 1e-2
 
 
-def test_outside_what_it_was_made_for_nothing_is_claimed():
+def test_sigma_is_infinite_outside_the_field():
     fit = fit_field(MeasuredSpots.from_table(np.zeros((0, 4))), PRIOR)
     assert np.isinf(fit.field.sigma_m(np.array([65000.0, np.nan]), np.array([32768.0, np.nan]))).all()
 
 
-def test_the_next_spot_is_where_it_helps_most():
-    """Against trying each, by what a measurement adds to the inverse of the covariance."""
+def test_the_next_spot_minimises_the_variance():
+    """Compare with each candidate's update of the inverse covariance."""
     truth, random = GroundTruthGeometry.sample(2, CONFIG), np.random.default_rng(8)
     fit = fit_field(measure_spots(truth, grid_codes(3)[:6], random, 0.0)[0], PRIOR, NOISE_M)
     candidates = grid_codes(5)
@@ -128,7 +128,7 @@ def test_the_next_spot_is_where_it_helps_most():
 
 
 @pytest.mark.slow
-def test_spots_as_proposed_reach_10_um_with_25():
+def test_25_proposed_spots_reach_10_um():
     for seed in (0, 1, 2):
         truth, random = GroundTruthGeometry.sample(seed, CONFIG), np.random.default_rng([seed, 2])
         table, candidates = np.zeros((0, 4)), grid_codes(13)

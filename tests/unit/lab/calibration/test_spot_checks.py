@@ -1,3 +1,5 @@
+"""Checks of spots: valid spots pass, and the cause of invalid ones is named."""
+
 import numpy as np
 import pytest
 
@@ -45,14 +47,14 @@ WRONG_TABLES = {
 
 
 @pytest.mark.parametrize("table", [MANY, NINE, SIX], ids=["289", "9", "6"])
-def test_true_spots_pass(table):
+def test_valid_spots_pass(table):
     check_spots("spots.csv", MeasuredSpots.from_table(table), PRIOR)
     check_fit("spots.csv", fit_field(MeasuredSpots.from_table(table), PRIOR))
 
 
 @pytest.mark.parametrize("named", WRONG_TABLES)
 @pytest.mark.parametrize("table", [MANY, NINE, SIX], ids=["289", "9", "6"])
-def test_wrong_spots_are_named_as_what_they_are(named, table):
+def test_the_cause_of_invalid_spots_is_named(named, table):
     with pytest.raises(InputError, match=named) as caught:
         check_spots("spots.csv", MeasuredSpots.from_table(WRONG_TABLES[named](table)), PRIOR)
     assert "\n" not in str(caught.value)
@@ -71,13 +73,13 @@ def test_wrong_spots_are_named_as_what_they_are(named, table):
         ("x_code,y_code,x_m,y_m\n0.01,0.02,0.01,0.02\n", "look like metres"),
     ],
 )
-def test_a_file_that_is_none_of_spots_is_refused(tmp_path, text, named):
+def test_a_file_without_spots_is_refused(tmp_path, text, named):
     path = tmp_path / "spots.csv"
     path.write_text(text)
     with pytest.raises(InputError, match=named):
         read_spots(path)
 
 
-def test_spots_there_and_back(tmp_path):
+def test_spots_round_trip(tmp_path):
     write_spots(tmp_path / "spots.csv", MeasuredSpots.from_table(MANY))
     assert np.allclose(read_spots(tmp_path / "spots.csv").to_table(), MANY, atol=1e-10)

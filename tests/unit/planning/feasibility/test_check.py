@@ -1,4 +1,4 @@
-"""Who breaks it, what is proven, what would fit, and what each face of refusal carries."""
+"""Feasibility check: the violation, the proof, the nearest feasible variants, and the content of refusals."""
 
 import json
 from dataclasses import replace
@@ -39,72 +39,72 @@ LATE_FRAME = build_frame(range(40), duration_s=0.1)
 HOT_FRAMES = [build_frame([200, 201], 300, 0.1 * k, 0.1, f"f{k}") for k in range(6)]
 
 
-def test_what_fits_costs_its_plan_and_no_more():
-    prepared, admission = check(build_frame(range(20)))
-    assert admission.fits
-    assert admission.proof == "planned"
-    assert admission.plans_tried == 0
-    assert 0 < admission.beam_required_s < admission.beam_available_s == pytest.approx(1.0)
-    alone = plan_sequence(DISPLAY, prepared.sequence, *DISPLAY.build_cold_state())
-    assert np.array_equal(prepared.plan.start_s, alone.plan.start_s)
+def test_a_feasible_sequence_costs_one_plan():
+    planned, report = check(build_frame(range(20)))
+    assert report.fits
+    assert report.proof == "planned"
+    assert report.plans_tried == 0
+    assert 0 < report.beam_required_s < report.beam_available_s == pytest.approx(1.0)
+    alone = plan_sequence(DISPLAY, planned.sequence, *DISPLAY.build_cold_state())
+    assert np.array_equal(planned.plan.start_s, alone.plan.start_s)
 
 
-def test_a_late_frame_is_named_with_what_it_needs_and_what_fits():
-    prepared, admission = check(LATE_FRAME)
-    assert not admission.fits
-    assert (admission.proof, admission.reason, admission.name) == ("bound", "deadline", "f")
-    assert admission.beam_required_s == pytest.approx(0.1 + prepared.frames[0].late_s)
-    assert admission.beam_available_s == pytest.approx(0.1)
-    assert 0.1 < admission.beam_lower_bound_s <= admission.beam_required_s
-    assert admission.plans_tried <= admission.plans_tried_max
-    nearest = admission.nearest
+def test_a_late_frame_is_reported_with_its_beam_time_and_the_nearest_feasible():
+    planned, report = check(LATE_FRAME)
+    assert not report.fits
+    assert (report.proof, report.reason, report.name) == ("bound", "deadline", "f")
+    assert report.beam_required_s == pytest.approx(0.1 + planned.frames[0].late_s)
+    assert report.beam_available_s == pytest.approx(0.1)
+    assert 0.1 < report.beam_lower_bound_s <= report.beam_required_s
+    assert report.plans_tried <= report.plans_tried_max
+    nearest = report.nearest
     assert nearest.complete
     assert nearest.pixels.kept + len(nearest.pixels.omitted[0].pixels) == nearest.pixels.requested == 40
-    assert nearest.time_factor == pytest.approx(admission.beam_required_s / 0.1, rel=0.02)
+    assert nearest.time_factor == pytest.approx(report.beam_required_s / 0.1, rel=0.02)
     for word in ("needs", "takes at least", f"{nearest.pixels.kept} of 40 pixels", f"× {nearest.height_factor:g}"):
-        assert word in admission.message
-    assert json.loads(json.dumps(admission.to_dict()))["nearest"]["time_factor"] == nearest.time_factor
+        assert word in report.message
+    assert json.loads(json.dumps(report.to_dict()))["nearest"]["time_factor"] == nearest.time_factor
 
 
-def test_an_order_that_fits_is_found_and_played():
-    """The long pulse does not fit before the train's, the short one does."""
+def test_an_order_that_fits_is_found_and_planned():
+    """The long pulse does not fit before the train's pulse, the short one does."""
     train = PulseTrain(9, 0.0045, 0.001, 0.001, 0.001, 0.5)
     both = build_frame([0, 1], [100.0, 40.0], duration_s=0.0134)
     sequence = FrameSequence((both,), (train,))
     late = plan_sequence(DISPLAY, sequence, *DISPLAY.build_cold_state())
     assert late.frames[0].late_s > 0
-    prepared, admission = check(both, trains=[train])
-    assert admission.fits
-    assert admission.proof == "searched"
-    assert admission.plans_tried <= 3
-    assert prepared.plan.pixel.tolist() == [1, 9, 0]
-    assert prepared.frames[0].late_s == 0
+    planned, report = check(both, trains=[train])
+    assert report.fits
+    assert report.proof == "searched"
+    assert report.plans_tried <= 3
+    assert planned.plan.pixel.tolist() == [1, 9, 0]
+    assert planned.frames[0].late_s == 0
 
 
-def test_a_frame_that_is_nearly_late_is_searched_through():
+def test_a_frame_near_its_deadline_is_searched_exhaustively():
     first = build_frame([0, 1, 2], 100, duration_s=0.02)
-    _, admission = check(first, replace(first, frame_id="again", show_at_s=0.02, duration_s=0.003))
-    assert (admission.fits, admission.proof, admission.name) == (False, "searched", "again")
-    assert admission.plans_tried > 6
+    _, report = check(first, replace(first, frame_id="again", show_at_s=0.02, duration_s=0.003))
+    assert (report.fits, report.proof, report.name) == (False, "searched", "again")
+    assert report.plans_tried > 6
 
 
-def test_nothing_is_claimed_beyond_what_was_shown():
-    """The second frame's pixels have been lit: the bound does not know their heat, and the orders are too many."""
+def test_an_inconclusive_search_proves_nothing():
+    """The second frame's pixels have been driven: their thermal state is not bounded, and the orders are too many."""
     first = build_frame(range(30), 60, 0.0, 0.2, "a")
-    _, admission = check(first, build_frame(range(30), 60, 0.2, 0.09, "b"))
-    assert (admission.fits, admission.proof, admission.name) == (False, "not found", "b")
-    assert "does not prove" in admission.message
-    assert admission.beam_required_s > admission.beam_available_s
+    _, report = check(first, build_frame(range(30), 60, 0.2, 0.09, "b"))
+    assert (report.fits, report.proof, report.name) == (False, "not found", "b")
+    assert "does not prove" in report.message
+    assert report.beam_required_s > report.beam_available_s
 
 
-def test_the_bound_claims_nothing_with_terms_in_the_model():
+def test_there_is_no_lower_bound_with_planner_terms():
     terms = replace(DISPLAY, parameters=DISPLAY.parameters.model_copy(update={"planner_terms": ("droop",)}))
     given = FrameSequence((LATE_FRAME,)), DISPLAY.build_cold_heat(), 0, 0.002
     assert beam_lower_bound_s(terms, *given) is None
     assert beam_lower_bound_s(DISPLAY, *given) > 0.1
 
 
-def test_pixels_lit_before_are_not_counted_in_the_bound():
+def test_the_lower_bound_excludes_pixels_driven_before():
     given = DISPLAY.build_cold_heat(), 1, 0.002
     alone = beam_lower_bound_s(
         DISPLAY, FrameSequence((build_frame([5], name="a"), build_frame([6, 7], show_at_s=1.0))), *given
@@ -112,23 +112,23 @@ def test_pixels_lit_before_are_not_counted_in_the_bound():
     shared = beam_lower_bound_s(
         DISPLAY, FrameSequence((build_frame([6], name="a"), build_frame([6, 7], show_at_s=1.0))), *given
     )
-    of_train = FrameSequence(
+    with_train = FrameSequence(
         (build_frame([5]), build_frame([6, 7], show_at_s=1.0)), (PulseTrain(6, 0, 0.1, 0.01, 0.01, 1.0),)
     )
     assert shared < 0.6 * alone
-    assert beam_lower_bound_s(DISPLAY, of_train, *given) == pytest.approx(shared)
+    assert beam_lower_bound_s(DISPLAY, with_train, *given) == pytest.approx(shared)
 
 
-def test_a_cap_is_named_as_what_breaks_it():
-    prepared, admission = check(*HOT_FRAMES, display=with_caps(touch_k=2.0))
-    assert not admission.fits
-    assert admission.reason == "touch_temperature"
-    assert admission.pixel == prepared.shortfall.pixel
-    assert "touch surface temperature cap" in admission.message
-    assert 0 < admission.nearest.height_factor < 1 < admission.nearest.time_factor
+def test_a_violated_cap_is_named():
+    planned, report = check(*HOT_FRAMES, display=with_caps(touch_k=2.0))
+    assert not report.fits
+    assert report.reason == "touch_temperature"
+    assert report.pixel == planned.shortfall.pixel
+    assert "touch surface temperature cap" in report.message
+    assert 0 < report.nearest.height_factor < 1 < report.nearest.time_factor
 
 
-def test_refuse_carries_the_admission():
+def test_a_refusal_carries_the_report():
     with pytest.raises(RefusedError, match="nearest feasible") as late:
         check(LATE_FRAME, policy="refuse")
     assert late.value.code == "refused"
@@ -138,11 +138,11 @@ def test_refuse_carries_the_admission():
     assert hot.value.feasibility["reason"] == "touch_temperature"
 
 
-def test_delay_waits_and_says_that_it_did_not_fit():
-    prepared, admission = check(*HOT_FRAMES, display=with_caps(touch_k=2.0), policy="delay")
-    assert prepared.delays
-    assert not prepared.plan.trimmed_j.any()
-    assert admission.reason == "touch_temperature"
+def test_delay_waits_and_reports_infeasibility():
+    planned, report = check(*HOT_FRAMES, display=with_caps(touch_k=2.0), policy="delay")
+    assert planned.delays
+    assert not planned.plan.trimmed_j.any()
+    assert report.reason == "touch_temperature"
     with pytest.raises(OverBudgetError) as never:
         check(HOT_FRAMES[0], display=with_caps(absorber_k=60.0), policy="delay")
     assert never.value.feasibility["reason"] == "absorber_temperature"
@@ -152,29 +152,29 @@ def test_delay_waits_and_says_that_it_did_not_fit():
 @pytest.mark.parametrize("fit", ["even", "priority"])
 def test_best_effort_passes_every_policy(fit, how):
     frames = HOT_FRAMES if how else [LATE_FRAME]
-    prepared, admission = check(*frames, fit=fit, policy="refuse", **how)
-    assert not admission.fits
-    assert (admission.height_factor < 1) == (fit == "even")
-    assert bool(admission.omitted) == (fit == "priority")
-    assert not prepared.plan.trimmed_j.any()
-    assert all(timing.late_s == 0 for timing in prepared.frames)
+    planned, report = check(*frames, fit=fit, policy="refuse", **how)
+    assert not report.fits
+    assert (report.height_factor < 1) == (fit == "even")
+    assert bool(report.omitted) == (fit == "priority")
+    assert not planned.plan.trimmed_j.any()
+    assert all(timing.late_s == 0 for timing in planned.frames)
 
 
-def test_out_of_reach_is_refused_as_it_is_and_mended_on_request():
+def test_an_unreachable_target_is_refused_as_is_and_changed_on_request():
     with pytest.raises(InputError, match="target_um of pixel 3"):
         check(build_frame([3], 5000))
     _, lower = check(build_frame([3, 4], [1000, 100]), fit="even")
     assert lower.reason == "unreachable"
     assert lower.height_factor == pytest.approx(0.5, abs=0.02)
-    prepared, fewer = check(build_frame([3, 4], [1000, 100]), fit="priority")
+    planned, fewer = check(build_frame([3, 4], [1000, 100]), fit="priority")
     assert [(item.name, item.pixels) for item in fewer.omitted] == [("f", (3,))]
-    assert prepared.plan.pixel.tolist() == [4]
+    assert planned.plan.pixel.tolist() == [4]
     with pytest.raises(RefusedError, match="no part of it fits"):
         check(build_frame([3], 1000), fit="priority")
 
 
-def test_the_more_important_stays():
-    """A train that leaves a frame no time: whichever matters less goes."""
+def test_the_source_of_higher_priority_stays():
+    """A train leaves a frame no beam time; the one of lower priority is omitted."""
     train = PulseTrain(9, 0.0, 0.1, 0.02, 0.005, 0.3)
     _, first = check(build_frame([0, 1], 200, duration_s=0.05, priority=1), trains=[train], fit="priority")
     assert [(item.name, item.pixels) for item in first.omitted] == [("train 0", (9,))]
@@ -184,22 +184,22 @@ def test_the_more_important_stays():
 
 def test_a_large_frame_loses_few_pixels():
     target_um = np.linspace(20, 120, 60)
-    _, admission = check(build_frame(range(60), target_um, duration_s=0.22), fit="priority")
-    (left,) = admission.omitted
+    _, report = check(build_frame(range(60), target_um, duration_s=0.22), fit="priority")
+    (left,) = report.omitted
     assert max(left.pixels) == 59
     assert len(left.pixels) < 20
 
 
-def test_a_long_animation_is_thinned_in_rounds():
+def test_a_long_animation_is_reduced_in_bulk():
     frames = [build_frame(range(k % 7, 40 + k % 7), 60 + k % 5, 0.12 * k, 0.12, f"f{k}") for k in range(100)]
-    prepared, admission = check(*frames, fit="priority")
-    assert len(admission.omitted) > 50
-    assert 0.6 * 4000 < len(prepared.plan) < 4000
-    assert all(timing.late_s == 0 for timing in prepared.frames)
+    planned, report = check(*frames, fit="priority")
+    assert len(report.omitted) > 50
+    assert 0.6 * 4000 < len(planned.plan) < 4000
+    assert all(timing.late_s == 0 for timing in planned.frames)
 
 
-def test_nothing_is_tried_any_more_when_the_plans_are_spent(monkeypatch):
-    """What is tried without a plan shows no progress, and costs the lease where it lasts."""
+def test_an_exhausted_search_tries_no_more_sequences(monkeypatch):
+    """A try without a plan reports no progress, and the lease would expire during many of them."""
     tried = []
     true = order_search.OrderSearch.find_orders
     monkeypatch.setattr(
@@ -207,19 +207,19 @@ def test_nothing_is_tried_any_more_when_the_plans_are_spent(monkeypatch):
     )
     monkeypatch.setattr("optodrive.planning.feasibility.check.PULSES_REQUESTED_MAX", 0)
     frames = [build_frame(range(40), 60, 0.11 * k, 0.11, f"f{k}") for k in range(50)]
-    _, admission = check(*frames, fit="priority")
-    assert not admission.nearest.complete
-    assert sum(len(item.pixels) for item in admission.omitted) > 200
+    _, report = check(*frames, fit="priority")
+    assert not report.nearest.complete
+    assert sum(len(item.pixels) for item in report.omitted) > 200
     assert len(tried) < 80
 
 
-def test_trains_whose_moves_add_up_do_not_fit_and_one_move_does():
+def test_trains_whose_settling_times_add_up_do_not_fit():
     trains = [PulseTrain(200 + k, 0.015 * k, 0.015, 0.015, 0.015, 1.0) for k in range(3)]
     assert check(trains=trains[:2])[1].fits
-    _, admission = check(trains=trains)
-    assert (admission.fits, admission.proof, admission.name) == (False, "bound", "train 2")
-    assert admission.beam_required_s > admission.beam_available_s > 0.015
-    assert admission.nearest.height_factor is None
+    _, report = check(trains=trains)
+    assert (report.fits, report.proof, report.name) == (False, "bound", "train 2")
+    assert report.beam_required_s > report.beam_available_s > 0.015
+    assert report.nearest.height_factor is None
     with pytest.raises(RefusedError, match="no height fits"):
         check(trains=trains, fit="even")
     slower = stretch_sequence(build_pattern("experiment-6", {}, DISPLAY.config), 1.06)
@@ -227,19 +227,19 @@ def test_trains_whose_moves_add_up_do_not_fit_and_one_move_does():
 
 
 def test_progress_is_shown_while_orders_are_searched():
-    told = []
+    progress = []
     frames = [build_frame(range(4 * k, 4 * k + 4), 100, 0.05 * k, 0.05 if k < 1 else 0.0245, f"f{k}") for k in range(2)]
-    _, admission = check(*frames, trains=[PulseTrain(9, 0.0501, 0.02, 0.0004, 0.003, 0.3)], on_progress=told.append)
-    assert admission.plans_tried > 20
-    assert len(told) > admission.plans_tried
+    _, report = check(*frames, trains=[PulseTrain(9, 0.0501, 0.02, 0.0004, 0.003, 0.3)], on_progress=progress.append)
+    assert report.plans_tried > 20
+    assert len(progress) > report.plans_tried
 
 
-def test_a_search_ends_at_its_bound_and_proves_nothing(monkeypatch):
+def test_a_search_ends_at_its_limit_and_proves_nothing(monkeypatch):
     monkeypatch.setattr("optodrive.planning.feasibility.check.ORDERS_MAX", 5)
     monkeypatch.setattr("optodrive.planning.feasibility.check.count_orders", lambda sequence: 1)
     monkeypatch.setattr(order_search, "beam_lower_bound_s", lambda *given: None)
-    _, admission = check(build_frame(range(4), 100, duration_s=0.02))
-    assert (admission.fits, admission.proof) == (False, "not found")
+    _, report = check(build_frame(range(4), 100, duration_s=0.02))
+    assert (report.fits, report.proof) == (False, "not found")
 
 
 def test_every_order_is_visited_once():
@@ -251,7 +251,7 @@ def test_every_order_is_visited_once():
     assert seen == {(first, (), last) for first in permutations(range(3)) for last in permutations(range(2))}
 
 
-def test_orders_that_begin_alike_are_passed_over():
+def test_orders_with_the_same_prefix_are_skipped():
     ranks = [[0, 1, 2, 3]]
     firsts = []
     while order_search._advance_orders(ranks, 0, 0):
@@ -259,7 +259,7 @@ def test_orders_that_begin_alike_are_passed_over():
     assert firsts == [1, 2, 3]
 
 
-def test_changes_keep_what_they_do_not_change():
+def test_variants_keep_all_other_fields():
     trains = (PulseTrain(3, 0.1, 0.4, 0.02, 0.02, 1.0), PulseTrain(4, 0.32, 0.02, 0.02, 0.02, 2.0, 5))
     sequence = FrameSequence((build_frame([1, 2], priority=3),), trains)
     slow = stretch_sequence(sequence, 2.0)
@@ -274,23 +274,23 @@ def test_changes_keep_what_they_do_not_change():
     assert fewer.trains == trains[:1]
 
 
-def test_trains_by_height_are_made_lower_and_slower_as_a_whole():
+def test_height_trains_are_scaled_and_stretched():
     train = HeightTrain(3, 0.1, 0.4, 0.04, 300e-6, 100e-6, priority=2)
     sequence = FrameSequence((), (train,))
     assert scale_sequence(sequence, 0.5).trains == (replace(train, target_m=150e-6, peak_to_peak_m=50e-6),)
     assert stretch_sequence(sequence, 2.0).trains == (replace(train, start_s=0.2, duration_s=0.8, period_s=0.08),)
 
 
-def test_a_train_by_height_takes_its_time_from_a_frame():
-    """Both do not fit at full height; what is suggested does, though the train has other cycles then."""
+def test_a_height_train_takes_beam_time_from_a_frame():
+    """Both do not fit at full height; the scaled variant fits, although the train has other cycles then."""
     train = HeightTrain(9, 0.0, 0.5, 0.025, 250e-6, 60e-6)
     _, alone = check(build_frame(range(30), 60, duration_s=0.14))
     assert alone.fits
-    _, admission = check(build_frame(range(30), 60, duration_s=0.14), trains=[train])
-    assert (admission.fits, admission.name) == (False, "f")
-    assert admission.nearest.height_factor is not None
+    _, report = check(build_frame(range(30), 60, duration_s=0.14), trains=[train])
+    assert (report.fits, report.name) == (False, "f")
+    assert report.nearest.height_factor is not None
     lower = scale_sequence(
-        FrameSequence((build_frame(range(30), 60, duration_s=0.14),), (train,)), admission.nearest.height_factor
+        FrameSequence((build_frame(range(30), 60, duration_s=0.14),), (train,)), report.nearest.height_factor
     )
     assert check_feasibility(DISPLAY, lower, *DISPLAY.build_cold_state())[1].fits
     assert check(build_frame(range(30), 60, duration_s=0.14), trains=[train], fit="priority")[1].omitted

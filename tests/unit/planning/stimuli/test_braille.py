@@ -1,3 +1,5 @@
+"""Braille encoding against the code table of Unified English Braille."""
+
 import pytest
 
 from optodrive.core.errors import InputError
@@ -5,7 +7,7 @@ from optodrive.planning.stimuli.braille import encode_lines, encode_word
 
 
 def to_unicode_braille(text):
-    """Cells as the characters of the Unicode block of braille, dot n on bit n - 1."""
+    """Return cells as characters of the Unicode braille block, dot n on bit n - 1."""
     return " ".join(
         "".join(chr(0x2800 + sum(1 << dot - 1 for dot in cell)) for cell in encode_word(w)) for w in text.split()
     )

@@ -1,3 +1,5 @@
+"""The paper's six experiments: times, places and powers of their pulses."""
+
 import numpy as np
 import pytest
 
@@ -21,14 +23,14 @@ MIDDLE = 218
 
 
 def pulses(sequence):
-    """Start, width, power and pixel of every pulse, in order of time."""
+    """Return start, width, power and pixel of every pulse, in order of time."""
     check_trains(sequence.trains, "trains", CONFIG)
     rows = [(at, t.pulse_width_s, t.power_w, t.pixel) for t in sequence.trains for at in t.pulse_starts_s()]
     return np.array(sorted(rows)).T
 
 
 def places(pixels, centre=MIDDLE):
-    """(rows up, columns right) from the centre."""
+    """Return (rows up, columns right) from the centre."""
     pixels = pixels.astype(int)
     return list(
         zip(LAYOUT.row[pixels] - LAYOUT.row[centre], LAYOUT.column[pixels] - LAYOUT.column[centre], strict=True)
@@ -59,7 +61,7 @@ def test_experiment_1_moves_over_three_pixels_twice(direction, path):
 
 
 @pytest.mark.parametrize(("speed", "slot_s", "each"), [("16", 0.2, 2), ("32", 0.1, 1), ("64", 0.05, 1)])
-def test_experiment_2_goes_round_from_the_bottom_left(speed, slot_s, each):
+def test_experiment_2_turns_from_the_bottom_left(speed, slot_s, each):
     start_s, width_s, _, pixel = pulses(build_rotation(CONFIG, "e", "cw", speed, None))
     assert start_s == pytest.approx([k * slot_s + j * 0.096 for k in range(8) for j in range(each)])
     assert width_s == pytest.approx(0.025)
@@ -70,7 +72,7 @@ def test_experiment_2_goes_round_from_the_bottom_left(speed, slot_s, each):
     assert counter == [(-1, -1), (-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1)]
 
 
-def test_experiment_2_turns_as_it_says():
+def test_experiment_2_turns_in_the_given_direction():
     for direction, sign in (("cw", -1), ("ccw", 1)):
         pixel = pulses(build_rotation(CONFIG, "e", direction, "64", None))[3].astype(int)
         angle = np.unwrap(np.arctan2(LAYOUT.y_m[pixel], LAYOUT.x_m[pixel]))
@@ -110,7 +112,7 @@ def test_experiment_5_has_one_odd_stimulus(oddball, kind):
     assert len(start_s) == 2 * counts[other][0] + counts[kind][0]
 
 
-def test_experiment_5_takes_another_pause():
+def test_experiment_5_accepts_another_pause():
     assert sequence_end_s(build_temporal_pattern(CONFIG, "e", 1, "slow", 0.0, None)) == pytest.approx(0.8 + 0.39)
 
 
@@ -137,7 +139,7 @@ def test_a_finger_keeps_its_place_whatever_its_partner():
 
 @pytest.mark.parametrize("name", ["display-357", "display-437", "display-1511"])
 @pytest.mark.parametrize("digits", ["2-3", "2-5", "4-5"])
-def test_a_hand_fits_the_large_displays(name, digits):
+def test_a_hand_fits_on_the_large_displays(name, digits):
     assert len(pulses(build_two_fingers(load_config(name), "e", digits, None))[0]) == 40
 
 
@@ -157,7 +159,7 @@ def test_another_centre_moves_the_stimulus():
         (lambda config: build_localisation(config, "e", 1, 0), "display-16"),
     ],
 )
-def test_a_display_too_small_is_refused_with_what_is_needed(build, name):
+def test_a_display_too_small_is_refused_with_the_requirement(build, name):
     with pytest.raises(InputError, match=rf"e: centre: got \d+, expected a pixel with .* \({name} is") as caught:
         build(load_config(name))
     assert caught.value.code == "does_not_fit"

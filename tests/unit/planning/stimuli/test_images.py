@@ -1,3 +1,5 @@
+"""Images and animations as frames: fit, brightness, durations, and refusal of invalid files."""
+
 import subprocess
 import sys
 from io import BytesIO
@@ -28,12 +30,12 @@ def grey(array):
 
 
 def shown(file, invert=False):
-    """Brightness at every place, [rows from the top, columns], NaN in the corners."""
+    """Return the brightness at every place, [rows from the top, columns], NaN in the corners."""
     target = build_image(CONFIG, "t", file, 1.0, 0.0, invert).frames[0].target_m
     return np.where(LATTICE.index >= 0, target[LATTICE.index], np.nan)[::-1]
 
 
-def test_a_picture_of_the_lattice_is_taken_pixel_by_pixel():
+def test_an_image_of_the_lattice_is_mapped_pixel_by_pixel():
     values = np.random.default_rng(1).integers(20, 256, (21, 21))
     found = shown(encoded(grey(values)))
     assert np.count_nonzero(np.isnan(found)) == 4
@@ -50,14 +52,14 @@ def test_left_is_left_and_top_is_top():
     assert LATTICE.layout.y_m[pixel] == pytest.approx(9 * 3.6e-3)
 
 
-def test_places_average_over_their_area():
+def test_brightness_is_averaged_over_the_area_of_a_place():
     fine = np.random.default_rng(2).integers(50, 256, (63, 63))
     expected = fine.reshape(21, 3, 21, 3).mean(axis=(1, 3)) / 255
     found = shown(encoded(grey(fine)))
     assert np.nanmax(np.abs(found - expected)) < 1e-5
 
 
-def test_area_is_kept_when_sizes_do_not_divide():
+def test_area_is_preserved_when_sizes_do_not_divide():
     one = np.zeros((50, 50))
     one[20:30, 22:29] = 255
     found = shown(encoded(grey(one)))
@@ -65,20 +67,20 @@ def test_area_is_kept_when_sizes_do_not_divide():
 
 
 @pytest.mark.parametrize(("size", "rows", "columns"), [((42, 14), 7, 21), ((14, 42), 21, 7), ((1, 1), 21, 21)])
-def test_the_aspect_is_kept_and_the_picture_centred(size, rows, columns):
+def test_the_aspect_ratio_is_preserved_and_the_image_centred(size, rows, columns):
     bright = np.nan_to_num(shown(encoded(Image.new("L", size, 255))), nan=1.0) > 0.5
     found_rows, found_columns = np.flatnonzero(bright[:, 10]), np.flatnonzero(bright[10])
     assert (len(found_rows), len(found_columns)) == (rows, columns)
     assert found_rows.mean() == found_columns.mean() == 10
 
 
-def test_invert_raises_what_is_dark_but_not_what_lies_outside():
+def test_invert_raises_dark_areas_but_not_the_border():
     picture = Image.new("L", (42, 14), 0)
     assert not np.nan_to_num(shown(encoded(picture))).any()
     assert np.nansum(shown(encoded(picture), invert=True)) == pytest.approx(7 * 21, rel=1e-6)
 
 
-def test_what_is_transparent_is_dark_inverted_or_not():
+def test_transparency_is_dark_inverted_or_not():
     picture = Image.new("RGBA", (21, 21), (255, 255, 255, 0))
     picture.paste((255, 255, 255, 128), (0, 0, 21, 10))
     found = shown(encoded(picture))
@@ -119,7 +121,7 @@ def test_nearly_black_is_not_driven():
     assert build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 12)), 1.0, 0.0, False).frames[0].target_m.all()
 
 
-def test_white_is_the_height_asked_for():
+def test_white_is_the_target_height():
     frame = build_image(CONFIG, "t", encoded(Image.new("L", (9, 9), 255)), 50e-6, 0.0, False).frames[0]
     assert frame.target_m == pytest.approx(50e-6)
     assert frame.duration_s > 437 * 3e-3
@@ -133,7 +135,7 @@ def dots(count):
 
 
 @pytest.mark.parametrize("kind", ["GIF", "PNG"])
-def test_an_animation_moves_at_the_pace_of_its_file(kind):
+def test_an_animation_uses_the_durations_of_its_file(kind):
     file = encoded(*dots(4), kind=kind, duration=[50, 120, 10, 80], **({"disposal": 2} if kind == "GIF" else {}))
     frames = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
     assert [frame.duration_s for frame in frames] == pytest.approx([0.05, 0.12, 0.02, 0.08])
@@ -143,7 +145,7 @@ def test_an_animation_moves_at_the_pace_of_its_file(kind):
     ]
 
 
-def test_a_picture_that_takes_the_beam_longer_is_given_the_time_unless_a_rate_is_asked_for():
+def test_an_image_lasts_for_its_beam_time_unless_a_rate_is_given():
     file = encoded(Image.new("L", (21, 21), 255), *dots(1), kind="GIF", duration=50)
     slow = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
     assert slow[0].duration_s > 437 * 3e-3
@@ -153,17 +155,17 @@ def test_a_picture_that_takes_the_beam_longer_is_given_the_time_unless_a_rate_is
     assert [frame.show_at_s for frame in fast] == pytest.approx([0.0, 0.04])
 
 
-def test_the_first_picture_of_an_animation_is_its_picture():
+def test_build_image_uses_the_first_image_of_an_animation():
     frame = build_image(CONFIG, "t", encoded(*dots(3), kind="GIF", duration=50), 50e-6, 0.0, False).frames[0]
     assert np.flatnonzero(frame.target_m).tolist() == [int(LATTICE.index[10, 5])]
 
 
-def test_a_still_picture_is_an_animation_of_one():
+def test_a_still_image_is_an_animation_of_one_frame():
     (frame,) = build_animation(CONFIG, "t", encoded(*dots(1)), 50e-6, None, False).frames
     assert frame.duration_s == pytest.approx(0.1)
 
 
-def test_the_poster_of_a_png_is_no_part_of_its_animation():
+def test_the_default_image_of_a_png_is_not_part_of_its_animation():
     poster, *moving = dots(4)
     file = encoded(poster, *moving, default_image=True, duration=100)
     frames = build_animation(CONFIG, "t", file, 50e-6, None, False).frames
@@ -173,7 +175,7 @@ def test_the_poster_of_a_png_is_no_part_of_its_animation():
 
 
 @pytest.mark.parametrize("text", ["nan", "abc", "1e999", "-5"])
-def test_a_note_called_duration_is_not_a_duration(text):
+def test_a_text_chunk_named_duration_is_ignored(text):
     notes = PngImagePlugin.PngInfo()
     notes.add_text("duration", text)
     (frame,) = build_animation(CONFIG, "t", encoded(*dots(1), pnginfo=notes), 50e-6, None, False).frames
@@ -192,14 +194,14 @@ def refusal(file, build=build_image):
     [b"", b"no picture", b"%PDF-1.4", b"\x89PNG\r\n\x1a\n", b"GIF89a", encoded(Image.new("L", (9, 9)), kind="BMP")],
 )
 @pytest.mark.parametrize("build", [build_image, build_animation])
-def test_a_picture_that_is_no_picture_is_refused(file, build):
+def test_a_file_that_is_not_an_image_is_refused(file, build):
     code, message = refusal(file, build)
     assert code == "bad_picture"
     assert message.startswith("image: file: got ")
 
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG", "GIF"])
-def test_a_picture_cut_short_is_refused(kind):
+def test_a_truncated_image_is_refused(kind):
     noise = grey(np.random.default_rng(3).integers(0, 256, (64, 64)))
     file = encoded(noise, kind=kind)
     assert shown(file).shape == (21, 21)
@@ -209,13 +211,13 @@ def test_a_picture_cut_short_is_refused(kind):
         assert message.startswith("image: file: got ")
 
 
-def test_an_animation_cut_short_is_refused():
+def test_a_truncated_animation_is_refused():
     noise = [grey(np.random.default_rng(k).integers(0, 256, (64, 64))) for k in range(4)]
     file = encoded(*noise, kind="GIF", duration=50)
     assert refusal(file[: len(file) // 2], build_animation)[0] == "bad_picture"
 
 
-def test_large_pictures_are_refused_before_they_are_unpacked(monkeypatch):
+def test_large_images_are_refused_before_decoding(monkeypatch):
     code, message = refusal(encoded(Image.new("1", (5000, 4000))))
     assert code == "too_many"
     assert message == "image: file: got '5000 × 4000', expected a picture of at most 16000000 pixels"
@@ -234,7 +236,7 @@ def test_long_animations_are_refused(monkeypatch):
     assert refusal(file, build_animation)[0] == "too_many"
 
 
-def test_a_drawing_keeps_its_shape_on_every_display():
+def test_a_drawing_has_the_same_shape_on_every_display():
     picture = Image.new("L", (300, 300), 0)
     ImageDraw.Draw(picture).ellipse((30, 30, 270, 270), fill=255)
     for name in ("display-16", "display-357", "display-1511"):
@@ -246,7 +248,7 @@ def test_a_drawing_keeps_its_shape_on_every_display():
         assert bright[radius > 0.8 * half + 1].max(initial=0.0) == 0.0
 
 
-def test_pillow_is_loaded_only_for_pictures():
+def test_pillow_is_imported_only_for_images():
     code = (
         "import sys, optodrive.planning.stimuli.pattern_registry as p; p.describe_patterns();"
         " sys.exit('PIL' in sys.modules)"

@@ -1,3 +1,5 @@
+"""Pattern registry: defaults, argument conversion, refusals, and agreement with the documentation."""
+
 import json
 from base64 import b64encode
 from io import BytesIO
@@ -69,7 +71,7 @@ def test_defaults_lie_within_their_own_bounds(name):
     pattern.resolve_arguments({**given, **NEEDED.get(name, {})}, CONFIG)
 
 
-def test_text_from_a_command_line_and_numbers_mean_the_same():
+def test_text_and_numbers_give_the_same_arguments():
     typed = build_pattern("all", {"height_um": "75.5", "seconds": "0"}, CONFIG)
     given = build_pattern("all", {"height_um": 75.5, "seconds": 0}, CONFIG)
     assert typed.frames[0].target_m == pytest.approx(75.5e-6)
@@ -157,7 +159,7 @@ def test_flags_are_true_or_false():
         ("circle", {"radius_mm": 500}, "does_not_fit", "radius_mm: got 500.0"),
     ],
 )
-def test_wrong_requests_are_refused_in_one_line(name, given, code, says):
+def test_invalid_requests_are_refused_in_one_line(name, given, code, says):
     found, message = refusal(name, given)
     assert found == code
     assert says in message
@@ -167,7 +169,7 @@ def test_a_number_may_be_written_as_text():
     assert build_pattern("text", {"text": 42}, CONFIG).frames[0].target_m.any()
 
 
-def test_patterns_keep_the_limits_of_the_display():
+def test_patterns_respect_the_limits_of_the_display():
     limits = CONFIG.limits.model_copy(update={"pulse_width_max_s": 0.02})
     tight = CONFIG.model_copy(update={"limits": limits})
     assert build_pattern("experiment-1", {}, tight).trains
@@ -178,7 +180,7 @@ def test_patterns_keep_the_limits_of_the_display():
     assert build_pattern("experiment-4", {"level": 9}, weak).trains[0].power_w == 1.0
 
 
-def test_a_frame_every_display_can_draw_in_its_time():
+def test_full_frames_last_as_long_as_the_beam_needs_on_every_display():
     for name in ("display-16", "display-357", "display-1511"):
         config = load_config(name)
         for frame in build_pattern("all", {}, config).frames:

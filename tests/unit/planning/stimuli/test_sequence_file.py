@@ -1,3 +1,5 @@
+"""Sequence files: parsing, bounds, refusals and round trips."""
+
 import json
 import re
 import time
@@ -111,14 +113,14 @@ def test_it_round_trips():
         ({"targt_um": {}}, "unknown_key", "frames[0]: got 'targt_um', expected a known key, nearest is 'target_um'"),
     ],
 )
-def test_a_wrong_frame_is_refused(frame, code, says):
+def test_an_invalid_frame_is_refused(frame, code, says):
     found, message = refusal(body([frame]))
     assert found == code
     assert says in message
 
 
 @pytest.mark.parametrize("key", ["show_at_s", "duration_s", "target_um"])
-def test_a_frame_without_a_part_is_refused(key):
+def test_a_frame_without_a_required_key_is_refused(key):
     frame = {name: value for name, value in FRAME.items() if name != key}
     assert refusal({"frames": [frame]}) == (
         "missing_key",
@@ -127,7 +129,7 @@ def test_a_frame_without_a_part_is_refused(key):
 
 
 @pytest.mark.parametrize("key", list(TRAIN))
-def test_a_train_without_a_part_is_refused(key):
+def test_a_train_without_a_required_key_is_refused(key):
     train = {name: value for name, value in TRAIN.items() if name != key}
     assert refusal({"trains": [train]})[0] == "missing_key"
 
@@ -175,13 +177,13 @@ def test_abutting_frames_survive_the_rounding_of_sums():
         (b"[" * 200_000, "bad_json", "nests less deep"),
     ],
 )
-def test_what_is_no_sequence_is_refused(text, code, says):
+def test_text_that_is_not_a_sequence_is_refused(text, code, says):
     found, message = refusal(text)
     assert found == code
     assert says in message
 
 
-def test_a_value_too_deep_to_be_shown_is_refused():
+def test_a_value_nested_too_deep_for_its_repr_is_refused():
     deep = []
     for _ in range(5000):
         deep = [deep]
@@ -194,7 +196,7 @@ def test_a_pixel_named_twice_is_refused():
 
 
 @pytest.mark.parametrize("literal", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_numbers_that_are_none_are_refused_where_they_stand(literal):
+def test_non_finite_numbers_are_refused_with_their_place(literal):
     text = json.dumps(body([{"target_um": {"17": 50}}])).replace("50", literal)
     code, message = refusal(text)
     assert code == "bad_target"
@@ -204,7 +206,7 @@ def test_numbers_that_are_none_are_refused_where_they_stand(literal):
     assert "trains[0].gap_s" in message
 
 
-def test_every_cut_of_a_file_and_every_tail_is_refused():
+def test_every_truncation_and_every_suffix_of_a_file_is_refused():
     whole = json.dumps(body([{}], [{}]))
     parse_sequence(whole + " \n", CONFIG, "f")
     for length in range(len(whole)):
@@ -225,14 +227,14 @@ def test_too_many_frames_or_trains_are_refused(monkeypatch):
         validate_sequence(FrameSequence(frames=(frame,) * 3), "pattern", CONFIG)
 
 
-def test_the_bounds_hold_as_stated():
+def test_the_documented_bounds_hold():
     assert (sequence_file.FRAMES_MAX, sequence_file.TRAINS_MAX, train_json.PULSES_MAX) == (10_000, 10_000, 2_000_000)
     assert refusal({"trains": [TRAIN] * 10_001})[0] == "too_many"
     empty = [{"show_at_s": k, "duration_s": 1, "target_um": {}} for k in range(10_001)]
     assert refusal({"frames": empty})[0] == "too_many"
 
 
-def test_a_large_lattice_takes_fewer_frames(monkeypatch):
+def test_a_large_lattice_allows_fewer_frames(monkeypatch):
     monkeypatch.setattr(sequence_file, "TARGETS_MAX", 437 * 3)
     frames = [{"show_at_s": k, "duration_s": 1} for k in range(4)]
     assert len(parse_sequence(body(frames[:3]), CONFIG, "f").frames) == 3
@@ -260,7 +262,7 @@ def test_a_file_too_large_is_refused(tmp_path, monkeypatch):
         load_sequence(path, CONFIG)
 
 
-def test_json_alone():
+def test_parse_json_decodes_text():
     assert parse_json('{"a": [1, 2.5]}', "body") == {"a": [1, 2.5]}
     with pytest.raises(InputError, match="valid JSON"):
         parse_json(b"{'a': 1}", "body")
@@ -279,7 +281,7 @@ def _seconds(call):
     return time.process_time() - start_s
 
 
-def test_a_priority_is_read_written_and_refused_by_name():
+def test_a_priority_is_parsed_written_and_validated():
     sequence = parse_sequence(body([{"priority": 2}], [{"priority": -1}]), CONFIG, "f")
     assert (sequence.frames[0].priority, sequence.trains[0].priority) == (2, -1)
     written = sequence_to_json(sequence)

@@ -1,3 +1,5 @@
+"""Shapes, beam time estimates, refreshed pictures and the showcase."""
+
 from itertools import pairwise
 
 import numpy as np
@@ -63,11 +65,11 @@ def test_the_shortest_pulse_that_reaches_a_height(target_um):
     assert width_s / 2e-4 == pytest.approx(round(width_s / 2e-4))
 
 
-def test_a_height_out_of_reach_counts_as_the_longest_pulse():
+def test_an_unreachable_height_counts_as_the_longest_pulse():
     assert BeamTimeEstimator(CONFIG).min_pulse_s(1.0) == pytest.approx(0.05)
 
 
-def test_beam_time_is_pulses_and_moves():
+def test_beam_time_is_the_sum_of_pulses_and_settling_times():
     beam, target_m = BeamTimeEstimator(CONFIG), np.zeros(437)
     assert beam.beam_time_s(target_m) == 0.0
     target_m[200] = 50e-6
@@ -79,7 +81,7 @@ def test_beam_time_is_pulses_and_moves():
     )
 
 
-def test_a_picture_is_held_by_drawing_it_again():
+def test_a_picture_is_held_by_refreshing_it():
     beam, target_m = BeamTimeEstimator(CONFIG), np.full(437, 50e-6)
     frames = hold_picture(beam, target_m, 4.0, "x", start_s=1.0)
     each_s = beam.beam_time_s(target_m)
@@ -90,7 +92,7 @@ def test_a_picture_is_held_by_drawing_it_again():
     assert len(hold_picture(beam, np.zeros(437), 0.5, "x")) == 5
 
 
-def test_steps_last_as_asked_or_as_the_beam_needs():
+def test_steps_last_as_requested_or_as_the_beam_needs():
     beam, full, none = BeamTimeEstimator(CONFIG), np.full(437, 50e-6), np.zeros(437)
     first, second, third = build_steps(beam, [none, full, none], 0.2, "s")
     assert (first.duration_s, third.duration_s) == (0.2, 0.2)
@@ -161,7 +163,7 @@ def test_a_shape_beyond_the_display_is_refused(build):
     assert caught.value.code == "does_not_fit"
 
 
-def test_sequences_are_joined_with_pauses():
+def test_sequences_are_concatenated_with_pauses():
     first, second = build_all_pixels(CONFIG, "t", 50e-6, 0.0), build_intensity(CONFIG, "t", 5, None)
     joined = concatenate_sequences(first, second, first)
     assert joined.trains[0].start_s == pytest.approx(sequence_end_s(first) + 0.3)
@@ -170,7 +172,7 @@ def test_sequences_are_joined_with_pauses():
 
 
 @pytest.mark.parametrize("name", ["display-357", "display-437", "display-1511"])
-def test_the_showcase_is_short_and_has_everything(name):
+def test_the_showcase_is_short_and_complete(name):
     sequence = build_showcase(load_config(name), "showcase")
     assert 7.0 < sequence_end_s(sequence) < 10.5
     assert {frame.frame_id.split("-")[0] for frame in sequence.frames} == {"dot", "circle", "page"}

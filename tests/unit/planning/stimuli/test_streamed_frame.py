@@ -1,4 +1,4 @@
-"""Frames of a stream: both forms, what is refused, and whose turn it is."""
+"""Streamed frames: both encodings, refusals, and the order of refresh."""
 
 import struct
 
@@ -16,7 +16,7 @@ def binary(heights, number=7, magic=b"ODF1"):
     return struct.pack("<4sI", magic, number) + np.array(heights, dtype="<u2").tobytes()
 
 
-def test_text_and_bytes_say_the_same():
+def test_text_and_bytes_give_the_same_frame():
     number, by_bytes = parse_live_frame(binary([0, 500, 12345]), 0, 3)
     text_number, by_text = parse_live_frame('{"frame": 7, "target_um": {"1": 50, "2": 1234.5}}', 0, 3)
     assert number == text_number == 7
@@ -51,8 +51,8 @@ def test_bad_frames_are_refused_in_one_line(message, says):
 
 
 @given(st.data())
-def test_every_pixel_has_its_turn_however_fast_frames_come(data):
-    """Of each frame one pixel is lit, heights change all the time; within one sweep nothing goes before the unseen."""
+def test_every_pixel_is_refreshed_at_any_frame_rate(data):
+    """Of each frame one pixel is drawn and heights change; within a cycle no pixel precedes the stale ones."""
     count = data.draw(st.integers(1, 12))
     seen = np.zeros(count, dtype=bool)
     active = np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
@@ -68,6 +68,6 @@ def test_every_pixel_has_its_turn_however_fast_frames_come(data):
     assert not wanted
 
 
-def test_an_empty_frame_stays_one():
+def test_an_empty_frame_is_not_split():
     sequence = FrameSequence((TactileFrame("1", 0.0, 1.0, np.zeros(2)),))
     assert stale_pixels_first(sequence, np.zeros(2, dtype=bool)) == sequence

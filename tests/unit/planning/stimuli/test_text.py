@@ -1,3 +1,5 @@
+"""Text in braille: wrapping, pages and placement on the lattice."""
+
 from itertools import pairwise
 
 import numpy as np
@@ -13,13 +15,13 @@ CONFIG = load_config("display-437")
 
 
 def picture(frame, config=CONFIG):
-    """Rows of # and blanks, from the top."""
+    """Return rows of # and blanks, from the top."""
     lattice = Lattice.from_config(config)
     raised = np.where(lattice.index >= 0, frame.target_m[lattice.index] > 0, False)[::-1]
     return ["".join("#" if dot else " " for dot in row).rstrip() for row in raised]
 
 
-def test_words_stand_on_the_lattice():
+def test_words_are_placed_on_the_lattice():
     frame = build_text(CONFIG, "t", "hi you", 1e-4, 1.0).frames[0]
     assert picture(frame)[:5] == [
         "",
@@ -31,7 +33,7 @@ def test_words_stand_on_the_lattice():
     assert frame.target_m.max() == 1e-4
 
 
-def test_a_page_is_drawn_again_until_its_time_is_over():
+def test_a_page_is_refreshed_until_its_time_ends():
     frames = build_text(CONFIG, "t", "hi", 1e-4, 2.0).frames
     assert frames[-1].show_at_s + frames[-1].duration_s >= 2.0
     assert frames[0].duration_s == pytest.approx(0.1)
@@ -40,14 +42,14 @@ def test_a_page_is_drawn_again_until_its_time_is_over():
     assert all(a.show_at_s + a.duration_s == pytest.approx(b.show_at_s) for a, b in pairwise(frames))
 
 
-def test_text_too_long_for_a_page_goes_on():
+def test_text_too_long_for_a_page_continues_on_the_next():
     frames = build_text(CONFIG, "t", "one two three four five six seven eight nine ten", 1e-4, 0.0).frames
     assert [frame.frame_id for frame in frames] == ["page-1-0", "page-2-0"]
     assert picture(frames[0]) != picture(frames[1])
     assert all(a.show_at_s + a.duration_s <= b.show_at_s + 1e-9 for a, b in pairwise(frames))
 
 
-def test_words_wrap_and_the_longest_are_cut():
+def test_words_wrap_and_words_longer_than_a_row_are_split():
     cells = {letter: encode_word(letter)[0] for letter in "abcdefghi"}
     back = {cell: letter for letter, cell in cells.items()} | {SPACE: " "}
 
@@ -66,7 +68,7 @@ def test_words_wrap_and_the_longest_are_cut():
 
 @pytest.mark.parametrize("name", [name for name in list_shipped_configs() if name != "display-1"])
 @pytest.mark.parametrize("spacing", [Spacing(1, 1, 1), Spacing(1, 0, 0), Spacing(1, 2, 3)])
-def test_no_two_dots_share_a_pixel_and_none_falls_into_a_hole(name, spacing):
+def test_every_dot_has_a_pixel_of_its_own(name, spacing):
     lattice = Lattice.from_config(load_config(name))
     pixels = [pixel for line in find_line_slots(lattice, spacing) for slot in line for pixel in slot.values()]
     assert pixels
@@ -74,7 +76,7 @@ def test_no_two_dots_share_a_pixel_and_none_falls_into_a_hole(name, spacing):
     assert min(pixels) >= 0
 
 
-def test_lines_go_round_the_missing_corners():
+def test_lines_avoid_the_missing_corners():
     lengths = [
         len(line) for line in find_line_slots(Lattice.from_config(load_config("display-1511")), Spacing(1, 1, 1))
     ]
@@ -82,7 +84,7 @@ def test_lines_go_round_the_missing_corners():
     assert [len(line) for line in find_line_slots(Lattice.from_config(CONFIG), Spacing(1, 1, 1))] == [7] * 5
 
 
-def test_dots_lie_as_in_a_cell():
+def test_dots_are_arranged_as_in_a_cell():
     lattice = Lattice.from_config(CONFIG)
     slot = find_line_slots(lattice, Spacing(2, 1, 1))[0][0]
     x_m, y_m = lattice.layout.x_m, lattice.layout.y_m

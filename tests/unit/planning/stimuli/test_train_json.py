@@ -1,3 +1,5 @@
+"""Pulse trains and height trains from JSON: validation, overlaps and limits."""
+
 import time
 from dataclasses import replace
 
@@ -56,7 +58,7 @@ def refusal(*changes):
         ({"pulse_width": 1}, "unknown_key", "got 'pulse_width', expected a known key, nearest is 'pulse_width_s'"),
     ],
 )
-def test_a_wrong_train_is_refused(change, code, says):
+def test_an_invalid_pulse_train_is_refused(change, code, says):
     found, message = refusal(change)
     assert found == code
     assert says in message
@@ -65,7 +67,7 @@ def test_a_wrong_train_is_refused(change, code, says):
 HEIGHTS = {"pixel": 17, "start_s": 0.0, "duration_s": 1.0, "period_s": 0.04, "target_um": 300, "peak_to_peak_um": 120}
 
 
-def test_a_train_by_height_is_told_by_its_keys():
+def test_a_height_train_is_recognised_by_its_keys():
     (train,) = parse_sequence({"trains": [HEIGHTS]}, CONFIG, "f").trains
     assert train == HeightTrain(17, 0.0, 1.0, 0.04, pytest.approx(300e-6), pytest.approx(120e-6))
     assert len(train.pulse_starts_s()) == count_pulses(train) == 25
@@ -87,14 +89,14 @@ def test_a_train_by_height_is_told_by_its_keys():
         ({"duration_s": 1001, "period_s": 0.01}, "too_many", "got 100100, expected at most 100000 pulses in all"),
     ],
 )
-def test_a_wrong_train_by_height_is_refused(change, code, says):
+def test_an_invalid_height_train_is_refused(change, code, says):
     with pytest.raises(InputError) as caught:
         parse_sequence({"trains": [{**HEIGHTS, **change}]}, CONFIG, "frames.json")
     assert caught.value.code == code
     assert says in str(caught.value)
 
 
-def test_a_train_by_height_needs_its_keys_and_its_share_of_the_beam():
+def test_a_height_train_needs_its_keys_and_free_beam_time():
     for key in ("target_um", "period_s", "pixel"):
         with pytest.raises(InputError) as caught:
             parse_sequence({"trains": [{k: v for k, v in HEIGHTS.items() if k != key}]}, CONFIG, "f")
@@ -106,7 +108,7 @@ def test_a_train_by_height_needs_its_keys_and_its_share_of_the_beam():
     assert parse_sequence({"trains": [{**HEIGHTS, "start_s": 0.025}, {**TRAIN, "gap_s": 0.02}]}, CONFIG, "f").trains
 
 
-def test_a_train_by_height_is_written_as_it_was_read():
+def test_a_height_train_round_trips():
     once = parse_sequence({"trains": [HEIGHTS, {**HEIGHTS, "start_s": 0.01, "peak_to_peak_um": None}]}, CONFIG, "f")
     assert parse_sequence(sequence_to_json(once), CONFIG, "f").trains == once.trains
 
@@ -116,7 +118,7 @@ def test_the_limits_themselves_are_allowed():
     parse({"pulse_width_s": 0.0002, "duration_s": 1e-9})
 
 
-def test_a_width_near_whole_periods_is_played_as_them():
+def test_a_width_near_whole_periods_is_rounded():
     (train,) = parse({"pulse_width_s": 0.020001})
     assert train.pulse_width_s == pytest.approx(0.02, abs=1e-15)
     assert refusal({"pulse_width_s": 0.020003})[0] == "bad_train"
@@ -149,7 +151,7 @@ def test_one_nanosecond_is_the_tolerance():
     assert refusal({}, {"pixel": 18, "start_s": 0.02 - 1.2e-9})[0] == "overlapping_trains"
 
 
-def test_a_long_pulse_reaches_over_a_short_train_between():
+def test_a_long_pulse_overlaps_a_short_train_within_it():
     code, message = refusal(
         {"pulse_width_s": 0.05, "duration_s": 0.01}, {"pixel": 3, "start_s": 0.04, "pulse_width_s": 0.001}
     )
@@ -157,13 +159,13 @@ def test_a_long_pulse_reaches_over_a_short_train_between():
     assert "trains[1]: got 0.04" in message
 
 
-def test_too_many_pulses_are_refused_before_they_are_made():
+def test_too_many_pulses_are_refused_before_they_are_generated():
     code, message = refusal({"duration_s": 86_400, "pulse_width_s": 0.0002, "gap_s": 0.0002})
     assert code == "too_many"
     assert "got 216000000, expected at most 2000000 pulses" in message
 
 
-def test_pulses_are_counted_as_they_are_made():
+def test_the_pulse_count_matches_the_generated_pulses():
     for duration_s in (0.001, 0.08, 0.0800001, 0.3, 1.0):
         train = PulseTrain(0, 0.0, duration_s, 0.02, 0.06, 1.0)
         assert count_pulses(train) == len(train.pulse_starts_s())

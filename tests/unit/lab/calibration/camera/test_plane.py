@@ -1,4 +1,4 @@
-"""From rendered grids to places on the display, by cameras nothing was tuned on."""
+"""Map from rendered grids to the display, for cameras not used for tuning."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +43,7 @@ def position_errors_m(plane, camera):
     return np.hypot(*(plane.position_m(camera.pixel(PLACES_M)) - PLACES_M).T)
 
 
-def test_the_grid_lies_where_first_corner_and_turn_say():
+def test_the_grid_is_placed_by_first_corner_and_rotation():
     assert np.allclose(grid_corners_m(section(GRID), origin()), corners_m(), rtol=0.0, atol=1e-12)
 
 
@@ -61,7 +61,7 @@ def test_one_picture_of_the_grid_is_enough_for_5_um(cameras, grid):
 
 
 @pytest.mark.slow
-def test_several_give_the_camera():
+def test_several_views_calibrate_the_camera():
     plane = fit_rendered_plane((CAMERA, *TILTED))
     assert plane.camera is not None
     matrix, _ = plane.camera
@@ -69,8 +69,8 @@ def test_several_give_the_camera():
     assert np.sqrt((position_errors_m(plane, CAMERA) ** 2).mean()) < 5e-6
 
 
-def test_corners_that_are_off_make_the_plane_less_sure_as_much_as_they_do():
-    """Corners moved at random by a known amount, many times over."""
+def test_the_stated_sigma_matches_the_effect_of_corner_noise():
+    """Corners are moved at random by a known amount, many times."""
     random, exact = np.random.default_rng(3), CAMERA.pixel(corners_m().reshape(-1, 2))
     off, stated = [], []
     for _ in range(30):
@@ -83,8 +83,8 @@ def test_corners_that_are_off_make_the_plane_less_sure_as_much_as_they_do():
 
 
 @pytest.mark.slow
-def test_without_the_lens_it_would_miss():
-    """The mutant: a homography alone."""
+def test_a_homography_without_distortion_would_miss():
+    """Mutant: a homography alone."""
     exact = CAMERA.pixel(corners_m().reshape(-1, 2))
     straight = np.column_stack([exact, np.ones(len(exact))])
     places = corners_m().reshape(-1, 2)
@@ -97,7 +97,7 @@ def test_without_the_lens_it_would_miss():
 
 
 @pytest.mark.parametrize("turn", range(4))
-def test_marks_put_the_grid_right_in_whatever_order_it_was_found(turn):
+def test_marks_orient_the_grid_from_any_detected_order(turn):
     exact = CAMERA.pixel(corners_m().reshape(-1, 2)).reshape(*corners_m().shape)
     given = exact[:: 1 - 2 * (turn & 1), :: 1 - (turn & 2)]
     assert np.array_equal(orient_to_marks("it", given, origin()), exact)

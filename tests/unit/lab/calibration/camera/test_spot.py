@@ -1,4 +1,4 @@
-"""One spot in a picture: found, to a fraction of a pixel, or named as what is wrong. Tried out with seeds from 1000."""
+"""Detection of one spot in a picture: accuracy and refusals. Tuned with seeds from 1000."""
 
 import numpy as np
 import pytest
@@ -38,14 +38,14 @@ def error_px(seen, at):
     widths=st.tuples(st.floats(1.2, 6), st.floats(1.2, 6)),
     seed=st.integers(0, 999),
 )
-def test_anywhere_of_any_shape_within_a_tenth_of_a_pixel_and_five_stated_sigma(at, peak, widths, seed):
+def test_a_spot_of_any_shape_is_located_within_five_stated_sigmas(at, peak, widths, seed):
     seen = find_spot("it", take_picture(peak * draw_blob(at, widths), seed), DARK)
     assert error_px(seen, at) < min(0.25, max(0.05, 5.0 * seen.sigma_px))
     assert not seen.saturated_pixels
 
 
 @pytest.mark.parametrize("times", [2, 10, 50])
-def test_a_saturated_core_costs_no_accuracy_and_is_said(times):
+def test_a_saturated_core_costs_no_accuracy_and_is_reported(times):
     for seed in range(5):
         at = np.random.default_rng([seed, times]).uniform(50, 150, 2)
         seen = find_spot("it", take_picture(250.0 * times * draw_blob(at), seed), DARK)
@@ -66,7 +66,7 @@ def test_sixteen_bits_and_their_saturation():
 
 
 @pytest.mark.parametrize("share", [0.05, 0.2, 0.4])
-def test_a_weaker_reflection_is_left_aside(share):
+def test_a_weaker_reflection_is_ignored(share):
     for seed in range(10):
         at = np.random.default_rng([seed, 7]).uniform(60, 180, 2)
         turned = 2.0 * np.pi * seed / 10.0
@@ -76,7 +76,7 @@ def test_a_weaker_reflection_is_left_aside(share):
         assert seen.rival_fraction < RIVAL_FRACTION_MAX
 
 
-def test_a_reflection_that_touches_the_spot_makes_it_less_sure():
+def test_a_reflection_that_touches_the_spot_increases_its_sigma():
     at = np.array((120.2, 90.4))
     alone = find_spot("it", take_picture(180.0 * draw_blob(at)), DARK)
     touched = find_spot("it", take_picture(180.0 * (draw_blob(at) + 0.3 * draw_blob(np.add(at, (8.0, 2.0))))), DARK)
@@ -84,7 +84,7 @@ def test_a_reflection_that_touches_the_spot_makes_it_less_sure():
     assert error_px(touched, at) < 4.0 * touched.sigma_px
 
 
-def test_the_stated_sigma_is_what_noise_does():
+def test_the_stated_sigma_matches_the_effect_of_noise():
     at = np.array((120.2, 90.4))
     seen = [find_spot("it", take_picture(60.0 * draw_blob(at), seed, noise=4.0), DARK) for seed in range(40)]
     off = np.array([each.centre_px - at for each in seen])
@@ -92,7 +92,7 @@ def test_the_stated_sigma_is_what_noise_does():
     assert 0.7 < np.sqrt((off**2).mean()) / stated < 1.3
 
 
-def test_pixels_that_are_always_bright_and_a_change_of_the_room_light_are_no_spots():
+def test_hot_pixels_and_a_change_of_ambient_light_are_not_spots():
     at = (120.2, 90.4)
     shown = take_picture(150.0 * draw_blob(at) + 12.0)
     shown[30, 40] = shown[200, 300] = 255
@@ -121,7 +121,7 @@ def test_a_spot_on_the_edge_of_a_black_square_is_named():
 
 
 @pytest.mark.parametrize("case", sorted(REFUSED))
-def test_what_is_no_single_spot_is_named(case):
+def test_a_picture_without_a_single_spot_is_refused_with_the_cause(case):
     light, named = REFUSED[case]
     with pytest.raises(InputError, match=named):
         find_spot("it", take_picture(light), DARK)

@@ -1,4 +1,4 @@
-"""Gains and offsets from runs of hidden pixels; tuned on seeds from 100 on, tested on others."""
+"""Gains and offsets from runs of hidden pixels; tuned with seeds from 100, tested on others."""
 
 from dataclasses import replace
 
@@ -27,7 +27,7 @@ EACH_AIM = [(aim.x_m, aim.y_m) for aim in list_aims(CONFIG)]
 
 
 def absorbed_fraction(aim_m, offset_m):
-    """How much of a 1 × 0.5 mm focus lies on a 2 × 1.5 mm absorber, by counting points of it."""
+    """Return the fraction of a 1 × 0.5 mm focus on a 2 × 1.5 mm absorber, by counting points."""
     x, y = (
         np.abs(np.linspace(-half, half, 2001) + a - o)
         for half, a, o in zip((5e-4, 2.5e-4), aim_m, offset_m, strict=True)
@@ -49,7 +49,7 @@ def estimate_pixel(runs):
     return fit_pixel([each for each in responses if each is not None], OPTICS)
 
 
-def test_gain_and_offset_as_sure_as_they_say():
+def test_gain_and_offset_agree_with_their_stated_sigmas():
     random, off = np.random.default_rng(17), []
     for _ in range(150):
         gain, offset_m = random.uniform(0.5, 1.6), random.uniform(-1.5e-4, 1.5e-4, 2)
@@ -65,20 +65,20 @@ def test_gain_and_offset_as_sure_as_they_say():
     assert np.all(within > 0.88), within
 
 
-def test_only_the_middle_gives_the_gain_and_no_offset():
+def test_centred_aims_determine_the_gain_and_no_offset():
     pixel = estimate_pixel([simulate_run(0.8, random=np.random.default_rng(k)) for k in range(3)])
     assert pixel.gain == pytest.approx(0.8, abs=4 * pixel.gain_sigma)
     assert pixel.offset_m == (0.0, 0.0)
     assert np.all(np.isnan(pixel.offset_sigma_m))
 
 
-def test_aims_across_one_edge_only_are_not_taken_for_a_low_gain():
+def test_aims_across_one_edge_only_are_not_mistaken_for_a_low_gain():
     pixel = estimate_pixel([simulate_run(0.9, aim_m, (1e-4, 0.0)) for aim_m in ((0.0, 0.0), (-8e-4, 0.0))])
     assert pixel.gain == pytest.approx(0.9, rel=1e-3)
     assert pixel.offset_m == (0.0, 0.0)
 
 
-def test_a_dead_pixel_is_told_from_one_that_is_not_seen():
+def test_a_dead_pixel_is_distinguished_from_an_unmeasured_one():
     random = np.random.default_rng(3)
     assert estimate_pixel([simulate_run(0.03, aim_m, random=random) for aim_m in EACH_AIM]).state == "dead"
     loud = [response._replace(sigma=0.3) for response in [PixelResponse(3, 0.0, 0.0, 0.05, 0.0)] * 2]
@@ -88,7 +88,7 @@ def test_a_dead_pixel_is_told_from_one_that_is_not_seen():
 
 
 @given(st.sets(st.integers(0, len(T_S) - 1), max_size=60), st.sets(st.integers(0, len(T_S) - 1), max_size=6))
-def test_missing_samples_and_a_few_wild_ones_change_little(missing, wild):
+def test_missing_samples_and_a_few_outliers_change_little(missing, wild):
     run = simulate_run(1.2, random=np.random.default_rng(1))
     value_m = run.signals["displacement_m"].value.copy()
     value_m[list(wild)] += 1e-3
@@ -99,7 +99,7 @@ def test_missing_samples_and_a_few_wild_ones_change_little(missing, wild):
     assert answer is None or answer.ratio == pytest.approx(1.2, abs=6 * answer.sigma)
 
 
-def test_too_little_is_not_measured():
+def test_too_few_samples_give_no_response():
     run = simulate_run(1.0)
     nothing = np.full(len(T_S), np.nan)
     nothing[:5] = 0.0
@@ -125,7 +125,7 @@ def test_too_little_is_not_measured():
         (0.0, "a pixel that responds"),
     ],
 )
-def test_a_whole_display_in_other_units_is_named(scale, says):
+def test_wrong_units_of_a_whole_display_are_named(scale, says):
     random, responses = np.random.default_rng(4), PixelMapFitter(CONFIG, PREDICT)
     for pixel in range(16):
         gain = 0.0 if pixel == 5 else random.uniform(0.9, 1.1)
@@ -136,7 +136,7 @@ def test_a_whole_display_in_other_units_is_named(scale, says):
     assert "\n" not in str(caught.value)
 
 
-def test_what_no_run_can_say_is_refused():
+def test_an_impossible_pixel_or_aim_is_refused():
     responses = PixelMapFitter(CONFIG, PREDICT)
     with pytest.raises(InputError, match="pixel: got 16, expected a pixel of display-16, 0 to 15"):
         responses.add_run("rec.h5", simulate_run(1.0, pixel=16))
@@ -148,7 +148,7 @@ def test_what_no_run_can_say_is_refused():
         responses.fit("rec.h5", "surroundings")
 
 
-def test_figures_name_what_is_dead_and_what_was_not_measured():
+def test_stats_list_dead_and_unmeasured_pixels():
     random, responses = np.random.default_rng(8), PixelMapFitter(CONFIG, PREDICT)
     for pixel in range(15):
         for aim_m in EACH_AIM:
@@ -162,8 +162,8 @@ def test_figures_name_what_is_dead_and_what_was_not_measured():
     assert told["offset_um"]["x"]["median"] == pytest.approx(50, abs=10)
 
 
-def test_light_that_misses_leaves_a_black_wall_below_its_cap():
-    """A half-space of acrylic that takes in the whole focus, pulse by pulse of the PWM, by superposition."""
+def test_light_beside_the_absorber_keeps_a_black_wall_below_its_cap():
+    """A half-space of acrylic absorbs the whole focus; rises of the PWM pulses are superposed."""
     laser = CONFIG.laser
     faint = [compute_pulse(CONFIG, aim) for aim in list_aims(CONFIG)[1:]]
     assert len(set(faint)) == 1

@@ -1,3 +1,5 @@
+"""Any JSON, text and image is parsed correctly or refused in one line."""
+
 import json
 from io import BytesIO
 
@@ -25,7 +27,7 @@ TRAIN = {"pixel": 3, "start_s": 0.0, "duration_s": 0.3, "pulse_width_s": 0.02, "
 
 
 def is_accepted(value):
-    """Whether a sequence was made of it; anything but a refusal in one line is an error."""
+    """Return whether a sequence was parsed; any error but a one-line refusal fails."""
     try:
         parse_sequence(value, CONFIG, "frames.json")
     except InputError as error:
@@ -52,7 +54,7 @@ def _is_one_line(error):
     st.floats(0, 1),
     st.floats(0.01, 2.45),
 )
-def test_what_is_written_is_read_again(frames, periods, gap_s, power_w):
+def test_sequences_round_trip(frames, periods, gap_s, power_w):
     entries, at_s = [], 0.0
     for duration_s, pause_s, heights in frames:
         target = {str(pixel): h for pixel, h in heights.items()} if isinstance(heights, dict) else heights
@@ -71,19 +73,19 @@ def test_what_is_written_is_read_again(frames, periods, gap_s, power_w):
 
 
 @given(JSON)
-def test_any_json_is_read_or_refused(value):
+def test_any_json_is_parsed_or_refused(value):
     assert not is_accepted(value)
     assert not is_accepted(json.dumps(value))
 
 
 @given(st.sampled_from(sorted(FRAME)), JSON)
-def test_any_value_in_a_frame_is_read_or_refused(key, value):
+def test_any_value_in_a_frame_is_parsed_or_refused(key, value):
     if is_accepted({"frames": [{**FRAME, key: value}]}):
         assert type(value) in ((dict, list) if key == "target_um" else (int, float))
 
 
 @given(st.sampled_from(sorted(TRAIN)), JSON)
-def test_any_value_in_a_train_is_read_or_refused(key, value):
+def test_any_value_in_a_train_is_parsed_or_refused(key, value):
     if is_accepted({"trains": [{**TRAIN, key: value}]}):
         assert type(value) in (int, float)
 
@@ -100,8 +102,8 @@ def test_any_bytes_are_refused(body):
         max_size=5,
     )
 )
-def test_overlaps_are_found_as_by_comparing_every_pair(rows):
-    """In PWM periods, so that both sides are exact."""
+def test_overlaps_match_a_comparison_of_every_pair(rows):
+    """Times are in PWM periods, so that both sides are exact."""
     entries = [
         dict(zip(TRAIN, (p, at / 5000, long / 5000, wide / 5000, gap / 5000, 1.0), strict=True))
         for p, at, wide, gap, long in rows
@@ -120,7 +122,7 @@ def test_overlaps_are_found_as_by_comparing_every_pair(rows):
     )
 )
 @settings(max_examples=50, deadline=None)
-def test_known_text_is_shown_whole(text):
+def test_supported_text_is_shown_completely(text):
     if not text.strip():
         return
     config = load_config("display-437")
@@ -150,7 +152,7 @@ PICTURES = list(_pictures())
 @pytest.mark.parametrize("name", ["image", "animation"])
 @given(data=st.data())
 @settings(max_examples=200, deadline=None)
-def test_a_damaged_picture_is_read_or_refused(name, data):
+def test_a_damaged_image_is_decoded_or_refused(name, data):
     file = bytearray(data.draw(st.sampled_from(PICTURES)))
     for _ in range(data.draw(st.integers(1, 6))):
         file[data.draw(st.integers(0, len(file) - 1))] = data.draw(st.integers(0, 255))
