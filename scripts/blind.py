@@ -19,19 +19,19 @@ sys.path.insert(0, str(ROOT / "tests" / "blind"))
 
 FIRST_SEEDS = {"dev": 9_000_000, "report": 3_000_000}
 SAMPLES = 30_000
-THINNED_GROUPS = 2
+REMAINING_GROUPS = 2
 """Groups of runs in a thinned recording."""
 
 
 def run_case(task: tuple[str, int]) -> dict[str, Any]:
     """One case: drawn, diagnosed, and once more after the experiment that the answer asks for."""
-    from blind_lab import draw
-    from blind_score import score
+    from blind_lab import draw_case
+    from blind_score import score_answer
 
     block, seed = task
     with TemporaryDirectory() as folder:
         try:
-            case = draw("single" if block == "thin" else block, seed, folder)
+            case = draw_case("single" if block == "thin" else block, seed, folder)
             if block == "thin":
                 thin_recording(case.path, seed)
         except RuntimeError as error:  # some seeds hide nothing that could be seen
@@ -48,7 +48,7 @@ def run_case(task: tuple[str, int]) -> dict[str, Any]:
                     repeats=experiment["repeats"],
                 )
             )
-        scored = replace(score(case, answer, after=repeated_answer), block=block)
+        scored = replace(score_answer(case, answer, after=repeated_answer), block=block)
     return {"score": scored, "baselines": name_baseline_causes(answer), "answer": answer}
 
 
@@ -61,7 +61,7 @@ def thin_recording(path: Path, seed: int) -> None:
         runs = file["runs"]
         groups = sorted({run.attrs["group"] for run in runs.values()})
         kept_groups = set(
-            np.random.default_rng([seed, 5]).choice(groups, min(THINNED_GROUPS, len(groups)), replace=False).tolist()
+            np.random.default_rng([seed, 5]).choice(groups, min(REMAINING_GROUPS, len(groups)), replace=False).tolist()
         )
         for name in [name for name, run in runs.items() if run.attrs["group"] not in kept_groups]:
             del runs[name]
@@ -128,20 +128,20 @@ def format_comparison(done: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Draw, diagnose, score, print; --keep writes every answer beside each other for a second look."""
+    """Draw, diagnose, score, print; --save writes every answer to a file."""
     from rich.console import Console
     from rich.progress import track
 
-    from blind_score import table
+    from blind_score import format_table
 
     parser = argparse.ArgumentParser(prog="scripts/bench blind")
     parser.add_argument("--seeds", choices=tuple(FIRST_SEEDS), default="dev")
     parser.add_argument("--nulls", type=int, default=24)
     parser.add_argument("--cases", type=int, default=18, help="of each other block")
-    parser.add_argument("--thin", type=int, help="instead: so many cases of one cause, two groups of runs each")
-    parser.add_argument("--skip", type=int, default=0, help="so many seeds of each block")
+    parser.add_argument("--thin", type=int, help="instead: number of cases of one cause with two groups of runs each")
+    parser.add_argument("--skip", type=int, default=0, help="seeds to skip in each block")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--keep", type=Path, help="folder for the answers")
+    parser.add_argument("--save", type=Path, help="folder for the answers")
     options = parser.parse_args()
     first = FIRST_SEEDS[options.seeds] + options.skip
     counts = {"none": options.nulls, "single": options.cases, "unknown": options.cases, "pair": options.cases}
@@ -161,7 +161,7 @@ def main() -> None:
         if "skipped" in item:
             print(f"not drawn: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
     scored = [item for item in done if "score" in item]
-    print(table(item["score"] for item in scored))
+    print(format_table(item["score"] for item in scored))
     print(format_comparison(scored))
 
 

@@ -26,7 +26,7 @@ def main() -> None:
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     from blind_causes import CATALOGUE
-    from blind_lab import draw
+    from blind_lab import draw_case
     from blind_loop import close_loop
     from optodrive.core.errors import InputError
 
@@ -34,20 +34,20 @@ def main() -> None:
     for number, cause in enumerate(options.causes or CATALOGUE):
         for case in range(options.cases):
             with TemporaryDirectory() as folder:
-                drawn = draw("single", FIRST_SEED + 100 * number + case, folder, cause=cause)
+                drawn = draw_case("single", FIRST_SEED + 100 * number + case, folder, cause=cause)
                 row: dict[str, object] = {"cause": cause, "seed": drawn.seed}
                 try:
                     loop = close_loop(drawn, Path(folder))
-                    row |= asdict(loop) | {"cut": loop.cut}
+                    row |= asdict(loop) | {"error_reduction": loop.error_reduction}
                 except InputError as error:
                     row |= {"refused": str(error)}
             rows.append(row)
             if not options.json:
                 print(format_row(row), flush=True)
     affected = [row for row in rows if float(str(row.get("nominal", 0.0))) > ERROR_MIN]
-    corrected = sum(float(str(row["cut"])) >= 0.8 for row in affected)
+    corrected = sum(float(str(row["error_reduction"])) >= 0.8 for row in affected)
     if options.json:
-        print(json.dumps({"rows": rows, "shown": len(affected), "mended": corrected}, indent=2))
+        print(json.dumps({"rows": rows, "affected": len(affected), "corrected": corrected}, indent=2))
     else:
         print(
             f"{corrected} of {len(affected)} heights wrong by more than {ERROR_MIN:.1%} lost four fifths of their error"
@@ -59,10 +59,11 @@ def format_row(row: dict[str, object]) -> str:
     head = f"{row['cause']!s:22} {row['seed']}"
     if "refused" in row:
         return f"{head}  refused: {row['refused']}"
-    diagnosed = "+".join(row["said"]) if isinstance(row["said"], tuple) and row["said"] else str(row["verdict"])
+    diagnosed = "+".join(row["causes"]) if isinstance(row["causes"], tuple) and row["causes"] else str(row["verdict"])
+    nominal, extended = float(str(row["nominal"])), float(str(row["extended"]))
     return (
-        f"{head}  {diagnosed:40} nominal {float(str(row['nominal'])):7.2%}  diagnosed {float(str(row['extended'])):7.2%}"
-        f"  cut {float(str(row['cut'])):8.1%}  trimmed {row['trimmed']}"
+        f"{head}  {diagnosed:40} nominal {nominal:7.2%}  diagnosed {extended:7.2%}"
+        f"  error reduction {float(str(row['error_reduction'])):8.1%}  trimmed {row['trimmed']}"
     )
 
 

@@ -1,7 +1,7 @@
-"""What may be hidden in a blind recording: the catalogue's causes and mechanisms that are in no catalogue.
+"""Hidden effects of a blind recording: the catalogue's causes, and mechanisms outside the catalogue.
 
-A cause is drawn as an `Effect`: its key, the functional form, its sizes and the changes it makes to the physics.
-`form` is "textbook" only where the form is the one the catalogue writes down.
+A cause is drawn as an `Effect`: its key, functional form, sizes and changes to the physics. `textbook` is True only if
+the form is that of the catalogue.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Effect:
-    """One hidden defect."""
+    """One hidden effect."""
 
     key: str
     form: str
@@ -28,8 +28,8 @@ class Effect:
 
 
 @dataclass(frozen=True)
-class Scene:
-    """What a draw of sizes may need to know of the experiment."""
+class SessionScale:
+    """Scales of the experiment that the sizes of an effect depend on."""
 
     base: Physics
     signals: tuple[str, ...]
@@ -52,25 +52,25 @@ def _pick(rng: Rng, *forms: str) -> str:
     return str(rng.choice(list(forms)))
 
 
-def _bridge_conductivity(rng: Rng, scene: Scene) -> Effect:
+def _bridge_conductivity(rng: Rng, scene: SessionScale) -> Effect:
     n, form = float(rng.uniform(0.04, 1.3)), _pick(rng, "mean", "integrated")
     return Effect("bridge_conductivity", form, {"n": n}, {"bridge": form, "bridge_n": n}, form == "mean")
 
 
-def _heat_capacity(rng: Rng, scene: Scene) -> Effect:
+def _heat_capacity(rng: Rng, scene: SessionScale) -> Effect:
     c, form = float(rng.uniform(0.01, 0.4)), _pick(rng, "linear", "graphite")
     changes: dict[str, object] = {"capacity": form, "capacity_c": c, "capacity_knee": float(rng.uniform(200.0, 450.0))}
     return Effect("heat_capacity", form, {"c": c}, changes, form == "linear")
 
 
-def _radiation(rng: Rng, scene: Scene) -> Effect:
+def _radiation(rng: Rng, scene: SessionScale) -> Effect:
     area, form = _log(rng, 1e-6, 1e-5), _pick(rng, "grey", "rising_emissivity")
     rise = 0.0 if form == "grey" else float(rng.uniform(0.1, 0.5))
     changes: dict[str, object] = {"radiating": area, "radiating_rise": rise}
     return Effect("radiation", form, {"eps_A": area}, changes, form == "grey")
 
 
-def _wall_heating(rng: Rng, scene: Scene) -> Effect:
+def _wall_heating(rng: Rng, scene: SessionScale) -> Effect:
     r, tau, form = _log(rng, 1.0, 40.0), _log(rng, 0.1, 10.0), _pick(rng, "one_node", "two_nodes")
     changes: dict[str, object] = {"wall_r": r, "wall_c": tau / r}
     if form == "two_nodes":
@@ -79,20 +79,20 @@ def _wall_heating(rng: Rng, scene: Scene) -> Effect:
     return Effect("wall_heating", form, {"R_w": r, "tau_w": tau}, changes, form == "one_node")
 
 
-def _neighbour_crosstalk(rng: Rng, scene: Scene) -> Effect:
+def _neighbour_crosstalk(rng: Rng, scene: SessionScale) -> Effect:
     share, form = _log(rng, 0.002, 0.1), _pick(rng, "instant", "lagged")
     lag = 0.0 if form == "instant" else _log(rng, 0.02, 0.2)
     changes: dict[str, object] = {"crosstalk": share, "crosstalk_lag": lag}
     return Effect("neighbour_crosstalk", form, {"kappa_x": share}, changes, form == "instant")
 
 
-def _laser_turn_on(rng: Rng, scene: Scene) -> Effect:
+def _laser_turn_on(rng: Rng, scene: SessionScale) -> Effect:
     tau, form = _log(rng, 2e-5, 3e-3), _pick(rng, "ramp", "exponential", "raised_cosine")
     changes: dict[str, object] = {"turn_on": form, "turn_on_s": tau}
     return Effect("laser_turn_on", form, {"tau": tau}, changes, form == "exponential")
 
 
-def _laser_droop(rng: Rng, scene: Scene) -> Effect:
+def _laser_droop(rng: Rng, scene: SessionScale) -> Effect:
     depth, tau, form = _log(rng, 0.01, 0.2), _log(rng, 3e-3, 1.0), _pick(rng, "one_exponential", "two_exponentials")
     by_power = bool(rng.random() < 0.5)
     share = 1.0 if form == "one_exponential" else float(rng.uniform(0.4, 0.7))
@@ -106,24 +106,24 @@ def _laser_droop(rng: Rng, scene: Scene) -> Effect:
     return Effect("laser_droop", form, {"depth": depth, "tau": tau}, changes, textbook)
 
 
-def _power_nonlinearity(rng: Rng, scene: Scene) -> Effect:
+def _power_nonlinearity(rng: Rng, scene: SessionScale) -> Effect:
     form = _pick(rng, "threshold", "threshold_full", "curvature")
     size = _sign(rng) * float(rng.uniform(0.01, 0.2)) if form == "curvature" else _log(rng, 0.01, 0.4)
     name = "curvature" if form == "curvature" else "threshold_W"
     return Effect("power_nonlinearity", form, {name: size}, {"power": form, "power_size": size})
 
 
-def _sensor_lag(rng: Rng, scene: Scene) -> Effect:
+def _sensor_lag(rng: Rng, scene: SessionScale) -> Effect:
     tau, form = _log(rng, 5e-5, 3e-3), _pick(rng, "first_order", "moving_average")
     return Effect("sensor_lag", form, {"tau": tau}, {"sensor": form, "sensor_s": tau}, form == "first_order")
 
 
-def _sensor_scale(rng: Rng, scene: Scene) -> Effect:
+def _sensor_scale(rng: Rng, scene: SessionScale) -> Effect:
     gain = 1.0 + _sign(rng) * float(rng.uniform(0.02, 0.1))
     return Effect("sensor_scale", "affine", {"gain": gain}, {"scale": gain}, True)
 
 
-def _membrane_creep(rng: Rng, scene: Scene) -> Effect:
+def _membrane_creep(rng: Rng, scene: SessionScale) -> Effect:
     size, tau = _log(rng, 0.03, 0.5), _log(rng, 0.01, 1.0)
     form = _pick(rng, "exponential", "power_law", "logarithmic")
     if form == "exponential":
@@ -141,7 +141,7 @@ def _membrane_creep(rng: Rng, scene: Scene) -> Effect:
     return Effect("membrane_creep", form, {"J": size, "tau": tau}, changes, form == "exponential")
 
 
-def _membrane_stiffening(rng: Rng, scene: Scene) -> Effect:
+def _membrane_stiffening(rng: Rng, scene: SessionScale) -> Effect:
     loss, form = _log(rng, 0.02, 0.35), _pick(rng, "cubic", "tanh")
     peak = scene.base.kappa * scene.peak_gas_k
     z = (1.0 - loss) * peak
@@ -155,12 +155,12 @@ def _membrane_stiffening(rng: Rng, scene: Scene) -> Effect:
     return Effect("membrane_stiffening", form, {"loss_at_peak": loss}, {"stiff": form, "stiff_m": scale})
 
 
-def _gas_leak(rng: Rng, scene: Scene) -> Effect:
+def _gas_leak(rng: Rng, scene: SessionScale) -> Effect:
     rate = _log(rng, 0.1, 10.0)
     return Effect("gas_leak", "exponential", {"rate": rate}, {"leak": rate}, True)
 
 
-def _absorber_ageing(rng: Rng, scene: Scene) -> Effect:
+def _absorber_ageing(rng: Rng, scene: SessionScale) -> Effect:
     loss, form = _log(rng, 0.01, 0.2), _pick(rng, "linear", "saturating")
     knee = float(rng.uniform(0.2, 0.6))
     changes: dict[str, object] = {
@@ -172,7 +172,7 @@ def _absorber_ageing(rng: Rng, scene: Scene) -> Effect:
     return Effect("absorber_ageing", form, {"loss": loss, "dose_j": scene.dose_j}, changes, form == "linear")
 
 
-def _beam_misalignment(rng: Rng, scene: Scene) -> Effect:
+def _beam_misalignment(rng: Rng, scene: SessionScale) -> Effect:
     share, pixel = _log(rng, 0.02, 0.3), int(rng.choice(scene.pixels))
     r, tau = float(rng.uniform(1.0, 6.0)), _log(rng, 0.1, 2.0)
     changes: dict[str, object] = {
@@ -185,7 +185,7 @@ def _beam_misalignment(rng: Rng, scene: Scene) -> Effect:
     return Effect("beam_misalignment", "into_the_wall", {"f": share, "pixel": pixel}, changes)
 
 
-def _ambient_drift(rng: Rng, scene: Scene) -> Effect:
+def _ambient_drift(rng: Rng, scene: SessionScale) -> Effect:
     size, form = _sign(rng) * _log(rng, 0.3, 5.0), _pick(rng, "ramp", "sine")
     changes: dict[str, object] = {
         "room": form,
@@ -197,7 +197,7 @@ def _ambient_drift(rng: Rng, scene: Scene) -> Effect:
     return Effect("ambient_drift", form, {"K": size}, changes)
 
 
-def _clock_offset(rng: Rng, scene: Scene) -> Effect:
+def _clock_offset(rng: Rng, scene: SessionScale) -> Effect:
     size = _sign(rng) * _log(rng, 5e-5, 3e-3)
     every = ("mirror_x_rad", "mirror_y_rad", *scene.signals)
     form = _pick(rng, "all", *scene.signals)
@@ -205,7 +205,7 @@ def _clock_offset(rng: Rng, scene: Scene) -> Effect:
     return Effect("clock_offset", form, {"offset": size}, {"clock_s": dict.fromkeys(which, size)}, True)
 
 
-def _mirror_lag(rng: Rng, scene: Scene) -> Effect:
+def _mirror_lag(rng: Rng, scene: SessionScale) -> Effect:
     hz, zeta = _log(rng, 300.0, 3000.0), float(rng.uniform(0.3, 1.0))
     form = _pick(rng, "servo", "servo_delay", "servo_slew", "servo_delay_slew")
     delay = _log(rng, 3e-5, 4e-4) if "delay" in form else 0.0
@@ -220,7 +220,7 @@ def _mirror_lag(rng: Rng, scene: Scene) -> Effect:
     return Effect("mirror_lag", form, sizes, changes, form == "servo")
 
 
-Draw = Callable[[Rng, Scene], Effect]
+Draw = Callable[[Rng, SessionScale], Effect]
 
 CATALOGUE: dict[str, Draw] = {
     "bridge_conductivity": _bridge_conductivity,
@@ -243,7 +243,7 @@ CATALOGUE: dict[str, Draw] = {
     "mirror_lag": _mirror_lag,
 }
 
-# Each with those the catalogue calls easily confused with it; a hidden pair is never one of these.
+# Pairs of causes that the catalogue lists as easily confused; a hidden pair is never one of these.
 CONFUSABLE: frozenset[frozenset[str]] = frozenset(
     frozenset(pair)
     for pair in (
@@ -269,74 +269,74 @@ CONFUSABLE: frozenset[frozenset[str]] = frozenset(
 )
 
 
-def _membrane_resonance(rng: Rng, scene: Scene) -> Effect:
+def _membrane_resonance(rng: Rng, scene: SessionScale) -> Effect:
     hz, zeta = _log(rng, 80.0, 400.0), _log(rng, 0.03, 0.2)
     return Effect("membrane_resonance", "z only", {"hz": hz, "zeta": zeta}, {"ring_hz": hz, "ring_zeta": zeta})
 
 
-def _glare(rng: Rng, scene: Scene) -> Effect:
-    """Stray light of the beam shifts the displacement meter while it is on.
+def _glare(rng: Rng, scene: SessionScale) -> Effect:
+    """Stray light of the beam shifts the displacement meter during pulses.
 
-    (A share of the absorber's temperature in z was tried instead: with τ_g and κ refitted a clock offset imitates it.)
+    (A share of the absorber's temperature in z was tried as well: with refitted τ_g and κ a clock offset imitates it.)
     """
     size = scene.base.kappa * scene.peak_gas_k * float(rng.uniform(0.01, 0.06)) / 2.45
     return Effect("glare", "step", {"m_per_W": size}, {"glare": size})
 
 
-def _mode_hops(rng: Rng, scene: Scene) -> Effect:
+def _mode_hops(rng: Rng, scene: SessionScale) -> Effect:
     size, rate = float(rng.uniform(0.03, 0.08)), _log(rng, 10.0, 60.0)
     return Effect("mode_hops", "telegraph", {"share": size, "rate": rate}, {"hop": size, "hop_rate": rate})
 
 
-def _membrane_play(rng: Rng, scene: Scene) -> Effect:
+def _membrane_play(rng: Rng, scene: SessionScale) -> Effect:
     reach = scene.base.kappa * scene.peak_gas_k * float(rng.uniform(0.02, 0.08))
-    return Effect("membrane_play", "dead travel", {"reach_m": reach}, {"play_m": reach})
+    return Effect("membrane_play", "dead travel", {"dead_travel_m": reach}, {"play_m": reach})
 
 
-def _thermometer_ceiling(rng: Rng, scene: Scene) -> Effect:
+def _thermometer_ceiling(rng: Rng, scene: SessionScale) -> Effect:
     at, slope = 295.0 + scene.peak_k * float(rng.uniform(0.35, 0.75)), float(rng.choice([0.0, 0.2, 0.4]))
     return Effect("thermometer_ceiling", "clip", {"at_K": at}, {"ceiling_k": at, "ceiling_slope": slope})
 
 
-def _second_node(rng: Rng, scene: Scene) -> Effect:
+def _second_node(rng: Rng, scene: SessionScale) -> Effect:
     share, tau = float(rng.uniform(0.15, 0.5)), _log(rng, 0.01, 0.06)
     return Effect("second_node", "behind", {"share": share, "tau": tau}, {"node_share": share, "node_s": tau})
 
 
-def _hum(rng: Rng, scene: Scene) -> Effect:
+def _hum(rng: Rng, scene: SessionScale) -> Effect:
     signal = str(rng.choice([TEMPERATURE, DISPLACEMENT] + [FORCE] * (FORCE in scene.signals)))
     size = {TEMPERATURE: 0.8, DISPLACEMENT: 4e-6, FORCE: 1.5e-3}[signal] * _log(rng, 1.0, 4.0)
     changes: dict[str, object] = {"hum_signal": signal, "hum": size, "hum_phase": float(rng.uniform(0, 2 * np.pi))}
     return Effect("hum", signal, {"amplitude": size}, changes)
 
 
-def _late_light(rng: Rng, scene: Scene) -> Effect:
+def _late_light(rng: Rng, scene: SessionScale) -> Effect:
     tau, form = _log(rng, 1e-3, 5e-3), _pick(rng, "flat", "fading")
     share = float(rng.uniform(0.3, 1.0))
     changes: dict[str, object] = {"after": form, "after_s": tau, "after_share": share}
     return Effect("late_light", form, {"tau": tau, "share": share}, changes)
 
 
-def _missed_pulses(rng: Rng, scene: Scene) -> Effect:
+def _missed_pulses(rng: Rng, scene: SessionScale) -> Effect:
     share = float(rng.uniform(0.03, 0.12))
     return Effect("missed_pulses", "random", {"share": share}, {"missed": share})
 
 
-def _melting(rng: Rng, scene: Scene) -> Effect:
-    """Something on the absorber melts: latent heat at one temperature."""
+def _melting(rng: Rng, scene: SessionScale) -> Effect:
+    """A substance on the absorber melts: latent heat at one temperature."""
     at = scene.peak_k * float(rng.uniform(0.3, 0.6))
     heat = scene.base.C * scene.peak_k * float(rng.uniform(0.05, 0.25))
     changes: dict[str, object] = {"melt_j": heat, "melt_at": at, "melt_width": float(rng.uniform(4.0, 10.0))}
     return Effect("melting", "latent heat", {"J": heat, "at_K": at}, changes)
 
 
-def _one_way_gas(rng: Rng, scene: Scene) -> Effect:
+def _one_way_gas(rng: Rng, scene: SessionScale) -> Effect:
     """The gas cools more slowly than it warms, or faster."""
     size = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.25, 0.5))
     return Effect("one_way_gas", "rate", {"share": size}, {"one_way": size})
 
 
-def _slack_membrane(rng: Rng, scene: Scene) -> Effect:
+def _slack_membrane(rng: Rng, scene: SessionScale) -> Effect:
     size = scene.base.kappa * scene.peak_gas_k * float(rng.uniform(0.03, 0.12))
     return Effect("slack_membrane", "dead zone", {"m": size}, {"slack_m": size})
 
@@ -357,8 +357,8 @@ MECHANISMS: dict[str, Draw] = {
 }
 
 
-def install(base: Physics, effects: tuple[Effect, ...]) -> Physics:
-    """The display with all its defects."""
+def apply_effects(base: Physics, effects: tuple[Effect, ...]) -> Physics:
+    """Return the physics of the display with all effects."""
     truth = base
     for effect in effects:
         changes = dict(effect.changes)

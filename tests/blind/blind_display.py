@@ -1,7 +1,7 @@
-"""The hidden truth of the blind tests: a pixel with any of its defects, integrated by a Runge-Kutta of its own.
+"""Ground truth of the blind tests: a pixel with any of its effects, integrated by an independent Runge–Kutta scheme.
 
-Written apart from the package: nothing here is imported from it and nothing there may be looked up here. All units
-are SI. Temperatures inside are rises above the room at the start of the run, unless a name ends in `_K`.
+Independent of the package: no module imports the other. All units are SI. Temperatures inside are rises above the
+ambient at the start of the run, unless a name ends in `_K`.
 
     C dθ/dt = ε P − flow(θ, w) − …      flow = (θ − w)/R in the nominal model
     τ_g dγ/dt = (θ + w)/2 − γ           z = κ γ,  F = φ γ,  T = ambient + θ
@@ -35,12 +35,12 @@ OUT_THETA, OUT_SENSED, OUT_GAS, OUT_MEMBRANE, OUT_SUM = range(5)
 
 # A segment of the drive: start, end, power, instant of turn-on, 0 own or 1 neighbour, mode, instant of turn-off,
 # drive of the droop, share that misses the absorber. The modes:
-DARK, LIT, AFTER_FLAT, AFTER_FADING = 0.0, 1.0, 2.0, 3.0
+GATE_OFF, GATE_ON, AFTER_FLAT, AFTER_FADING = 0.0, 1.0, 2.0, 3.0
 
 
 @dataclass(frozen=True)
 class Physics:
-    """Everything that can be true of the hidden display; the defaults are the nominal model."""
+    """All parameters of the hidden display; the defaults are the nominal model."""
 
     R: float = 200.0
     C: float = 1.0e-4
@@ -131,7 +131,7 @@ _KINDS = {"": 0.0, "mean": 1.0, "integrated": 2.0, "linear": 1.0, "graphite": 2.
 _TURNS = {"": 0.0, "ramp": 1.0, "exponential": 2.0, "raised_cosine": 3.0}
 
 
-def _vector(p: Physics, ambient_k: float) -> np.ndarray:
+def _pack_parameters(p: Physics, ambient_k: float) -> np.ndarray:
     v = np.zeros(64)
     v[:5] = p.R, p.C, p.tau_g, _KINDS[p.bridge], p.bridge_n
     v[5:8] = _KINDS[p.capacity], p.capacity_c, p.capacity_knee
@@ -156,7 +156,7 @@ def _vector(p: Physics, ambient_k: float) -> np.ndarray:
 
 
 @njit(cache=True)
-def _capacity(v, theta):
+def _compute_capacity_j_per_k(v, theta):
     c = v[1]
     if v[5] == 1.0:
         c *= 1.0 + v[6] * theta / 100.0
@@ -169,7 +169,7 @@ def _capacity(v, theta):
 
 
 @njit(cache=True)
-def _flow(v, theta, wall):
+def _compute_flow_w(v, theta, wall):
     room = v[36]
     if v[3] == 0.0:
         return (theta - wall) / v[0]
@@ -184,7 +184,7 @@ def _flow(v, theta, wall):
 
 
 @njit(cache=True)
-def _radiated(v, theta):
+def _compute_radiation_w(v, theta):
     if v[8] == 0.0:
         return 0.0
     room = v[36]
@@ -193,8 +193,8 @@ def _radiated(v, theta):
 
 
 @njit(cache=True)
-def _light(v, seg, t, s):
-    """Power of the beam at t, W, whoever it falls on."""
+def _compute_beam_power_w(v, seg, t, s):
+    """Return the power of the beam at t, W, independent of its target."""
     if seg[5] == 0.0:
         return 0.0
     power = seg[2] * (1.0 - v[19] * s[16] - v[20] * s[17])
@@ -213,8 +213,8 @@ def _light(v, seg, t, s):
 
 
 @njit(cache=True)
-def _rates(v, seg, t, s, d):
-    light = _light(v, seg, t, s)
+def _compute_rates(v, seg, t, s, d):
+    light = _compute_beam_power_w(v, seg, t, s)
     own, beside = 0.0, 0.0
     if seg[4] == 0.0:
         own = light
@@ -223,18 +223,20 @@ def _rates(v, seg, t, s, d):
     theta = s[0]
     wall = s[1]
     if v[15] > 0.0:
-        d[12] = (0.66 * beside - _flow(v, s[12], 0.0) - _radiated(v, s[12])) / _capacity(v, s[12])
+        d[12] = (
+            0.66 * beside - _compute_flow_w(v, s[12], 0.0) - _compute_radiation_w(v, s[12])
+        ) / _compute_capacity_j_per_k(v, s[12])
         if v[16] > 0.0:
             d[13] = (s[12] - s[13]) / v[16]
             wall += v[15] * s[13]
         else:
             wall += v[15] * s[12]
-    flow = _flow(v, theta, wall)
-    net = 0.66 * own * (1.0 - seg[8]) - flow - _radiated(v, theta)
+    flow = _compute_flow_w(v, theta, wall)
+    net = 0.66 * own * (1.0 - seg[8]) - flow - _compute_radiation_w(v, theta)
     if v[28] > 0.0:
         net -= v[28] * v[1] / v[29] * (theta - s[11])
         d[11] = (theta - s[11]) / v[29]
-    d[0] = net / _capacity(v, theta)
+    d[0] = net / _compute_capacity_j_per_k(v, theta)
     if v[10] > 0.0:
         out = (s[1] - s[2]) / v[10]
         d[1] = (v[12] * flow + 0.66 * own * seg[8] - out) / v[11]
@@ -265,8 +267,8 @@ def _rates(v, seg, t, s, d):
 
 
 @njit(cache=True)
-def _outputs(v, x, y):
-    """Linear read-outs of a state, or of its rates."""
+def _compute_outputs(v, x, y):
+    """Compute linear outputs of a state, or of its derivatives."""
     y[0] = x[0]
     y[1] = x[14] if v[24] == 1.0 else x[0]
     y[2] = x[3] - x[4]
@@ -281,7 +283,7 @@ def _outputs(v, x, y):
 
 @njit(cache=True)
 def _integrate(v, segments, longest, shortest):
-    """Classical fourth-order steps that never cross an edge, short after it and growing; dense output by Hermite."""
+    """Integrate with classical Runge–Kutta steps that start short after each edge and grow, with Hermite output."""
     count = 0
     for i in range(len(segments)):
         t = 0.0
@@ -299,41 +301,41 @@ def _integrate(v, segments, longest, shortest):
     for i in range(len(segments)):
         seg = segments[i]
         start, span, t = seg[0], seg[1] - seg[0], 0.0
-        _rates(v, seg, start, s, k1)
+        _compute_rates(v, seg, start, s, k1)
         while t < span * (1.0 - 1e-12):
             nominal = min(longest, shortest + 0.12 * t)
             h = min(nominal, span - t)
             now = start + t
             times[at] = now
-            _outputs(v, s, values[at, 0])
-            _outputs(v, k1, slopes[at, 0])
+            _compute_outputs(v, s, values[at, 0])
+            _compute_outputs(v, k1, slopes[at, 0])
             for j in range(20):
                 work[j] = s[j] + 0.5 * h * k1[j]
-            _rates(v, seg, now + 0.5 * h, work, k2)
+            _compute_rates(v, seg, now + 0.5 * h, work, k2)
             for j in range(20):
                 work[j] = s[j] + 0.5 * h * k2[j]
-            _rates(v, seg, now + 0.5 * h, work, k3)
+            _compute_rates(v, seg, now + 0.5 * h, work, k3)
             for j in range(20):
                 work[j] = s[j] + h * k3[j]
-            _rates(v, seg, now + h, work, k4)
+            _compute_rates(v, seg, now + h, work, k4)
             for j in range(20):
                 s[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j])
             t += nominal
-            _rates(v, seg, now + h, s, k1)
-            _outputs(v, s, values[at, 1])
-            _outputs(v, k1, slopes[at, 1])
+            _compute_rates(v, seg, now + h, s, k1)
+            _compute_outputs(v, s, values[at, 1])
+            _compute_outputs(v, k1, slopes[at, 1])
             at += 1
     times[at] = segments[len(segments) - 1, 1]
     return times, values, slopes
 
 
 @njit(cache=True)
-def _read(times, values, slopes, column, wanted):
-    """One read-out at the wanted times; at rest before the start."""
-    result = np.zeros(len(wanted))
+def _interpolate(times, values, slopes, column, query_s):
+    """Return one output at the query times; zero before the start."""
+    result = np.zeros(len(query_s))
     last = len(times) - 2
-    for i in range(len(wanted)):
-        t = wanted[i]
+    for i in range(len(query_s)):
+        t = query_s[i]
         if t <= times[0]:
             continue
         k = min(np.searchsorted(times, t, side="right") - 1, last)
@@ -350,27 +352,27 @@ def _read(times, values, slopes, column, wanted):
 
 
 @njit(cache=True)
-def _play(times, ends, wanted, inputs, reach):
-    """A follower with dead travel of ± reach, carried along the steps and read between them."""
+def _apply_backlash(times, ends, query_s, inputs, reach):
+    """Return a follower with dead travel of ± reach, propagated along the steps and evaluated between them."""
     held = np.zeros(len(times))
     for k in range(len(times) - 1):
         held[k + 1] = min(max(held[k], ends[k] - reach), ends[k] + reach)
-    result = np.zeros(len(wanted))
-    for i in range(len(wanted)):
-        k = max(np.searchsorted(times, wanted[i], side="right") - 1, 0)
+    result = np.zeros(len(query_s))
+    for i in range(len(query_s)):
+        k = max(np.searchsorted(times, query_s[i], side="right") - 1, 0)
         result[i] = min(max(held[k], inputs[i] - reach), inputs[i] + reach)
     return result
 
 
 @njit(cache=True)
-def _servo(steps, targets, wanted, omega, zeta, slew):
-    """A position servo of second order whose speed is limited, at the wanted times."""
-    result = np.zeros(len(wanted))
+def _simulate_servo(steps, targets, query_s, omega, zeta, slew):
+    """Return a second-order position servo with limited speed at the query times."""
+    result = np.zeros(len(query_s))
     h = min(4e-6, 0.02 / omega)
     x, speed, t, row = 0.0, 0.0, 0.0, -1
-    for i in range(len(wanted)):
-        while t < wanted[i] - 1e-12:
-            dt = min(h, wanted[i] - t)
+    for i in range(len(query_s)):
+        while t < query_s[i] - 1e-12:
+            dt = min(h, query_s[i] - t)
             while row + 1 < len(steps) and steps[row + 1] <= t + 1e-12:
                 row += 1
             if row + 1 < len(steps):
@@ -391,19 +393,19 @@ def _servo(steps, targets, wanted, omega, zeta, slew):
     return result
 
 
-def delivered_w(p: Physics, asked_w: float) -> float:
-    """Optical power that comes out when so much is asked for."""
+def compute_delivered_w(p: Physics, commanded_w: float) -> float:
+    """Return the optical power for a commanded power."""
     if p.power == "threshold":
-        return max(asked_w - p.power_size, 0.0)
+        return max(commanded_w - p.power_size, 0.0)
     if p.power == "threshold_full":
-        return max(asked_w - p.power_size, 0.0) * FULL_POWER_W / (FULL_POWER_W - p.power_size)
+        return max(commanded_w - p.power_size, 0.0) * FULL_POWER_W / (FULL_POWER_W - p.power_size)
     if p.power == "curvature":
-        return asked_w * (1.0 + p.power_size * (asked_w / FULL_POWER_W - 1.0))
-    return asked_w
+        return commanded_w * (1.0 + p.power_size * (commanded_w / FULL_POWER_W - 1.0))
+    return commanded_w
 
 
-def aged(p: Physics, dose_j: float) -> float:
-    """What is left of the absorption after a dose."""
+def compute_absorption(p: Physics, dose_j: float) -> float:
+    """Return the remaining share of the absorption after a dose."""
     x = dose_j / p.ageing_dose
     if p.ageing == "linear":
         return 1.0 - p.ageing_loss * x
@@ -412,9 +414,11 @@ def aged(p: Physics, dose_j: float) -> float:
     return 1.0
 
 
-def _segments(p: Physics, pulses: np.ndarray, pixel: int, end: float, factor: float, dose: float, chance: int):
-    """The drive as pieces on which the light is smooth."""
-    rng = np.random.default_rng([chance, 77])
+def _build_segments(
+    p: Physics, pulses: np.ndarray, pixel: int, end: float, factor: float, dose: float, noise_seed: int
+):
+    """Return the drive as segments with smooth power."""
+    rng = np.random.default_rng([noise_seed, 77])
     order = np.argsort(pulses[:, 0], kind="stable") if len(pulses) else np.zeros(0, int)
     hops = np.zeros(0)
     if p.hop:
@@ -431,24 +435,24 @@ def _segments(p: Physics, pulses: np.ndarray, pixel: int, end: float, factor: fl
                 rows.append([a, b, row[0] * level, *row[1:]])
 
     for nth, index in enumerate(order):
-        start, width, asked, lit = pulses[index]
+        start, width, commanded, pulsed = pulses[index]
         missed = p.missed and len(order) > 5 and rng.random() < p.missed
-        own = int(lit) == pixel
-        power = delivered_w(p, asked) * factor
+        own = int(pulsed) == pixel
+        power = compute_delivered_w(p, commanded) * factor
         wall = 0.0
         if own:
-            power *= aged(p, dose)
-            dose += asked * width
-        if int(lit) == p.stray_pixel:
+            power *= compute_absorption(p, dose)
+            dose += commanded * width
+        if int(pulsed) == p.stray_pixel:
             wall = p.stray
         if missed:
             continue
         target = 0.0 if own else 1.0
         begin, stop = min(start, end), min(start + width, end)
-        drive = asked / FULL_POWER_W if p.droop_by_power else 1.0
+        drive = commanded / FULL_POWER_W if p.droop_by_power else 1.0
         if begin > clock:
-            rows.append([clock, begin, 0.0, 0.0, 0.0, DARK, 0.0, 0.0, 0.0])
-        full = [power, start, target, LIT, 0.0, drive, wall]
+            rows.append([clock, begin, 0.0, 0.0, 0.0, GATE_OFF, 0.0, 0.0, 0.0])
+        full = [power, start, target, GATE_ON, 0.0, drive, wall]
         ready = start + p.turn_on_s
         if p.turn_on in ("ramp", "raised_cosine") and ready < stop:
             add(start, ready, full)
@@ -464,12 +468,12 @@ def _segments(p: Physics, pulses: np.ndarray, pixel: int, end: float, factor: fl
             add(stop, last, [power, start, target, mode, stop, 0.0, wall])
             clock = max(clock, last)
     if clock < end:
-        rows.append([clock, end, 0.0, 0.0, 0.0, DARK, 0.0, 0.0, 0.0])
+        rows.append([clock, end, 0.0, 0.0, 0.0, GATE_OFF, 0.0, 0.0, 0.0])
     return np.array(rows)
 
 
-def _fastest(p: Physics) -> float:
-    """The longest step that still resolves every time constant that is present."""
+def _compute_max_step_s(p: Physics) -> float:
+    """Return the longest step that resolves every time constant present."""
     longest = min(1e-4, 0.04 * p.tau_g)
     if p.sensor == "first_order":
         longest = min(longest, 0.8 * p.sensor_s)
@@ -478,8 +482,8 @@ def _fastest(p: Physics) -> float:
     return longest
 
 
-def room_rise(p: Physics, session_s: float) -> float:
-    """How far the room has moved unseen, K, at so many seconds of the session."""
+def compute_ambient_rise_k(p: Physics, session_s: float) -> float:
+    """Return the unrecorded change of the ambient temperature, K, at a time of the session."""
     x = session_s / p.room_session_s
     if p.room == "ramp":
         return p.room_k * x
@@ -488,8 +492,8 @@ def room_rise(p: Physics, session_s: float) -> float:
     return 0.0
 
 
-def membrane(p: Physics, free_m: np.ndarray) -> np.ndarray:
-    """Where a membrane that stiffens stands when a linear one would stand at free_m."""
+def compute_membrane_m(p: Physics, free_m: np.ndarray) -> np.ndarray:
+    """Return the displacement of a stiffening membrane from that of a linear one."""
     if p.stiff == "tanh":
         return p.stiff_m * np.tanh(free_m / p.stiff_m)
     if p.stiff == "cubic":
@@ -501,7 +505,7 @@ def membrane(p: Physics, free_m: np.ndarray) -> np.ndarray:
     return free_m
 
 
-def respond(
+def simulate_signals(
     p: Physics,
     pulses: np.ndarray,
     times: dict[str, np.ndarray],
@@ -510,89 +514,93 @@ def respond(
     ambient_k: float = 295.0,
     session_s: float = 0.0,
     dose_j: float = 0.0,
-    chance: int = 0,
+    noise_seed: int = 0,
     factor: float = 1.0,
     late_s: float = 0.0,
     commands: np.ndarray | None = None,
-    finer: float = 1.0,
+    refinement: float = 1.0,
 ) -> dict[str, np.ndarray]:
-    """What ideal instruments at `pixel` would show at the given times, defects included, noise not."""
-    wanted = {name: t - late_s - p.clock_s.get(name, 0.0) for name, t in times.items()}
+    """Return the readings of ideal instruments at `pixel` at the given times, with effects and without noise."""
+    query_s = {name: t - late_s - p.clock_s.get(name, 0.0) for name, t in times.items()}
     result: dict[str, np.ndarray] = {}
     thermal = [name for name in times if name not in MIRRORS]
     if thermal:
-        end = max(max(float(wanted[name][-1]) for name in thermal), 1e-3) + 1e-6
-        segments = _segments(p, np.asarray(pulses, float).reshape(-1, 4), pixel, end, factor, dose_j, chance)
-        v = _vector(p, ambient_k)
-        steps = _integrate(v, segments, _fastest(p) / finer, 2e-6 / finer)
+        end = max(max(float(query_s[name][-1]) for name in thermal), 1e-3) + 1e-6
+        segments = _build_segments(p, np.asarray(pulses, float).reshape(-1, 4), pixel, end, factor, dose_j, noise_seed)
+        v = _pack_parameters(p, ambient_k)
+        steps = _integrate(v, segments, _compute_max_step_s(p) / refinement, 2e-6 / refinement)
         for name in thermal:
-            result[name] = _instrument(p, name, segments, steps, wanted[name], times[name], ambient_k, session_s)
+            result[name] = _simulate_instrument(
+                p, name, segments, steps, query_s[name], times[name], ambient_k, session_s
+            )
     for name in times:
         if name in MIRRORS:
             assert commands is not None
-            result[name] = _mirror(p, commands[:, 0], commands[:, 1 + MIRRORS.index(name)], wanted[name])
+            result[name] = _simulate_mirror(p, commands[:, 0], commands[:, 1 + MIRRORS.index(name)], query_s[name])
     return result
 
 
-def _instrument(p: Physics, name, segments, steps, wanted, stamps, ambient_k, session_s) -> np.ndarray:
+def _simulate_instrument(p: Physics, name, segments, steps, query_s, shown_t_s, ambient_k, session_s) -> np.ndarray:
     grid, values, slopes = steps
     if name == TEMPERATURE:
         if p.sensor == "moving_average":
             window = 2.0 * p.sensor_s
-            total = _read(grid, values, slopes, OUT_SUM, wanted)
-            result = (total - _read(grid, values, slopes, OUT_SUM, wanted - window)) / window
+            total = _interpolate(grid, values, slopes, OUT_SUM, query_s)
+            result = (total - _interpolate(grid, values, slopes, OUT_SUM, query_s - window)) / window
         else:
-            result = _read(grid, values, slopes, OUT_SENSED, wanted)
-        result = result + ambient_k + room_rise(p, session_s) + p.room_in_run * stamps
+            result = _interpolate(grid, values, slopes, OUT_SENSED, query_s)
+        result = result + ambient_k + compute_ambient_rise_k(p, session_s) + p.room_in_run * shown_t_s
         if p.ceiling_k:
             over = result > p.ceiling_k
             result = np.where(over, p.ceiling_k + p.ceiling_slope * (result - p.ceiling_k), result)
         result = p.scale_room_k + p.scale * (result - p.scale_room_k)
     elif name == DISPLACEMENT:
-        result = p.kappa * _read(grid, values, slopes, OUT_MEMBRANE, wanted)
+        result = p.kappa * _interpolate(grid, values, slopes, OUT_MEMBRANE, query_s)
         if p.play_m:
-            result = _play(grid, p.kappa * values[:, 1, OUT_MEMBRANE], wanted, result, p.play_m)
-        result = membrane(p, result)
+            result = _apply_backlash(grid, p.kappa * values[:, 1, OUT_MEMBRANE], query_s, result, p.play_m)
+        result = compute_membrane_m(p, result)
         if p.slack_m:
             result = np.maximum(result - p.slack_m, 0.0)
         if p.glare:
-            row = np.clip(np.searchsorted(segments[:, 0], wanted, side="right") - 1, 0, len(segments) - 1)
-            result = result - p.glare * np.where(segments[row, 5] == LIT, segments[row, 2], 0.0)
+            row = np.clip(np.searchsorted(segments[:, 0], query_s, side="right") - 1, 0, len(segments) - 1)
+            result = result - p.glare * np.where(segments[row, 5] == GATE_ON, segments[row, 2], 0.0)
     else:
-        result = p.phi * _read(grid, values, slopes, OUT_GAS, wanted)
+        result = p.phi * _interpolate(grid, values, slopes, OUT_GAS, query_s)
     if p.hum_signal == name:
-        result = result + p.hum * np.sin(2 * math.pi * 50.0 * stamps + p.hum_phase)
+        result = result + p.hum * np.sin(2 * math.pi * 50.0 * shown_t_s + p.hum_phase)
     return result
 
 
-def _mirror(p: Physics, steps: np.ndarray, targets: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def _simulate_mirror(p: Physics, steps: np.ndarray, targets: np.ndarray, query_s: np.ndarray) -> np.ndarray:
     steps, targets = np.ascontiguousarray(steps), np.ascontiguousarray(targets)
     if p.mirror_hz:
         omega = 2 * math.pi * p.mirror_hz
-        return _servo(steps + p.mirror_delay_s, targets, wanted, omega, p.mirror_zeta, p.mirror_slew)
-    row = np.searchsorted(steps, wanted, side="right") - 1
+        return _simulate_servo(steps + p.mirror_delay_s, targets, query_s, omega, p.mirror_zeta, p.mirror_slew)
+    row = np.searchsorted(steps, query_s, side="right") - 1
     return np.where(row >= 0, targets[np.maximum(row, 0)], 0.0)
 
 
-def hottest(p: Physics, pulses: np.ndarray, pixel: int = 0) -> float:
-    """The largest rise of the absorber, K."""
+def compute_max_rise_k(p: Physics, pulses: np.ndarray, pixel: int = 0) -> float:
+    """Return the largest rise of the absorber, K."""
     pulses = np.asarray(pulses, float).reshape(-1, 4)
     end = float((pulses[:, 0] + pulses[:, 1]).max()) + 1e-3
-    steps = _integrate(_vector(p, 295.0), _segments(p, pulses, pixel, end, 1.0, 0.0, 0), _fastest(p), 2e-6)
+    steps = _integrate(
+        _pack_parameters(p, 295.0), _build_segments(p, pulses, pixel, end, 1.0, 0.0, 0), _compute_max_step_s(p), 2e-6
+    )
     return float(steps[1][:, 1, OUT_THETA].max())
 
 
 @njit(cache=True)
-def nominal(edges, powers, wanted, r, c, tau):
-    """Rise of absorber and gas in the nominal model after piecewise constant absorbed power, in closed form."""
-    theta, gas = np.zeros(len(wanted)), np.zeros(len(wanted))
+def compute_nominal_rises(edges, powers, query_s, r, c, tau):
+    """Return nominal rises of absorber and gas for piecewise constant absorbed power, in closed form."""
+    theta, gas = np.zeros(len(query_s)), np.zeros(len(query_s))
     rc = r * c
     t, a, g, power, row = 0.0, 0.0, 0.0, 0.0, 0
     mix = 0.5 * rc / (rc - tau)
-    for i in range(len(wanted)):
-        if wanted[i] <= 0.0:
+    for i in range(len(query_s)):
+        if query_s[i] <= 0.0:
             continue
-        while row < len(edges) and edges[row] <= wanted[i]:
+        while row < len(edges) and edges[row] <= query_s[i]:
             dt = edges[row] - t
             ea, eg = math.exp(-dt / rc), math.exp(-dt / tau)
             rest = r * power
@@ -600,7 +608,7 @@ def nominal(edges, powers, wanted, r, c, tau):
             a = rest + (a - rest) * ea
             t, power = edges[row], powers[row]
             row += 1
-        dt = wanted[i] - t
+        dt = query_s[i] - t
         ea, eg = math.exp(-dt / rc), math.exp(-dt / tau)
         rest = r * power
         gas[i] = 0.5 * rest + mix * (a - rest) * ea + (g - 0.5 * rest - mix * (a - rest)) * eg
@@ -608,8 +616,8 @@ def nominal(edges, powers, wanted, r, c, tau):
     return theta, gas
 
 
-def edges_of(pulses: np.ndarray, pixel: int) -> tuple[np.ndarray, np.ndarray]:
-    """Instants at which the absorbed power of a pixel changes, and what it changes to, W."""
+def find_edges(pulses: np.ndarray, pixel: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the times at which the absorbed power of a pixel changes, and the power from then on, W."""
     own = np.asarray(pulses, float).reshape(-1, 4)
     own = own[own[:, 3].astype(int) == pixel]
     own = own[np.argsort(own[:, 0], kind="stable")]

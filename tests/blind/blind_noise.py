@@ -1,4 +1,4 @@
-"""Noise of the blind recordings, and how many σ an effect is above it once the nominal model is refitted."""
+"""Noise of the blind recordings, and the significance of an effect after refitting the nominal model."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from blind_display import DISPLACEMENT, FORCE, TEMPERATURE, Physics, edges_of, nominal
+from blind_display import DISPLACEMENT, FORCE, TEMPERATURE, Physics, compute_nominal_rises, find_edges
 
 BASE = ("R", "C", "tau_g", "kappa", "phi")
 
 
 @dataclass(frozen=True)
-class Colour:
-    """White noise and a slow part: relaxations ("ou": deviation, time) or a damped swing (deviation, Hz, ζ)."""
+class NoiseColour:
+    """White noise plus relaxations ("ou": deviation, time) or a damped oscillation (deviation, Hz, ζ)."""
 
     white: float
     kind: str = ""
     parts: tuple[tuple[float, ...], ...] = ()
 
     def system(self, dt: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Transition, its noise, stationary spread and read-out of the slow part on a grid."""
+        """Return transition, process noise, stationary covariance and read-out of the coloured part on a grid."""
         a, spread, read = np.zeros((2, 2)), np.zeros((2, 2)), np.zeros(2)
         if self.kind == "ou":
             for k, (deviation, time) in enumerate(self.parts):
                 a[k, k], spread[k, k], read[k] = math.exp(-dt / time), deviation**2, 1.0
-        elif self.kind == "swing":
+        elif self.kind == "oscillation":
             deviation, hz, zeta = self.parts[0]
             w = 2 * math.pi * hz
             damped, fade = w * math.sqrt(1.0 - zeta**2), math.exp(-zeta * w * dt)
@@ -37,37 +37,41 @@ class Colour:
         return a, spread - a @ spread @ a.T, spread, read
 
     def sample(self, rng: np.random.Generator, n: int, dt: float) -> np.ndarray:
-        """One stretch of noise."""
+        """Return one realisation of the noise."""
         a, jump, spread, read = self.system(dt)
         white = self.white * rng.standard_normal(n)
-        dice = rng.standard_normal((n, 2))
-        return white + (_walk(a, _root(jump), _root(spread), read, dice) if self.kind else 0.0)
+        normals = rng.standard_normal((n, 2))
+        return white + (
+            _simulate_state_space(a, _compute_square_root(jump), _compute_square_root(spread), read, normals)
+            if self.kind
+            else 0.0
+        )
 
     def whiten(self, columns: np.ndarray, dt: float) -> np.ndarray:
-        """Columns divided by the noise: what was white after it has unit variance."""
-        return _innovate(*self.system(dt), self.white**2, np.ascontiguousarray(columns))
+        """Return columns whitened to unit variance."""
+        return _compute_innovations(*self.system(dt), self.white**2, np.ascontiguousarray(columns))
 
 
-def _root(m: np.ndarray) -> np.ndarray:
+def _compute_square_root(m: np.ndarray) -> np.ndarray:
     values, vectors = np.linalg.eigh(m)
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
 @njit(cache=True)
-def _walk(a, jump, spread, read, dice):
-    n = len(dice)
+def _simulate_state_space(a, jump, spread, read, normals):
+    n = len(normals)
     result = np.empty(n)
-    x = np.dot(spread, dice[0])
+    x = np.dot(spread, normals[0])
     for i in range(n):
         if i:
-            x = np.dot(a, x) + np.dot(jump, dice[i])
+            x = np.dot(a, x) + np.dot(jump, normals[i])
         result[i] = read[0] * x[0] + read[1] * x[1]
     return result
 
 
 @njit(cache=True)
-def _innovate(a, jump, spread, read, variance, columns):
-    """Kalman filter of every column with the same gains; returns the scaled innovations."""
+def _compute_innovations(a, jump, spread, read, variance, columns):
+    """Return the normalised innovations of a Kalman filter for every column, with common gains."""
     n, m = columns.shape
     result = np.empty((n, m))
     p = spread.copy()
@@ -91,23 +95,25 @@ def _innovate(a, jump, spread, read, variance, columns):
     return result
 
 
-def draw_colour(rng: np.random.Generator, white: float) -> Colour:
-    """White noise with one of the slow companions a lab has."""
+def draw_noise_colour(rng: np.random.Generator, white: float) -> NoiseColour:
+    """Draw white noise with one coloured part."""
     kind = int(rng.integers(4))
     size = white * float(np.exp(rng.uniform(np.log(0.3), np.log(1.2))))
     if kind == 0:
-        return Colour(white, "ou", ((size, float(np.exp(rng.uniform(np.log(5e-4), np.log(0.02))))),))
+        return NoiseColour(white, "ou", ((size, float(np.exp(rng.uniform(np.log(5e-4), np.log(0.02))))),))
     if kind == 1:
-        return Colour(white, "swing", ((size, float(rng.uniform(15.0, 150.0)), float(rng.uniform(0.15, 0.7))),))
+        return NoiseColour(
+            white, "oscillation", ((size, float(rng.uniform(15.0, 150.0)), float(rng.uniform(0.15, 0.7))),)
+        )
     if kind == 2:
         quick, slow = float(rng.uniform(5e-4, 5e-3)), float(rng.uniform(0.02, 0.2))
-        return Colour(white, "ou", ((0.8 * size, quick), (0.6 * size, slow)))
-    return Colour(white, "ou", ((size, float(np.exp(rng.uniform(np.log(0.01), np.log(0.1))))),))
+        return NoiseColour(white, "ou", ((0.8 * size, quick), (0.6 * size, slow)))
+    return NoiseColour(white, "ou", ((size, float(np.exp(rng.uniform(np.log(0.01), np.log(0.1))))),))
 
 
 @dataclass(frozen=True)
-class Nuisance:
-    """Spreads of what differs from run to run."""
+class RunVariation:
+    """Standard deviations of quantities that vary between runs."""
 
     power: float
     timing_s: float
@@ -115,8 +121,8 @@ class Nuisance:
 
 
 @dataclass
-class Row:
-    """One run as the projection sees it: its drive, its clocks, the pixel looked at."""
+class BenchRun:
+    """One run in the projection: drive, sample times and measured pixel."""
 
     key: str
     pulses: np.ndarray
@@ -125,28 +131,28 @@ class Row:
     ambient_k: float
 
 
-def nominal_signals(base: Physics, row: Row, shift: float = 0.0) -> dict[str, np.ndarray]:
-    """The nominal model's answer, rises only (the ambient is left out); mirrors are left to the caller."""
-    edges, powers = edges_of(row.pulses, row.pixel)
+def simulate_nominal_signals(base: Physics, row: BenchRun, shift: float = 0.0) -> dict[str, np.ndarray]:
+    """Return the nominal signals as rises, without ambient and without mirrors."""
+    edges, powers = find_edges(row.pulses, row.pixel)
     result = {}
     for name, t in row.times.items():
         if name in (TEMPERATURE, DISPLACEMENT, FORCE):
-            theta, gas = nominal(edges, powers, t - shift, base.R, base.C, base.tau_g)
+            theta, gas = compute_nominal_rises(edges, powers, t - shift, base.R, base.C, base.tau_g)
             result[name] = {TEMPERATURE: theta, DISPLACEMENT: base.kappa * gas, FORCE: base.phi * gas}[name]
     return result
 
 
-def _columns(base: Physics, row: Row) -> dict[str, np.ndarray]:
-    """Sensitivities to the logarithms of the five, to the power's logarithm and to a late start."""
-    centre = nominal_signals(base, row)
+def _columns(base: Physics, row: BenchRun) -> dict[str, np.ndarray]:
+    """Return sensitivities to the logarithms of the base parameters and of the power, and to a late start."""
+    centre = simulate_nominal_signals(base, row)
     result = {name: np.zeros((len(y), 7)) for name, y in centre.items()}
     for k, name in enumerate(BASE[:3]):
         step = 1e-4
-        up = nominal_signals(base.with_(**{name: getattr(base, name) * (1 + step)}), row)
-        down = nominal_signals(base.with_(**{name: getattr(base, name) * (1 - step)}), row)
+        up = simulate_nominal_signals(base.with_(**{name: getattr(base, name) * (1 + step)}), row)
+        down = simulate_nominal_signals(base.with_(**{name: getattr(base, name) * (1 - step)}), row)
         for signal in centre:
             result[signal][:, k] = (up[signal] - down[signal]) / (2 * step)
-    late, early = nominal_signals(base, row, 2e-6), nominal_signals(base, row, -2e-6)
+    late, early = simulate_nominal_signals(base, row, 2e-6), simulate_nominal_signals(base, row, -2e-6)
     for signal, y in centre.items():
         result[signal][:, 3] = y if signal == DISPLACEMENT else 0.0
         result[signal][:, 4] = y if signal == FORCE else 0.0
@@ -156,10 +162,12 @@ def _columns(base: Physics, row: Row) -> dict[str, np.ndarray]:
 
 
 class Bench:
-    """The recording as a yardstick: how long is a difference, in σ, once nuisances and base parameters have moved."""
+    """Norm of a difference in σ after nuisance and base parameters are refitted."""
 
-    def __init__(self, base: Physics, rows: list[Row], colours: dict[str, Colour], nuisance: Nuisance):
-        self.base, self.rows, self.colours, self.nuisance = base, rows, colours, nuisance
+    def __init__(
+        self, base: Physics, rows: list[BenchRun], colours: dict[str, NoiseColour], run_variation: RunVariation
+    ):
+        self.base, self.rows, self.colours, self.run_variation = base, rows, colours, run_variation
         self._start = self._sensitivities(base)
 
     def _sensitivities(self, base: Physics) -> dict[str, dict[str, np.ndarray]]:
@@ -172,19 +180,19 @@ class Bench:
                 }
         return result
 
-    def _whiten(self, signal: str, row: Row, columns: np.ndarray) -> np.ndarray:
+    def _whiten(self, signal: str, row: BenchRun, columns: np.ndarray) -> np.ndarray:
         t = row.times[signal]
         return self.colours[signal].whiten(columns, float(t[-1] - t[0]) / (len(t) - 1))
 
     def _reduce(self, differences, sensitivities, extras) -> tuple[float, np.ndarray]:
-        """χ² left and the best steps of the five (and of the extra columns)."""
+        """Return the residual χ² and the best steps of the five parameters and of the extra columns."""
         many = 5 + len(extras)
         total = np.zeros((1 + many, 1 + many))
-        alike: dict[tuple, list[int]] = {}
+        members_by_content: dict[tuple, list[int]] = {}
         for index, row in enumerate(self.rows):
-            same = (row.key, id(differences[index]), *(id(e[index]) for e in extras))
-            alike.setdefault(same, []).append(index)
-        for members in alike.values():
+            content = (row.key, id(differences[index]), *(id(e[index]) for e in extras))
+            members_by_content.setdefault(content, []).append(index)
+        for members in members_by_content.values():
             index, row = members[0], self.rows[members[0]]
             names = [name for name in row.times if name in self.colours]
             wide = 1 + many + 2 + len(names)
@@ -201,7 +209,11 @@ class Bench:
                 else:
                     block[:, 3 + many + k] = self._whiten(name, row, np.ones((len(own), 1)))[:, 0]
                 blocks.append(block)
-            spread = [self.nuisance.power, self.nuisance.timing_s, *(self.nuisance.baseline[n] for n in names)]
+            spread = [
+                self.run_variation.power,
+                self.run_variation.timing_s,
+                *(self.run_variation.baseline[n] for n in names),
+            ]
             stack = np.vstack(blocks)
             normal = stack.T @ stack
             local = normal[1 + many :, 1 + many :] + np.diag(1.0 / np.square(spread))
@@ -215,7 +227,7 @@ class Bench:
         return float(max(total[0, 0] - total[1:, 0] @ steps, 0.0)), steps
 
     def sigma(self, shown: list[dict[str, np.ndarray]], refits: int = 4, extras=()) -> float:
-        """Length of what is shown beyond the nominal model, rises and mirror errors as in `differences`."""
+        """Return the norm of the signals beyond the nominal model; rises and mirror errors as in `differences`."""
         base, sensitivities = self.base, self._start
         chi2 = 0.0
         for nth in range(max(refits, 1)):
@@ -227,27 +239,29 @@ class Bench:
         return math.sqrt(chi2)
 
     def differences(self, base: Physics, shown: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-        """Shown less nominal, run by run; temperatures are shown above ambient, mirrors above their command."""
+        """Return signals minus nominal per run; temperatures relative to ambient, mirrors to their commands."""
         known: dict[str, dict[str, np.ndarray]] = {}
         done: dict[tuple[str, int], dict[str, np.ndarray]] = {}
         result = []
         for row, values in zip(self.rows, shown, strict=True):
-            same = (row.key, id(values))
+            content = (row.key, id(values))
             if row.key not in known:
-                known[row.key] = nominal_signals(base, row)
-            if same not in done:
-                done[same] = {name: y - known[row.key].get(name, 0.0) for name, y in values.items()}
-            result.append(done[same])
+                known[row.key] = simulate_nominal_signals(base, row)
+            if content not in done:
+                done[content] = {name: y - known[row.key].get(name, 0.0) for name, y in values.items()}
+            result.append(done[content])
         return result
 
 
-def minus(some: list[dict[str, np.ndarray]], others: list[dict[str, np.ndarray]]) -> list[dict[str, np.ndarray]]:
-    """Run by run what some show more than others; runs that are one object stay one."""
+def subtract_signals(
+    some: list[dict[str, np.ndarray]], others: list[dict[str, np.ndarray]]
+) -> list[dict[str, np.ndarray]]:
+    """Subtract signals run by run; runs that are one object stay one."""
     done: dict[tuple[int, int], dict[str, np.ndarray]] = {}
     result = []
     for a, b in zip(some, others, strict=True):
-        same = (id(a), id(b))
-        if same not in done:
-            done[same] = {name: a[name] - b[name] for name in a}
-        result.append(done[same])
+        content = (id(a), id(b))
+        if content not in done:
+            done[content] = {name: a[name] - b[name] for name in a}
+        result.append(done[content])
     return result

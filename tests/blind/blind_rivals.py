@@ -1,21 +1,21 @@
-"""What an ideal analysis could tell apart in a case: how many σ are left when each catalogue cause is fitted instead.
+"""Distinguishability by an ideal analysis: the residual in σ when each catalogue cause is fitted instead.
 
 Each cause is tried with a free amplitude and a grid of time constants, base parameters refitted; a cause that leaves
 only a few σ is a rival that this data cannot exclude. Takes some seconds.
 
-    rivals_of(case) -> {cause: σ left}, smallest first; "" is the nominal model alone
+    compute_case_rivals(case) -> {cause: residual σ}, in ascending order; "" is the nominal model alone
 """
 
 from __future__ import annotations
 
 from blind_causes import CATALOGUE
 from blind_display import MIRRORS, Physics
-from blind_noise import minus
-from blind_session import Habits, Run, bench_of, ideal_rises, scene_of
+from blind_noise import subtract_signals
+from blind_session import Instruments, Run, build_bench, build_scene, simulate_ideal_rises
 
 
 def _trials(base: Physics, runs: list[Run]) -> list[tuple[str, dict[str, object]]]:
-    scene = scene_of(base, runs)
+    scene = build_scene(base, runs)
     peak = scene.base.kappa * scene.peak_gas_k
     trials: list[tuple[str, dict[str, object]]] = [
         ("bridge_conductivity", {"bridge": "mean", "bridge_n": n}) for n in (0.1, 0.6)
@@ -53,19 +53,19 @@ def _trials(base: Physics, runs: list[Run]) -> list[tuple[str, dict[str, object]
     return trials
 
 
-def rivals(base: Physics, habits: Habits, runs: list[Run], truth: Physics) -> dict[str, float]:
-    """σ left after the best fit of each catalogue cause, smallest first."""
-    bench = bench_of(base, habits, runs)
-    shown = ideal_rises(base, runs, truth)
-    nothing = ideal_rises(base, runs, base)
+def compute_rivals(base: Physics, instruments: Instruments, runs: list[Run], truth: Physics) -> dict[str, float]:
+    """Return the residual in σ after the best fit of each catalogue cause, in ascending order."""
+    bench = build_bench(base, instruments, runs)
+    shown = simulate_ideal_rises(base, runs, truth)
+    nothing = simulate_ideal_rises(base, runs, base)
     left = {"": bench.sigma(shown)} | dict.fromkeys(CATALOGUE, float("inf"))
     left["sensor_scale"] = left[""]
     for key, changes in _trials(base, runs):
-        column = minus(ideal_rises(base, runs, base.with_(**changes)), nothing)
+        column = subtract_signals(simulate_ideal_rises(base, runs, base.with_(**changes)), nothing)
         left[key] = min(left[key], bench.sigma(shown, refits=2, extras=(column,)))
     return dict(sorted(left.items(), key=lambda item: item[1]))
 
 
-def rivals_of(case) -> dict[str, float]:
-    """The same of a drawn case."""
-    return rivals(Physics(**case.base), case.habits, case.runs, case.truth)
+def compute_case_rivals(case) -> dict[str, float]:
+    """Return the rivals of a drawn case."""
+    return compute_rivals(Physics(**case.base), case.instruments, case.runs, case.truth)

@@ -1,12 +1,12 @@
-"""Judge an answer (`diagnosis.json`, as recordings.md has it) against the truth of a case, and make the table.
+"""Score of an answer (`diagnosis.json`) against the ground truth of a case, and the table of scores.
 
-    s = score(case, answer, after=second_answer)      # after: the answer once the experiment asked for was done
-    print(table(scores))
+    s = score_answer(case, answer, after=second_answer)      # after: the answer with the proposed experiment included
+    print(format_table(scores))
 
-Rules where the design leaves room: without a hidden effect every verdict but "none" is a false alarm. A set counts
-only when the verdict is "ambiguous" or one cause alone. Naming anything for a mechanism outside the catalogue is
-misnaming, an ambiguous set too. `sensor_scale` shows in no data without a reference: naming it alone is wrong, "none"
-is right and so is a set that holds it; it has a row of its own.
+Rules that the design leaves open: without a hidden effect every verdict but "none" is a false alarm. A set counts only
+if the verdict is "ambiguous" or names one cause. Naming anything for a mechanism outside the catalogue is misnaming, an
+ambiguous set included. `sensor_scale` is not observable without a reference: naming it alone is wrong, "none" is right
+and so is a set that holds it; it has its own row.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from typing import Any
 
 UNNAMEABLE = "sensor_scale"
 BASE = ("R", "C", "tau_g", "kappa", "phi")
-# Forms under which R and C mean one thing here and may mean another in an equally good model (what ε P is called).
+# Causes under which R and C depend on the convention for ε P.
 BASE_BY_CONVENTION = ("power_nonlinearity", "sensor_scale", "beam_misalignment", "absorber_ageing")
 
-# Names an answer may use for a size; only these are compared, and only where the form is the textbook one.
+# Names of a size in an answer; only these are compared, and only for the textbook form.
 NAMES: dict[str, tuple[str, ...]] = {
     "bridge_conductivity.n": ("n", "exponent"),
     "heat_capacity.c": ("c", "slope"),
@@ -41,13 +41,13 @@ NAMES: dict[str, tuple[str, ...]] = {
     "mirror_lag.zeta": ("zeta", "damping"),
 }
 
-# Sizes that an answer may state in another unit: c per 100 K is a slope per kelvin.
+# Sizes with another unit in the answer: c per 100 K is a slope per kelvin.
 UNITS = {"heat_capacity.slope": 0.01}
 
 
 @dataclass(frozen=True)
 class Score:
-    """One case judged; None where a question does not arise."""
+    """Score of one case; None where a question does not apply."""
 
     block: str
     seed: int
@@ -102,10 +102,10 @@ def _covered(case: Any, answer: Mapping[str, Any]) -> tuple[dict[str, bool], dic
     return base, terms
 
 
-def score(
+def score_answer(
     case: Any, answer: Mapping[str, Any], *, after: Mapping[str, Any] | None = None, known: float | None = None
 ) -> Score:
-    """Judge one answer. `known` is the gain of a fit that was told the cause, 1 (down to the noise) when not given."""
+    """Score one answer; `known` is the gain of a fit with the known cause, default 1 (down to the noise)."""
     verdict = str(answer.get("verdict"))
     named = tuple(answer.get("causes") or ())
     truth = set(case.causes)
@@ -158,7 +158,7 @@ def score(
 
 
 def wilson(hits: int, count: int, z: float = 1.959964) -> tuple[float, float]:
-    """95 % interval of a proportion."""
+    """Return the 95 % Wilson interval of a proportion."""
     if count == 0:
         return 0.0, 1.0
     p, zz = hits / count, z * z
@@ -168,13 +168,13 @@ def wilson(hits: int, count: int, z: float = 1.959964) -> tuple[float, float]:
 
 
 def _row(block: str, what: str, values: Iterable[bool | None], aim: str) -> str:
-    told = [v for v in values if v is not None]
-    if not told:
+    values = [v for v in values if v is not None]
+    if not values:
         return f"| {block} | {what} | – | – | – | {aim} |"
-    hits = sum(told)
-    low, high = wilson(hits, len(told))
+    hits = sum(values)
+    low, high = wilson(hits, len(values))
     return (
-        f"| {block} | {what} | {hits}/{len(told)} | {100 * hits / len(told):.1f} % "
+        f"| {block} | {what} | {hits}/{len(values)} | {100 * hits / len(values):.1f} % "
         f"| {100 * low:.1f} to {100 * high:.1f} % | {aim} |"
     )
 
@@ -187,8 +187,8 @@ def _quantile(values: list[float], q: float) -> float:
     return ranked[low] + (at - low) * (ranked[high] - ranked[low])
 
 
-def table(scores: Iterable[Score]) -> str:
-    """The table of diagnosis.md with 95 % intervals, then each cause and mechanism by itself."""
+def format_table(scores: Iterable[Score]) -> str:
+    """Return the table of docs/explanation/blind-tests.md, then each cause and mechanism by itself."""
     every = list(scores)
     lines = ["| block | score | hits | share | 95 % interval | aim |", "|---|---|---|---|---|---|"]
 
@@ -233,6 +233,6 @@ def table(scores: Iterable[Score]) -> str:
         for s in some:
             words = s.verdict + (" " + "+".join(s.named) if s.named else "")
             said[words] = said.get(words, 0) + 1
-        told = ", ".join(f"{n} × {w}" for w, n in sorted(said.items(), key=lambda item: -item[1]))
-        lines.append(f"| {name} | {len(some)} | {told} |")
+        answers = ", ".join(f"{n} × {w}" for w, n in sorted(said.items(), key=lambda item: -item[1]))
+        lines.append(f"| {name} | {len(some)} | {answers} |")
     return "\n".join(lines) + "\n"

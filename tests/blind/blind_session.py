@@ -1,4 +1,4 @@
-"""A lab's session: its design, its instruments and their noise, its runs and how they are written to a file."""
+"""A lab's session: its design, its instruments and their noise, its runs and its file."""
 
 from __future__ import annotations
 
@@ -7,12 +7,21 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 
-from blind_causes import Scene
-from blind_display import DISPLACEMENT, FORCE, FULL_POWER_W, MIRRORS, TEMPERATURE, Physics, edges_of, respond
-from blind_display import nominal as nominal_rise
-from blind_noise import Bench, Colour, Nuisance, Row, draw_colour
+from blind_causes import SessionScale
+from blind_display import (
+    DISPLACEMENT,
+    FORCE,
+    FULL_POWER_W,
+    MIRRORS,
+    TEMPERATURE,
+    Physics,
+    compute_nominal_rises,
+    find_edges,
+    simulate_signals,
+)
+from blind_noise import Bench, BenchRun, NoiseColour, RunVariation, draw_noise_colour
 
-HOTTEST_K = 700.0
+MAX_ABSORBER_K = 700.0
 SAMPLES = 1500
 # Bridge width, m, and resistance, K/W, of the five samples of Table S3.
 SAMPLES_S3 = ((2.0e-4, 382.0), (2.5e-4, 269.0), (4.0e-4, 184.0), (5.5e-4, 145.0), (7.5e-4, 95.0))
@@ -22,7 +31,7 @@ Rng = np.random.Generator
 
 @dataclass(frozen=True)
 class Experiment:
-    """What is repeated: a drive and what is looked at."""
+    """One repeated experiment: its drive and the measured signals."""
 
     name: str
     pulses: np.ndarray
@@ -34,44 +43,44 @@ class Experiment:
 
 @dataclass(frozen=True)
 class Run:
-    """One repeat, as it happened."""
+    """One repeat, with its actual conditions."""
 
     name: str
     experiment: Experiment
     session_s: float
     dose_j: float
     ambient_k: float
-    stated_k: float
+    stated_ambient_k: float
     power: float
     late_s: float
-    chance: int
+    noise_seed: int
     shown: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Habits:
-    """The instruments of a lab and the spreads they have."""
+class Instruments:
+    """Instruments of a lab and their errors."""
 
-    colours: dict[str, Colour]
-    nuisance: Nuisance
+    colours: dict[str, NoiseColour]
+    run_variation: RunVariation
     stated: dict[str, float]  # sigma as the instrument's sheet has it
     missing: float
     rates: dict[str, float]
-    tail: float  # in RC
+    cooling_rc: float  # in RC
     ambient_k: float
-    swing_k: float
-    swing_s: float
+    ambient_amplitude_k: float
+    ambient_period_s: float
     start: datetime
 
 
-def sample_times(rng: Rng, span: float, rate: float) -> np.ndarray:
-    """Sample times from just after 0 to the end, no more than the memory of the instrument holds."""
+def draw_sample_times(rng: Rng, span: float, rate: float) -> np.ndarray:
+    """Draw sample times from just after 0 to the end, limited by the memory of the instrument."""
     rate = min(rate, (SAMPLES - 1) / span)
     return (np.arange(int(span * rate)) + rng.uniform(0.05, 0.95)) / rate
 
 
-def mirror_steps(rng: Rng) -> np.ndarray:
-    """Steps of three sizes of both mirrors, there and back; each falls between two samples at 5 kHz."""
+def draw_mirror_steps(rng: Rng) -> np.ndarray:
+    """Draw steps of three sizes of both mirrors, forth and back; each falls between two samples at 5 kHz."""
     sizes = [0.004, 0.03, 0.16] * np.exp(0.3 * rng.standard_normal(3))
     rows = [(0.0, 0.0, 0.0)]
     t, x, y = 0.01, 0.0, 0.0
@@ -86,7 +95,7 @@ def mirror_steps(rng: Rng) -> np.ndarray:
 
 
 def draw_base(rng: Rng) -> tuple[Physics, float]:
-    """The five parameters of a sample as Table S3 has them, and its bridge width."""
+    """Draw the five parameters of a sample as in Table S3, and its bridge width."""
     width, resistance = SAMPLES_S3[int(rng.integers(len(SAMPLES_S3)))]
     r = float(np.clip(resistance * np.exp(0.07 * rng.standard_normal()), 88.0, 400.0))
     c = float(np.clip(101e-6 + 16e-6 * rng.standard_normal(), 75e-6, 130e-6))
@@ -94,14 +103,14 @@ def draw_base(rng: Rng) -> tuple[Physics, float]:
     return Physics(R=r, C=c, tau_g=float(rng.uniform(2.0e-3, 4.5e-3)), kappa=kappa, phi=phi), width
 
 
-def draw_habits(rng: Rng) -> Habits:
-    """The instruments, what they do to a signal, and the room."""
+def draw_instruments(rng: Rng) -> Instruments:
+    """Draw the instruments with their noise, and the ambient temperature."""
     whites = {
         TEMPERATURE: float(rng.uniform(0.1, 0.4)),
         DISPLACEMENT: float(rng.uniform(1e-6, 3e-6)),
         FORCE: float(rng.uniform(3e-4, 1e-3)),
     } | dict.fromkeys(MIRRORS, float(rng.uniform(2e-5, 6e-5)))
-    colours = {name: draw_colour(rng, white) for name, white in whites.items()}
+    colours = {name: draw_noise_colour(rng, white) for name, white in whites.items()}
     baseline = {
         TEMPERATURE: float(rng.uniform(0.05, 0.15)),
         DISPLACEMENT: float(rng.uniform(3e-7, 1.5e-6)),
@@ -109,37 +118,37 @@ def draw_habits(rng: Rng) -> Habits:
     } | dict.fromkeys(MIRRORS, 5e-6)
     stated = {name: white * float(rng.uniform(0.77, 1.3)) for name, white in whites.items() if rng.random() < 0.5}
     rates = {name: float(rng.choice([1000.0, 2000.0, 2500.0, 5000.0])) for name in (TEMPERATURE, DISPLACEMENT, FORCE)}
-    nuisance = Nuisance(float(rng.uniform(0.002, 0.008)), float(rng.uniform(1e-5, 3e-5)), baseline)
+    run_variation = RunVariation(float(rng.uniform(0.002, 0.008)), float(rng.uniform(1e-5, 3e-5)), baseline)
     start = datetime(2025, 3, 3, 9, 0, 0, tzinfo=UTC) + timedelta(minutes=float(int(rng.integers(60 * 24 * 60))))
-    return Habits(
+    return Instruments(
         colours,
-        nuisance,
+        run_variation,
         stated,
         missing=float(rng.uniform(0.0, 0.02)),
         rates=rates | dict.fromkeys(MIRRORS, 5000.0),
-        tail=float(rng.uniform(3.0, 6.0)),
+        cooling_rc=float(rng.uniform(3.0, 6.0)),
         ambient_k=float(rng.uniform(293.0, 298.0)),
-        swing_k=float(rng.uniform(0.2, 1.0)),
-        swing_s=float(rng.uniform(1800.0, 7200.0)),
+        ambient_amplitude_k=float(rng.uniform(0.2, 1.0)),
+        ambient_period_s=float(rng.uniform(1800.0, 7200.0)),
         start=start,
     )
 
 
-def draw_design(rng: Rng, base: Physics, habits: Habits, *, pixels: bool, mirrors: bool) -> list[Experiment]:
-    """The experiments in the order of the session, one entry for each run."""
+def draw_design(rng: Rng, base: Physics, instruments: Instruments, *, pixels: bool, mirrors: bool) -> list[Experiment]:
+    """Draw the experiments in the order of the session, one entry per run."""
     rc = base.R * base.C
-    top = min(FULL_POWER_W, HOTTEST_K * 0.95 / (0.66 * base.R))
+    top = min(FULL_POWER_W, MAX_ABSORBER_K * 0.95 / (0.66 * base.R))
     lead = float(rng.uniform(0.010, 0.050))
     with_force = {"ladder": rng.random() < 0.6, "width": rng.random() < 0.5, "train": rng.random() < 0.5}
     with_force[str(rng.choice(["ladder", "train"]))] = True
 
-    def looked(span: float, force: bool, slow: float | None = None) -> dict[str, np.ndarray]:
+    def build_times(span: float, force: bool, slow: float | None = None) -> dict[str, np.ndarray]:
         names = (TEMPERATURE, DISPLACEMENT, FORCE) if force else (TEMPERATURE, DISPLACEMENT)
-        return {n: sample_times(rng, span, min(habits.rates[n], slow or 1e9)) for n in names}
+        return {n: draw_sample_times(rng, span, min(instruments.rates[n], slow or 1e9)) for n in names}
 
-    def single(name: str, width: float, power: float, force: bool, pixel: int = 0, lit: int = 0) -> Experiment:
-        span = lead + width + habits.tail * rc
-        return Experiment(name, np.array([[lead, width, power, lit]]), looked(span, force), pixel)
+    def single(name: str, width: float, power: float, force: bool, pixel: int = 0, pulsed: int = 0) -> Experiment:
+        span = lead + width + instruments.cooling_rc * rc
+        return Experiment(name, np.array([[lead, width, power, pulsed]]), build_times(span, force), pixel)
 
     hold = float(np.clip(rng.uniform(0.06, 0.12), min(2.5 * rc, 0.12), 0.12))
     rungs = np.linspace(0.5, top, int(rng.integers(3, 6))) * np.exp(0.03 * rng.standard_normal())
@@ -154,23 +163,23 @@ def draw_design(rng: Rng, base: Physics, habits: Habits, *, pixels: bool, mirror
         length, power = float(rng.uniform(1.0, 4.0)), float(rng.uniform(0.6, 1.0) * top)
         starts = lead + np.arange(max(int(length / (width + gap)), 6)) * (width + gap)
         drive = np.column_stack([starts, np.full((len(starts), 3), [width, power, 0.0])])
-        span = float(starts[-1] + width + habits.tail * rc + rng.uniform(0.0, 0.4))
+        span = float(starts[-1] + width + instruments.cooling_rc * rc + rng.uniform(0.0, 0.4))
         slow = float(rng.uniform(200.0, 1000.0))
-        trains.append(Experiment(f"train-{k + 1}", drive, looked(span, bool(with_force["train"]), slow)))
-    beside = [single("neighbour-only", hold, strength, False, lit=1)]
+        trains.append(Experiment(f"train-{k + 1}", drive, build_times(span, bool(with_force["train"]), slow)))
+    beside = [single("neighbour-only", hold, strength, False, pulsed=1)]
     if pixels:
         for other in range(1, int(rng.integers(3, 5))):
-            beside.append(single(f"pixel-{other}", hold, float(rungs[-1]), False, pixel=other, lit=other))
+            beside.append(single(f"pixel-{other}", hold, float(rungs[-1]), False, pixel=other, pulsed=other))
     if mirrors:
-        moves = mirror_steps(rng)
+        moves = draw_mirror_steps(rng)
         times = np.arange(int((moves[-1, 0] + 0.015) * 5000.0)) / 5000.0 + 1e-4
         beside.append(Experiment("mirror", np.zeros((0, 4)), dict.fromkeys(MIRRORS, times), commands=moves))
     reference = single("reference", float(rng.uniform(0.02, 0.05)), strength, bool(with_force["ladder"]))
-    return _schedule(rng, [*ladder, *short, *trains, *beside], reference)
+    return _schedule_runs(rng, [*ladder, *short, *trains, *beside], reference)
 
 
-def _schedule(rng: Rng, experiments: list[Experiment], reference: Experiment) -> list[Experiment]:
-    """Repeats within 20 to 30 runs, blocked or mixed, the reference pulse first and last."""
+def _schedule_runs(rng: Rng, experiments: list[Experiment], reference: Experiment) -> list[Experiment]:
+    """Distribute repeats over 20 to 30 runs, blocked or mixed, with the reference pulse first and last."""
     budget = 30 - 4
     repeats = np.full(len(experiments), 2)
     while repeats.sum() > budget:  # two ladders less rather than one repeat
@@ -187,40 +196,42 @@ def _schedule(rng: Rng, experiments: list[Experiment], reference: Experiment) ->
 
 
 def _add_dose(dose: dict[int, float], pulses: np.ndarray) -> None:
-    for _, width, power, lit in pulses:
-        dose[int(lit)] = dose.get(int(lit), 0.0) + float(width * power)
+    for _, width, power, pulsed in pulses:
+        dose[int(pulsed)] = dose.get(int(pulsed), 0.0) + float(width * power)
 
 
-def session_runs(
-    rng: Rng, design: list[Experiment], habits: Habits, *, before: list[Run] | None = None, drop: float = 0.0
+def build_session_runs(
+    rng: Rng, design: list[Experiment], instruments: Instruments, *, before: list[Run] | None = None, drop: float = 0.0
 ) -> list[Run]:
-    """The runs of a session as they follow one another, or follow those before."""
+    """Return the runs of a session in order, optionally after earlier runs."""
     runs: list[Run] = []
     before = before or []
     clock = before[-1].session_s + 600.0 if before else 0.0
     dose: dict[int, float] = {}
     for run in before:
         _add_dose(dose, run.experiment.pulses)
-    seen: dict[str, int] = {}
-    chance = int(rng.integers(1_000_000)) * 1000
+    repeat_counts: dict[str, int] = {}
+    noise_seed = int(rng.integers(1_000_000)) * 1000
     for k, experiment in enumerate(design, start=len(before)):
         clock += float(rng.uniform(20.0, 90.0))
-        seen[experiment.name] = seen.get(experiment.name, 0) + 1
+        repeat_counts[experiment.name] = repeat_counts.get(experiment.name, 0) + 1
         shown = list(experiment.times)
         if drop and experiment.commands is None and rng.random() < drop:
             shown.remove(str(rng.choice([TEMPERATURE, DISPLACEMENT])))
-        room = habits.ambient_k + habits.swing_k * np.sin(2 * np.pi * clock / habits.swing_s)
+        room = instruments.ambient_k + instruments.ambient_amplitude_k * np.sin(
+            2 * np.pi * clock / instruments.ambient_period_s
+        )
         runs.append(
             Run(
-                name=f"r{k:03d}-{experiment.name}-{seen[experiment.name]}",
+                name=f"r{k:03d}-{experiment.name}-{repeat_counts[experiment.name]}",
                 experiment=experiment,
                 session_s=clock,
                 dose_j=dose.get(experiment.pixel, 0.0),
                 ambient_k=float(room),
-                stated_k=float(room + 0.05 * rng.standard_normal()),
-                power=float(1.0 + habits.nuisance.power * rng.standard_normal()),
-                late_s=float(habits.nuisance.timing_s * rng.standard_normal()),
-                chance=chance + k,
+                stated_ambient_k=float(room + 0.05 * rng.standard_normal()),
+                power=float(1.0 + instruments.run_variation.power * rng.standard_normal()),
+                late_s=float(instruments.run_variation.timing_s * rng.standard_normal()),
+                noise_seed=noise_seed + k,
                 shown=tuple(shown),
             )
         )
@@ -228,9 +239,9 @@ def session_runs(
     return runs
 
 
-def ideal_signals(truth: Physics, run: Run, *, jittered: bool) -> dict[str, np.ndarray]:
+def simulate_ideal_signals(truth: Physics, run: Run, *, jittered: bool) -> dict[str, np.ndarray]:
     e = run.experiment
-    return respond(
+    return simulate_signals(
         truth,
         e.pulses,
         {name: e.times[name] for name in run.shown},
@@ -238,64 +249,64 @@ def ideal_signals(truth: Physics, run: Run, *, jittered: bool) -> dict[str, np.n
         ambient_k=run.ambient_k,
         session_s=run.session_s,
         dose_j=run.dose_j,
-        chance=run.chance,
+        noise_seed=run.noise_seed,
         factor=run.power if jittered else 1.0,
         late_s=run.late_s if jittered else 0.0,
         commands=e.commands,
     )
 
 
-def _missing(rng: Rng, n: int, share: float) -> np.ndarray:
-    """Which samples are lost, singly and in bursts."""
+def _draw_missing(rng: Rng, n: int, share: float) -> np.ndarray:
+    """Draw the lost samples, single and in bursts."""
     lost = rng.random(n) < 0.5 * share
     for start in np.flatnonzero(rng.random(n) < 0.5 * share / 6.0):
         lost[start : start + int(rng.integers(3, 10))] = True
     return lost
 
 
-def write_run(parent, run: Run, truth: Physics, habits: Habits, rng: Rng, width: float | None) -> None:
+def write_run(parent, run: Run, truth: Physics, instruments: Instruments, rng: Rng, width: float | None) -> None:
     group = parent.create_group(run.name)
-    group.attrs["ambient_K"] = run.stated_k
+    group.attrs["ambient_K"] = run.stated_ambient_k
     group.attrs["group"] = run.experiment.name
-    group.attrs["started_at"] = (habits.start + timedelta(seconds=run.session_s)).isoformat()
+    group.attrs["started_at"] = (instruments.start + timedelta(seconds=run.session_s)).isoformat()
     if width is not None:
         group.attrs["bridge_width_m"] = float(width)
     group.create_dataset("pulses", data=np.asarray(run.experiment.pulses, np.float64))
     if run.experiment.commands is not None:
         group.create_dataset("commands", data=np.asarray(run.experiment.commands, np.float64))
-    for name, ideal in ideal_signals(truth, run, jittered=True).items():
+    for name, ideal in simulate_ideal_signals(truth, run, jittered=True).items():
         t = run.experiment.times[name]
         dt = float(t[-1] - t[0]) / (len(t) - 1)
-        offset = habits.nuisance.baseline[name] * rng.standard_normal()
-        value = ideal + offset + habits.colours[name].sample(rng, len(t), dt)
-        value[_missing(rng, len(t), habits.missing)] = np.nan
+        offset = instruments.run_variation.baseline[name] * rng.standard_normal()
+        value = ideal + offset + instruments.colours[name].sample(rng, len(t), dt)
+        value[_draw_missing(rng, len(t), instruments.missing)] = np.nan
         signal = group.create_group(name)
         signal.attrs["pixel"] = run.experiment.pixel
-        if name in habits.stated:
-            signal.attrs["sigma"] = habits.stated[name]
+        if name in instruments.stated:
+            signal.attrs["sigma"] = instruments.stated[name]
         signal.create_dataset("t_s", data=np.asarray(t, np.float64))
         signal.create_dataset("value", data=np.asarray(value, np.float64))
 
 
-def scene_of(base: Physics, runs: list[Run]) -> Scene:
+def build_scene(base: Physics, runs: list[Run]) -> SessionScale:
     signals = tuple(n for n in (TEMPERATURE, DISPLACEMENT, FORCE) if any(n in r.shown for r in runs))
     own = {r.experiment.name: r.experiment for r in runs if len(r.experiment.pulses)}
     gas, rise, dose = 0.0, 0.0, 0.0
     for e in own.values():
-        edges, powers = edges_of(e.pulses, e.pixel)
+        edges, powers = find_edges(e.pulses, e.pixel)
         if len(edges):
             grid = np.linspace(0.0, float(edges[-1]) + 0.01, 2000)
-            theta, inside = nominal_rise(edges, powers, grid, base.R, base.C, base.tau_g)
+            theta, inside = compute_nominal_rises(edges, powers, grid, base.R, base.C, base.tau_g)
             gas, rise = max(gas, float(inside.max())), max(rise, float(theta.max()))
     for r in runs:
         on_zero = r.experiment.pulses[r.experiment.pulses[:, 3].astype(int) == 0]
         dose += float(np.sum(on_zero[:, 1] * on_zero[:, 2]))
-    lit = sorted({int(p) for r in runs if r.experiment.pixel for p in r.experiment.pulses[:, 3]} | {0})
-    return Scene(base, signals, gas, rise, dose, runs[-1].session_s, tuple(lit))
+    pulsed = sorted({int(p) for r in runs if r.experiment.pixel for p in r.experiment.pulses[:, 3]} | {0})
+    return SessionScale(base, signals, gas, rise, dose, runs[-1].session_s, tuple(pulsed))
 
 
-def cooler(design: list[Experiment], share: float) -> list[Experiment]:
-    """The same session with less light."""
+def reduce_power(design: list[Experiment], share: float) -> list[Experiment]:
+    """Return the same session with less power."""
     done: dict[int, Experiment] = {}
     for e in design:
         if id(e) not in done:
@@ -305,36 +316,39 @@ def cooler(design: list[Experiment], share: float) -> list[Experiment]:
     return [done[id(e)] for e in design]
 
 
-def bench_of(base: Physics, habits: Habits, runs: list[Run]) -> Bench:
-    """The yardstick of these runs."""
-    rows = [Row(_key(r), r.experiment.pulses, _chosen(r), r.experiment.pixel, r.stated_k) for r in runs]
-    spread = dict(habits.nuisance.baseline)
+def build_bench(base: Physics, instruments: Instruments, runs: list[Run]) -> Bench:
+    """Return the detectability bench of these runs."""
+    rows = [
+        BenchRun(_build_key(r), r.experiment.pulses, _select_times(r), r.experiment.pixel, r.stated_ambient_k)
+        for r in runs
+    ]
+    spread = dict(instruments.run_variation.baseline)
     spread[TEMPERATURE] = float(np.hypot(spread[TEMPERATURE], 0.05))
-    return Bench(base, rows, habits.colours, replace(habits.nuisance, baseline=spread))
+    return Bench(base, rows, instruments.colours, replace(instruments.run_variation, baseline=spread))
 
 
-def _key(run: Run) -> str:
+def _build_key(run: Run) -> str:
     return run.experiment.name + "|" + ",".join(run.shown)
 
 
-def _chosen(run: Run) -> dict[str, np.ndarray]:
+def _select_times(run: Run) -> dict[str, np.ndarray]:
     return {name: run.experiment.times[name] for name in run.shown}
 
 
-def ideal_rises(base: Physics, runs: list[Run], truth: Physics) -> list[dict[str, np.ndarray]]:
-    """What the runs would show without noise: rises above the room, mirrors less their commands."""
+def simulate_ideal_rises(base: Physics, runs: list[Run], truth: Physics) -> list[dict[str, np.ndarray]]:
+    """Return the noise-free signals: rises above ambient, mirrors relative to their commands."""
     each = bool(truth.ageing or truth.room or truth.hop or truth.missed)
     kept: dict[str, dict[str, np.ndarray]] = {}
     result = []
     for run in runs:
-        key = run.name if each else _key(run)
+        key = run.name if each else _build_key(run)
         if key not in kept:
             kept[key] = {}
-            for name, y in ideal_signals(truth, run, jittered=False).items():
+            for name, y in simulate_ideal_signals(truth, run, jittered=False).items():
                 if name == TEMPERATURE:
                     y = y - run.ambient_k
                 elif name in MIRRORS:
-                    y = y - ideal_signals(base, run, jittered=False)[name]
+                    y = y - simulate_ideal_signals(base, run, jittered=False)[name]
                 kept[key][name] = y
         result.append(kept[key])
     return result

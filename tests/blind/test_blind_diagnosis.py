@@ -1,6 +1,6 @@
-"""Effects hidden by the generator, found through the library: other cases each run, the seed printed.
+"""Effects hidden by the generator are found through the library; the cases change with the printed seed.
 
-BLIND_SEED=n replays a failure. Thresholds are such that chance rarely breaks them; `scripts/bench blind` measures.
+BLIND_SEED=n replays a failure. Thresholds are such that random failures are rare; `scripts/bench blind` measures rates.
 """
 
 import os
@@ -8,7 +8,7 @@ import secrets
 
 import pytest
 
-from blind_lab import draw
+from blind_lab import draw_case
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.narrative import build_answer
 from optodrive.lab.diagnosis.priors import build_prior
@@ -29,16 +29,16 @@ def found(case):
 def answers(tmp_path_factory):
     """(case, answer) of every block."""
     print(f"BLIND_SEED={SEED}")
-    told = {}
+    results = {}
     for block, count in (("none", NULLS), ("single", SINGLES), ("pair", PAIRS), ("unknown", UNKNOWNS)):
-        cases = [draw(block, SEED + row, tmp_path_factory.mktemp(block)) for row in range(count)]
-        told[block] = [(case, found(case)) for case in cases]
-    return told
+        cases = [draw_case(block, SEED + row, tmp_path_factory.mktemp(block)) for row in range(count)]
+        results[block] = [(case, found(case)) for case in cases]
+    return results
 
 
-def what(told):
+def what(results):
     return f"BLIND_SEED={SEED}: " + "; ".join(
-        f"{case.causes} → {item['verdict']} {item['causes']}" for case, item in told
+        f"{case.causes} → {item['verdict']} {item['causes']}" for case, item in results
     )
 
 
@@ -48,11 +48,11 @@ def test_nothing_hidden_is_mostly_left_alone(answers):
 
 
 def test_most_single_causes_are_found_and_hardly_one_is_misnamed(answers):
-    told = [(case, item) for case, item in answers["single"] if "sensor_scale" not in case.causes]
-    right = sum(set(case.causes) <= set(item["causes"]) for case, item in told)
-    wrong = sum(item["verdict"] == "cause" and set(item["causes"]) != set(case.causes) for case, item in told)
-    assert right >= len(told) - 2, what(told)
-    assert wrong <= 1, what(told)
+    results = [(case, item) for case, item in answers["single"] if "sensor_scale" not in case.causes]
+    right = sum(set(case.causes) <= set(item["causes"]) for case, item in results)
+    wrong = sum(item["verdict"] == "cause" and set(item["causes"]) != set(case.causes) for case, item in results)
+    assert right >= len(results) - 2, what(results)
+    assert wrong <= 1, what(results)
 
 
 def test_what_is_in_no_catalogue_is_not_all_named(answers):

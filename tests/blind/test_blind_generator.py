@@ -1,4 +1,4 @@
-"""The generator and the score of the blind tests: do they do what they say?"""
+"""The generator and the score of the blind tests work as specified."""
 
 from types import SimpleNamespace
 
@@ -7,27 +7,27 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from blind_causes import CATALOGUE, CONFUSABLE, MECHANISMS, install
-from blind_display import DISPLACEMENT, FORCE, TEMPERATURE, Physics, edges_of, nominal, respond
-from blind_lab import BLOCKS, ENOUGH_SIGMA, draw
-from blind_noise import Colour
-from blind_score import score, table, wilson
+from blind_causes import CATALOGUE, CONFUSABLE, MECHANISMS, apply_effects
+from blind_display import DISPLACEMENT, FORCE, TEMPERATURE, Physics, compute_nominal_rises, find_edges, simulate_signals
+from blind_lab import BLOCKS, MIN_EFFECT_SIGMA, draw_case
+from blind_noise import NoiseColour
+from blind_score import format_table, score_answer, wilson
 from blind_session import (
-    bench_of,
+    build_bench,
+    build_scene,
+    build_session_runs,
     draw_base,
     draw_design,
-    draw_habits,
-    ideal_rises,
-    ideal_signals,
-    scene_of,
-    session_runs,
+    draw_instruments,
+    simulate_ideal_rises,
+    simulate_ideal_signals,
 )
 
 SIGNALS = {TEMPERATURE, DISPLACEMENT, FORCE, "mirror_x_rad", "mirror_y_rad"}
 
 
 def contents(path):
-    """Everything in a file, in values."""
+    """Return the whole content of a file as values."""
     found = {}
     with h5py.File(path) as file:
         found["/"] = dict(file.attrs)
@@ -43,20 +43,20 @@ def contents(path):
 
 @pytest.fixture(scope="module")
 def lab():
-    """A session with several pixels and a mirror, and nothing hidden yet."""
+    """Return a session with several pixels and a mirror, without hidden effects."""
     rng = np.random.default_rng(5)
     base, _ = draw_base(rng)
-    habits = draw_habits(rng)
-    design = draw_design(rng, base, habits, pixels=True, mirrors=True)
-    runs = session_runs(rng, design, habits)
-    return SimpleNamespace(base=base, habits=habits, runs=runs, bench=bench_of(base, habits, runs))
+    instruments = draw_instruments(rng)
+    design = draw_design(rng, base, instruments, pixels=True, mirrors=True)
+    runs = build_session_runs(rng, design, instruments)
+    return SimpleNamespace(base=base, instruments=instruments, runs=runs, bench=build_bench(base, instruments, runs))
 
 
 def test_nominal_part_agrees_with_scipy():
     p = Physics(R=300.0, C=9e-5, tau_g=2.5e-3)
     pulses = np.array([[0.02, 0.06, 2.0, 0.0], [0.11, 0.004, 1.0, 0.0]])
     t = np.linspace(0.0, 0.25, 900)
-    edges, powers = edges_of(pulses, 0)
+    edges, powers = find_edges(pulses, 0)
 
     def rates(now, s):
         k = np.searchsorted(edges, now, side="right") - 1
@@ -70,37 +70,41 @@ def test_nominal_part_agrees_with_scipy():
         got = solve_ivp(rates, (a, end), state, t_eval=[*t[inside], end], rtol=1e-9, atol=1e-9, method="DOP853")
         theta[inside], gas[inside] = got.y[0, :-1], got.y[1, :-1]
         state = got.y[:, -1]
-    shown = respond(p, pulses, dict.fromkeys((TEMPERATURE, DISPLACEMENT, FORCE), t), ambient_k=295.0)
+    shown = simulate_signals(p, pulses, dict.fromkeys((TEMPERATURE, DISPLACEMENT, FORCE), t), ambient_k=295.0)
     assert np.abs(shown[TEMPERATURE] - 295.0 - theta).max() < 1e-5 * theta.max()
     assert np.abs(shown[DISPLACEMENT] / p.kappa - gas).max() < 1e-5 * gas.max()
     assert np.allclose(shown[FORCE] / p.phi, shown[DISPLACEMENT] / p.kappa)
-    closed = nominal(edges, powers, t, p.R, p.C, p.tau_g)
+    closed = compute_nominal_rises(edges, powers, t, p.R, p.C, p.tau_g)
     assert np.abs(closed[0] - theta).max() < 1e-6 * theta.max()
     assert np.abs(closed[1] - gas).max() < 1e-6 * gas.max()
 
 
 @pytest.mark.parametrize("key", [*CATALOGUE, *MECHANISMS])
 def test_each_changes_the_data_and_steps_are_short_enough(lab, key):
-    effect = (CATALOGUE | MECHANISMS)[key](np.random.default_rng(1), scene_of(lab.base, lab.runs))
-    truth = install(lab.base, (effect,))
-    nothing, shown = ideal_rises(lab.base, lab.runs, lab.base), ideal_rises(lab.base, lab.runs, truth)
-    spread = {n: lab.habits.colours[n].white for n in lab.habits.colours}
+    effect = (CATALOGUE | MECHANISMS)[key](np.random.default_rng(1), build_scene(lab.base, lab.runs))
+    truth = apply_effects(lab.base, (effect,))
+    nothing, shown = simulate_ideal_rises(lab.base, lab.runs, lab.base), simulate_ideal_rises(lab.base, lab.runs, truth)
+    spread = {n: lab.instruments.colours[n].white for n in lab.instruments.colours}
     change = max(np.abs(a[n] - b[n]).max() / spread[n] for a, b in zip(shown, nothing, strict=True) for n in a)
     assert change > 0.3
     run = next(r for r in lab.runs if r.experiment.name.startswith("width"))
     coarse, fine = (
-        respond(truth, run.experiment.pulses, run.experiment.times, session_s=900.0, chance=3, finer=f)
+        simulate_signals(
+            truth, run.experiment.pulses, run.experiment.times, session_s=900.0, noise_seed=3, refinement=f
+        )
         for f in (1.0, 4.0)
     )
     for name, y in fine.items():
         assert np.abs(coarse[name] - y).max() < 1e-5 * np.ptp(y)
 
 
-@pytest.mark.parametrize("kind", ["ou", "swing"])
+@pytest.mark.parametrize("kind", ["ou", "oscillation"])
 def test_whitening_is_the_inverse_of_the_covariance(kind):
     dt, n = 1e-3, 60
     colour = (
-        Colour(0.2, "ou", ((0.3, 0.004), (0.1, 0.05))) if kind == "ou" else Colour(0.2, "swing", ((0.3, 60.0, 0.3),))
+        NoiseColour(0.2, "ou", ((0.3, 0.004), (0.1, 0.05)))
+        if kind == "ou"
+        else NoiseColour(0.2, "oscillation", ((0.3, 60.0, 0.3),))
     )
     a, _, spread, read = colour.system(dt)
     lags = [read @ np.linalg.matrix_power(a, k) @ spread @ read for k in range(n)]
@@ -115,7 +119,7 @@ def test_whitening_is_the_inverse_of_the_covariance(kind):
 
 def test_a_change_of_base_parameters_is_no_effect(lab):
     moved = lab.base.with_(R=lab.base.R * 1.1, C=lab.base.C * 0.95, kappa=lab.base.kappa * 1.05)
-    shown = ideal_rises(lab.base, lab.runs, moved)
+    shown = simulate_ideal_rises(lab.base, lab.runs, moved)
     assert lab.bench.sigma(shown, refits=1) < 100.0
     assert lab.bench.sigma(shown) < 0.5
 
@@ -125,50 +129,50 @@ def test_the_noise_that_is_added_is_the_noise_that_is_meant(lab):
     noisy = []
     for run in lab.runs:
         noisy.append({})
-        for name, y in ideal_signals(lab.base, run, jittered=True).items():
+        for name, y in simulate_ideal_signals(lab.base, run, jittered=True).items():
             t = run.experiment.times[name]
-            y = y + lab.habits.nuisance.baseline[name] * rng.standard_normal()
-            y = y + lab.habits.colours[name].sample(rng, len(t), float(t[1] - t[0]))
+            y = y + lab.instruments.run_variation.baseline[name] * rng.standard_normal()
+            y = y + lab.instruments.colours[name].sample(rng, len(t), float(t[1] - t[0]))
             if name == TEMPERATURE:
-                y = y - run.stated_k
+                y = y - run.stated_ambient_k
             elif name.startswith("mirror"):
-                y = y - ideal_signals(lab.base, run, jittered=False)[name]
+                y = y - simulate_ideal_signals(lab.base, run, jittered=False)[name]
             noisy[-1][name] = y
     count = sum(len(y) for run in noisy for y in run.values())
     assert lab.bench.sigma(noisy) ** 2 == pytest.approx(count, abs=5.0 * np.sqrt(2.0 * count))
 
 
 def test_the_same_seed_gives_the_same_file(tmp_path):
-    first, again, other = (draw("none", seed, tmp_path / str(k)) for k, seed in enumerate((4, 4, 5)))
+    first, again, other = (draw_case("none", seed, tmp_path / str(k)) for k, seed in enumerate((4, 4, 5)))
     assert contents(first.path) == contents(again.path)
     assert contents(first.path) != contents(other.path)
     assert (first.causes, first.effect_sigma) == ((), 0.0)
-    named = draw("single", 7, tmp_path / "a"), draw("single", 7, tmp_path / "b", cause="power_nonlinearity")
+    named = draw_case("single", 7, tmp_path / "a"), draw_case("single", 7, tmp_path / "b", cause="power_nonlinearity")
     assert contents(named[0].path) == contents(named[1].path)
 
 
 @pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(6, 18))])
 def test_singles_show(tmp_path, seed):
-    case = draw("single", seed, tmp_path)
+    case = draw_case("single", seed, tmp_path)
     assert case.causes == (list(CATALOGUE)[seed],)
-    assert case.effect_sigma > ENOUGH_SIGMA or case.causes == ("sensor_scale",)
+    assert case.effect_sigma > MIN_EFFECT_SIGMA or case.causes == ("sensor_scale",)
     assert all(name.startswith(case.causes[0] + ".") for name in case.sizes)
     assert 20 <= len(case.runs) <= 30
 
 
 def test_pairs_show_each_and_are_not_confusable(tmp_path):
-    case = draw("pair", 0, tmp_path)
+    case = draw_case("pair", 0, tmp_path)
     assert len(case.causes) == 2
     assert frozenset(case.causes) not in CONFUSABLE
-    assert min(case.each_sigma[c] for c in case.causes) > ENOUGH_SIGMA
+    assert min(case.each_sigma[c] for c in case.causes) > MIN_EFFECT_SIGMA
 
 
 @pytest.mark.slow
 def test_an_unknown_is_imitated_by_no_cause(tmp_path):
-    case = draw("unknown", 8, tmp_path, mechanism="mode_hops")
+    case = draw_case("unknown", 8, tmp_path, mechanism="mode_hops")
     assert case.causes == ("unknown", "mode_hops")
     assert len(case.each_sigma) == 3
-    assert ENOUGH_SIGMA < min(case.each_sigma.values()) <= case.effect_sigma
+    assert MIN_EFFECT_SIGMA < min(case.each_sigma.values()) <= case.effect_sigma
 
 
 def check_format(path):
@@ -200,7 +204,7 @@ def check_format(path):
 
 
 def test_format_and_one_more_experiment(tmp_path):
-    case = draw("single", 35, tmp_path)
+    case = draw_case("single", 35, tmp_path)
     groups = check_format(case.path)
     assert set(groups.values()) <= {2, 3, 4}
     assert "neighbour-only" in groups
@@ -213,7 +217,7 @@ def test_format_and_one_more_experiment(tmp_path):
     with pytest.raises(ValueError, match="full power"):
         case.measure([[0.02, 0.05, 5.0, 0]], [TEMPERATURE], tmp_path)
     with pytest.raises(ValueError, match="block"):
-        draw("nothing", 0, tmp_path)
+        draw_case("nothing", 0, tmp_path)
     assert BLOCKS == ("none", "single", "pair", "unknown")
 
 
@@ -231,67 +235,67 @@ def said(verdict, *causes, **more):
 def test_score_without_an_effect():
     case = case_of("none")
     parameters = {"R": {"value": 201.0, "ci95": [199.0, 203.0]}, "C": {"value": 1e-4, "ci95": [1.01e-4, 1.02e-4]}}
-    good = score(case, said("none", parameters=parameters))
+    good = score_answer(case, said("none", parameters=parameters))
     assert good.false_alarm is False
     assert good.base_inside == {"R": True, "C": False}
-    assert all(score(case, said(v)).false_alarm for v in ("cause", "ambiguous", "unexplained"))
+    assert all(score_answer(case, said(v)).false_alarm for v in ("cause", "ambiguous", "unexplained"))
 
 
 def test_score_of_one_cause():
     case = case_of("single", "gas_leak")
     parameters = {"gas_leak.rate": {"value": 1.1, "ci95": [0.9, 1.3]}}
-    alone = score(case, said("cause", "gas_leak", parameters=parameters, gain={"reduction": 0.9}), known=0.95)
+    alone = score_answer(case, said("cause", "gas_leak", parameters=parameters, gain={"reduction": 0.9}), known=0.95)
     assert (alone.alone, alone.in_set, alone.right, alone.misnamed) == (True, True, True, False)
     assert alone.term_inside == {"gas_leak.rate": True}
     assert alone.gain == pytest.approx(0.9 / 0.95)
     assert alone.worse is False
-    assert not score(case_of("single", "gas_leak", textbook=False), said("cause", "gas_leak")).term_inside
+    assert not score_answer(case_of("single", "gas_leak", textbook=False), said("cause", "gas_leak")).term_inside
     warm = case_of("single", "heat_capacity")
     warm.effects[0].sizes["c"] = 0.2
     slope = {"heat_capacity.slope": {"value": 2.1e-3, "ci95": [1.9e-3, 2.3e-3]}}
-    assert score(warm, said("cause", "heat_capacity", parameters=slope)).term_inside == {"heat_capacity.c": True}
-    two = score(case, said("ambiguous", "gas_leak", "radiation"), after=said("cause", "gas_leak"))
+    assert score_answer(warm, said("cause", "heat_capacity", parameters=slope)).term_inside == {"heat_capacity.c": True}
+    two = score_answer(case, said("ambiguous", "gas_leak", "radiation"), after=said("cause", "gas_leak"))
     assert (two.alone, two.in_set, two.right, two.misnamed, two.resolved) == (False, True, None, False, True)
-    three = score(case, said("ambiguous", "gas_leak", "radiation", "hum"), after=said("ambiguous", "gas_leak"))
+    three = score_answer(case, said("ambiguous", "gas_leak", "radiation", "hum"), after=said("ambiguous", "gas_leak"))
     assert (three.in_set, three.resolved) == (False, False)
-    wrong = score(case, said("cause", "radiation", gain={"reduction": -0.1}))
+    wrong = score_answer(case, said("cause", "radiation", gain={"reduction": -0.1}))
     assert (wrong.alone, wrong.in_set, wrong.right, wrong.misnamed, wrong.worse) == (False, False, False, True, True)
-    more = score(case, said("cause", "gas_leak", "radiation"))
+    more = score_answer(case, said("cause", "gas_leak", "radiation"))
     assert (more.alone, more.in_set, more.right, more.misnamed) == (False, False, None, True)
-    none = score(case, said("none"))
+    none = score_answer(case, said("none"))
     assert (none.alone, none.in_set, none.right, none.misnamed) == (False, False, None, False)
 
 
 def test_score_of_what_cannot_be_named_alone():
     case = case_of("single", "sensor_scale")
-    assert score(case, said("none")).scale_right
-    assert score(case, said("ambiguous", "sensor_scale", "gas_leak")).scale_right
-    alone = score(case, said("cause", "sensor_scale"))
+    assert score_answer(case, said("none")).scale_right
+    assert score_answer(case, said("ambiguous", "sensor_scale", "gas_leak")).scale_right
+    alone = score_answer(case, said("cause", "sensor_scale"))
     assert (alone.scale_right, alone.misnamed, alone.alone) == (False, True, None)
 
 
 def test_score_of_unknowns_and_pairs():
     hidden = case_of("unknown", "unknown", "hum")
-    assert score(hidden, said("unexplained")).unexplained
-    assert score(hidden, said("ambiguous", "gas_leak")).misnamed
-    assert score(hidden, said("none")).misnamed is False
+    assert score_answer(hidden, said("unexplained")).unexplained
+    assert score_answer(hidden, said("ambiguous", "gas_leak")).misnamed
+    assert score_answer(hidden, said("none")).misnamed is False
     pair = case_of("pair", "gas_leak", "bridge_conductivity")
-    both = score(pair, said("cause", "bridge_conductivity", "gas_leak"))
+    both = score_answer(pair, said("cause", "bridge_conductivity", "gas_leak"))
     assert (both.both, both.some_none_false, both.misnamed) == (True, True, False)
-    one = score(pair, said("cause", "gas_leak"))
+    one = score_answer(pair, said("cause", "gas_leak"))
     assert (one.both, one.some_none_false, one.misnamed) == (False, True, False)
-    false = score(pair, said("cause", "gas_leak", "radiation"))
+    false = score_answer(pair, said("cause", "gas_leak", "radiation"))
     assert (false.both, false.some_none_false, false.misnamed) == (False, False, True)
-    assert score(pair, said("none")).some_none_false is False
+    assert score_answer(pair, said("none")).some_none_false is False
 
 
 def test_table_has_shares_intervals_and_aims():
     low, high = wilson(95, 100)
     assert (low, high) == (pytest.approx(0.8882, abs=1e-3), pytest.approx(0.9785, abs=1e-3))
     assert wilson(0, 0) == (0.0, 1.0)
-    scores = [score(case_of("none"), said(v)) for v in ("none", "none", "none", "cause")]
-    scores.append(score(case_of("single", "gas_leak"), said("cause", "gas_leak", gain={"reduction": 0.97})))
-    text = table(scores)
+    scores = [score_answer(case_of("none"), said(v)) for v in ("none", "none", "none", "cause")]
+    scores.append(score_answer(case_of("single", "gas_leak"), said("cause", "gas_leak", gain={"reduction": 0.97})))
+    text = format_table(scores)
     assert "| no hidden effect | false alarms | 1/4 | 25.0 % | 4.6 to 69.9 % | ≤ 1 % |" in text
     assert "| one cause | alone | 1/1 | 100.0 % |" in text
     assert "| two causes | both | – |" in text
