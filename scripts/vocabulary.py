@@ -63,7 +63,10 @@ def load_phrases(text: str) -> re.Pattern[str]:
     """Return a pattern for the phrases in the table of two columns."""
     rows = [line for line in text.splitlines() if line.startswith("|") and line.count("|") == 3]
     phrases = [entry for line in rows for entry in ENTRY.findall(line.split("|")[1])]
-    alternatives = "|".join(r"\s+".join(map(re.escape, phrase.split())) for phrase in phrases)
+    # A single word also matches its inflections; the last word of a phrase must end.
+    alternatives = "|".join(
+        r"\s+".join(map(re.escape, phrase.split())) + (r"\b" if " " in phrase else "") for phrase in phrases
+    )
     return re.compile(rf"\b(?:{alternatives})", re.IGNORECASE)
 
 

@@ -118,15 +118,15 @@ def random_sequence(seed, trains_max=2):
     rng = np.random.default_rng(seed)
     pool = rng.choice(16, size=6, replace=False)
     trains = _random_trains(rng, pool, int(rng.integers(0, trains_max + 1)))
-    share = min(0.5, sum(t.pulse_width_s / (t.pulse_width_s + t.gap_s) for t in trains))
+    fraction = min(0.5, sum(t.pulse_width_s / (t.pulse_width_s + t.gap_s) for t in trains))
     frames, at_s = [], 0.0
     for k in range(int(rng.integers(1, 4))):
         target_m, need_s = np.zeros(16), 0.0
         for pixel in rng.choice(pool, size=int(rng.integers(1, 5)), replace=False):
             target_m[pixel] = rng.uniform(20e-6, 160e-6)
-            at_rest = DISPLAY.build_cold_heat().solve_pulse(int(pixel), 0.0, target_m[pixel], SCAN_HEAD.drive)
-            need_s += at_rest[0] * SCAN_HEAD.drive.period_s + 0.0006
-        duration_s = (need_s - 0.0006) * rng.uniform(0.96, 1.12) / (1.0 - share) + (0.002 if trains else 0.0)
+            pulse = DISPLAY.build_cold_heat().solve_pulse(int(pixel), 0.0, target_m[pixel], SCAN_HEAD.drive)
+            need_s += pulse[0] * SCAN_HEAD.drive.period_s + 0.0006
+        duration_s = (need_s - 0.0006) * rng.uniform(0.96, 1.12) / (1.0 - fraction) + (0.002 if trains else 0.0)
         frames.append(TactileFrame(f"f{k}", at_s, duration_s, target_m, priority=int(rng.integers(0, 3))))
         at_s += duration_s + rng.choice([0.0, 0.0, 0.01])
     return FrameSequence(tuple(frames), trains)

@@ -68,8 +68,8 @@ def test_sequences_round_trip(frames, periods, gap_s, power_w):
         assert (one.frame_id, one.show_at_s, one.duration_s) == (two.frame_id, two.show_at_s, two.duration_s)
         assert np.allclose(one.target_m, two.target_m, rtol=1e-12, atol=1e-15)
         target = entry["target_um"]
-        wanted = [target.get(str(k), 0.0) for k in range(16)] if isinstance(target, dict) else target
-        assert np.allclose(one.target_m, np.array(wanted) * 1e-6, rtol=1e-12, atol=0)
+        expected_um = [target.get(str(k), 0.0) for k in range(16)] if isinstance(target, dict) else target
+        assert np.allclose(one.target_m, np.array(expected_um) * 1e-6, rtol=1e-12, atol=0)
 
 
 @given(JSON)

@@ -49,13 +49,13 @@ def test_best_effort_is_executed_in_time(armed, fit):
     plan = armed.call("POST", "/v1/plans", json=LATE, params={"fit": fit})["plan"]
     answer = armed.finished(plan)
     assert answer["status"] == "done", answer["error"]
-    figures = answer["summary"]
-    assert figures["late_messages"] == []
-    assert (figures["feasibility"]["height_factor"] < 1.0) == (fit == "even")
-    omitted = [pixel for item in figures["feasibility"]["omitted"] for pixel in item["pixels"]]
+    summary = answer["summary"]
+    assert summary["late_messages"] == []
+    assert (summary["feasibility"]["height_factor"] < 1.0) == (fit == "even")
+    omitted = [pixel for item in summary["feasibility"]["omitted"] for pixel in item["pixels"]]
     assert answer["executed"] == 40 - len(omitted)
     executed = answer["executed_pulses"]
-    assert executed["start_s"][-1] + executed["width_s"][-1] <= figures["lead_in_s"] + 0.1 + 1e-4
+    assert executed["start_s"][-1] + executed["width_s"][-1] <= summary["lead_in_s"] + 0.1 + 1e-4
 
 
 def test_a_pattern_takes_it_too(armed):
@@ -96,9 +96,9 @@ def test_the_command_line_says_it_in_one_line(armed, tmp_path):
     late = run("plan", path).stdout.splitlines()[0]
     assert late.startswith("fits: no, frame late needs 0.2")
     assert "nearest feasible: " in late
-    figures = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
-    assert figures["late_messages"] == []
-    assert figures["feasibility"]["height_factor"] < 1.0
+    summary = json.loads(run("plan", path, "--json", "--fit", "even").stdout)
+    assert summary["late_messages"] == []
+    assert summary["feasibility"]["height_factor"] < 1.0
     refused = run("plan", path, "--strict")
     assert refused.returncode == 1
     assert "nearest feasible: " in refused.stderr

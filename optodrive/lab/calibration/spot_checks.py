@@ -56,8 +56,8 @@ def check_spots(where: str, spots: MeasuredSpots, prior: FieldPrior) -> None:
             f"{where}: x_code, y_code", codes[0].tolist(), "several places, but all spots have the same codes"
         )
     if widths[1] < COLLINEARITY_RATIO_MIN * widths[0]:
-        share = f"all on a line, {widths[1] / widths[0]:.1%} as wide as long"
-        raise InputError(f"{where}: x_code, y_code", share, "spots over the whole field")
+        found = f"all on a line, {widths[1] / widths[0]:.1%} as wide as long"
+        raise InputError(f"{where}: x_code, y_code", found, "spots over the whole field")
     commanded_m = 2.0 * prior.focal_length_m * prior.rad_per_code * (codes - CENTRE_CODE)
     measured_m = np.column_stack([spots.x_m, spots.y_m])
     _check_beam_moves(where, commanded_m, measured_m)

@@ -88,13 +88,13 @@ class _Reducer:
             any(self._try_omitted(self._omitted | {source: omitted}) for omitted in _generate_omissions(pixels))
             return
         infeasible = self._find_infeasible_pixels(source, pixels)
-        tallest = [pixel for pixel in pixels if pixel not in infeasible]
-        before, low, high = self._omitted, 0, len(tallest)
+        candidates = [pixel for pixel in pixels if pixel not in infeasible]
+        before, low, high = self._omitted, 0, len(candidates)
         if infeasible and self._try_omitted(before | {source: infeasible}):
             return
         while high - low > 1:
             middle = (low + high) // 2
-            fits = self._try_omitted(before | {source: infeasible + tuple(tallest[:middle])})
+            fits = self._try_omitted(before | {source: infeasible + tuple(candidates[:middle])})
             low, high = (low, middle) if fits else (middle, high)
 
     def _find_infeasible_pixels(self, source: int, pixels: tuple[int, ...]) -> tuple[int, ...]:

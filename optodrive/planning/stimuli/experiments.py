@@ -77,7 +77,7 @@ def build_localisation(config: Config, where: str, target: int, centre: int | No
 
 def build_intensity(config: Config, where: str, level: int, centre: int | None) -> FrameSequence:
     """Build experiment 4: one pixel for 1 s at 25/25 ms, level 1…9 from 0.5 to 2.5 W, limited to the laser's power."""
-    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
+    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "a place for the stimulus")
     power_w = min(0.5 + 0.25 * (level - 1), config.laser.max_power_w)
     return _build_sequence([build_slot_train(pixel, 0.0, 1.0, 0.025, 0.025, power_w)])
 
@@ -86,7 +86,7 @@ def build_temporal_pattern(
     config: Config, where: str, oddball: int, kind: str, pause_s: float, centre: int | None
 ) -> FrameSequence:
     """Build experiment 5: three stimuli of 400 ms on one pixel, one of them (oddball, 1…3) of `kind`, slow or fast."""
-    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "room for itself")
+    (pixel,) = Lattice.from_config(config).pixels_around(centre, [(0, 0)], where, "a place for the stimulus")
     other = "fast" if kind == "slow" else "slow"
     widths_s = [PULSE_AND_GAP_S[kind if k == oddball else other] for k in (1, 2, 3)]
     return _build_sequence(
@@ -103,8 +103,8 @@ def build_two_fingers(config: Config, where: str, digits: str, centre: int | Non
     pitch_m = config.display.pitch_m
     pair = [compute_finger_places(int(digit), pitch_m) for digit in digits.split("-")]
     turns = [place for both in zip(*pair, strict=True) for place in both]
-    needs = "room for fingertips that spread over 58 × 22 mm around it"
-    pixels = Lattice.from_config(config).pixels_around(centre, turns, where, needs)
+    requirement = "space for fingertips that spread over 58 × 22 mm around it"
+    pixels = Lattice.from_config(config).pixels_around(centre, turns, where, requirement)
     width_s, period_s, rounds = 0.015, 0.015 * len(pixels), 5
     return _build_sequence(
         PulseTrain(

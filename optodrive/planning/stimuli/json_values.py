@@ -1,4 +1,4 @@
-"""Checks of single values of decoded JSON; each error names the place, the value and the expected value."""
+"""Check single values of decoded JSON, with errors that name the place, the value and the expected value."""
 
 import json
 from collections.abc import Mapping, Sequence

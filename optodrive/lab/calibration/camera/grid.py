@@ -87,8 +87,8 @@ def _find_chessboard(path: Path, grey: Any, grid: GridSection) -> FloatArray:
     size = (grid.columns, grid.rows)
     found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, size, flags)
     if not found:
-        smallest = (min(FALLBACK_CORNERS_PER_SIDE, grid.columns), min(FALLBACK_CORNERS_PER_SIDE, grid.rows))
-        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, smallest, flags)
+        fallback_size = (min(FALLBACK_CORNERS_PER_SIDE, grid.columns), min(FALLBACK_CORNERS_PER_SIDE, grid.rows))
+        found, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, fallback_size, flags)
     if not found:
         raise _not_found_error(path, grid)
     places = np.asarray(corners).reshape(*meta.shape, 2)

@@ -46,7 +46,7 @@ def compute_response(
 
     Raises InputError for an aim that is not a number or beyond aim_max_m.
     """
-    x_m, y_m = (_read_aim_m(where, run, axis, most_m) for axis, most_m in zip("xy", aim_max_m, strict=True))
+    x_m, y_m = (_read_aim_m(where, run, axis, limit_m) for axis, limit_m in zip("xy", aim_max_m, strict=True))
     signal = run.signals.get(SIGNAL)
     if signal is None:
         return None

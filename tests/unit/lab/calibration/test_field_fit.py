@@ -116,15 +116,15 @@ def test_the_next_spot_minimises_the_variance():
     truth, random = GroundTruthGeometry.sample(2, CONFIG), np.random.default_rng(8)
     fit = fit_field(measure_spots(truth, grid_codes(3)[:6], random, 0.0)[0], PRIOR, NOISE_M)
     candidates = grid_codes(5)
-    looked_at = fit.jacobian_m(*PRIOR.display_extent.build_grid(9)).reshape(-1, len(fit.parameter_sigma))
+    display_jacobian = fit.jacobian_m(*PRIOR.display_extent.build_grid(9)).reshape(-1, len(fit.parameter_sigma))
 
     def variance(candidate):
-        asked = fit.jacobian_m(*candidates[candidate, :, None])[:, 0]
-        after = np.linalg.inv(np.linalg.inv(fit.covariance) + asked.T @ asked / NOISE_M**2)
-        return np.trace(looked_at @ after @ looked_at.T)
+        candidate_jacobian = fit.jacobian_m(*candidates[candidate, :, None])[:, 0]
+        after = np.linalg.inv(np.linalg.inv(fit.covariance) + candidate_jacobian.T @ candidate_jacobian / NOISE_M**2)
+        return np.trace(display_jacobian @ after @ display_jacobian.T)
 
-    tried = [variance(candidate) for candidate in range(len(candidates))]
-    assert select_next_spot(fit, candidates) == np.argmin(tried)
+    variances = [variance(candidate) for candidate in range(len(candidates))]
+    assert select_next_spot(fit, candidates) == np.argmin(variances)
 
 
 @pytest.mark.slow

@@ -54,18 +54,18 @@ def test_bad_frames_are_refused_in_one_line(message, says):
 def test_every_pixel_is_refreshed_at_any_frame_rate(data):
     """Of each frame one pixel is drawn and heights change; within a cycle no pixel precedes the stale ones."""
     count = data.draw(st.integers(1, 12))
-    seen = np.zeros(count, dtype=bool)
+    refreshed = np.zeros(count, dtype=bool)
     active = np.array(data.draw(st.lists(st.booleans(), min_size=count, max_size=count)))
-    wanted = set(np.flatnonzero(active))
-    for height_m in range(1, len(wanted) + 1):
+    remaining = set(np.flatnonzero(active))
+    for height_m in range(1, len(remaining) + 1):
         target_m = 1e-5 * height_m * active
-        parts = stale_pixels_first(FrameSequence((TactileFrame("1", 0.0, 1.0, target_m),)), seen).frames
+        parts = stale_pixels_first(FrameSequence((TactileFrame("1", 0.0, 1.0, target_m),)), refreshed).frames
         assert sum(part.target_m for part in parts) == pytest.approx(target_m)
         first = data.draw(st.sampled_from(np.flatnonzero(parts[0].target_m).tolist()))
-        assert first in wanted
-        seen[first] = True
-        wanted.discard(first)
-    assert not wanted
+        assert first in remaining
+        refreshed[first] = True
+        remaining.discard(first)
+    assert not remaining
 
 
 def test_an_empty_frame_is_not_split():

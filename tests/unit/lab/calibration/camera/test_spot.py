@@ -113,9 +113,9 @@ REFUSED = {
 def test_a_spot_on_the_edge_of_a_black_square_is_named():
     squares = np.where((X // 40 + Y // 40) % 2, 1.0, 0.1)
     dark = take_picture(100.0 * squares, 98)
-    lit = take_picture(100.0 * squares + 120.0 * squares * draw_blob((120.0, 100.0)))
+    on_edge = take_picture(100.0 * squares + 120.0 * squares * draw_blob((120.0, 100.0)))
     with pytest.raises(InputError, match="on a pattern of"):
-        find_spot("it", lit, dark)
+        find_spot("it", on_edge, dark)
     inside = take_picture(100.0 * squares + 120.0 * squares * draw_blob((140.3, 100.2)))
     assert error_px(find_spot("it", inside, dark), (140.3, 100.2)) < 0.1
 

@@ -108,8 +108,8 @@ def test_too_few_samples_give_no_response():
         is None
     )
     assert compute_response("t", replace(run, signals={}), PREDICT, AIM_MAX_M) is None
-    dark = replace(run, pulses=np.zeros((0, 4)))
-    assert compute_response("t", dark, PREDICT, AIM_MAX_M) is None
+    without_pulses = replace(run, pulses=np.zeros((0, 4)))
+    assert compute_response("t", without_pulses, PREDICT, AIM_MAX_M) is None
 
 
 @pytest.mark.parametrize(
@@ -154,12 +154,12 @@ def test_stats_list_dead_and_unmeasured_pixels():
         for aim_m in EACH_AIM:
             gain = 0.01 if pixel in (4, 9) else 1.0 + 0.01 * pixel
             responses.add_run("rec.h5", simulate_run(gain, aim_m, (5e-5, -1e-5), random, pixel=pixel))
-    told = compute_stats(responses.fit("rec.h5", "surroundings"), responses.run_count)
-    assert told["dead"] == [4, 9]
-    assert told["not_measured"] == [15]
-    assert told["measured"] == 13
-    assert (told["gain"]["min_pixel"], told["gain"]["max_pixel"]) == (0, 14)
-    assert told["offset_um"]["x"]["median"] == pytest.approx(50, abs=10)
+    stats = compute_stats(responses.fit("rec.h5", "surroundings"), responses.run_count)
+    assert stats["dead"] == [4, 9]
+    assert stats["not_measured"] == [15]
+    assert stats["measured"] == 13
+    assert (stats["gain"]["min_pixel"], stats["gain"]["max_pixel"]) == (0, 14)
+    assert stats["offset_um"]["x"]["median"] == pytest.approx(50, abs=10)
 
 
 def test_light_beside_the_absorber_keeps_a_black_wall_below_its_cap():
