@@ -1,5 +1,6 @@
 """Write the reference pages that follow from the code: configuration, terms, REST."""
 
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,14 +17,15 @@ from optodrive.physics.terms import discover_terms
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 CONFIGURATION_HEAD = f"""# Configuration
 
-Generated from `optodrive/device/config.py` by `scripts/reference`. A configuration is one TOML file per display, format version
-{VERSION}; `optodrive config check` checks it whole, and `optodrive config show --json` prints it with every default and derived number. All
-quantities are in SI units, named by the suffix of the key.
+Generated from `optodrive/device/config.py` by `scripts/reference`. A configuration is one TOML file per display, format
+version {VERSION}. `optodrive config check` checks it completely, and `optodrive config show --json` prints it with every
+default and derived number. Quantities are in SI units, named by the suffix of the key.
 """
 TERMS_HEAD = """# Terms
 
-Generated from `optodrive/physics/terms` by `scripts/reference`. A term is a physical effect beyond the nominal pixel. A parameter set
-may hold its parameters, `optodrive diagnose` looks for it in recordings, and the limiter bounds the heat that it can add.
+Generated from `optodrive/physics/terms` by `scripts/reference`. A term is a physical effect beyond the nominal pixel. A
+parameter set may hold its parameters, `optodrive diagnose` looks for it in recordings, and the limiter bounds the heat
+that it can add.
 """
 
 
@@ -49,7 +51,7 @@ def format_type(schema: dict[str, Any]) -> str:
     if "enum" in schema:
         return ", ".join(f'`"{value}"`' for value in schema["enum"])
     if "const" in schema:
-        return f'`"{schema["const"]}"`'
+        return f"`{json.dumps(schema['const'])}`"
     bounds = {"exclusiveMinimum": ">", "minimum": "≥", "exclusiveMaximum": "<", "maximum": "≤"}
     limits = " and ".join(f"{sign} {schema[key]:g}" for key, sign in bounds.items() if key in schema)
     return " ".join(part for part in (schema.get("type", "value"), limits) if part)

@@ -38,7 +38,8 @@ def format_section(title, route):
     """One route: what it does, what it takes, what it answers."""
     lines = [f"## {title}", "", route.get("description", ""), ""]
     rows = [
-        f"| `{item['name']}` | {item['in']} | {format_type(item['schema'])} | {escape_cell(item.get('description', ''))} |"
+        f"| `{item['name']}` | {item['in']} | {format_type(item['schema'])} |"
+        f" {escape_cell(item.get('description', ''))} |"
         for item in route.get("parameters", ())
     ]
     if rows:

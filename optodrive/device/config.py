@@ -1,4 +1,4 @@
-"""Configuration: one TOML file a display, versioned, checked whole before anything uses it."""
+"""The configuration of one display, read from a versioned TOML file and checked before use."""
 
 from dataclasses import dataclass
 from importlib.resources import files
@@ -13,25 +13,27 @@ from optodrive.core.files import read_toml
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 
 FORMAT = "optodrive-config"
-VERSION = 3
+VERSION = 4
+RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
+"""Keys that version 4 renamed, with their new names."""
 MIRRORS_FORMAT = "optodrive-mirrors"
 MIRRORS_VERSION = 1
 DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
-"""Longest gate-on time one point of the wire protocol can carry (16 bit, microseconds)."""
+"""Longest gate-on time that one point of the protocol can carry (16 bit, microseconds), s."""
 
 HALF_RANGE_CODES = 32_767
-"""Steps of the board's converter from the middle to the end of a mirror's range."""
+"""Codes of the board's converter from the centre to the end of a mirror's range."""
 HELIOS_HALF_RANGE_CODES = 2_047
-"""The same of a Helios, whose converter has 12 bits."""
+"""Half range of a Helios, whose converter has 12 bits."""
 POWER_STEPS = 65_535
-"""Steps of the board's duty from none to the laser's full power."""
+"""Steps of the board's duty from zero to the laser's full power."""
 HELIOS_POWER_STEPS = 255
 HELIOS_TIMING_SLACK_POINTS = 5
-"""Light on a Helios begins up to two points late (rounding; the end of a frame) and ends up to three early (the same,
-and the dark point before a pulse that follows at once)."""
+"""On a Helios a pulse starts up to two points late (rounding; the end of a frame) and ends up to three points early
+(the same, and the dark point before an immediately following pulse)."""
 HELIOS_POINT_EXCESS_S = 1e-8
-"""A point lasts up to a tick of the board's clock longer than asked for."""
+"""A point lasts up to one tick of the board's clock longer than requested, s."""
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
@@ -40,25 +42,30 @@ UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
 
 
 class Section(BaseModel):
-    """A part of the configuration: immutable, no unknown keys."""
+    """Base of all configuration tables: immutable, without unknown keys; field docstrings are their descriptions."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class DisplaySection(Section):
-    """The lattice of pixels: rows × columns at one pitch, centred on the optical axis, less the missing places.
-
-    pixel_map: file of what was measured of each pixel, from the configuration's folder.
-    """
+    """The pixel lattice: rows × columns at one pitch, centred on the optical axis, without the missing places."""
 
     rows: Annotated[int, Field(ge=1, le=200)]
+    """Number of rows, counted from the bottom."""
     columns: Annotated[int, Field(ge=1, le=200)]
+    """Number of columns, counted from the left."""
     pitch_m: Positive
+    """Distance between neighbouring pixels, m."""
     missing: tuple[tuple[int, int], ...] = ()
+    """Places without a pixel, as pairs of row and column."""
     bridge_width_m: Positive
+    """Width of the bridges that hold the absorbers, m."""
     absorber_width_m: Positive = 2.0e-3
+    """Width of an absorber in x, m."""
     absorber_height_m: Positive = 1.5e-3
+    """Height of an absorber in y, m."""
     pixel_map: Annotated[str, Field(min_length=1)] | None = None
+    """File with the measured gain, offset and state of every pixel, relative to the configuration's folder."""
 
     @model_validator(mode="after")
     def _check_missing_places(self) -> Self:
@@ -75,110 +82,139 @@ class DisplaySection(Section):
 
 
 class PixelModelSection(Section):
-    """Which parameter set of configs/parameters the pixels follow."""
+    """The thermal and mechanical model of the pixels."""
 
     parameters: str = "calibrated"
+    """Name of a parameter set in configs/parameters."""
 
 
 class LaserSection(Section):
-    """The diode: incident power at the sample with the gate fully on, its modulation, its focus on the absorber."""
+    """The diode, its modulation and its focus."""
 
     max_power_w: Positive
+    """Incident power at the sample at full duty, W."""
     pwm_hz: Positive
+    """Frequency of the pulse-width modulation, Hz; pulses are whole periods wide."""
     focus_width_m: Positive
+    """Width of the focus on the absorber in x, m."""
     focus_height_m: Positive
+    """Height of the focus on the absorber in y, m."""
 
 
 class ServoSection(Section):
-    """How either mirror follows its command.
-
-    delay_s after a command the servo's own target begins to move towards it at slew_rad_per_s; the angle follows that
-    with natural frequency bandwidth_hz and damping, always underdamped.
-    """
+    """The servo of either mirror: a delay, a slew-limited target, and two underdamped poles."""
 
     bandwidth_hz: Annotated[float, Field(ge=100, le=100_000)]
+    """Natural frequency of the closed loop, Hz."""
     damping: Annotated[float, Field(ge=0.3, le=0.9)]
+    """Damping ratio of the closed loop."""
     delay_s: Annotated[float, Field(ge=0, le=0.01)]
+    """Time from a command to the first movement of the servo's target, s."""
     slew_rad_per_s: Annotated[float, Field(ge=1, le=100_000)]
+    """Speed at which the servo's target moves to the command, rad/s."""
 
 
 class ScannerSection(ServoSection):
-    """Mirrors and lens: ideal f-theta x = f · 2 · angle; either mirror follows its command as a servo.
-
-    aim_error_m: how far a settled beam may stand from where it should. field: file of a calibrated field in place of
-    the ideal lens, from the configuration's folder; mirrors: the same of measured servos, which go before those stated.
-    half_range_codes: steps of the converter from the middle to the end of the range.
-    """
+    """The mirrors and the lens; without a calibrated field an ideal f-theta lens, x = f · 2 · angle."""
 
     focal_length_m: Positive
+    """Focal length of the f-theta lens, m."""
     range_rad: Annotated[float, Field(gt=0, lt=0.8)]
+    """Mechanical mirror angle at either end of the converter's range, rad."""
     aim_error_m: NonNegative
+    """Largest distance of a settled beam from its target, m."""
     field: Annotated[str, Field(min_length=1)] | None = None
+    """File of a calibrated scan field that replaces the ideal lens, relative to the configuration's folder."""
     mirrors: Annotated[str, Field(min_length=1)] | None = None
+    """File of measured servos that replace the stated one, relative to the configuration's folder."""
     half_range_codes: int = HALF_RANGE_CODES
+    """Codes of the converter from the centre to the end of the range: 32767, for a Helios 2047."""
 
     @property
     def rad_per_code(self) -> float:
-        """Mirror angle of one step of the converter, rad: range_rad is the most it can say."""
+        """Mirror angle of one code of the converter, rad."""
         return self.range_rad / self.half_range_codes
 
 
 class UncertaintySection(Section):
-    """Declared half-widths of the model's parameters, relative; exponent: absolute. The limiter counts them in full."""
+    """Declared half-widths of the model's parameters, relative unless stated; the limiter covers the whole box."""
 
     absorbed_power: HalfWidth = 0.03
+    """Absorbed power."""
     bridge_resistance: HalfWidth = 0.02
+    """Thermal resistance of the bridges."""
     absorber_capacity: HalfWidth = 0.05
+    """Heat capacity of an absorber."""
     exponent: Annotated[float, Field(ge=0, le=0.5)] = 0.02
+    """Exponent of the bridge resistance in temperature, absolute."""
     gas_lag: HalfWidth = 0.25
+    """Time constant of the gas."""
     wall_resistance: HalfWidth = 0.02
+    """Thermal resistance from a wall to the surroundings."""
     wall_capacity: HalfWidth = 0.1
+    """Heat capacity of a wall."""
     side_resistance: HalfWidth = 0.1
+    """Thermal resistance between neighbouring walls."""
     touch_share: HalfWidth = 0.02
+    """Shares of the gas and of the wall in the touch surface's temperature."""
     touch_lag: HalfWidth = 0.1
+    """Time constant of the touch surface."""
 
 
 class LimitsSection(Section):
-    """Caps that no sequence of plans passes.
-
-    absorber_max_c, wall_max_c, touch_max_c: temperatures anywhere on the display, wall and touch surface as far as
-    the parameter set has them. galvo_acceleration_rms_max_rad_per_s2: of either mirror, mean over galvo_mean_s.
-    pulse_energy_max_j caps a pulse, and what several pulses leave in a pixel's bucket, which leaks at
-    pixel_mean_power_max_w. Pulses on a pixel closer than pulse_gap_min_s count as one against pulse_width_max_s.
-    """
+    """Caps that no sequence of plans exceeds."""
 
     absorber_max_c: float
+    """Highest absorber temperature, °C."""
     wall_max_c: float
+    """Highest wall temperature, °C, if the parameter set has walls."""
     touch_max_c: float
+    """Highest temperature of the touch surface, °C, if the parameter set has one."""
     galvo_acceleration_rms_max_rad_per_s2: Positive
+    """Root mean square of either mirror's angular acceleration, rad/s²."""
     galvo_mean_s: Annotated[float, Field(ge=0.05, allow_inf_nan=False)]
+    """Averaging time of the galvo acceleration, s."""
     pulse_energy_max_j: Positive
+    """Incident energy of a pulse, and of a pixel's leaky bucket, J."""
     pulse_width_max_s: Annotated[float, Field(gt=0, le=WIRE_ON_MAX_S)]
+    """Gate-on time of a pulse, s."""
     pulse_gap_min_s: Annotated[float, Field(gt=0, le=0.01)] = 5e-4
+    """Pulses on a pixel with a shorter gap count as one against pulse_width_max_s, s."""
     pixel_mean_power_max_w: Positive
+    """Mean incident power of a pixel over its window, and leak rate of its energy bucket, W."""
     pixel_mean_window_s: Positive
+    """Averaging window of a pixel's mean power, s."""
     display_mean_power_max_w: Positive
+    """Mean incident power of the display over its window, W."""
     display_mean_window_s: Positive
+    """Averaging window of the display's mean power, s."""
     uncertainty: UncertaintySection = UncertaintySection()
+    """Declared uncertainty of the model."""
 
 
 class BoardSection(Section):
-    """How the board is reached; uid: refuse any other board; port: serial device, or the simulated board's link.
-
-    vendor_id, product_id, serial_number: a board on USB; without a serial number it must be the only one of its kind.
-    points_per_s, interlock_watched: for a Helios, whose uid is its name; whether an external interlock cuts its light.
-    """
+    """The board and the way to reach it."""
 
     transport: Literal["simulated", "serial", "usb", "helios"]
+    """The simulated board, a serial port, USB bulk endpoints, or a Helios laser DAC."""
     port: str = ""
+    """Serial device, or link of the simulated board's pseudo-terminal."""
     baud: Annotated[int, Field(ge=9600, le=12_000_000)] = 1_000_000
+    """Bit rate of the serial port, 1/s."""
     uid: str = ""
+    """The only board, or name of a Helios, that is accepted; empty: any."""
     lease_s: Annotated[float, Field(ge=0.02, le=1.0)] = 0.1
+    """Time after the last lease until the board closes the gate, s."""
     vendor_id: UsbId | None = None
+    """USB vendor of the board."""
     product_id: UsbId | None = None
+    """USB product of the board."""
     serial_number: str = ""
+    """USB serial number; empty: the only board of its kind."""
     points_per_s: Annotated[int, Field(ge=20_000, le=50_000)] = 40_000
+    """Point rate of a Helios, 1/s."""
     interlock_watched: bool = False
+    """Statement that an external interlock cuts the laser's supply; a Helios emits nothing without it."""
 
     @model_validator(mode="after")
     def _check_address(self) -> Self:
@@ -190,53 +226,72 @@ class BoardSection(Section):
 
     @property
     def timing_slack_s(self) -> float:
-        """By how much two times of a plan may come nearer to each other on this board, s; a tick is none."""
+        """Largest reduction of the interval between two planned times on this board, s; zero for ticks."""
         point_s = 1.0 / self.points_per_s + HELIOS_POINT_EXCESS_S
         return HELIOS_TIMING_SLACK_POINTS * point_s if self.transport == "helios" else 0.0
 
 
 class SensorSection(Section):
-    """A spot sensor on a serial port of its own, as SENSOR.md says; a simulated board brings one."""
+    """A spot sensor on its own serial port (SENSOR.md); a simulated board includes one."""
 
     port: Annotated[str, Field(min_length=1)]
+    """Serial device of the sensor."""
     baud: Annotated[int, Field(ge=1200, le=12_000_000)] = 115_200
+    """Bit rate of its port, 1/s."""
 
 
 class DaemonSection(Section):
-    """The daemon's address; hosts: names it answers to besides loopback; body_max_bytes: largest request body.
-
-    socket: a Unix socket it listens at too. tokens: file of its tokens, kept over restarts; without one they are made
-    anew at each start. audit: file to which it adds who armed, stopped, pushed. requests_per_s, requests_burst: what a
-    caller may ask for, for ever and at once; STOP is not counted. record: a folder in which each session is recorded.
-    """
+    """Addresses, access and files of the daemon."""
 
     host: str = "127.0.0.1"
+    """Address to listen on."""
     port: Annotated[int, Field(ge=0, le=65_535)] = 8450
+    """TCP port; 0: any free one."""
     socket: str = ""
+    """Path of an additional Unix socket."""
     hosts: tuple[str, ...] = ()
+    """Accepted names in the Host and Origin headers besides loopback."""
     body_max_bytes: Annotated[int, Field(ge=1024, le=64_000_000)] = 8_000_000
+    """Largest request body, bytes."""
     tokens: str = ""
+    """File of permanent tokens; empty: new tokens at each start."""
     audit: str = ""
+    """File to which arming, stopping and pushing are appended."""
     requests_per_s: Annotated[float, Field(ge=1, le=100_000)] = 500.0
+    """Sustained request rate of one client, 1/s; STOP is exempt."""
     requests_burst: Annotated[int, Field(ge=1, le=100_000)] = 1000
+    """Requests of one client at once."""
     record: str = ""
+    """Folder for a recording of each session."""
 
 
 class Config(Section):
-    """The whole configuration of one display."""
+    """The configuration of one display."""
 
     format: Literal["optodrive-config"]
-    version: Literal[3]
+    """Name of the format."""
+    version: Literal[4]
+    """Version of the format."""
     name: str
+    """Name of the display."""
     ambient_c: Annotated[float, Field(ge=-20, le=60)]
+    """Ambient temperature, °C."""
     display: DisplaySection
+    """The pixel lattice."""
     pixel_model: PixelModelSection = PixelModelSection()
+    """The pixel model."""
     laser: LaserSection
+    """The laser."""
     scanner: ScannerSection
+    """Mirrors and lens."""
     limits: LimitsSection
+    """Caps."""
     board: BoardSection
+    """The board."""
     sensor: SensorSection | None = None
+    """The spot sensor."""
     daemon: DaemonSection = DaemonSection()
+    """The daemon."""
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
@@ -278,12 +333,12 @@ class Config(Section):
     @model_validator(mode="after")
     def _check_focus(self) -> Self:
         display, laser = self.display, self.laser
-        least_rad = 2.0 * self.scanner.rad_per_code
+        min_rad = 2.0 * self.scanner.rad_per_code
         for side, tolerance_rad in zip(("width", "height"), self.tolerance_rad, strict=True):
-            if tolerance_rad <= least_rad:
+            if tolerance_rad <= min_rad:
                 raise ValueError(
                     f"laser.focus_{side}_m {getattr(laser, f'focus_{side}_m')} with scanner.aim_error_m "
-                    f"{self.scanner.aim_error_m} to either side does not fit on display.absorber_{side}_m "
+                    f"{self.scanner.aim_error_m} on either side does not fit on display.absorber_{side}_m "
                     f"{getattr(display, f'absorber_{side}_m')} with two steps of the converter to spare"
                 )
         return self
@@ -300,24 +355,24 @@ class Config(Section):
 
     @property
     def min_power_w(self) -> float:
-        """The laser power that the board's smallest step stands for, W; it rounds down."""
+        """Laser power of the board's smallest duty step, W; the board rounds down."""
         steps = HELIOS_POWER_STEPS if self.board.transport == "helios" else POWER_STEPS
         return self.laser.max_power_w / steps
 
     @property
     def tolerance_rad(self) -> tuple[float, float]:
-        """How far mirrors x and y may stand from where they should with the whole focus on the absorber, rad."""
+        """Largest errors of mirrors x and y with the whole focus on the absorber, rad."""
         display, laser, scanner = self.display, self.laser, self.scanner
-        room_m = (
+        margin_m = (
             (display.absorber_width_m - laser.focus_width_m) / 2.0 - scanner.aim_error_m,
             (display.absorber_height_m - laser.focus_height_m) / 2.0 - scanner.aim_error_m,
         )
-        return room_m[0] / (2.0 * scanner.focal_length_m), room_m[1] / (2.0 * scanner.focal_length_m)
+        return margin_m[0] / (2.0 * scanner.focal_length_m), margin_m[1] / (2.0 * scanner.focal_length_m)
 
 
 @dataclass(frozen=True, eq=False)
 class PixelLayout:
-    """Where pixels lie, on the optical axis' origin, x to the right, y up; index by rows from the bottom. All [p]."""
+    """Pixel positions [p], m, from the optical axis, x to the right, y up; indices count by rows from the bottom."""
 
     x_m: FloatArray
     y_m: FloatArray
@@ -332,7 +387,7 @@ class PixelLayout:
 
 
 def build_pixel_layout(display: DisplaySection) -> PixelLayout:
-    """Pixel positions of a lattice; missing places take no index."""
+    """Compute the pixel positions of a lattice; missing places have no index."""
     missing = set(display.missing)
     places = [
         (row, column)
@@ -350,21 +405,21 @@ def build_pixel_layout(display: DisplaySection) -> PixelLayout:
 
 
 def locate_shipped(*parts: str) -> Path:
-    """A file that ships with the package: from the wheel, or from the source tree beside the package."""
+    """Return the path of a file that ships with the package, in the wheel or in the source tree."""
     package = Path(str(files("optodrive")))
     installed = package / "_shipped" / "configs"
     return (installed if installed.is_dir() else package.parent / "configs").joinpath(*parts)
 
 
 def list_shipped_configs() -> list[str]:
-    """Names of the configurations that ship with the package."""
+    """Return the names of the shipped configurations."""
     return sorted(path.stem for path in locate_shipped().glob("display-*.toml"))
 
 
 def load_config(source: str | Path | None = None, measured_servo: bool = True) -> Config:
-    """Read a configuration file, or a shipped one by its name; raises InputError with one line.
+    """Read a configuration file, or a shipped one by its name. Raise InputError with one line.
 
-    measured: with the mirrors' file it names, else with the servo it states.
+    measured_servo: apply the file of measured servos that the configuration names
     """
     source = DEFAULT_CONFIG if source is None else source
     path = Path(source)
@@ -373,6 +428,9 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
             raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
         path = locate_shipped(f"{source}.toml")
     table = read_toml(path)
+    if table.get("format") == FORMAT and table.get("version") == 3:
+        renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
+        raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
     check_format(path, table, FORMAT, VERSION)
     _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
     _resolve_paths(path, table.get("display"), ("pixel_map",))
@@ -385,20 +443,21 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
 
 
 def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:
-    """Files that a section names are looked for from the configuration's folder."""
+    """Resolve the files that a table names relative to the configuration's folder."""
     for key in keys:
         if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
             section[key] = str(path.parent / section[key])
 
 
 class GalvoSection(Section):
-    """share: of the galvo cap that is left, where a mirror accelerates more than the one servo that is counted."""
+    """Correction of the galvo cap for mirrors that accelerate more than the common servo."""
 
     share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Remaining fraction of the cap."""
 
 
 class MirrorsFile(Section):
-    """mirrors.toml, as `optodrive calibrate servo` writes it; about and axes are for people."""
+    """mirrors.toml as `optodrive calibrate servo` writes it; about and axes are informative."""
 
     format: Literal["optodrive-mirrors"]
     version: Literal[1]
@@ -409,7 +468,7 @@ class MirrorsFile(Section):
 
 
 def apply_measured_servo(config: Config, path: Path) -> Config:
-    """The configuration with measured servos, and the galvo cap that they leave; InputError with one line."""
+    """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
     table = read_toml(path)
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
     try:
@@ -423,7 +482,7 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
 
 
 def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:
-    """Refuse a file of another format or version by name, rather than misread it."""
+    """Raise InputError for a file of another format or version."""
     if table.get("format") != expected:
         raise InputError(f"{path}: format", table.get("format"), f"'{expected}'")
     if table.get("version") != version:
@@ -431,7 +490,7 @@ def check_format(path: Path, table: dict[str, Any], expected: str, version: int)
 
 
 def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
-    """The first of pydantic's complaints as one line; an unknown key comes with the nearest known one."""
+    """Convert pydantic's first complaint to one line; suggest the nearest known key for an unknown one."""
     complaints = error.errors(include_url=False)
     first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
     place = ".".join(str(part) for part in first["loc"])
@@ -442,7 +501,7 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
         return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
     message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
     if first["type"] == "missing":
-        return InputError(label, None, "this key to be there")
+        return InputError(label, None, "this key")
     if first["type"] == "value_error":
         return InputError(label, "values that contradict", message)
     return InputError(label, first["input"], message)

@@ -15,7 +15,7 @@ from optodrive.device.field_geometry import FieldGeometry
 from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 
 FORMAT = "optodrive-field"
-VERSION = 1
+VERSION = 2
 
 
 class _Scanner(Section):
@@ -57,7 +57,7 @@ def strip_toml_specials(text: str) -> str:
 
 
 def format_field(field: CalibratedField, about: dict[str, str | float | int]) -> str:
-    """TOML of format optodrive-field, version 1."""
+    """TOML of format optodrive-field, version 2."""
     extent = field.extent
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]

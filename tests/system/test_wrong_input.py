@@ -202,7 +202,7 @@ CONFIGS = {
     "uncertainty beyond half": ("wall_capacity = 0.1", "wall_capacity = 1.5", "limits.uncertainty.wall_capacity"),
     "crossed powers": ("pixel_mean_power_max_w = 1.3", "pixel_mean_power_max_w = 9.0", "must not exceed"),
     "wrong type": ("pwm_hz = 5000.0", 'pwm_hz = "fast"', "laser.pwm_hz"),
-    "other version": ("version = 3", "version = 2", "version: got 2, expected 3"),
+    "other version": ("version = 4", "version = 2", "version: got 2, expected 4"),
     "other format": ('format = "optodrive-config"', 'format = "svg"', "format"),
     "no TOML": ("[display]", "[display", "valid TOML"),
     "unreachable pixel": ("pitch_m = 3.6e-3", "pitch_m = 9e-3", "reaches"),

@@ -15,7 +15,7 @@ from optodrive.device.config import Section, build_input_error, check_format
 from optodrive.device.field_geometry import CODE_MAX
 
 FORMAT = "optodrive-pictures"
-VERSION = 1
+VERSION = 2
 DESCRIPTION_FILE = "pictures.toml"
 COLUMNS = ("file", "x_code", "y_code")
 CODES_IN_NAME = re.compile(r"(\d+)[_,-](\d+)\.[A-Za-z]+$")
