@@ -33,7 +33,7 @@ def test_in_the_dark(make_board, start):
     assert answer["failure"] is None
     assert [step["step"] for step in answer["steps"]] == STEPS
     assert not assert_dark(board).of("gate")
-    assert answer["steps"][3]["lit_s"] >= 2.0
+    assert answer["steps"][3]["indicator_s"] >= 2.0
     states = [event["state"] for event in board.of("state")]
     assert states[:3] == ["DISARMED", "ARMING", "ARMED"]
     assert states[-1] == "DISARMED"
@@ -44,7 +44,7 @@ def test_with_a_spot_and_no_position_outputs(make_board, start):
     status, out, errors = start(board, "home", "--spot-power-mw", "5").ended()
     assert status == 0, errors
     assert "no position outputs: not checked" in out
-    assert "seen by spot" in out
+    assert "observed by spot" in out
     pulses = assert_dark(board).of("pulse")
     assert len(pulses) == 15
     assert (
@@ -56,7 +56,7 @@ def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
     status, out, errors = start(board, "home").ended()
     assert status == 0, errors
     assert "no sensor" in out
-    assert "nothing here sees the mirrors" in out
+    assert "no instrument observes the mirrors" in out
     assert not assert_dark(board).of("gate")
 
 
@@ -64,13 +64,13 @@ def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
     ("script", "arguments", "says"),
     [
         pytest.param(
-            *("stick_x", (), "home: travel x: mirror x, sent 0.1636 rad from end to end,: got does not move"),
+            *("stick_x", (), "home: travel x: mirror x, commanded 0.1636 rad from end to end,: got does not move"),
             marks=pytest.mark.slow,
         ),
         (
             "stick_y",
             ("--spot-power-mw", "5"),
-            "home: travel y: mirror y, sent 0.1636 rad from end to end,: got does not move",
+            "home: travel y: mirror y, commanded 0.1636 rad from end to end,: got does not move",
         ),
         pytest.param("invert_readback", (), "rad, inverted, expected 0.16364 ±", marks=pytest.mark.slow),
         pytest.param(

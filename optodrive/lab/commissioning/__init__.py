@@ -1,1 +1,1 @@
-"""Bringing a display up: homing the mirrors, measuring where the beam lands. It holds the board itself, no daemon."""
+"""Commissioning of a display with exclusive access to the board: homing, and measurement of beam positions."""

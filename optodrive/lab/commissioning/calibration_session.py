@@ -1,4 +1,4 @@
-"""What a calibration has measured so far, on disk after every spot: an interrupted one goes on where it was."""
+"""The spots of a calibration, saved after each one so that an interrupted calibration can be resumed."""
 
 import json
 import os
@@ -17,7 +17,7 @@ VERSION = 1
 
 
 class SpotRow(NamedTuple):
-    """One spot: where it was sent, codes, and where it landed, m."""
+    """One spot: commanded codes and measured position, m."""
 
     x_code: float
     y_code: float
@@ -26,7 +26,7 @@ class SpotRow(NamedTuple):
 
 
 class CalibrationSession:
-    """The spots of one calibration, in a file beside what will come of it."""
+    """The spots of one calibration and their file beside the output file."""
 
     def __init__(self, path: Path, header: dict[str, Any], rows: list[SpotRow]) -> None:
         self.path, self.rows = path, rows
@@ -34,7 +34,7 @@ class CalibrationSession:
 
     @classmethod
     def load_or_create(cls, out: Path, config: Config) -> Self:
-        """The session of an output file, an earlier one or a new one; InputError for one of another display."""
+        """Load the session of an output file, or create one. Raise InputError for a session of another display."""
         path = session_path_for(out)
         header = {
             "format": FORMAT,
@@ -47,21 +47,21 @@ class CalibrationSession:
 
     @property
     def spots(self) -> MeasuredSpots:
-        """All rows, in order."""
+        """All spots, in order of measurement."""
         return MeasuredSpots.from_table(np.array(self.rows, dtype=np.float64))
 
     def to_json(self) -> str:
-        """All of it, as the file holds it."""
+        """Return the content of the file."""
         return json.dumps({**self._header, "spots": self.rows}) + "\n"
 
 
 def session_path_for(out: Path) -> Path:
-    """Where the session of an output file is kept."""
+    """Return the path of an output file's session."""
     return out.with_name(out.name + ".session.json")
 
 
 def save_text(path: Path, text: str) -> None:
-    """Replace the file, on disk when this returns."""
+    """Replace the file and flush it to disk."""
     with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write(text)
         file.flush()
@@ -74,11 +74,11 @@ def _read_rows(path: Path, header: dict[str, Any]) -> list[SpotRow]:
     except OSError as error:
         raise InputError(str(path), error.strerror or str(error), "a readable file") from None
     except ValueError:
-        raise InputError(str(path), "not JSON", "a calibration's session; delete it to begin anew") from None
+        raise InputError(str(path), "not JSON", "a calibration's session; delete it to start again") from None
     for key, value in header.items():
         stored = document.get(key) if isinstance(document, dict) else None
         if stored != value:
-            raise InputError(f"{path}: {key}", stored, f"{value!r}; delete the file to begin anew")
+            raise InputError(f"{path}: {key}", stored, f"{value!r}; delete the file to start again")
     try:
         rows = [SpotRow(*(float(number) for number in row)) for row in document["spots"]]
     except (KeyError, TypeError, ValueError):

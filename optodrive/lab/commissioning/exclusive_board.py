@@ -1,7 +1,6 @@
-"""A board held for one task: armed once, points one at a time, and none that the limiter has not passed.
+"""Exclusive access to a board for one task: it is armed once and executes single points that the limiter has passed.
 
-Whoever holds it leaves it through `close`, which tells it to abort; where that is not heard, the closed port and the
-lease end it dark.
+`close` sends ABORT. If the board does not receive it, the closed port and the lease turn the gate off.
 """
 
 import gc
@@ -35,24 +34,24 @@ from optodrive.planning.limiter.limiter import limit, shift_state, verify
 
 LOOP_STEP_S = 0.002
 SWITCH_INTERVAL_S = 2e-4
-"""As the engine's: another thread that computes must not keep the lease waiting."""
+"""As in the engine: a computing thread must not delay the lease."""
 FIELD_MARGIN_M = 4e-3
-"""Beams are sent so far beyond the outermost pixels: uncorrected they miss by less."""
+"""Permitted margin beyond the outermost pixels; the error of an uncorrected beam is smaller."""
 SPOT_POWER_MAX_W = 0.05
-"""Most power of a spot: 2 % of what draws a pixel, and steadily on one absorber a few kelvin."""
+"""Maximum power of a spot: 2 % of a pixel's drive power; steady on one absorber it adds a few kelvin."""
 SPOT_SHARE_MAX = 0.05
-"""And no more than this share of the laser's power."""
+"""Maximum power of a spot relative to the laser's power."""
 SPOT_WIDTH_S = 0.02
 START_LEAD_S = 0.03
 SETTLING_TIME_CONSTANTS = 15.0
-"""A move has so many of the servo's time constants to die out."""
+"""Settling time after a move in time constants of the servo."""
 ARM_TIMEOUT_S = 6.0
 POINT_TIMEOUT_S = 3.0
 FAULT_NAME_TIMEOUT_S = 0.5
 
 
 class ExclusiveBoard:
-    """A board and its session. Methods raise LinkError, BoardFaultError, NotReadyError for what ends the task."""
+    """A board and its session. Methods raise LinkError, BoardFaultError or NotReadyError when the task must end."""
 
     def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
         self._display, self._clock = display, clock
@@ -77,27 +76,30 @@ class ExclusiveBoard:
 
     @property
     def config(self) -> Config:
-        """Of the display before it."""
+        """Configuration of the display."""
         return self._display.config
 
     def connect(self) -> None:
-        """Open the link and shake hands; kernels are loaded first, for whoever compiles renews no lease."""
+        """Open the link and begin a session. Kernels are loaded first, because compilation would delay the lease."""
         sys.setswitchinterval(SWITCH_INTERVAL_S)
         request_realtime_scheduling()
         limit(self._plan(0.0, 0.0, self._zero_duty_power_w), self._state, self._display.budget)
         gc.collect()
         gc.freeze()
         self.session.connect()
-        while self.session.board.temperature_c is None:  # until a STATUS tells of faults and inputs
+        while self.session.board.temperature_c is None:  # until the first STATUS, which has faults and inputs
             self.session.step(LOOP_STEP_S, renew_lease=False)
 
     def close(self) -> None:
-        """Abort, and close the link for good."""
+        """Send ABORT and close the link."""
         self._arm_requested = self._armed = False
         self.session.close()
 
     def step(self) -> None:
-        """Keep the lease and listen, for a moment; raises where the board ended the task by itself."""
+        """Renew the lease and process messages for LOOP_STEP_S.
+
+        Raise BoardFaultError if the board left its armed states, NotReadyError if it refused a message.
+        """
         self.session.step(LOOP_STEP_S, renew_lease=True)
         board, refusal = self.session.board, self.session.pop_refusal()
         if board.state == BoardState.FAULT and self._arm_requested:
@@ -108,7 +110,7 @@ class ExclusiveBoard:
             raise BoardFaultError(f"the board went to {board.state} by itself: {self.session.last_event_reason}")
 
     def _build_fault_error(self) -> BoardFaultError:
-        """The fault by its name, which a STATUS tells soon after an ACK told of FAULT."""
+        """Build the error with the fault's name, which a STATUS reports soon after the ACK that reported FAULT."""
         until_s = self._clock.now_s() + FAULT_NAME_TIMEOUT_S
         while not self.session.board.fault and self._clock.now_s() < until_s:
             self.session.step(LOOP_STEP_S, renew_lease=False)
@@ -116,13 +118,13 @@ class ExclusiveBoard:
         return BoardFaultError(f"the board went to FAULT {fault}: {get_fault_hint(fault)}")
 
     def wait(self, duration_s: float) -> None:
-        """Let time pass, the lease kept."""
+        """Wait and keep the lease."""
         until_s = self._clock.now_s() + duration_s
         while self._clock.now_s() < until_s:
             self.step()
 
     def arm(self) -> float:
-        """Arm; how long it took from the order to ARMED, s: the board lights its indicator for two seconds first."""
+        """Arm the board and return the time from the request to ARMED, s; the indicator is on for two seconds of it."""
         start_s = self._clock.now_s()
         self.session.arm()
         self._arm_requested = True
@@ -134,7 +136,7 @@ class ExclusiveBoard:
         return self._clock.now_s() - start_s
 
     def disarm(self) -> None:
-        """To DISARMED, a fault acknowledged, and hear that it is; NotReadyError where the board refuses."""
+        """Disarm, acknowledge a fault, and wait for DISARMED. Raise NotReadyError if the board refuses."""
         self._arm_requested = self._armed = False
         self.session.disarm()
         until_s = self._clock.now_s() + ARM_TIMEOUT_S
@@ -144,26 +146,26 @@ class ExclusiveBoard:
             if refusal is not None:
                 raise NotReadyError(f"the board refuses to disarm: {refusal}")
             if self._clock.now_s() > until_s:
-                raise LinkError(f"the board does not say that it is disarmed: {self.session.board.state}")
+                raise LinkError(f"the board does not report DISARMED: {self.session.board.state}")
 
     # --- points -------------------------------------------------------------------------------------------------
 
     def move_to(self, x_code: int, y_code: int) -> None:
-        """Send the mirrors somewhere in the dark, and wait until they have settled."""
+        """Move the mirrors with the gate off and wait until they have settled."""
         self._execute_point(x_code, y_code, self._zero_duty_power_w, gate_on=False)
 
     def fire_spot(self, x_code: int, y_code: int, power_w: float) -> None:
-        """One short pulse at a place, mirrors settled; done when the board has reported it in full."""
+        """Emit one short pulse with settled mirrors and wait until the board has reported it in full."""
         check_spot_power(self.config, power_w)
         self._execute_point(x_code, y_code, power_w, gate_on=True)
 
     @property
     def _zero_duty_power_w(self) -> float:
-        """Rounds to a duty of nothing: the board gets a dark point, while the limiter counts the mirrors' move."""
+        """Power that rounds to duty 0: the gate stays off, while the limiter still counts the move."""
         return 0.5 * self.config.laser.max_power_w / DUTY_MAX
 
     def _plan(self, x_rad: float, y_rad: float, power_w: float) -> PulsePlan:
-        """One pulse. Nobody knows yet which pixel it meets: all count on one, the one that bears least."""
+        """Build a plan of one pulse, accounted to the weakest pixel because the pixel it hits is unknown."""
         return PulsePlan(
             start_s=np.array([self._settling_s]),
             width_s=np.array([self._width_s]),
@@ -193,7 +195,7 @@ class ExclusiveBoard:
         self._timeline_zero_s += self._stream(points, limited, start_s, gate_on)
 
     def check_range(self, x_code: int, y_code: int) -> None:
-        """InputError for codes beyond the display and a little more."""
+        """Raise InputError for codes beyond the display and its margin."""
         limits = self._limits
         for axis, code in (("x", x_code), ("y", y_code)):
             low, high = getattr(limits, f"{axis}_min"), getattr(limits, f"{axis}_max")
@@ -203,12 +205,12 @@ class ExclusiveBoard:
                 )
 
     def clip_codes(self, codes: FloatArray) -> FloatArray:
-        """Codes [k, 2], those too far out drawn in as far as the board goes."""
+        """Clip codes [k, 2] to the board's range."""
         limits = self._limits
         return np.clip(codes, [limits.x_min, limits.y_min], [limits.x_max, limits.y_max])
 
     def _limit_when_feasible(self, plan: PulsePlan) -> tuple[LimitedPlan, BudgetState, BudgetState, float]:
-        """The plan as the limiter lets it pass, the state before and after, and when it begins; waits where it must."""
+        """Wait until the limiter passes the plan; return it with the state before and after, and its start, s."""
         while True:
             start_s = self.session.board_s() + START_LEAD_S
             before = shift_state(
@@ -224,14 +226,14 @@ class ExclusiveBoard:
             return limited, before, after, start_s
 
     def _verify_encoded(self, points: WirePoints, plan: LimitedPlan, before: BudgetState, gate_on: bool) -> None:
-        """Decode the very bytes that will leave, and hold them against the budget."""
+        """Decode the encoded points and verify them against the budget."""
         decoded = decode(points.encode_payload(), self.session.scale)
         if len(decoded.index) != int(gate_on):
-            raise LocalProtocolError(f"{len(decoded.index)} lit points where {int(gate_on)} is meant")
+            raise LocalProtocolError(f"{len(decoded.index)} points with the gate on, expected {int(gate_on)}")
         verify(plan, points.row[decoded.index], decoded, before, self._display.budget)
 
     def _stream(self, points: WirePoints, plan: LimitedPlan, start_s: float, gate_on: bool) -> float:
-        """Stream points and hear them through; by how much they came late, s."""
+        """Stream points, wait for their reports, and return their delay, s."""
         job = self.session.begin(points, start_s)
         until_s = self._clock.now_s() + POINT_TIMEOUT_S
         while not job.is_finished:
@@ -241,20 +243,20 @@ class ExclusiveBoard:
         executed = job.build_executed(plan, self.session.scale.full_power_w, self.session.scale.tick_s)
         if gate_on and not np.allclose(executed.width_s, plan.width_s):
             raise BoardFaultError(
-                f"the board lit a spot for {executed.width_s.sum():g} s, asked for {plan.width_s[0]:g} s"
+                f"the board kept the gate on for {executed.width_s.sum():g} s; expected {plan.width_s[0]:g} s"
             )
         ended_s = float(executed.start_s[-1] + executed.width_s[-1])
         return max(0.0, ended_s - float(plan.start_s[0] + plan.width_s[0]))
 
 
 def find_weakest_pixel(display: DisplayModel) -> int:
-    """The pixel whose absorber steady light warms most."""
+    """Return the pixel with the highest steady temperature rise per watt."""
     heat = display.budget.heat
     return int(np.argmax(heat.epsilon * heat.r_k_per_w))
 
 
 def max_settling_s(config: Config) -> float:
-    """Dark time in which any move dies out, s, whole milliseconds."""
+    """Return the gate-off time in which any move settles, s, rounded up to milliseconds."""
     scanner = config.scanner
     ramp_s = 2.0 * scanner.range_rad / scanner.slew_rad_per_s
     constant_s = 1.0 / (2.0 * pi * scanner.bandwidth_hz * scanner.damping)
@@ -262,19 +264,19 @@ def max_settling_s(config: Config) -> float:
 
 
 def spot_width_s(config: Config) -> float:
-    """Width of a spot's pulse, s: whole PWM periods, no more than a pulse may have."""
+    """Return the width of a spot's pulse, s: whole PWM periods within the configured maximum."""
     pwm_hz = config.laser.pwm_hz
     periods = max(1, int(min(SPOT_WIDTH_S, config.limits.pulse_width_max_s) * pwm_hz * (1 + 1e-9)))
     return round(periods / pwm_hz * 1e6) * 1e-6
 
 
 def max_spot_power_w(config: Config) -> float:
-    """Most power of a spot, W."""
+    """Return the maximum power of a spot, W."""
     return min(SPOT_POWER_MAX_W, SPOT_SHARE_MAX * config.laser.max_power_w)
 
 
 def check_spot_power(config: Config, power_w: float, option: str = "--spot-power-mw") -> None:
-    """InputError, naming the option, for a power that no spot may have."""
+    """Raise InputError, naming the option, for a power outside the range of a spot."""
     max_w = max_spot_power_w(config)
     if not 0.0 < power_w <= max_w:
         raise InputError(option, f"{power_w * 1e3:g} mW", f"more than 0 and at most {max_w * 1e3:g} mW")

@@ -1,7 +1,7 @@
-"""Homing: a table of steps that ends with the mirrors in their middle and the board disarmed, or with a reason.
+"""Homing: a table of steps that ends with centred mirrors and a disarmed board, or with the reason for a refusal.
 
-All is dark unless a spot's power is given. Mirrors are seen by their position outputs, by the spot, or not at all: then
-only the board's word is checked, and the answer says so.
+The gate stays off unless a spot power is given. The mirrors are observed by their position outputs, by the spot, or not
+at all; without observation only the board's reports are checked, and the result says so.
 """
 
 from collections.abc import Callable
@@ -21,24 +21,24 @@ from optodrive.link.session.fault_hints import get_fault_hint
 
 INDICATOR_S = 2.0
 READINGS_PER_SPOT = 3
-"""Of each spot: one reflection among them does not count."""
+"""Readings per spot, enough to reject one reflection."""
 CLOCK_TOLERANCE = 1e-3
-"""Host and board count seconds alike within this share."""
+"""Relative tolerance between the clocks of host and board."""
 TRAVEL_MIN_M = 3e-3
 INPUT_LABELS = {"interlock": ("open", "closed"), "key": ("off", "on"), "estop": ("released", "pressed")}
-"""Words for an input that is 0 and 1."""
+"""Labels of an input for 0 and 1."""
 SAFE_LABELS = {"interlock": "closed", "key": "on", "estop": "released"}
 STUCK_SHARE = 0.1
-"""A mirror that goes less than this share of its way does not move."""
+"""A mirror that moves less than this share of the commanded travel is stuck."""
 OUTPUT_TOLERANCE, SPOT_TOLERANCE = 0.05, 0.1
-"""Position outputs and spots may be off by such a share of the way: what the calibration is there for."""
+"""Permitted relative error of position outputs and of spots; the calibration corrects it."""
 ZERO_TOLERANCE_RAD = 2e-3
-"""Position outputs may be off by so much in the middle."""
+"""Permitted error of the position outputs at the centre."""
 AXES = "xy"
 
 
 class HomingPosition(NamedTuple):
-    """Where mirrors were sent, rad, and what was seen there: outputs, rad, and spot, m; None where nothing looks."""
+    """Commanded mirror angles, position outputs and spot position; None without an instrument."""
 
     commanded_rad: tuple[float, float]
     output_rad: tuple[float, float] | None
@@ -47,7 +47,7 @@ class HomingPosition(NamedTuple):
 
 @dataclass(frozen=True)
 class HomingResult:
-    """A step that went well, in words and figures."""
+    """Result of a successful step: message and details."""
 
     step: str
     message: str
@@ -57,7 +57,7 @@ class HomingResult:
 class Homing:
     """One run of the steps on one board.
 
-    eyes: None without a sensor; power_w: of spots, 0 in the dark; acknowledge: a fault that the board still shows
+    spot_reader: None without a sensor; power_w: of spots, 0 to keep the gate off; acknowledge: a fault of the board
     """
 
     def __init__(
@@ -69,14 +69,14 @@ class Homing:
         self._ends: dict[int, tuple[HomingPosition, HomingPosition]] = {}
 
     def run(self, on_step: Callable[[HomingResult], None]) -> None:
-        """Do every step of the table in order, telling each; an OptodriveError names what stops it."""
+        """Run each step in order and report its result to on_step. Raise OptodriveError if a step fails."""
         for name, step in STEPS:
             on_step(step(self, name))
 
     # --- the steps ----------------------------------------------------------------------------------------------
 
     def check_link(self, name: str) -> HomingResult:
-        """Board and sensor answer."""
+        """Check that board and sensor answer."""
         self._board.connect()
         if self._spot_reader is not None:
             self._spot_reader.open()
@@ -88,7 +88,7 @@ class Homing:
         return HomingResult(name, f"board {uid} at {session.port}, {sensor}", {"board": session.port, "uid": uid})
 
     def check_status(self, name: str) -> HomingResult:
-        """The board waits, without a fault."""
+        """Check that the board is DISARMED without a fault."""
         board = self._board.session.board
         if board.state == BoardState.FAULT and self._acknowledge:
             self._board.disarm()
@@ -100,7 +100,7 @@ class Homing:
         return HomingResult(name, f"DISARMED, {board.temperature_c:g} °C", {"temperature_c": board.temperature_c})
 
     def check_inputs(self, name: str) -> HomingResult:
-        """Interlock, key and emergency stop are safe."""
+        """Check that interlock, key and emergency stop are safe."""
         bits = self._board.session.board.inputs
         labels = {each: INPUT_LABELS[each][bits >> k & 1] for k, each in enumerate(INPUTS)}
         for each, label in labels.items():
@@ -109,37 +109,39 @@ class Homing:
         return HomingResult(name, ", ".join(f"{each} {word}" for each, word in labels.items()), dict(labels))
 
     def check_indicator(self, name: str) -> HomingResult:
-        """The board arms, and warns for two seconds before it is ARMED."""
+        """Arm the board and check that its indicator is on for two seconds before ARMED."""
         indicator_s = self._board.arm()
         if indicator_s < INDICATOR_S * (1.0 - CLOCK_TOLERANCE):
             raise _build_refusal(
-                name, "time from the order to ARMED", f"{indicator_s:.2f} s", f"at least {INDICATOR_S:g} s"
+                name, "time from the request to ARMED", f"{indicator_s:.2f} s", f"at least {INDICATOR_S:g} s"
             )
-        return HomingResult(name, f"lit for {indicator_s:.2f} s, ARMED", {"lit_s": round(indicator_s, 3)})
+        return HomingResult(
+            name, f"indicator on for {indicator_s:.2f} s, ARMED", {"indicator_s": round(indicator_s, 3)}
+        )
 
     def move_to_zero(self, name: str) -> HomingResult:
-        """Mirrors to their middle."""
+        """Move the mirrors to the centre and check the position outputs there."""
         self._zero = position = self._measure_at(CENTRE_CODE, CENTRE_CODE)
         if position.output_rad is not None:
             for axis in range(2):
                 output_rad = position.output_rad[axis]
                 if abs(output_rad) > ZERO_TOLERANCE_RAD:
-                    expected = f"0 ± {ZERO_TOLERANCE_RAD:g} rad in the middle"
+                    expected = f"0 ± {ZERO_TOLERANCE_RAD:g} rad at the centre"
                     raise _build_refusal(
                         name, f"position output of mirror {AXES[axis]}", f"{output_rad:.5f} rad", expected
                     )
         return HomingResult(name, _describe_position(position), _position_details(position))
 
     def check_travel_x(self, name: str) -> HomingResult:
-        """Mirror x to both ends of the display."""
+        """Move mirror x to both ends of the display and check its travel."""
         return self._check_travel(name, 0)
 
     def check_travel_y(self, name: str) -> HomingResult:
-        """Mirror y to both ends of the display."""
+        """Move mirror y to both ends of the display and check its travel."""
         return self._check_travel(name, 1)
 
     def check_readback(self, name: str) -> HomingResult:
-        """Position outputs follow: the right mirror, the right way, as far as sent."""
+        """Check that the position outputs follow the commands: axis, direction and scale."""
         if self._zero is None or self._zero.output_rad is None:
             return HomingResult(name, "no position outputs: not checked", {"checked": False})
         for axis, (high, low) in self._ends.items():
@@ -148,23 +150,23 @@ class Homing:
             expected = f"{commanded_rad:.5f} ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
             what = f"position output of mirror {AXES[axis]}"
             if abs(own_rad + commanded_rad) <= OUTPUT_TOLERANCE * commanded_rad:
-                raise _build_refusal(name, f"{what} over its way", f"{own_rad:.5f} rad, inverted", expected)
+                raise _build_refusal(name, f"{what} over its travel", f"{own_rad:.5f} rad, inverted", expected)
             if abs(own_rad - commanded_rad) > OUTPUT_TOLERANCE * commanded_rad:
-                raise _build_refusal(name, f"{what} over its way", f"{own_rad:.5f} rad", expected)
+                raise _build_refusal(name, f"{what} over its travel", f"{own_rad:.5f} rad", expected)
             if abs(other_rad) > OUTPUT_TOLERANCE * commanded_rad:
-                other = f"position output of mirror {AXES[1 - axis]} while {AXES[axis]} goes"
+                other = f"position output of mirror {AXES[1 - axis]} while {AXES[axis]} moves"
                 raise _build_refusal(
                     name, other, f"{other_rad:.5f} rad", f"0 ± {OUTPUT_TOLERANCE * commanded_rad:.5f} rad"
                 )
         return HomingResult(name, f"both mirrors follow within {OUTPUT_TOLERANCE:.0%}", {"checked": True})
 
     def return_to_zero(self, name: str) -> HomingResult:
-        """Back to the middle in the dark, and disarmed."""
+        """Return the mirrors to the centre with the gate off, and disarm."""
         self._board.move_to(CENTRE_CODE, CENTRE_CODE)
         self._board.disarm()
-        return HomingResult(name, "mirrors in the middle, DISARMED", {"board": BoardState.DISARMED})
+        return HomingResult(name, "mirrors at the centre, DISARMED", {"board": BoardState.DISARMED})
 
-    # --- what they share ----------------------------------------------------------------------------------------
+    # --- measurements -------------------------------------------------------------------------------------------
 
     def _measure_at(self, x_code: int, y_code: int) -> HomingPosition:
         self._board.move_to(x_code, y_code)
@@ -197,12 +199,12 @@ class Homing:
             self._check_moved(name, axis, own_m, commanded_m, "m")
             expected, what = (
                 f"{commanded_m:.4f} ± {SPOT_TOLERANCE * commanded_m:.4f} m",
-                f"spot while mirror {AXES[axis]} goes its way",
+                f"spot over the travel of mirror {AXES[axis]}",
             )
             if abs(own_m - commanded_m) > SPOT_TOLERANCE * commanded_m or abs(other_m) > SPOT_TOLERANCE * commanded_m:
                 measured = f"{own_m:.4f} m along {AXES[axis]}, {other_m:.4f} m along {AXES[1 - axis]}"
                 raise _build_refusal(
-                    name, what, measured, f"{expected} along {AXES[axis]}: axes mirrored, swapped, another lens?"
+                    name, what, measured, f"{expected} along {AXES[axis]}: axes mirrored or exchanged, or another lens?"
                 )
         message = f"±{commanded_rad / 2:.4f} rad, {_describe_evidence(high)}"
         return HomingResult(name, message, {"plus": _position_details(high), "minus": _position_details(low)})
@@ -217,7 +219,7 @@ class Homing:
 
     def _check_moved(self, name: str, axis: int, moved: float, commanded: float, unit: str) -> None:
         if abs(moved) < STUCK_SHARE * commanded:
-            what = f"mirror {AXES[axis]}, sent {commanded:.4f} {unit} from end to end,"
+            what = f"mirror {AXES[axis]}, commanded {commanded:.4f} {unit} from end to end,"
             raise _build_refusal(name, what, f"does not move: {moved:.4f} {unit}", f"{commanded:.4f} {unit}")
 
 
@@ -233,7 +235,7 @@ def _describe_evidence(position: HomingPosition) -> str:
     instruments = [
         word for word, reading in (("position outputs", position.output_rad), ("spot", position.spot_m)) if reading
     ]
-    return f"seen by {' and '.join(instruments)}" if instruments else "executed; nothing here sees the mirrors"
+    return f"observed by {' and '.join(instruments)}" if instruments else "executed; no instrument observes the mirrors"
 
 
 def _describe_position(position: HomingPosition) -> str:
@@ -244,11 +246,11 @@ def _describe_position(position: HomingPosition) -> str:
     )
     if position.spot_m is not None:
         parts.append(f"spot {position.spot_m[0] * 1e3:.3f}, {position.spot_m[1] * 1e3:.3f} mm")
-    return "; ".join(parts) or "executed; nothing here sees the mirrors"
+    return "; ".join(parts) or "executed; no instrument observes the mirrors"
 
 
 def _position_details(position: HomingPosition) -> dict[str, object]:
-    return {"sent_rad": position.commanded_rad, "output_rad": position.output_rad, "spot_m": position.spot_m}
+    return {"commanded_rad": position.commanded_rad, "output_rad": position.output_rad, "spot_m": position.spot_m}
 
 
 STEPS: tuple[tuple[str, Callable[[Homing, str], HomingResult]], ...] = (
@@ -262,4 +264,4 @@ STEPS: tuple[tuple[str, Callable[[Homing, str], HomingResult]], ...] = (
     ("readback", Homing.check_readback),
     ("zero again", Homing.return_to_zero),
 )
-"""In order; each begins in what the one before it left."""
+"""Steps in order; each one starts from the result of the step before."""

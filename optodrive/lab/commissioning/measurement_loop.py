@@ -1,6 +1,6 @@
-"""The closed loop: measure where it tells most, fit, until the field is sure enough.
+"""Closed-loop calibration: measure the most informative spot, fit, and repeat until the field is accurate enough.
 
-Whoever looks, a sensor or a person, says where the beam may be sent next and what came of it; the rest is the same.
+A `SpotLocator`, a sensor or a person, offers candidate positions and measures the spot at the chosen one.
 """
 
 from collections.abc import Callable
@@ -24,50 +24,50 @@ from optodrive.lab.commissioning.predicted_error import predicted_rms_m
 from optodrive.lab.commissioning.worker_process import WorkerProcess
 
 WORKER_TIMEOUT_S = 30.0
-"""What takes longer has gone wrong; the board is not kept armed for it."""
+"""Time limit of a computation, during which the board stays armed."""
 CONSECUTIVE_MISSES_MAX = 3
-"""So many places one after another without a spot, and nothing is seen at all."""
+"""Consecutive positions without a spot that end the calibration."""
 SPOTS_MIN = 20
-"""With fewer spots a fit knows its own noise and surface too little to be believed that it is good."""
+"""Minimum number of spots for a credible error estimate."""
 CONFIDENCE_FACTOR = 1.3
-"""What comes out is itself uncertain: nine times in ten it is less than this times the prediction."""
+"""Ratio of the 90 % bound of the actual error to its prediction."""
 
 
 RECHECKS_MAX = 2
-"""An interrupted calibration begins by so many of its spots at the most."""
+"""Maximum number of spots that a resumed calibration measures again."""
 RECHECK_SIGMAS = 5.0
-"""Spots so many sigmas apart, measured twice, are not the same."""
+"""Two measurements of a spot differ if they are more sigmas apart than this."""
 
 
 class SpotLocator(Protocol):
-    """What finds a spot."""
+    """Source of candidate positions and of spot measurements."""
 
     @property
     def name(self) -> str:
-        """Who looks."""
+        """Name of the sensor or method."""
 
     @property
     def not_found_message(self) -> str:
-        """What is told when it finds none: value and expectation."""
+        """Message if no spot is found: value and expectation."""
 
     def candidate_codes(self, fit: FieldFit) -> FloatArray:
-        """Codes to which the beam might be sent, [k, 2]; the same k, in the same order, every time."""
+        """Return candidate codes, [k, 2], in the same number and order for each fit."""
 
     def initial_places(self) -> list[int]:
-        """Candidates to begin with: corners, edges and the middle."""
+        """Return the first candidates to measure: corners, edges and centre."""
 
     def match_places(self, spots: MeasuredSpots) -> IntArray:
-        """Which candidate each spot is of, -1 for none, [n]."""
+        """Return the candidate of each spot, -1 for none, [n]."""
 
     def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
-        """Send the beam to a candidate and say where it landed; None where nothing is seen."""
+        """Measure the spot of a candidate; return None if no spot is found."""
 
 
 @dataclass(frozen=True)
 class MeasurementProgress:
-    """After a spot: how many there are, and the field's predicted error over the display, rms of its length.
+    """Progress after a spot: number of spots, and the predicted rms error of the field over the display, m.
 
-    sure_m: what that is nine times in ten less than
+    error_bound_m: 90 % bound of that error
     """
 
     spots: int
@@ -78,7 +78,7 @@ class MeasurementProgress:
 
 @dataclass(frozen=True)
 class MeasurementResult:
-    """What came of it: the fit, its predicted error, and whether it is surely as small as asked for."""
+    """Result: the fit, its predicted error with its 90 % bound, m, and whether the bound meets the target."""
 
     fit: FieldFit
     predicted_error_m: float
@@ -87,14 +87,14 @@ class MeasurementResult:
 
 
 def fit_and_warm_up(spots: MeasuredSpots, prior: FieldPrior) -> FieldFit:
-    """As `fit_field`, and ready to be asked for codes: what that takes once would cost the lease."""
+    """Fit the field and build its inverse now, which would later delay the lease."""
     fit = fit_field(spots, prior)
     fit.field.codes(np.zeros(1), np.zeros(1))
     return fit
 
 
 class MeasurementLoop:
-    """One calibration on a held, armed board. Raises what ends it; every spot so far is in the session."""
+    """One calibration on an armed board. Each measured spot is saved in the session before an error is raised."""
 
     def __init__(
         self,
@@ -112,9 +112,9 @@ class MeasurementLoop:
         self._unseen_places: set[int] = set()
 
     def run(self, on_progress: Callable[[MeasurementProgress], None]) -> MeasurementResult:
-        """Measure until sure enough, or until there are spots_max; telling after each spot.
+        """Measure until the error bound meets the target or spots_max is reached; report progress after each spot.
 
-        Spots of an interrupted session are gone on with only where the first of them still lies where it did.
+        Continue an interrupted session only if its first spot is still at the same position, else raise RefusedError.
         """
         if self._session.rows:
             self._check_unchanged()
@@ -135,7 +135,7 @@ class MeasurementLoop:
             self._measure_next(fit)
 
     def _run_keeping_lease(self, function: Callable[..., Any], *arguments: object) -> Any:
-        """Have it done aside, the lease kept."""
+        """Run a function in the worker process and keep the lease. Raise NotReadyError on timeout."""
         self._worker.submit(function, *arguments)
         until_s = self._clock.now_s() + WORKER_TIMEOUT_S
         while not self._worker.is_ready():
@@ -147,7 +147,7 @@ class MeasurementLoop:
         return self._worker.result()
 
     def _check_unchanged(self) -> None:
-        """Measure the first good spot again, and where that is off the second: one alone may be false."""
+        """Measure the first valid spot again, and the second if the first one has moved: it may be an outlier."""
         spots = self._session.spots
         fit: FieldFit = self._run_keeping_lease(fit_and_warm_up, spots, self._prior)
         places, max_shift_m = self._locator.match_places(spots), RECHECK_SIGMAS * 2.0**0.5 * fit.noise_m
@@ -166,13 +166,13 @@ class MeasurementLoop:
             shifts.append(f"{m_to_um(float(np.hypot(x_m, y_m))):.0f} µm off")
         if shifts:
             raise RefusedError(
-                f"calibrate: the display or the optics moved since: the spots measured first are now seen "
+                f"calibrate: the display or the optics moved since: the spots measured first are now "
                 f"{' and '.join(shifts)}, expected at most {m_to_um(max_shift_m):.0f} µm; "
-                f"delete {self._session.path} to begin anew"
+                f"delete {self._session.path} to start again"
             )
 
     def _measure_next(self, fit: FieldFit) -> None:
-        """Measure one more spot; a place where none is seen is given up for another."""
+        """Measure one more spot; exclude positions where no spot is found."""
         misses = 0
         while True:
             codes = np.rint(self._locator.candidate_codes(fit))
@@ -186,16 +186,17 @@ class MeasurementLoop:
             misses += 1
             if misses == CONSECUTIVE_MISSES_MAX:
                 raise RefusedError(
-                    f"calibrate: {CONSECUTIVE_MISSES_MAX} places one after another: {self._locator.not_found_message}"
+                    f"calibrate: {CONSECUTIVE_MISSES_MAX} consecutive positions without a spot: "
+                    f"{self._locator.not_found_message}"
                 )
 
     def _remaining_initial_places(self) -> list[int]:
-        """What is left of the places to begin with."""
+        """Return the initial positions not yet measured."""
         done = {*self._locator.match_places(self._session.spots).tolist(), *self._unseen_places}
         return [place for place in self._locator.initial_places() if place not in done]
 
     def _choose_place(self, fit: FieldFit, codes: FloatArray) -> int:
-        """What to begin with first, then what tells most; never where a good spot is already, or none was seen."""
+        """Choose the next position: the initial ones first, then the most informative one not yet measured."""
         initial = self._remaining_initial_places()
         if initial:
             return initial[0]
@@ -203,7 +204,7 @@ class MeasurementLoop:
         remaining = [place for place in range(len(codes)) if place not in done]
         if not remaining:
             raise RefusedError(
-                f"calibrate: all {len(codes)} places are measured, expected more of them or a lesser goal"
+                f"calibrate: all {len(codes)} positions are measured, expected more of them or a larger target"
             )
         row: int = self._run_keeping_lease(select_next_spot, fit, codes[remaining])
         return remaining[row]

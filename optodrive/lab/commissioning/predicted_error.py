@@ -1,4 +1,4 @@
-"""How wrong a field is on the display, as its own fit predicts it."""
+"""Predicted error of a fitted field over the display."""
 
 import numpy as np
 
@@ -8,11 +8,11 @@ from optodrive.lab.calibration.field_fit import FieldFit
 from optodrive.link.protocol.quantisation import CENTRE_CODE
 
 GRID_SIDE = 15
-"""Places a side at which the uncertainty is averaged."""
+"""Grid points per side at which the uncertainty is averaged."""
 
 
 def build_code_grid(config: Config, margin_m: float, side: int) -> FloatArray:
-    """A grid of nominal codes over the display and a little more, [side², 2], by rows from the bottom."""
+    """Build a grid of nominal codes over the display and a margin, [side², 2], by rows from the bottom."""
     layout = build_pixel_layout(config.display)
     code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
     x, y = (
@@ -23,6 +23,6 @@ def build_code_grid(config: Config, margin_m: float, side: int) -> FloatArray:
 
 
 def predicted_rms_m(fit: FieldFit, config: Config) -> float:
-    """The field's error over the display as predicted, rms of its length, m."""
+    """Return the predicted rms length of the field's error over the display, m."""
     sigma_m = fit.field.sigma_m(*build_code_grid(config, 0.0, GRID_SIDE).T)
     return float(np.sqrt(2.0 * np.mean(sigma_m**2)))

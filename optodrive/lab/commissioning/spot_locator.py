@@ -1,4 +1,4 @@
-"""Who finds the spot: the sensor, or a person who moves it onto a mark."""
+"""Spot locators: a sensor, or a person who moves the spot onto a mark."""
 
 from collections.abc import Callable
 from queue import Empty, SimpleQueue
@@ -17,48 +17,48 @@ from optodrive.lab.commissioning.predicted_error import build_code_grid
 from optodrive.lab.commissioning.spot_reader import SpotReader
 
 GRID_SIDE = 11
-"""Places a side that a sensor may be asked about."""
+"""Candidate positions per side for a sensor."""
 GRID_MARGIN_M = 1.5e-3
 BLINK_S = 0.1
-"""Darkness between two flashes for a person's eye."""
+"""Gate-off time between two flashes, visible to a person."""
 NUDGE_MAX_UM = 5000.0
-HELP = "'dx dy' in µm moves the spot, an empty line says that it lies on the mark, 's' skips this pixel"
+HELP = "'dx dy' in µm moves the spot, an empty line confirms that it is on the mark, 's' skips this pixel"
 
 
 class SensorLocator:
-    """A sensor looks, a few times at each place."""
+    """Locates spots with a sensor, several readings per position."""
 
     def __init__(self, board: ExclusiveBoard, spot_reader: SpotReader, power_w: float, readings: int) -> None:
         self._spot_reader, self._power_w, self._readings = spot_reader, power_w, readings
         self._codes = np.rint(board.clip_codes(build_code_grid(board.config, GRID_MARGIN_M, GRID_SIDE)))
         self.name = f"sensor at {spot_reader.port}"
         self.not_found_message = (
-            f"{self.name} sees no spot, expected one: is it covered, or {power_w * 1e3:g} mW too dim?"
+            f"{self.name} sees no spot, expected one: is it covered, or is {power_w * 1e3:g} mW too dim?"
         )
 
     def candidate_codes(self, fit: FieldFit) -> FloatArray:
-        """A grid over the display and a little more."""
+        """Return a grid over the display and a margin."""
         return self._codes
 
     def initial_places(self) -> list[int]:
-        """Corners, edges and the middle."""
+        """Return corners, edges and centre."""
         ends = (0, GRID_SIDE // 2, GRID_SIDE - 1)
         return [row * GRID_SIDE + column for row in ends for column in ends]
 
     def match_places(self, spots: MeasuredSpots) -> IntArray:
-        """By the codes they were sent to."""
+        """Match spots by their commanded codes."""
         return _match_rows(self._codes, np.column_stack([spots.x_code, spots.y_code]))
 
     def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
-        """Light it, and take the mean of what is seen."""
+        """Measure a position as the robust mean of several readings."""
         reading = self._spot_reader.read_spot(x_code, y_code, self._power_w, self._readings)
         return None if reading is None else SpotRow(x_code, y_code, reading.x_m, reading.y_m)
 
 
 class ManualLocator:
-    """A person looks: the spot is to be moved onto the middle of a pixel, whose place is known.
+    """Locates spots with a person, who moves the spot onto the centre of a pixel of known position.
 
-    lines: what the person types, None at its end; say: words for the person.
+    input_lines: typed lines, None at the end of input; show: shows a message to the person
     """
 
     name = "spots moved by hand"
@@ -73,11 +73,11 @@ class ManualLocator:
         self._code_m = 2.0 * scanner.focal_length_m * scanner.rad_per_code
 
     def candidate_codes(self, fit: FieldFit) -> FloatArray:
-        """The middle of every pixel, where the field so far leads the beam to it; no farther than the board goes."""
+        """Return the codes of each pixel's centre by the present fit, clipped to the board's range."""
         return self._board.clip_codes(np.column_stack(fit.field.codes(self._layout.x_m, self._layout.y_m)))
 
     def initial_places(self) -> list[int]:
-        """Pixels nearest to the corners, edges and middle of the lattice."""
+        """Return the pixels nearest to the corners, edges and centre of the lattice."""
         x_m, y_m = self._layout.x_m, self._layout.y_m
         places = [
             int(np.argmin(np.hypot(x_m - x * np.abs(x_m).max(), y_m - y * np.abs(y_m).max())))
@@ -87,13 +87,13 @@ class ManualLocator:
         return list(dict.fromkeys(places))
 
     def match_places(self, spots: MeasuredSpots) -> IntArray:
-        """By the pixels they lie on."""
+        """Match spots by their pixel."""
         return _match_rows(
             np.column_stack([self._layout.x_m, self._layout.y_m]), np.column_stack([spots.x_m, spots.y_m])
         )
 
     def measure(self, place: int, x_code: int, y_code: int) -> SpotRow | None:
-        """Flash the spot until the person says that it lies on the mark."""
+        """Flash the spot until the person confirms that it is on the mark."""
         x_m, y_m = float(self._layout.x_m[place]), float(self._layout.y_m[place])
         self._show(f"pixel {place}, {x_m * 1e3:+.2f} {y_m * 1e3:+.2f} mm: {HELP}")
         while True:
@@ -118,7 +118,7 @@ class ManualLocator:
             x_code, y_code = new_x_code, new_y_code
 
     def _read_line(self, x_code: int, y_code: int) -> str:
-        """What the person types, the spot flashing meanwhile."""
+        """Return the next typed line; flash the spot while waiting. Raise RefusedError at the end of input."""
         while True:
             try:
                 line = self._input_lines.get_nowait()
@@ -127,12 +127,12 @@ class ManualLocator:
                 self._board.wait(BLINK_S)
                 continue
             if line is None:
-                raise RefusedError("calibrate: nobody answers any more (end of input); what was measured is kept")
+                raise RefusedError("calibrate: end of input; the measured spots are kept")
             return line.strip()
 
 
 def _match_rows(known: FloatArray, given: FloatArray) -> IntArray:
-    """Row of known [k, 2] that each row of given [n, 2] repeats, -1 where none does."""
+    """Return for each row of given [n, 2] the equal row of known [k, 2], -1 if there is none."""
     equal = np.all(np.isclose(given[:, None], known[None], rtol=0.0, atol=1e-9), axis=2)
     return np.where(equal.any(axis=1), equal.argmax(axis=1), -1)
 

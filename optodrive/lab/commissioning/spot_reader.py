@@ -1,4 +1,4 @@
-"""Spots and mirrors through the sensor, while the board is held."""
+"""Readings of spots and mirrors from the sensor, with exclusive access to the board."""
 
 from math import sqrt
 from statistics import fmean, median
@@ -10,27 +10,27 @@ from optodrive.lab.commissioning.spot_sensor_client import SpotReading, SpotSens
 
 ANSWER_TIMEOUT_S = 1.0
 ATTEMPTS = 3
-"""So often a place is lit before it counts as unseen."""
+"""Pulses at a position before it counts as without a spot."""
 OUTLIER_SIGMAS = 6.0
-"""Readings so many sigma from their middle are something else: a reflection."""
+"""Readings farther than this from the median are outliers, for example reflections."""
 OUTLIER_MIN_M = 1e-6
 
 
 class SpotReader:
-    """A held board's sensor: keeps the lease while it waits for answers."""
+    """Reads the sensor and keeps the board's lease while it waits."""
 
     def __init__(self, board: ExclusiveBoard, sensor: SpotSensorClient, clock: Clock) -> None:
         self._board, self._sensor, self._clock = board, sensor, clock
 
     @property
     def port(self) -> str:
-        """Where the sensor is."""
+        """The sensor's port."""
         return self._sensor.port
 
     def read_spot(self, x_code: int, y_code: int, power_w: float, readings: int) -> SpotReading | None:
-        """Light a place and see where the beam lands: the mean of several readings, less those far from their middle.
+        """Measure a spot as the mean of several readings without outliers; return None if no spot is detected.
 
-        None where nothing is seen however often it is lit.
+        Raise RefusedError if the sensor detects a spot with the gate off.
         """
         collected: list[SpotReading] = []
         for _ in range(readings):
@@ -44,7 +44,7 @@ class SpotReader:
         for _ in range(ATTEMPTS):
             if self._query_spot() is not None:
                 raise RefusedError(
-                    f"sensor at {self.port}: sees a spot though the beam is dark: shield it from other light"
+                    f"sensor at {self.port}: sees a spot with the beam off: shield it from ambient light"
                 )
             self._board.fire_spot(x_code, y_code, power_w)
             reading = self._query_spot()
@@ -53,11 +53,11 @@ class SpotReader:
         return None
 
     def read_mirrors_rad(self) -> tuple[float, float] | None:
-        """Where the position outputs say that the mirrors stand; None where there are none."""
+        """Return the position outputs of the mirrors, rad; None without position outputs."""
         return self._sensor.parse_mirrors_rad(self._query("mirrors"))
 
     def open(self) -> None:
-        """Open the sensor's port; InputError where there is none, LinkError where no sensor answers."""
+        """Open the sensor's port. Raise InputError if it does not exist, LinkError if no sensor answers."""
         self._sensor.open()
         self._query_spot()
 
@@ -74,14 +74,15 @@ class SpotReader:
         while (line := self._sensor.poll_answer()) is None:
             if self._clock.now_s() > until_s:
                 raise LinkError(
-                    f"sensor at {self.port}: no answer within {ANSWER_TIMEOUT_S:g} s: is it powered, the right port and rate?"
+                    f"sensor at {self.port}: no answer within {ANSWER_TIMEOUT_S:g} s: "
+                    "is it powered, and are port and baud rate right?"
                 )
             self._board.step()
         return line
 
 
 def robust_mean(readings: list[SpotReading]) -> SpotReading:
-    """The mean of readings that lie near their medians; of the first where none do."""
+    """Return the mean of the readings near their median; the first reading if none is near."""
     x_m, y_m = median(each.x_m for each in readings), median(each.y_m for each in readings)
     inliers = [
         each

@@ -1,4 +1,4 @@
-"""The host's side of a spot sensor: a line asked, a line answered, and nothing that blocks. See SENSOR.md."""
+"""Non-blocking client of a spot sensor: one request line, one answer line. See SENSOR.md."""
 
 from math import isfinite
 from typing import NamedTuple
@@ -11,7 +11,7 @@ LINE_MAX = 64
 
 
 class SpotReading(NamedTuple):
-    """Where a spot was seen on the display, and one sigma of either number."""
+    """Position of a spot on the display, and its standard deviation per axis, m."""
 
     x_m: float
     y_m: float
@@ -19,7 +19,7 @@ class SpotReading(NamedTuple):
 
 
 class SpotSensorClient:
-    """A sensor on a transport of its own. Methods raise LinkError when the link fails or what is heard is no answer."""
+    """A sensor on its own transport. Methods raise LinkError if the link fails or an answer is invalid."""
 
     def __init__(self, transport: Transport) -> None:
         self._transport = transport
@@ -31,15 +31,15 @@ class SpotSensorClient:
         return self._transport.name
 
     def open(self) -> None:
-        """Open its port; InputError where there is none."""
+        """Open the port. Raise InputError if it does not exist."""
         self._transport.open()
 
     def close(self) -> None:
-        """Close its port."""
+        """Close the port."""
         self._transport.release()
 
     def send_request(self, request: str) -> None:
-        """Say a line; what lay there unheard belongs to no question and is dropped."""
+        """Send a request line; discard input that arrived before it."""
         self._read()
         self._buffer = b""
         try:
@@ -48,7 +48,7 @@ class SpotSensorClient:
             raise LinkError(f"sensor: {error}") from None
 
     def poll_answer(self) -> str | None:
-        """The line that came, None as long as there is none."""
+        """Return the answer line, None if it has not arrived yet."""
         self._buffer += self._read()
         line, end, _ = self._buffer.partition(b"\n")
         if not end:
@@ -64,7 +64,7 @@ class SpotSensorClient:
             raise LinkError(f"sensor: {error}") from None
 
     def parse_spot(self, line: str) -> SpotReading | None:
-        """The answer to `spot`; None where it saw nothing."""
+        """Parse the answer to `spot`; None if the sensor detected no spot."""
         numbers = self._parse_numbers(line, "spot", 3)
         if numbers is None:
             return None
@@ -72,7 +72,7 @@ class SpotSensorClient:
         return SpotReading(x_m, y_m, sigma_m)
 
     def parse_mirrors_rad(self, line: str) -> tuple[float, float] | None:
-        """The answer to `mirrors`; None where the driver has no position outputs."""
+        """Parse the answer to `mirrors`, rad; None if the driver has no position outputs."""
         numbers = self._parse_numbers(line, "mirrors", 2)
         return None if numbers is None else (numbers[0], numbers[1])
 
@@ -90,5 +90,5 @@ class SpotSensorClient:
 
     def _build_answer_error(self, received: str, expected: str) -> LinkError:
         return LinkError(
-            f"sensor at {self.port}: heard {received[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
+            f"sensor at {self.port}: received {received[:LINE_MAX]!r}, expected {expected}; is it a spot sensor?"
         )

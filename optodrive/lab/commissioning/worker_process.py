@@ -1,6 +1,6 @@
-"""Work in a process of its own: whoever holds an armed board renews its lease while numbers and disks take their time.
+"""A worker process for computations and disk access while the parent process renews the lease of an armed board.
 
-A thread would share the interpreter's lock, and on a busy machine the lease would wait for it.
+A thread would share the interpreter's lock, which would delay the lease on a busy machine.
 """
 
 import multiprocessing as mp
@@ -16,10 +16,10 @@ NICE = 5
 
 
 class WorkerProcess:
-    """Does one thing at a time; ends with whoever started it, however that ends."""
+    """Runs one function at a time; it ends with its parent process, however that ends."""
 
     def __init__(self) -> None:
-        context = mp.get_context("spawn")  # a fork would keep the board's port open after its holder has gone
+        context = mp.get_context("spawn")  # a fork would keep the board's port open after the parent ended
         self._pipe, child_end = context.Pipe()
         self._process = context.Process(target=_serve, args=(child_end,), name="aside", daemon=True)
         self._process.start()
@@ -36,18 +36,21 @@ class WorkerProcess:
         self._process.join()
 
     def submit(self, function: Callable[..., Any], *arguments: object) -> None:
-        """Hand over a function of a module, and what it takes."""
+        """Start a function of a module with its arguments."""
         try:
             self._pipe.send((function, arguments))
         except OSError:
             raise self._build_exit_error() from None
 
     def is_ready(self) -> bool:
-        """Whether it is done."""
+        """Return whether the result is available."""
         return self._pipe.poll()
 
     def result(self) -> Any:
-        """What came of it; waits for it. RefusedError where its input was wrong, OptodriveError where it failed."""
+        """Wait for the result and return it.
+
+        Raise RefusedError if the function raised InputError, OptodriveError for any other error.
+        """
         try:
             outcome = self._pipe.recv()
         except (EOFError, OSError):
@@ -57,12 +60,11 @@ class WorkerProcess:
         return outcome
 
     def _build_exit_error(self) -> OptodriveError:
-        return OptodriveError("the process that fits has ended: out of memory, or ended from outside?")
+        return OptodriveError("the worker process has ended: out of memory, or killed?")
 
 
 def _serve(pipe: Connection) -> None:
-    # A session of its own: a Ctrl-C at the terminal is for the holder, and so is its share of the processor, which
-    # Linux deals out by sessions.
+    # A new session: Ctrl-C at the terminal then reaches only the parent, and Linux schedules the processor by session.
     os.setsid()
     os.setpriority(os.PRIO_PROCESS, 0, NICE)
     while True:

@@ -44,7 +44,7 @@ def test_none_is_an_answer():
     "line", ["", "spot", "spot 1 2", "spot 1 2 x", "spot 1 nan 3", "mirrors 1 2", "error no", "\ufffd"]
 )
 def test_what_is_no_answer_is_named(line):
-    with pytest.raises(LinkError, match=r"a wire: heard .*expected 'spot' and 3 numbers"):
+    with pytest.raises(LinkError, match=r"a wire: received .*expected 'spot' and 3 numbers"):
         SpotSensorClient(Wire()).parse_spot(line)
 
 
