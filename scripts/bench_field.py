@@ -1,4 +1,4 @@
-"""The calibrated field: how far off it is on hidden geometries, and how long conversions take."""
+"""Benchmark of the calibrated field: error on hidden geometries, and duration of conversions."""
 
 import statistics
 import subprocess
@@ -30,7 +30,7 @@ class HiddenGeometryLab:
         self.code_m = 2.0 * self.config.scanner.focal_length_m * self.config.scanner.rad_per_code
 
     def fit_spots(self, seed, side):
-        """A grid of spots with noise and false detections, fitted."""
+        """Fit a grid of spots with noise and outliers; return the ground truth and the fit."""
         truth, random = GroundTruthGeometry.sample(seed, self.config), np.random.default_rng([seed, side])
         axis_codes = np.rint(CENTRE_CODE + np.linspace(-self.half_m, self.half_m, side) / self.code_m)
         codes = np.stack(np.meshgrid(axis_codes, axis_codes), axis=-1).reshape(-1, 2)
@@ -40,23 +40,24 @@ class HiddenGeometryLab:
         return truth, fit_field(MeasuredSpots.from_table(np.column_stack([codes, positions])), self.prior)
 
     def sample_positions(self, count):
-        """Places on the display's square, [2, count]."""
+        """Sample positions uniformly on the display's square, [2, count], m."""
         return np.random.default_rng(5).uniform(-self.half_m, self.half_m, (2, count))
 
     def measure_errors(self, side):
-        """Of each geometry: rms and largest length of the miss, µm; and the share within two stated sigmas, by axis."""
+        """Return for each geometry the rms and maximum error, µm, and the fraction of axis errors within two sigma."""
         out, targets = [], self.sample_positions(3000)
         for seed in range(GEOMETRIES):
             truth, fit = self.fit_spots(seed, side)
             codes = fit.field.codes(*targets)
-            miss = np.array(truth.position_m(*codes)) - targets
-            covered = float((np.abs(miss) <= 2.0 * fit.field.sigma_m(*codes)).mean())
-            length_um = 1e6 * np.hypot(*miss)
+            error_m = np.array(truth.position_m(*codes)) - targets
+            covered = float((np.abs(error_m) <= 2.0 * fit.field.sigma_m(*codes)).mean())
+            length_um = 1e6 * np.hypot(*error_m)
             out.append((float(np.sqrt((length_um**2).mean())), float(length_um.max()), covered))
         return np.array(out)
 
 
 def measure_median_cpu_s(work):
+    """Return the median CPU time of a call, s."""
     times = []
     for _ in range(RUNS):
         begin_s = time.process_time()
@@ -66,28 +67,30 @@ def measure_median_cpu_s(work):
 
 
 def measure_command_s(*arguments):
+    """Return the wall time of a command, s."""
     begin_s = time.perf_counter()
     subprocess.run(["optodrive", *arguments], check=True, stdout=subprocess.DEVNULL)
     return time.perf_counter() - begin_s
 
 
 def bench_field():
+    """Return the rows of the table."""
     lab, rows = HiddenGeometryLab(), []
     for side in (17, 5, 3):
         rms_um, max_um, covered = lab.measure_errors(side).T
         rows.append(
-            (f"{side**2} spots: miss, rms length, median of {GEOMETRIES} hidden geometries", np.median(rms_um), "µm")
+            (f"{side**2} spots: rms position error, median of {GEOMETRIES} hidden geometries", np.median(rms_um), "µm")
         )
-        rows.append((f"{side**2} spots: the same, the worst geometry", rms_um.max(), "µm"))
-        rows.append((f"{side**2} spots: the largest miss of all", max_um.max(), "µm"))
-        rows.append((f"{side**2} spots: within two stated sigmas", covered.mean(), "1"))
+        rows.append((f"{side**2} spots: rms position error, worst geometry", rms_um.max(), "µm"))
+        rows.append((f"{side**2} spots: maximum position error", max_um.max(), "µm"))
+        rows.append((f"{side**2} spots: fraction within two sigma", covered.mean(), "1"))
     _, fit = lab.fit_spots(0, 17)
     field, targets = fit.field, lab.sample_positions(POINTS)
     codes = field.codes(*targets)
-    rows.append(("a million places to codes", measure_median_cpu_s(lambda: field.codes(*targets)), "s CPU"))
-    rows.append(("a million codes to places", measure_median_cpu_s(lambda: field.position_m(*codes)), "s CPU"))
+    rows.append(("1,000,000 positions to codes", measure_median_cpu_s(lambda: field.codes(*targets)), "s CPU"))
+    rows.append(("1,000,000 codes to positions", measure_median_cpu_s(lambda: field.position_m(*codes)), "s CPU"))
     round_trip = np.abs(np.subtract(field.codes(*field.position_m(*codes)), codes)).max()
-    rows.append(("to metres and back, the most", float(round_trip), "codes"))
+    rows.append(("round trip to metres and back, maximum error", float(round_trip), "codes"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_field(folder / "field.toml", fit)
@@ -95,6 +98,6 @@ def bench_field():
         common = ["field", "--calibration", f"{folder}/field.toml", "--points"]
         there_s = measure_command_s(*common, f"{folder}/points.csv", "--out", f"{folder}/codes.csv")
         back_s = measure_command_s(*common, f"{folder}/codes.csv", "--inverse", "--out", f"{folder}/back.csv")
-    rows.append(("optodrive field, a million lines to codes, the whole command", there_s, "s"))
-    rows.append(("optodrive field --inverse, a million lines, the whole command", back_s, "s"))
+    rows.append(("optodrive field, 1,000,000 lines to codes, whole command", there_s, "s"))
+    rows.append(("optodrive field --inverse, 1,000,000 lines, whole command", back_s, "s"))
     return rows

@@ -1,9 +1,9 @@
-"""The scheduler at the physical limit: a naive order, a strong solver's order, ours, and the floor that optics set.
+"""Benchmark of the scheduler: its order, a naive order, a solver's order, and the lower bound set by the optics.
 
-Every order is drawn with the same pulses: from rest, one after the other, each the shortest that reaches its height
-from the heat there is when its turn comes. The naive order goes row by row, and at each move waits 0.4 ms and the way
-at the slew rate, for the mirrors to settle. The solver is LKH (elkai), on the very times that our moves take. The floor
-is light alone: the same pulses without moves, and without rounding to whole PWM periods.
+Every order starts cold and uses the same pulse rule: each pulse is the shortest that reaches its target from the
+residual heat at its start. The naive order visits the pixels row by row; each of its moves takes 0.4 ms plus the
+distance at the slew rate. The solver is LKH (elkai), with the settling times of the scheduler. The lower bound is
+beam-on time alone: the same pulses without moves and without rounding to whole PWM periods.
 """
 
 import time
@@ -21,47 +21,51 @@ from optodrive.planning.stimuli.pattern_registry import build_pattern
 NAIVE_SETTLE_S = 4e-4
 LKH_RUNS = 10
 LONG_DWELL_US = 1_000_000
-"""A stay after which every move is calm."""
+"""Dwell after which every move has the settling time of a long dwell, µs."""
 EXPERIMENTS = tuple(f"experiment-{k}" for k in range(1, 7))
 
 
 class OrderBenchmark:
-    """A display at rest, its mirrors, and the times its moves take."""
+    """A cold display with its scan head and settling times."""
 
     def __init__(self, name):
         self.display = DisplayModel.from_config(load_config(name))
-        machine = self.display.scan_head
-        self.layout, self.moves, self.drive = machine.layout, machine.settling, machine.drive
-        self.x_rad, self.y_rad = machine.field.angles_rad(self.layout.x_m, self.layout.y_m)
+        scan_head = self.display.scan_head
+        self.layout, self.settling, self.drive = scan_head.layout, scan_head.settling, scan_head.drive
+        self.x_rad, self.y_rad = scan_head.field.angles_rad(self.layout.x_m, self.layout.y_m)
 
     def compute_move_us(self, origin, pixel, dwell_us=LONG_DWELL_US):
+        """Return the settling time of a move, µs; the lead-in without an origin."""
         if origin is None:
-            return self.moves.lead_in_us
-        return self.moves.settling_us(
+            return self.settling.lead_in_us
+        return self.settling.settling_us(
             self.x_rad[pixel] - self.x_rad[origin], self.y_rad[pixel] - self.y_rad[origin], dwell_us
         )
 
     def compute_naive_move_us(self, origin, pixel, _dwell_us=0):
+        """Return the naive duration of a move, µs; the lead-in without an origin."""
         if origin is None:
-            return self.moves.lead_in_us
+            return self.settling.lead_in_us
         distance_rad = max(abs(self.x_rad[pixel] - self.x_rad[origin]), abs(self.y_rad[pixel] - self.y_rad[origin]))
         return 1e6 * (NAIVE_SETTLE_S + distance_rad / self.display.config.scanner.slew_rad_per_s)
 
     # --- orders -------------------------------------------------------------------------------------------------
 
     def order_by_row(self, active, _origin):
+        """Return the pixels row by row."""
         return active
 
     def order_by_scheduler(self, active, origin):
+        """Return the pixels in the order of the scheduler."""
         return compute_visiting_order(active, self.layout.row, self.layout.column, self.x_rad, self.y_rad, origin)
 
     def order_by_solver(self, active, origin):
-        """LKH's shortest open path, by the times of our moves; from the origin if there is one."""
+        """Return the shortest open path that LKH finds for the settling times; it starts at `origin` if there is one."""
         if len(active) < 3:
             return active
         nodes = active if origin is None else np.concatenate([[origin], active])
         durations = [[self.compute_move_us(a, b) for b in nodes.tolist()] for a in nodes.tolist()]
-        # A place that costs nothing to go to joins the ends; with an origin, nothing but that may follow it.
+        # A dummy node at zero distance closes the open path; with an origin, only the origin may follow the dummy.
         forbidden = 10 * max(map(max, durations)) * len(nodes)
         matrix = [[0] * (len(nodes) + 1)]
         for k, row in enumerate(durations):
@@ -76,10 +80,10 @@ class OrderBenchmark:
         path = nodes[np.array(tour[begin + 1 :] + tour[:begin]) - 1]
         return path if origin is None else path[1:]
 
-    # --- drawing ------------------------------------------------------------------------------------------------
+    # --- planning -----------------------------------------------------------------------------------------------
 
     def plan_order(self, frames, order_of, move_us):
-        """Total time, light, moves (s), pulses, and the light that rounding to PWM periods added."""
+        """Return the total time, the beam-on time with and without rounding to PWM periods, s, and the pulse count."""
         heat = self.display.build_cold_heat()
         now_us, pixel_before, dwell_us = 0, None, LONG_DWELL_US
         light_us, exact_us, moves_us, count = 0, 0.0, 0, 0
@@ -101,7 +105,7 @@ class OrderBenchmark:
 
 
 def build_cases(bench):
-    """Name to frames, each [p] metres, drawn one after the other."""
+    """Yield the name of each case and its frames, targets [p] in m, shown one after the other."""
     layout, count = bench.layout, len(bench.layout)
     rng = np.random.default_rng(11)
 
@@ -122,66 +126,67 @@ def build_cases(bench):
 
 
 def measure_case(bench, name, frames):
-    naive = bench.drawn(frames, bench.rows, bench.compute_naive_move_us)
+    """Yield the rows of one case."""
+    naive = bench.plan_order(frames, bench.order_by_row, bench.compute_naive_move_us)
     begin_s = time.process_time()
-    solver_result = bench.drawn(frames, bench.order_by_solver, bench.compute_move_us)
+    solver_result = bench.plan_order(frames, bench.order_by_solver, bench.compute_move_us)
     solver_s = time.process_time() - begin_s
-    scheduler_result = bench.drawn(frames, bench.order_by_scheduler, bench.compute_move_us)
-    floor = bench.drawn(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
-    excess_s = scheduler_result["total_s"] - floor
+    scheduler_result = bench.plan_order(frames, bench.order_by_scheduler, bench.compute_move_us)
+    lower_bound_s = bench.plan_order(frames, bench.order_by_scheduler, lambda *_: 0)["exact_s"]
+    excess_s = scheduler_result["total_s"] - lower_bound_s
     moves, rounding = (
         scheduler_result["total_s"] - scheduler_result["light_s"],
         scheduler_result["light_s"] - scheduler_result["exact_s"],
     )
     yield f"{name}: pixels shown", scheduler_result["count"], "1"
-    yield f"{name}: pixels a second, naive", naive["count"] / naive["total_s"], "1/s"
-    yield f"{name}: pixels a second, ours", scheduler_result["count"] / scheduler_result["total_s"], "1/s"
-    yield f"{name}: beam-on share, naive", naive["light_s"] / naive["total_s"], "1"
-    yield f"{name}: beam-on share, solver's order", solver_result["light_s"] / solver_result["total_s"], "1"
-    yield f"{name}: beam-on share, ours", scheduler_result["light_s"] / scheduler_result["total_s"], "1"
-    yield f"{name}: time over the floor, naive", naive["total_s"] / floor, "×"
-    yield f"{name}: time over the floor, solver's order", solver_result["total_s"] / floor, "×"
-    yield f"{name}: time over the floor, ours", scheduler_result["total_s"] / floor, "×"
-    yield f"{name}: ours over the solver's", scheduler_result["total_s"] / solver_result["total_s"], "×"
-    yield f"{name}: of what is over the floor, moves", moves / excess_s, "1"
-    yield f"{name}: of what is over the floor, whole PWM periods", rounding / excess_s, "1"
+    yield f"{name}: pixels per second, naive", naive["count"] / naive["total_s"], "1/s"
+    yield f"{name}: pixels per second, scheduler", scheduler_result["count"] / scheduler_result["total_s"], "1/s"
+    yield f"{name}: beam-on fraction, naive", naive["light_s"] / naive["total_s"], "1"
+    yield f"{name}: beam-on fraction, solver", solver_result["light_s"] / solver_result["total_s"], "1"
+    yield f"{name}: beam-on fraction, scheduler", scheduler_result["light_s"] / scheduler_result["total_s"], "1"
+    yield f"{name}: time over lower bound, naive", naive["total_s"] / lower_bound_s, "×"
+    yield f"{name}: time over lower bound, solver", solver_result["total_s"] / lower_bound_s, "×"
+    yield f"{name}: time over lower bound, scheduler", scheduler_result["total_s"] / lower_bound_s, "×"
+    yield f"{name}: scheduler over solver", scheduler_result["total_s"] / solver_result["total_s"], "×"
+    yield f"{name}: excess over lower bound, fraction by moves", moves / excess_s, "1"
+    yield f"{name}: excess over lower bound, fraction by whole PWM periods", rounding / excess_s, "1"
     yield (
-        f"{name}: of what is over the floor, heat that left meanwhile",
-        (scheduler_result["exact_s"] - floor) / excess_s,
+        f"{name}: excess over lower bound, fraction by heat lost meanwhile",
+        (scheduler_result["exact_s"] - lower_bound_s) / excess_s,
         "1",
     )
-    yield f"{name}: the solver's time", solver_s, "s CPU"
+    yield f"{name}: CPU time of the solver", solver_s, "s CPU"
     if len(frames) == 1:
         sequence = FrameSequence((TactileFrame("f", 0.0, 3600.0, frames[0]),))
         planned_sequence = plan_sequence(bench.display, sequence, *bench.display.build_cold_state())
         assert (
             abs(planned_sequence.duration_s - scheduler_result["total_s"]) < 1e-6
             or planned_sequence.shortfall is not None
-        ), "not what is planned"
+        ), "the order differs from the plan"
 
 
 def measure_experiment(bench, name):
-    """A stimulus says when its pulses come, so there is one order; what differs is how late the moves make them."""
+    """Measure an experiment: its stimulus fixes the order, and the moves determine the lateness."""
     sequence = build_pattern(name, {}, bench.display.config)
     planned_sequence = plan_sequence(bench.display, sequence, *bench.display.build_cold_state())
     plan = planned_sequence.plan
     light_s = float(plan.width_s.sum())
     free_us, pixel_before, late_us = 0.0, None, 0.0
-    for pixel, nominal_s, width_s in zip(plan.pixel.tolist(), plan.requested_start_s, plan.width_s, strict=True):
+    for pixel, requested_s, width_s in zip(plan.pixel.tolist(), plan.requested_start_s, plan.width_s, strict=True):
         move_us = 0.0 if pixel == pixel_before else bench.compute_naive_move_us(pixel_before, pixel)
-        start_us = max(1e6 * nominal_s, free_us + move_us)
-        late_us = max(late_us, start_us - 1e6 * nominal_s)
+        start_us = max(1e6 * requested_s, free_us + move_us)
+        late_us = max(late_us, start_us - 1e6 * requested_s)
         free_us, pixel_before = start_us + 1e6 * width_s, pixel
-    yield f"{name}: pulses a second", len(plan) / planned_sequence.duration_s, "1/s"
-    yield f"{name}: beam-on share, in its own order", light_s / planned_sequence.duration_s, "1"
-    yield f"{name}: time over the light, naive", 1e-6 * free_us / light_s, "×"
-    yield f"{name}: time over the light, ours", planned_sequence.duration_s / light_s, "×"
-    yield f"{name}: the latest pulse is late by, naive", 1e-3 * late_us, "ms"
-    yield f"{name}: the latest pulse is late by, ours", 1e3 * planned_sequence.train_lateness_max_s, "ms"
+    yield f"{name}: pulses per second", len(plan) / planned_sequence.duration_s, "1/s"
+    yield f"{name}: beam-on fraction", light_s / planned_sequence.duration_s, "1"
+    yield f"{name}: time over beam-on time, naive", 1e-6 * free_us / light_s, "×"
+    yield f"{name}: time over beam-on time, scheduler", planned_sequence.duration_s / light_s, "×"
+    yield f"{name}: maximum lateness of a pulse, naive", 1e-3 * late_us, "ms"
+    yield f"{name}: maximum lateness of a pulse, scheduler", 1e3 * planned_sequence.train_lateness_max_s, "ms"
 
 
 def bench_order():
-    """Rows of the table."""
+    """Return the rows of the table."""
     bench = OrderBenchmark("display-1511")
     rows = [row for name, frames in build_cases(bench) for row in measure_case(bench, name, frames)]
     perceived = OrderBenchmark("display-437")

@@ -1,4 +1,4 @@
-"""The page on 1,511 pixels while a full pattern plays: frames a second as it counts them, and what looks cost."""
+"""Benchmark of the page on 1,511 pixels while a pattern plays: its frame rate, and the cost of snapshots."""
 
 import sys
 import tempfile
@@ -15,7 +15,7 @@ PERIODS_S = 20.0
 
 
 def measure_snapshots():
-    """Wall time of one look at heat and of one at the budget, half of the display lit."""
+    """Measure the wall time of a snapshot of heights and of the budget, with half of the pixels driven."""
     import numpy as np
 
     from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
@@ -31,8 +31,8 @@ def measure_snapshots():
     live.apply(ExecutedBatch(None, pixel, pixel, start_s, np.full(count, 4e-3), np.full(count, 2.0), none, none))
     rows = []
     for what, compute_snapshot in (
-        ("a look at all heights", live.state_at),
-        ("a look at the budget", live.compute_usage),
+        ("snapshot of all heights", live.state_at),
+        ("snapshot of the budget", live.compute_usage),
     ):
         taken_s = []
         for k in range(SNAPSHOTS):
@@ -44,7 +44,7 @@ def measure_snapshots():
 
 
 def measure_page():
-    """Frames that the page painted in each second, and what the daemon's loop bore of it."""
+    """Measure the frames painted per second, and the longest stall of the daemon's loop."""
     from rig import Board, Daemon
     from window import Visit, chromium
 
@@ -69,10 +69,10 @@ def measure_page():
             board.stop()
     rates = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(counted)]
     return [
-        ("frames a second, 1,511 pixels, median", median(rates), "1/s"),
-        ("frames a second, the worst second", min(rates), "1/s"),
-        ("pulses executed meanwhile", state["totals"]["executed"], "1"),
-        ("underruns meanwhile", state["board"]["underruns"], "1"),
+        ("frames per second, 1,511 pixels, median", median(rates), "1/s"),
+        ("frames per second, worst second", min(rates), "1/s"),
+        ("pulses executed", state["totals"]["executed"], "1"),
+        ("underruns", state["board"]["underruns"], "1"),
         ("longest stall of the daemon's loop", state["link"]["longest_stall_ms"], "ms"),
     ]
 
@@ -82,5 +82,5 @@ def _read_frame_count(page):
 
 
 def bench_page():
-    """Looks, then the page itself."""
+    """Return the rows of the table."""
     return measure_snapshots() + measure_page()

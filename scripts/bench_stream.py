@@ -1,8 +1,8 @@
-"""Continuous use: how soon a changed frame is planned, its first byte leaves and its first light falls, under load.
+"""Benchmark of streaming: latency from a frame to its plan, its first byte on the link and its first light, under load.
 
-A daemon on its simulated board, frames of 200 pixels at 20 a second, while other callers ask for the state as fast as
-they can; and the same bodies at the same rate to a bare FastAPI in a process of its own, under the same load: that
-share is not ours.
+A daemon with a simulated board receives frames of 200 pixels at 20 per second, while other clients request the state
+as fast as they can. A bare FastAPI application in another process receives the same bodies at the same rate under the
+same load; its latency is the part that the web framework causes.
 """
 
 import json
@@ -24,7 +24,7 @@ PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
 TOKEN = "a-token-for-a-benchmark"
 CONFIG = Path(__file__).parents[1] / "configs" / "display-1511.toml"
 UNLIMITED_RATES = "\n[daemon]\nrequests_per_s = 100000\nrequests_burst = 100000\n"
-"""The load is the daemon's to carry, not its doorkeeper's to turn away."""
+"""The daemon must serve the load; its rate limit must not reject it."""
 
 BARE_SERVER = """
 import sys
@@ -46,12 +46,13 @@ uvicorn.run(app, port=int(sys.argv[1]), log_level="warning", access_log=False)
 
 
 def build_random_frame(rng):
+    """Build the targets of a frame of random pixels, µm by pixel."""
     pixels = rng.choice(PIXELS, ACTIVE, replace=False)
     return {str(pixel): 60.0 for pixel in pixels.tolist()}
 
 
 def measure_planning():
-    """CPU time of everything between a frame and its proven bytes: plan, limit, predict, quantise, decode, verify."""
+    """Measure the CPU time from a frame to verified bytes: plan, limit, predict, quantise, decode, verify."""
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.device.config import load_config
     from optodrive.link.protocol.quantisation import decode, quantise
@@ -72,19 +73,19 @@ def measure_planning():
             target[rng.choice(PIXELS, active, replace=False)] = 60e-6
             sequence = FrameSequence((TactileFrame("f", 0.0, 60.0, target),))
             begin_s = time.process_time()
-            prepared = plan_sequence(display, sequence, heat, budget, initial_pixel=7)
-            points = quantise(prepared.plan, scale)
+            planned_sequence = plan_sequence(display, sequence, heat, budget, initial_pixel=7)
+            points = quantise(planned_sequence.plan, scale)
             decoded = decode(points.encode_payload(), scale)
-            verify(prepared.plan, points.row[decoded.index], decoded, budget, display.budget)
+            verify(planned_sequence.plan, points.row[decoded.index], decoded, budget, display.budget)
             times.append(time.process_time() - begin_s)
         rows.append(
-            (f"a changed frame of {active} pixels: planned, limited, proven", 1e3 * statistics.median(times), "ms")
+            (f"changed frame of {active} pixels: planned, limited, verified", 1e3 * statistics.median(times), "ms")
         )
     return rows
 
 
 class RequestLoad:
-    """Callers that ask for the state as fast as they are answered."""
+    """Clients that request the state continuously."""
 
     def __init__(self, url):
         self._url = url
@@ -110,7 +111,7 @@ class RequestLoad:
 
 
 def push_frames(url):
-    """Round trips of frames pushed at the rate, s, and the daemon's own answers."""
+    """Push frames at the rate; return round trips, s, the answers, the final state, and the plans of the last frames."""
     rng = np.random.default_rng(7)
     trips, answers = [], []
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:
@@ -136,7 +137,7 @@ def push_frames(url):
 
 
 def measure_full_frames():
-    """Full frames that ripple over the display, as fast as 16 a second, without other callers; from rest to the end."""
+    """Stream full frames with a travelling wave at up to 16 per second, without other clients, from the cold state."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.daemon.engine.engine import Engine
@@ -179,22 +180,25 @@ def measure_full_frames():
     finally:
         engine.close()
         board.release()
-    name = f"full frames, {FULL_HZ:g} a second for {MINUTE_S:g} s, no other callers"
+    name = f"full frames, {FULL_HZ:g} per second for {MINUTE_S:g} s, no other clients"
     return [
         (f"{name}: arrival to first light, median", 1e3 * statistics.median(first_light_s), "ms"),
-        (f"{name}: the same, largest", 1e3 * max(first_light_s), "ms"),
-        (f"{name}: pixels lit", len(set().union(*plans)), "1"),
-        (f"{name}: largest error of a height", float(np.abs(errors).max()), "1"),
-        (f"{name}: times the board ran out of points", underruns, "1"),
+        (f"{name}: arrival to first light, maximum", 1e3 * max(first_light_s), "ms"),
+        (f"{name}: pixels driven", len(set().union(*plans)), "1"),
+        (f"{name}: maximum relative error of a height", float(np.abs(errors).max()), "1"),
+        (f"{name}: underruns", underruns, "1"),
     ]
 
 
 def start_process(arguments, environment, ready):
+    """Start a process; return it and the URL that `ready` reads or waits for."""
     process = subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
     return process, ready(process)
 
 
 def make_bare_url_reader(port):
+    """Return a function that waits for the bare server and returns its URL."""
+
     def ready(_):
         while True:
             try:
@@ -207,10 +211,12 @@ def make_bare_url_reader(port):
 
 
 def read_daemon_url(process):
+    """Read the daemon's URL from its first line of output."""
     return process.stdout.readline().split(" on ")[1].split(",")[0]
 
 
 def format_percentiles(name, values, unit="ms"):
+    """Return the rows of the median and the 99th percentile."""
     return [
         (f"{name}, {label}", 1e3 * float(np.percentile(values, at)), unit)
         for label, at in (("median", 50), ("p99", 99))
@@ -218,7 +224,7 @@ def format_percentiles(name, values, unit="ms"):
 
 
 def bench_stream():
-    """Rows of the table."""
+    """Return the rows of the table."""
     rows = measure_planning()
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": folder}
@@ -242,26 +248,26 @@ def bench_stream():
         finally:
             daemon.terminate()
     finished = [plan for plan in plans if plan["latency"]["first_light_s"] is not None]
-    rows += [("callers besides, questions answered a second", load.answered / SECONDS, "1/s")]
-    rows += format_percentiles("a frame's round trip over REST", trips)
-    rows += format_percentiles("the same to a bare FastAPI", bare_trips)
+    rows += [("other clients, requests answered per second", load.answered / SECONDS, "1/s")]
+    rows += format_percentiles("round trip of a frame over REST", trips)
+    rows += format_percentiles("round trip of a frame to a bare FastAPI", bare_trips)
     for key, name in (
-        ("planned_s", "arrival to plan taken on"),
+        ("planned_s", "arrival to plan accepted"),
         ("first_byte_s", "arrival to first byte to the board"),
         ("first_light_s", "arrival to first light"),
     ):
         rows += format_percentiles(name, [plan["latency"][key] for plan in finished])
     rows += [
         (
-            "share of the p99 to the first byte that a bare FastAPI takes too",
+            "p99 round trip to a bare FastAPI over p99 to the first byte",
             float(np.percentile(bare_trips, 99) / np.percentile([p["latency"]["first_byte_s"] for p in finished], 99)),
             "1",
         ),
         (
-            "frames that gave way to a newer one before they were through",
+            "fraction of frames superseded by a newer one",
             sum(p["status"] == "superseded" for p in plans) / len(plans),
             "1",
         ),
-        ("times the board ran out of points", state["board"]["underruns"], "1"),
+        ("underruns", state["board"]["underruns"], "1"),
     ]
     return rows + measure_full_frames()

@@ -1,4 +1,4 @@
-"""Fits kappa, tau_g and phi, one fact each; epsilon, R and C stay the paper's own."""
+"""Fit kappa, tau_g and phi to one fact each; epsilon, R and C keep the values of the paper."""
 
 import argparse
 import re
@@ -19,10 +19,10 @@ SCATTER = {
     "tau_g": ("dpp_200Hz", "z_tp8_w040"),
     "phi": ("F_peak_w020", "F_peak_w055"),
 }
-"""Facts whose scatter, each taken alone with the other parameters held, is a parameter's sigma."""
+"""Facts by parameter; sigma is the scatter of the values that each fact alone gives with the other parameters fixed."""
 
 EXCLUDED_FACTS = {"tau_g": ("N_50um",)}
-"""What contradicts the facts of SCATTER at every width of Table S3; its width is not given either."""
+"""Facts that contradict those of SCATTER at every width of Table S3; their own width is not stated."""
 
 CLAIMS = """\
 kappa, tau_g and phi from one fact each; epsilon, R and C the paper's own. A displacement fixes the product of
@@ -45,17 +45,17 @@ def main() -> None:
         value = getattr(fitted, name).value
         print(f"{name:6} {value:.4g} ± {sigmas[name]:.2g} {UNITS[name]}, fitted on {fact}")
         for other, implied in single_fact_values[name].items():
-            print(f"         {other:12} alone asks for {implied:.4g}")
+            print(f"         {other:12} alone gives {implied:.4g}")
         for other in EXCLUDED_FACTS.get(name, ()):
             print(
-                f"         {other:12} alone asks for {solve_for_fact(fitted, name, other):.4g} (left out: met at no width)"
+                f"         {other:12} alone gives {solve_for_fact(fitted, name, other):.4g} (excluded: fits no width)"
             )
     out.write_text(format_toml(fitted, sigmas), encoding="utf-8")
     print(f"written {out}")
 
 
 def fit_parameters(start: ParameterSet) -> ParameterSet:
-    """Solves the parameters' facts in turn until nothing moves: kappa and tau_g act on both of theirs."""
+    """Solve for each parameter in turn until convergence: kappa and tau_g affect each other's fact."""
     current = start
     while True:
         previous = current
@@ -66,7 +66,7 @@ def fit_parameters(start: ParameterSet) -> ParameterSet:
 
 
 def solve_for_fact(parameters: ParameterSet, name: str, fact: str) -> float:
-    """The value of one parameter at which one fact is met, the others held."""
+    """Return the value of one parameter that reproduces one fact, with the others fixed."""
     low, high = BRACKETS[name]
     measured = load_paper_facts()[fact].value
     outcome = OUTCOMES[fact]
@@ -74,13 +74,13 @@ def solve_for_fact(parameters: ParameterSet, name: str, fact: str) -> float:
 
 
 def replace_value(parameters: ParameterSet, name: str, value: float) -> ParameterSet:
-    """The set with one parameter replaced."""
+    """Return the set with one parameter replaced."""
     parameter = Parameter(value=value, unit=UNITS[name], source=f"fitted on {FITTED_ON[name]}")
     return parameters.model_copy(update={name: parameter})
 
 
 def format_toml(fitted: ParameterSet, sigmas: dict[str, float]) -> str:
-    """The calibrated set as a file; what is the paper's own is copied from the literal set's file."""
+    """Format the calibrated set as TOML; parameters of the paper are copied from the file of the literal set."""
     own = locate_shipped("parameters", "paper_s1_literal.toml").read_text(encoding="utf-8")
     epsilon = re.search(r"\[epsilon\].*?(?=\n\[)", own, re.DOTALL).group()
     absorber = own[own.index("[R_width_product]") :]

@@ -1,4 +1,4 @@
-"""Plays patterns on a daemon with a simulated board, and says what was asked for, sent, executed and felt."""
+"""Play patterns on a daemon with a simulated board, and print targets, pulses sent and executed, and displacements."""
 
 import argparse
 import itertools
@@ -19,10 +19,11 @@ from optodrive.daemon.web.tokens import build_tokens_path
 
 PATTERNS = ("showcase", "experiment-1", "experiment-2", "experiment-3", "experiment-4", "experiment-5", "experiment-6")
 START_TIMEOUT_S = 30.0
-COLUMNS = ("pattern", "planned", "sent", "executed", "asked µm", "got µm")
+COLUMNS = ("pattern", "planned", "sent", "executed", "target µm", "reached µm")
 
 
 def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
+    """Start a daemon and wait until it answers."""
     build_tokens_path(port).unlink(missing_ok=True)
     optodrive = Path(sys.executable).with_name("optodrive")
     daemon = subprocess.Popen([optodrive, "serve", "--port", str(port)])
@@ -38,7 +39,7 @@ def start_daemon(port: int) -> tuple[subprocess.Popen[bytes], DaemonClient]:
                 return daemon, client
         time.sleep(0.05)
     daemon.terminate()
-    raise RefusedError("the daemon did not start; its own line above says why")
+    raise RefusedError("the daemon did not start; its message above gives the reason")
 
 
 def play_pattern(client: DaemonClient, pattern: str) -> Plan:
@@ -89,7 +90,7 @@ def print_report(shown: list[tuple[str, Plan]]) -> bool:
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="scripts/demo", description=__doc__)
-    parser.add_argument("--seconds", type=float, help="show for about so long, then end; without it, until Ctrl-C")
+    parser.add_argument("--seconds", type=float, help="duration of the demo; default: until Ctrl-C")
     parser.add_argument("--port", type=int, default=8450, help="TCP port of the daemon")
     options = parser.parse_args()
     shown: list[tuple[str, Plan]] = []

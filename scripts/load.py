@@ -1,8 +1,8 @@
-"""Load on a daemon with a simulated board: callers push and watch while a plan runs; every few seconds someone stops.
+"""Load test of a daemon with a simulated board: clients push frames and poll the state; a STOP every few seconds.
 
-Of the pushers every second sends dry runs, the others frames that take the place of what has not left. Callers are
-paced, in a process of their own; who stops is in another. The gate's end is the board's own: the last edge in its log,
-against the log's clock when stop was sent. All of them share this computer, so other work on it shows in the figures.
+Half of the pushing clients send dry runs, the others send frames that supersede waiting ones. The clients run at fixed
+rates in one process, STOP is sent by another. The time to gate off is taken from the board's log: the last edge minus
+the log's clock when STOP was sent. All processes share this computer, so other load on it affects the results.
 """
 
 import argparse
@@ -25,7 +25,7 @@ TOKEN = "a-token-for-a-load"
 HEADERS = {"Authorization": f"Bearer {TOKEN}"}
 STOP_EVERY_S = 3.0
 GROWTH_MAX_MB = 30.0
-"""More than this from the first third to the last is a leak; records of plans are kept up to a bound."""
+"""Growth of memory from the first third to the last that counts as a leak; records of plans are bounded."""
 STOP_P99_MAX_S = 0.05
 
 
@@ -42,11 +42,11 @@ while on:
     late_s.append(time.monotonic() - due_s)
 print(json.dumps(late_s[:: max(1, len(late_s) // 100_000)] + [max(late_s)]))
 """
-"""A process that only sleeps: how late it wakes is the computer's doing, and no program's on it."""
+"""A process that only sleeps: its lateness is that of the computer, not of the daemon."""
 
 
 class LoadRig:
-    """Board and daemon, both processes of their own."""
+    """A board process and a daemon process."""
 
     def __init__(self, folder, config):
         from optodrive.device.config import locate_shipped
@@ -69,17 +69,17 @@ class LoadRig:
         )
         line = self.daemon.stdout.readline()
         if "http" not in line:
-            raise SystemExit("scripts/load: the daemon did not start; its own line above says why")
+            raise SystemExit("scripts/load: the daemon did not start; its message above gives the reason")
         self.url = re.search(r"http://[\d.:]+", line)[0]
         self._read_bytes = 0
 
     def read_memory_mb(self):
-        """What the daemon holds in memory."""
+        """Return the resident memory of the daemon, MB."""
         status = Path(f"/proc/{self.daemon.pid}/status").read_text()
         return int(re.search(r"VmRSS:\s+(\d+)", status)[1]) / 1024
 
     def read_new_events(self):
-        """What the board has logged since the last call, whole lines only."""
+        """Return the events that the board has logged since the last call."""
         with self.log.open() as file:
             file.seek(self._read_bytes)
             text = file.read()
@@ -95,14 +95,14 @@ class LoadRig:
 
 
 class HttpClient:
-    """One connection of plain HTTP, so that callers cost this computer little beside the daemon they load."""
+    """A minimal HTTP connection, which costs little CPU time compared with the daemon."""
 
     def __init__(self, url):
         self._host, self._port = url.removeprefix("http://").split(":")
         self._reader = self._writer = None
 
     async def request(self, method, path, body=b""):
-        """The answer's status; its body is read and left."""
+        """Send a request, discard the body of the response, and return its status."""
         if self._writer is None:
             self._reader, self._writer = await asyncio.open_connection(self._host, int(self._port))
         head = f"{method} {path} HTTP/1.1\r\nHost: {self._host}\r\nAuthorization: Bearer {TOKEN}\r\n"
@@ -114,7 +114,7 @@ class HttpClient:
         return int(answer.split()[1])
 
     async def read_more(self):
-        """More of an answer that does not end."""
+        """Return further bytes of a streamed response."""
         return await self._reader.read(65536)
 
     def close(self):
@@ -123,7 +123,7 @@ class HttpClient:
 
 
 class ClientPool:
-    """Callers in a process of their own: who push and who watch, for as long as was said."""
+    """The pushing and polling clients, which run in their own process for the requested time."""
 
     def __init__(self, options):
         self._options = options
@@ -132,7 +132,7 @@ class ClientPool:
         self.trips = {"push": [], "dry run": [], "state": [], "telemetry": []}
 
     async def run(self):
-        paths = httpx.get(f"{self._options.crowd}/openapi.json", headers=HEADERS).json()["paths"]
+        paths = httpx.get(f"{self._options.client_url}/openapi.json", headers=HEADERS).json()["paths"]
         watchers = range(self._options.watchers)
         listening = [k for k in watchers if k % 2 and "/v1/telemetry" in paths]
         await asyncio.gather(
@@ -145,40 +145,40 @@ class ClientPool:
         return time.monotonic() >= self._end_s
 
     async def _repeat(self, period_s, kind, send):
-        caller = HttpClient(self._options.crowd)
+        client = HttpClient(self._options.client_url)
         await asyncio.sleep(random.random() * period_s)
         while not self._is_over():
             begin_s = time.monotonic()
-            self.answers[await send(caller)] += 1
+            self.answers[await send(client)] += 1
             self.trips[kind].append(time.monotonic() - begin_s)
             await asyncio.sleep(max(0.0, begin_s + period_s - time.monotonic()))
-        caller.close()
+        client.close()
 
     async def _push_frames(self, number):
         rng = random.Random(number)
         dry = number % 2 == 0
         path = f"/v1/plans?{'dry_run' if dry else 'newest'}=true"
 
-        def ask(caller):
+        def send(client):
             targets = {str(pixel): rng.uniform(30, 90) for pixel in rng.sample(range(400), self._options.pixels)}
             frame = {"show_at_s": 0, "duration_s": 60, "target_um": targets}
-            return caller.ask("POST", path, json.dumps({"frames": [frame]}).encode())
+            return client.request("POST", path, json.dumps({"frames": [frame]}).encode())
 
-        await self._repeat(self._options.push_s, "dry run" if dry else "push", ask)
+        await self._repeat(self._options.push_s, "dry run" if dry else "push", send)
 
     async def _poll_state(self):
-        await self._repeat(self._options.watch_s, "state", lambda caller: caller.ask("GET", "/v1/state"))
+        await self._repeat(self._options.watch_s, "state", lambda client: client.request("GET", "/v1/state"))
 
     async def _read_telemetry(self):
-        caller = HttpClient(self._options.crowd)
-        self.answers[await caller.request("GET", "/v1/telemetry")] += 1
-        while not self._is_over() and await caller.read_more():
+        client = HttpClient(self._options.client_url)
+        self.answers[await client.request("GET", "/v1/telemetry")] += 1
+        while not self._is_over() and await client.read_more():
             pass
-        caller.close()
+        client.close()
 
 
 class StopTest:
-    """Who stops, in this process and with nothing else to do; what is counted."""
+    """The STOP requests, sent from this process, and the measurements."""
 
     def __init__(self, rig, options):
         self._rig = rig
@@ -186,21 +186,23 @@ class StopTest:
         self._client = httpx.Client(base_url=rig.url, headers=HEADERS, timeout=30)
         self.stop_s, self.gate_off_s, self.memory_mb, self.wake_delays_s = [], [], [], []
         self.underruns = self.faults = self.stall_ms = 0
-        arguments = [f"--{name.replace('_', '-')}={value}" for name, value in vars(options).items() if name != "crowd"]
+        arguments = [
+            f"--{name.replace('_', '-')}={value}" for name, value in vars(options).items() if name != "client_url"
+        ]
         self._client.post("/v1/arm").raise_for_status()
         self._sleeper = subprocess.Popen([sys.executable, "-c", SLEEPER], stdout=subprocess.PIPE, text=True)
         self._client_process = subprocess.Popen(
-            [sys.executable, __file__, *arguments, f"--crowd={rig.url}"], stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__, *arguments, f"--client-url={rig.url}"], stdout=subprocess.PIPE, text=True
         )
 
     def run(self):
-        """Until the time is over: a second's pulses, a stop in the midst of them, arm again."""
+        """Repeat until the end: play pulses, send STOP while they play, arm again."""
         while time.monotonic() < self._end_s:
             train = {"pixel": 200, "start_s": 0, "duration_s": 9, "pulse_width_s": 0.01, "gap_s": 0.01, "power_w": 1.0}
             self._client.post("/v1/plans", json={"trains": [train]})
             time.sleep(random.uniform(0.1, 1.0) * STOP_EVERY_S)
             self._stop()
-            self.memory_mb.append(self._rig.memory_mb())
+            self.memory_mb.append(self._rig.read_memory_mb())
             state = self._client.get("/v1/state").json()
             self.underruns = state["board"]["underruns"]
             self.stall_ms = state["link"]["longest_stall_ms"]
@@ -210,9 +212,9 @@ class StopTest:
             self._client.post("/v1/arm")
         self._sleeper.terminate()
         self.wake_delays_s = json.loads(self._sleeper.communicate(timeout=60)[0])
-        told, _ = self._client_process.communicate(timeout=60)
-        crowd = json.loads(told)
-        self.answers, self.trips = Counter(crowd["answers"]), crowd["trips"]
+        output, _ = self._client_process.communicate(timeout=60)
+        results = json.loads(output)
+        self.answers, self.trips = Counter(results["answers"]), results["trips"]
 
     def _stop(self):
         sent_us, begin_s = self._wait_for_gate_edge_us(), time.monotonic()
@@ -221,12 +223,12 @@ class StopTest:
         response.raise_for_status()
         edges = [event for event in self._rig.read_new_events() if event["event"] == "gate"]
         if edges and edges[-1]["on"]:
-            raise SystemExit("scripts/load: STOP was answered, and the gate is on")
+            raise SystemExit("scripts/load: the gate is on after the response to STOP")
         if edges and sent_us is not None:
             self.gate_off_s.append(max(0.0, 1e-6 * (edges[-1]["t_us"] - sent_us)))
 
     def _wait_for_gate_edge_us(self):
-        """The board's clock now, from the newest line of its log; None where it stays dark."""
+        """Wait for an edge of the gate and return its time on the board's clock, µs; None if the gate stays off."""
         self._rig.read_new_events()
         end_s = time.monotonic() + 0.3
         while time.monotonic() < end_s:
@@ -246,55 +248,59 @@ class StopTest:
 
 
 def compute_percentile_ms(values, share):
+    """Return the value below which a share of the values lies, ms; NaN without values."""
     ordered = sorted(values)
     return 1e3 * ordered[min(len(ordered) - 1, int(share * len(ordered)))] if ordered else float("nan")
 
 
 def format_percentiles(values):
-    return f"{len(values)} times, p50 {compute_percentile_ms(values, 0.5):.1f} ms, p99 {compute_percentile_ms(values, 0.99):.1f} ms"
+    """Format the count, median and 99th percentile."""
+    p50_ms, p99_ms = (compute_percentile_ms(values, share) for share in (0.5, 0.99))
+    return f"{len(values)} times, p50 {p50_ms:.1f} ms, p99 {p99_ms:.1f} ms"
 
 
 def print_report(stop_test, seconds):
-    """Print the figures; what was wrong in them."""
-    for what, trips in stop_test.trips.items():
+    """Print the measurements, and return the failures."""
+    for kind, trips in stop_test.trips.items():
         if trips:
-            print(f"{what:10} answered {format_percentiles(trips)}")
-    print(f"answers    {sum(stop_test.answers.values()) / seconds:.0f} a second, by status {dict(stop_test.answers)}")
+            print(f"{kind:10} answered {format_percentiles(trips)}")
+    print(f"answers    {sum(stop_test.answers.values()) / seconds:.0f} per second, by status {dict(stop_test.answers)}")
     print(f"STOP       answered {format_percentiles(stop_test.stop_s)}")
-    print(f"gate off   by the board's log, while lit: {format_percentiles(stop_test.gate_off_s)}")
-    third = max(1, len(stop_test.memory) // 3)
-    first, last = statistics.median(stop_test.memory[:third]), statistics.median(stop_test.memory[-third:])
+    print(f"gate off   in the board's log, from gate on: {format_percentiles(stop_test.gate_off_s)}")
+    third = max(1, len(stop_test.memory_mb) // 3)
+    first, last = statistics.median(stop_test.memory_mb[:third]), statistics.median(stop_test.memory_mb[-third:])
     print(
-        f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, most {max(stop_test.memory):.1f} MB"
+        f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, max {max(stop_test.memory_mb):.1f} MB"
     )
-    print(f"underruns  {stop_test.underruns}; faults seen at a stop: {stop_test.faults}")
-    print(f"engine     longest turn of its loop {stop_test.stall_ms:.0f} ms")
+    print(f"underruns  {stop_test.underruns}; faults after STOP: {stop_test.faults}")
+    print(f"engine     longest stall of its loop {stop_test.stall_ms:.0f} ms")
     print(
-        f"asleep     a process that only sleeps woke late {format_percentiles(stop_test.late)}, most {1e3 * max(stop_test.late):.0f} ms"
+        f"sleeper    lateness of a sleeping process {format_percentiles(stop_test.wake_delays_s)}, "
+        f"max {1e3 * max(stop_test.wake_delays_s):.0f} ms"
     )
-    print(f"computer   load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, these callers among it")
+    print(f"computer   load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores, including these clients")
     failures = []
     if stop_test.underruns:
         failures.append(f"{stop_test.underruns} underruns")
     if last - first > GROWTH_MAX_MB:
         failures.append(f"memory grew by {last - first:.0f} MB")
     if any(int(status) >= 500 for status in stop_test.answers):
-        failures.append("answers of status 500 and above")
+        failures.append("responses with status 500 or above")
     return failures
 
 
 def main():
     parser = argparse.ArgumentParser(prog="scripts/load", description=__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
-    parser.add_argument("--clients", type=int, default=50, help="who push")
-    parser.add_argument("--watchers", type=int, default=20, help="who watch")
-    parser.add_argument("--push-s", type=float, default=1.0, help="each pushes so often")
-    parser.add_argument("--watch-s", type=float, default=0.1, help="each watches so often")
-    parser.add_argument("--pixels", type=int, default=20, help="of each frame")
+    parser.add_argument("--clients", type=int, default=50, help="clients that push frames")
+    parser.add_argument("--watchers", type=int, default=20, help="clients that poll the state")
+    parser.add_argument("--push-s", type=float, default=1.0, help="period of each pushing client")
+    parser.add_argument("--watch-s", type=float, default=0.1, help="period of each polling client")
+    parser.add_argument("--pixels", type=int, default=20, help="pixels per frame")
     parser.add_argument("--config", default="display-437")
-    parser.add_argument("--crowd", metavar="URL", help=argparse.SUPPRESS)
+    parser.add_argument("--client-url", metavar="URL", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.crowd:
+    if options.client_url:
         asyncio.run(ClientPool(options).run())
         return 0
     with tempfile.TemporaryDirectory() as folder:
@@ -310,7 +316,7 @@ def main():
             rig.close()
     p99_s = compute_percentile_ms(stop_test.stop_s, 0.99) * 1e-3
     if p99_s >= STOP_P99_MAX_S:
-        print(f"slow       STOP answered p99 {1e3 * p99_s:.0f} ms, wished below {1e3 * STOP_P99_MAX_S:.0f} ms")
+        print(f"slow       STOP answered p99 {1e3 * p99_s:.0f} ms, expected below {1e3 * STOP_P99_MAX_S:.0f} ms")
     if failures:
         print(f"scripts/load: {'; '.join(failures)}", file=sys.stderr)
     return 1 if failures else 0

@@ -1,6 +1,6 @@
-"""The blind benchmark: hidden effects drawn from seeds, diagnosed through the library, scored. Prints the table.
+"""Blind benchmark of the diagnosis: sample hidden effects from seeds, diagnose them, score and print the table.
 
-Development seeds begin at 9,000,000, report seeds at 3,000,000: nothing is tuned on the latter.
+Development seeds start at 9,000,000, report seeds at 3,000,000; nothing is tuned on the latter.
 """
 
 import argparse
@@ -19,12 +19,12 @@ sys.path.insert(0, str(ROOT / "tests" / "blind"))
 
 FIRST_SEEDS = {"dev": 9_000_000, "report": 3_000_000}
 SAMPLES = 30_000
-REMAINING_GROUPS = 2
-"""Groups of runs in a thinned recording."""
+REDUCED_GROUPS = 2
+"""Groups of runs in a reduced recording."""
 
 
 def run_case(task: tuple[str, int]) -> dict[str, Any]:
-    """One case: drawn, diagnosed, and once more after the experiment that the answer asks for."""
+    """Sample, diagnose and score one case; where the answer is ambiguous, again after the recommended experiment."""
     from blind_lab import draw_case
     from blind_score import score_answer
 
@@ -33,8 +33,8 @@ def run_case(task: tuple[str, int]) -> dict[str, Any]:
         try:
             case = draw_case("single" if block == "thin" else block, seed, folder)
             if block == "thin":
-                thin_recording(case.path, seed)
-        except RuntimeError as error:  # some seeds hide nothing that could be seen
+                reduce_recording(case.path, seed)
+        except RuntimeError as error:  # some seeds hide nothing that the data could show
             return {"block": block, "seed": seed, "skipped": str(error)}
         answer = diagnose_recording(case.path)
         repeated_answer, experiment = None, answer["next_experiment"]
@@ -52,8 +52,8 @@ def run_case(task: tuple[str, int]) -> dict[str, Any]:
     return {"score": scored, "baselines": name_baseline_causes(answer), "answer": answer}
 
 
-def thin_recording(path: Path, seed: int) -> None:
-    """Leave a few groups of a recording: what a lab in a hurry measures, and what makes causes look alike."""
+def reduce_recording(path: Path, seed: int) -> None:
+    """Delete all but a few groups of runs: short recordings make causes indistinguishable."""
     import h5py
     import numpy as np
 
@@ -61,14 +61,14 @@ def thin_recording(path: Path, seed: int) -> None:
         runs = file["runs"]
         groups = sorted({run.attrs["group"] for run in runs.values()})
         kept_groups = set(
-            np.random.default_rng([seed, 5]).choice(groups, min(REMAINING_GROUPS, len(groups)), replace=False).tolist()
+            np.random.default_rng([seed, 5]).choice(groups, min(REDUCED_GROUPS, len(groups)), replace=False).tolist()
         )
         for name in [name for name, run in runs.items() if run.attrs["group"] not in kept_groups]:
             del runs[name]
 
 
 def diagnose_recording(path: Path) -> dict[str, Any]:
-    """The answer as the command line gives it."""
+    """Return the answer that `optodrive diagnose` gives."""
     from optodrive.lab.diagnosis.diagnose import diagnose
     from optodrive.lab.diagnosis.narrative import build_answer
     from optodrive.lab.diagnosis.priors import build_prior
@@ -80,7 +80,7 @@ def diagnose_recording(path: Path) -> dict[str, Any]:
 
 
 def name_baseline_causes(answer: dict[str, Any]) -> dict[str, str]:
-    """What simpler rules would have named, from the same likelihood ratios; "" for nothing."""
+    """Return the cause that each simpler rule names from the same likelihood ratios, "" for none."""
     from math import log
 
     from optodrive.physics.terms import discover_terms
@@ -97,11 +97,11 @@ def name_baseline_causes(answer: dict[str, Any]) -> dict[str, str]:
 
 
 def format_comparison(done: list[dict[str, Any]]) -> str:
-    """Simple rules beside the verdicts: they always name one."""
+    """Format the comparison with simpler rules as Markdown."""
     from blind_score import wilson
 
     lines = [
-        "| rule | nulls left alone | one cause named alone | outside the catalogue left unnamed |",
+        "| rule | nulls without a cause | single cause identified | cause outside the catalogue not named |",
         "|---|---|---|---|",
     ]
     rules = {"this method": None, "largest R²": "largest R²", "AIC": "AIC", "BIC": "BIC"}
@@ -110,14 +110,14 @@ def format_comparison(done: list[dict[str, Any]]) -> str:
         for block in ("none", "single", "unknown"):
             hits = []
             for item in done:
-                marked = item["score"]
-                if marked.block != block or "sensor_scale" in marked.causes:
+                scored = item["score"]
+                if scored.block != block or "sensor_scale" in scored.causes:
                     continue
                 if rule is None:
-                    named = marked.named if marked.verdict == "cause" else ()
+                    named = scored.named if scored.verdict == "cause" else ()
                 else:
                     named = (item["baselines"][rule],) if item["baselines"][rule] else ()
-                hits.append(set(named) == set(marked.causes) if block == "single" else not named)
+                hits.append(set(named) == set(scored.causes) if block == "single" else not named)
             if not hits:
                 cells.append("–")
                 continue
@@ -128,7 +128,7 @@ def format_comparison(done: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
-    """Draw, diagnose, score, print; --save writes every answer to a file."""
+    """Run the benchmark and print the table; --save writes every answer to a folder."""
     from rich.console import Console
     from rich.progress import track
 
@@ -137,9 +137,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="scripts/bench blind")
     parser.add_argument("--seeds", choices=tuple(FIRST_SEEDS), default="dev")
     parser.add_argument("--nulls", type=int, default=24)
-    parser.add_argument("--cases", type=int, default=18, help="of each other block")
-    parser.add_argument("--thin", type=int, help="instead: number of cases of one cause with two groups of runs each")
-    parser.add_argument("--skip", type=int, default=0, help="seeds to skip in each block")
+    parser.add_argument("--cases", type=int, default=18, help="cases of each other block")
+    parser.add_argument(
+        "--thin", type=int, help="run this many cases of one cause instead, with two groups of runs each"
+    )
+    parser.add_argument("--skip", type=int, default=0, help="seeds of each block to skip")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--save", type=Path, help="folder for the answers")
     options = parser.parse_args()
@@ -159,7 +161,7 @@ def main() -> None:
                 (options.save / f"{block}-{seed}.json").write_text(json.dumps(item["answer"], indent=1))
     for item in done:
         if "skipped" in item:
-            print(f"not drawn: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
+            print(f"not sampled: {item['block']} {item['seed']}: {item['skipped']}", file=sys.stderr)
     scored = [item for item in done if "score" in item]
     print(format_table(item["score"] for item in scored))
     print(format_comparison(scored))
