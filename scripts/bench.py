@@ -1,4 +1,4 @@
-"""Benchmarks: medians of several runs, CPU time of one core unless a row says otherwise."""
+"""Benchmarks: medians of several runs, CPU time of one core unless a row states otherwise."""
 
 import argparse
 import json
@@ -38,7 +38,7 @@ RUNS = 7
 
 
 def measure_median_s(work) -> float:
-    """Median CPU seconds of a call."""
+    """Return the median CPU time of a call, s."""
     times = []
     for _ in range(RUNS):
         begin_s = time.process_time()
@@ -48,12 +48,15 @@ def measure_median_s(work) -> float:
 
 
 def build_full_frame(name="display-1511", height_m=50e-6):
+    """Return a display and a sequence of one frame with the same target on every pixel."""
     display = DisplayModel.from_config(load_config(name))
     count = len(display.layout)
     return display, FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(count, height_m)),))
 
 
 def measure_child_cpu_s(arguments) -> float:
+    """Return the CPU time of a command, s."""
+
     def read_cpu_s():
         usage = resource.getrusage(resource.RUSAGE_CHILDREN)
         return usage.ru_utime + usage.ru_stime
@@ -70,6 +73,7 @@ def schedule_batches(display, sequence, heat):
 
 
 def measure_plan_rows(height_um):
+    """Return the rows of planning for one height."""
     display, sequence = build_full_frame(height_m=height_um * 1e-6)
     heat, budget = display.build_cold_state()
     planned_sequence = plan_sequence(display, sequence, heat, budget)
@@ -79,31 +83,31 @@ def measure_plan_rows(height_um):
     limit_s = measure_median_s(lambda: limit(batch, budget, display.budget))
     total_s = measure_median_s(lambda: plan_sequence(display, sequence, heat, budget))
     return [
-        (f"{height_um} µm: pulses planned a second", count / schedule_s, "1/s"),
-        (f"{height_um} µm: pulses limited a second", count / limit_s, "1/s"),
-        (f"{height_um} µm: planned, limited and predicted a second", count / total_s, "1/s"),
+        (f"{height_um} µm: pulses planned per second", count / schedule_s, "1/s"),
+        (f"{height_um} µm: pulses limited per second", count / limit_s, "1/s"),
+        (f"{height_um} µm: planned, limited and predicted per second", count / total_s, "1/s"),
         (
-            f"{height_um} µm: beam-on share of the plan",
+            f"{height_um} µm: beam-on fraction of the plan",
             planned_sequence.plan.width_s.sum() / planned_sequence.duration_s,
             "1",
         ),
-        (f"{height_um} µm: pixels shown a second of the plan", count / planned_sequence.duration_s, "1/s"),
+        (f"{height_um} µm: pixels shown per second of the plan", count / planned_sequence.duration_s, "1/s"),
     ]
 
 
 def bench_plan():
-    """A full 1,511-pixel frame: planned, limited, predicted; and the whole command from the shell."""
+    """Benchmark planning, limiting and predicting a full 1,511-pixel frame, and the whole command."""
     rows = [row for height_um in (50, 100, 400) for row in measure_plan_rows(height_um)]
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "frames.json"
         path.write_text(json.dumps({"frames": [{"show_at_s": 0, "duration_s": 10, "target_um": [50.0] * 1511}]}))
         command = [Path(sys.executable).with_name("optodrive"), "plan", path, "--config", "display-1511"]
         cpu_s = statistics.median(measure_child_cpu_s(command) for _ in range(RUNS))
-    return [*rows, ("optodrive plan, 1,511 pixels at 50 µm, the whole command", cpu_s, "s CPU")]
+    return [*rows, ("optodrive plan, 1,511 pixels at 50 µm, whole command", cpu_s, "s CPU")]
 
 
 def bench_wire():
-    """From limited plan to bytes, and the proof that reads them back."""
+    """Benchmark the encoding of a limited plan, and the verification that decodes it."""
     display, sequence = build_full_frame()
     heat, budget = display.build_cold_state()
     plan = plan_sequence(display, sequence, heat, budget).plan
@@ -116,30 +120,30 @@ def bench_wire():
         verify(plan, points.row[decoded.index], decoded, budget, display.budget)
 
     return [
-        ("pulses quantised a second", len(plan) / measure_median_s(lambda: quantise(plan, scale)), "1/s"),
-        ("pulses decoded and proven a second", len(plan) / measure_median_s(run_verification), "1/s"),
-        ("bytes of points a pulse", len(payload) / len(plan), "B"),
+        ("pulses quantised per second", len(plan) / measure_median_s(lambda: quantise(plan, scale)), "1/s"),
+        ("pulses decoded and verified per second", len(plan) / measure_median_s(run_verification), "1/s"),
+        ("bytes per pulse", len(payload) / len(plan), "B"),
     ]
 
 
 def bench_board():
-    """The real session and the simulated board in virtual time."""
+    """Benchmark the board session with the simulated board in virtual time."""
     display, sequence = build_full_frame()
     planned_sequence = plan_sequence(display, sequence, *display.build_cold_state())
     seconds = measure_median_s(lambda: execute(display, planned_sequence))
     return [
-        ("pulses through session and simulated board a second", len(planned_sequence.plan) / seconds, "1/s"),
+        ("pulses through session and simulated board per second", len(planned_sequence.plan) / seconds, "1/s"),
         ("times real time", planned_sequence.duration_s / seconds, "×"),
     ]
 
 
 HOUR_S = 3600.0
 INTEGRATED_PULSES = 300
-"""Pulses that the general integrator is given; it takes the same time for each."""
+"""Pulses for the general integrator, whose time per pulse is constant."""
 
 
 def build_hour_of_frames():
-    """Columns of pulses: full frames at 50 µm as the planner makes them, one after the other for an hour."""
+    """Return the display and the pulse columns of planned full frames at 50 µm, repeated for one hour."""
     display, sequence = build_full_frame()
     planned_sequence = plan_sequence(display, sequence, *display.build_cold_state())
     plan, frames = planned_sequence.plan, int(HOUR_S / planned_sequence.duration_s)
@@ -149,13 +153,17 @@ def build_hour_of_frames():
 
 
 def measure_once_s(work):
+    """Return the CPU time of one call, s, and its result."""
     begin_s = time.process_time()
     result = work()
     return time.process_time() - begin_s, result
 
 
 def integrate_pulses(slope, count, columns):
-    """The state [variables × pixels] after the pulses, by solve_ivp from edge to edge; slope(light_w) makes dy/dt."""
+    """Integrate the pulses with solve_ivp from edge to edge; return the state [variables × pixels].
+
+    `slope(pixel, light_w)` returns the function dy/dt.
+    """
     state, now_s = np.zeros(count), 0.0
     for pixel, start_s, width_s, power_w in zip(*columns, strict=True):
         for light_w, to_s in ((0.0, start_s), (power_w, start_s + width_s)):
@@ -166,6 +174,8 @@ def integrate_pulses(slope, count, columns):
 
 
 def make_nominal_slope(pixel, count):
+    """Return a function that builds dy/dt of nominal pixels."""
+
     def make_slope(index, light_w):
         def slope(_, state):
             theta, gas = state[:count], state[count:]
@@ -179,6 +189,8 @@ def make_nominal_slope(pixel, count):
 
 
 def make_wall_slope(pixel, walls, neighbours):
+    """Return a function that builds dy/dt of pixels with walls and neighbours."""
+
     count, leak = len(neighbours), csr_array(build_conductances_w_per_k(walls, neighbours))
 
     def make_slope(index, light_w):
@@ -187,8 +199,8 @@ def make_wall_slope(pixel, walls, neighbours):
             flow_w = (theta - wall) / pixel.r_k_per_w
             heating = -flow_w / pixel.c_j_per_k
             heating[index] += pixel.epsilon * light_w / pixel.c_j_per_k
-            warming = (flow_w - leak @ wall) / walls.c_j_per_k
-            return np.concatenate([heating, warming, ((theta + wall) / 2 - gas) / pixel.tau_g_s])
+            wall_heating = (flow_w - leak @ wall) / walls.c_j_per_k
+            return np.concatenate([heating, wall_heating, ((theta + wall) / 2 - gas) / pixel.tau_g_s])
 
         return slope
 
@@ -196,7 +208,7 @@ def make_wall_slope(pixel, walls, neighbours):
 
 
 def measure_hour_rows(name, make_heat, columns, make_slope):
-    """One simulator against the clock, and a general integrator on the first pulses of the same list."""
+    """Measure one kernel on all pulses, and the general integrator on the first pulses of the same list."""
     first = [column[:INTEGRATED_PULSES] for column in columns]
     reference = make_heat()
     reference.apply_pulses(*first)
@@ -207,17 +219,17 @@ def measure_hour_rows(name, make_heat, columns, make_slope):
     kernel_ms, solver_ms = 1e3 * kernel_s / len(columns[0]), 1e3 * solver_s / INTEGRATED_PULSES
     difference_k = np.abs(rises_k - state).max()
     return [
-        (f"{name}: one hour, every pulse's peaks", kernel_s, "s CPU"),
+        (f"{name}: one hour, with the peaks of every pulse", kernel_s, "s CPU"),
         (f"{name}: times real time", HOUR_S / kernel_s, "×"),
-        (f"{name}: a pulse", kernel_ms, "ms"),
-        (f"{name}: a pulse by solve_ivp, rtol 1e-8", solver_ms, "ms"),
-        (f"{name}: solve_ivp takes longer", solver_ms / kernel_ms, "×"),
-        (f"{name}: largest difference to solve_ivp after {INTEGRATED_PULSES} pulses", difference_k, "K"),
+        (f"{name}: per pulse", kernel_ms, "ms"),
+        (f"{name}: per pulse by solve_ivp, rtol 1e-8", solver_ms, "ms"),
+        (f"{name}: time of solve_ivp over kernel", solver_ms / kernel_ms, "×"),
+        (f"{name}: maximum difference from solve_ivp after {INTEGRATED_PULSES} pulses", difference_k, "K"),
     ]
 
 
 def read_rises_at_end(heat, columns):
-    """The rises [p] of each kind at the last pulse's end."""
+    """Return the temperature rises [p] of each kind at the end of the last pulse."""
     end_s = float(columns[1][-1] + columns[2][-1])
     if isinstance(heat, CoupledDisplay):
         return heat.rises_k(end_s)
@@ -226,7 +238,7 @@ def read_rises_at_end(heat, columns):
 
 
 def bench_hour():
-    """An hour of full frames on 1,511 pixels, each pulse simulated: the nominal pixel, and with walls. One run each."""
+    """Benchmark one hour of full frames on 1,511 pixels, nominal and with walls; one run each."""
     display, columns = build_hour_of_frames()
     pixel, neighbours = display.pixels.elements[0], Neighbours.from_display(display.config.display)
     walls = WallParameters.from_parameters(load_parameters("surroundings"))
@@ -237,7 +249,7 @@ def bench_hour():
         *measure_hour_rows(
             "nominal", lambda: NominalThermalState(display.pixels), columns, make_nominal_slope(pixel, count)
         ),
-        ("walls and neighbours: the modes, once a display", modes_s, "s CPU"),
+        ("walls and neighbours: modes, once per display", modes_s, "s CPU"),
         *measure_hour_rows(
             "walls and neighbours",
             lambda: CoupledDisplay(modes),
@@ -248,20 +260,20 @@ def bench_hour():
 
 
 def read_resident_mib():
-    """Memory the process holds now, MiB."""
+    """Return the resident memory of this process, MiB."""
     fields = Path("/proc/self/statm").read_text().split()
     return int(fields[1]) * resource.getpagesize() / 2**20
 
 
 def bench_limit():
-    """The limiter alone: a full frame, and a million pulses in pieces with the state carried on."""
+    """Benchmark the limiter alone: a full frame, and 1,000,000 pulses in batches with a continuous budget state."""
     rows = []
     for height_um in (50, 400):
         display, sequence = build_full_frame(height_m=height_um * 1e-6)
         heat, state = display.build_cold_state()
         batch = next(schedule_batches(display, sequence, heat))
-        limit_s = measure_median_s(lambda piece=batch, state=state, budget=display.budget: limit(piece, state, budget))
-        rows.append((f"{height_um} µm: a full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
+        limit_s = measure_median_s(lambda batch=batch, state=state, budget=display.budget: limit(batch, state, budget))
+        rows.append((f"{height_um} µm: full frame of 1,511 pulses", 1e3 * limit_s, "ms"))
     display, sequence = build_full_frame()
     heat, state = display.build_cold_state()
     batch = next(schedule_batches(display, sequence, heat))
@@ -271,9 +283,9 @@ def bench_limit():
         state = shift_state(limit(batch, state, display.budget)[1], -period_s)
         count += len(batch)
         samples_mib.append(read_resident_mib())
-    rows.append(("a million pulses, frame after frame", time.process_time() - begin_s, "s"))
-    rows.append(("memory after 10,000 of them", samples_mib[7], "MiB"))
-    rows.append(("memory after all of them", samples_mib[-1], "MiB"))
+    rows.append(("1,000,000 pulses, frame after frame", time.process_time() - begin_s, "s"))
+    rows.append(("memory after 10,000 pulses", samples_mib[7], "MiB"))
+    rows.append(("memory after all pulses", samples_mib[-1], "MiB"))
     return rows
 
 
@@ -284,11 +296,11 @@ HIDDEN_TERMS = (
     {"gas_leak": {"rate": 4.0}},
     {"heat_capacity": {"slope": 2e-3}},
 )
-"""On four pixels of ten, one each; the others have nothing hidden."""
+"""Terms hidden on four pixels of ten, one per pixel."""
 
 
 def bench_display():
-    """A recording of 100 pixels, 15 runs each, diagnosed pixel by pixel on two worker processes. One run."""
+    """Benchmark the diagnosis of 100 pixels with 15 runs each on two worker processes; one run."""
     from display_lab import display_lab
     from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
     from optodrive.lab.diagnosis.display_diagnosis import PixelTask, compile_kernels, diagnose_pixel
@@ -314,33 +326,33 @@ def bench_display():
     named = [answers[pixel].discrepancy.causes == tuple(terms) for pixel, terms in hidden.items()]
     busy_s = sum(answer.discrepancy.elapsed_s for answer in answers.values())
     return [
-        ("pixels, 15 runs each", len(answers), "1"),
+        ("pixels, 15 runs per pixel", len(answers), "1"),
         ("size of the recording", file_mib, "MiB"),
-        ("answers that are right", sum(named), "1"),
-        ("the whole diagnosis", end_s - begin_s, "s"),
-        ("of it, looking into the recording", opened_s - begin_s, "s"),
-        ("of it, starting two workers", ready_s - opened_s, "s"),
-        ("a pixel, of the whole", (end_s - begin_s) / len(answers), "s"),
-        ("a pixel, on its worker", busy_s / len(answers), "s"),
-        ("share of the workers' time that is diagnosis", busy_s / DISPLAY_WORKERS / (end_s - ready_s), "1"),
-        ("largest memory of a worker", largest_mib, "MiB"),
+        ("correct answers", sum(named), "1"),
+        ("whole diagnosis", end_s - begin_s, "s"),
+        ("part: opening the recording", opened_s - begin_s, "s"),
+        ("part: starting two workers", ready_s - opened_s, "s"),
+        ("per pixel, whole diagnosis", (end_s - begin_s) / len(answers), "s"),
+        ("per pixel, on its worker", busy_s / len(answers), "s"),
+        ("fraction of the workers' time in the diagnosis", busy_s / DISPLAY_WORKERS / (end_s - ready_s), "1"),
+        ("maximum memory of a worker", largest_mib, "MiB"),
     ]
 
 
 def read_peak_mib():
-    """The most memory this process ever held, MiB."""
+    """Return the peak memory of this process, MiB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
 
 
 def bench_order():
-    """The scheduler at the physical limit; the solver it is held against is of the extra `bench`."""
+    """Benchmark the scheduler against a solver, which needs the extra `bench`."""
     from bench_order import bench_order as run
 
     return run()
 
 
 def bench_page():
-    """The page in Chromium, which must be there."""
+    """Benchmark the page in Chromium, which must be installed."""
     from bench_page import bench_page as run
 
     return run()

@@ -1,6 +1,6 @@
-"""Trains by height and frames together: what is asked, what an independent integrator sees, what it costs.
+"""Benchmark of periodic trains and simultaneous frames: targets, results of an independent integrator, energy.
 
-Every figure is a calculation on the shipped display-437, nothing is measured on hardware.
+Every number is a calculation on the shipped display-437; nothing is measured on hardware.
 """
 
 import sys
@@ -16,7 +16,7 @@ from rich.table import Table
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.cold_heat import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler import scheduler
 from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
@@ -26,16 +26,16 @@ from reference_models.nominal_pixel import height_um
 
 PIXELS = (200, 201, 222, 221)
 SECONDS, CYCLES = 0.6, 12
-"""A train lasts so long, and so many cycles at least."""
+"""Duration of a train, s, and its minimum number of cycles."""
 STEADY_CYCLES = 5
-"""Cycles at the end that are looked at."""
+"""Cycles at the end of a train that are evaluated."""
 FRAMES = 300
 PEAK_TO_PEAK_SHARE = 0.5
-"""Swing asked for, between the least (0) and the most (1) that a height and a rate allow."""
+"""Requested peak-to-peak between the minimum (0) and the maximum (1) that a height and a rate allow."""
 
 
 def measure_last_cycles(display, result, train, period_s):
-    """Peak and swing, µm, mean of the last cycles of a train, and its energy a cycle there, J."""
+    """Return the mean peak and peak-to-peak of a train's last cycles, µm, and its energy per cycle, J."""
     plan = result.plan
     rows = np.flatnonzero(plan.pixel == train.pixel)
     starts_s = train.pulse_starts_s()[-STEADY_CYCLES - 1 : -1] + result.lead_s
@@ -47,21 +47,21 @@ def measure_last_cycles(display, result, train, period_s):
 
 
 def compute_beam_time_us(display, count, period_s):
-    """Beam time of a pulse of one of so many trains that share a period."""
-    machine = display.scan_head
-    period_share_us = round((period_s - machine.pulse_gap_s) * 1e6)
+    """Return the beam time per pulse of one of `count` trains that share a period, µs."""
+    scan_head = display.scan_head
+    period_share_us = round((period_s - scan_head.pulse_gap_s) * 1e6)
     if count == 1:
         return period_share_us
-    x_rad, _ = machine.field.angles_rad(display.layout.x_m, display.layout.y_m)
+    x_rad, _ = scan_head.field.angles_rad(display.layout.x_m, display.layout.y_m)
     return min(
-        period_share_us, int(1e6 * period_s / count) - machine.settling.settling_us(x_rad[201] - x_rad[200], 0.0)
+        period_share_us, int(1e6 * period_s / count) - scan_head.settling.settling_us(x_rad[201] - x_rad[200], 0.0)
     )
 
 
 def measure_train(display, count, rate_hz, target_um):
-    """One row of the table of cycles."""
+    """Return one row of the table of cycles."""
     period_s = 1.0 / rate_hz
-    display_model, drive = (
+    cold_heat, drive = (
         display.build_cold_heat(),
         limit_pulse_width(display.scan_head.drive, compute_beam_time_us(display, count, period_s)),
     )
@@ -72,17 +72,17 @@ def measure_train(display, count, rate_hz, target_um):
         (
             n
             for n in range(1, drive.max_periods + 1)
-            if solve_steady_state(first, display_model, drive, n).peak_m > 0.9999e-6 * target_um
+            if solve_steady_state(first, cold_heat, drive, n).peak_m > 0.9999e-6 * target_um
         ),
         None,
     )
     if min_periods is None:
         return (
             *row_start,
-            f"out of reach: {1e6 * solve_steady_state(first, display_model, drive, drive.max_periods).peak_m:.0f} at most",
+            f"unreachable: max {1e6 * solve_steady_state(first, cold_heat, drive, drive.max_periods).peak_m:.0f}",
         )
     peak_to_peak_max_m, peak_to_peak_min_m = (
-        solve_steady_state(first, display_model, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
+        solve_steady_state(first, cold_heat, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
     )
     peak_to_peak_m = peak_to_peak_min_m + PEAK_TO_PEAK_SHARE * (peak_to_peak_max_m - peak_to_peak_min_m)
     trains = tuple(
@@ -92,7 +92,7 @@ def measure_train(display, count, rate_hz, target_um):
     result = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
     peak_um, simulated_peak_to_peak_um, train_j = measure_last_cycles(display, result, trains[0], period_s)
     width_s = result.plan.width_s[result.plan.pixel == PIXELS[0]][-1]
-    periods, duty = display_model.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
+    periods, duty = cold_heat.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
     cold = tuple(
         PulseTrain(
             item.pixel, item.start_s, duration_s, periods * drive.period_s,
@@ -116,9 +116,9 @@ def measure_train(display, count, rate_hz, target_um):
 
 
 def build_cycles_table(display):
-    """Trains by height against pulses planned as if from rest."""
-    table = Table("pixels", "Hz", "peak µm", "simulated", "swing µm", "simulated", "mJ a cycle", "from rest", "less",
-                  "peak from rest", title="trains by height")  # fmt: skip
+    """Compare trains by height with trains whose pulses are planned from the cold state."""
+    table = Table("pixels", "Hz", "peak µm", "simulated", "peak-to-peak µm", "simulated", "mJ/cycle", "cold plan", "saved",
+                  "peak of cold plan", title="trains by height")  # fmt: skip
     for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
         try:
             table.add_row(*measure_train(display, count, rate_hz, target_um))
@@ -129,9 +129,9 @@ def build_cycles_table(display):
 
 @contextmanager
 def record_candidates():
-    """Every list of rehearsals that the scheduler chooses from meanwhile."""
+    """Record the candidate schedules that the scheduler selects from."""
     original, recorded = scheduler.select_schedule, []
-    scheduler.select_schedule = lambda items, due_s: (recorded.append(items), original(items, due_s))[1]
+    scheduler.select_schedule = lambda items, deadline_s: (recorded.append(items), original(items, deadline_s))[1]
     try:
         yield recorded
     finally:
@@ -139,7 +139,7 @@ def record_candidates():
 
 
 def plan_frame(display, heights_um):
-    """A frame of heights by pixel, as prepared, with time enough for any number of rounds."""
+    """Plan a simultaneous frame of heights by pixel, with time for any number of interleaved sub-pulses."""
     target_m = np.zeros(len(display.layout))
     target_m[list(heights_um)] = np.array(list(heights_um.values())) * 1e-6
     frame = TactileFrame("f", 0.0, 20.0, target_m, simultaneous=True)
@@ -147,8 +147,8 @@ def plan_frame(display, heights_um):
 
 
 def build_simultaneous_table(display):
-    """Squares of pixels in rounds: simultaneity, and how long the whole takes."""
-    table = Table("pixels", "µm", "rounds", "simultaneity", "ends ms", "longer by ms", "", title="frames together")
+    """Return simultaneity and duration of squares of pixels by number of interleaved rounds."""
+    table = Table("pixels", "µm", "rounds", "simultaneity", "end ms", "added ms", "", title="simultaneous frames")
     for side, target_um in ((2, 100), (2, 300), (3, 50), (3, 100), (3, 200), (6, 50)):
         square = [200 + 21 * row + column for row in range(side) for column in range(side)]
         with record_candidates() as recorded:
@@ -162,13 +162,13 @@ def build_simultaneous_table(display):
                 f"{item.simultaneity:.3f}",
                 f"{1e3 * item.end_s:.1f}",
                 f"{longer_ms:+.1f}",
-                "chosen" if item.rounds == report.interleaved_rounds else "",
+                "selected" if item.rounds == report.interleaved_rounds else "",
             )
     return table
 
 
 def measure_shortening(display):
-    """Whether more rounds ever shorten a frame: random pixels and heights, one line."""
+    """Count the random frames that interleaving shortens; return one line."""
     generator = np.random.default_rng(1)
     with record_candidates() as recorded:
         for _ in range(FRAMES):
@@ -176,8 +176,8 @@ def measure_shortening(display):
             plan_frame(display, dict(zip(pixels.tolist(), generator.uniform(5.0, 400.0, len(pixels)), strict=True)))
     longer_s = np.array([item.end_s - items[0].end_s for items in recorded for item in items[1:]])
     return (
-        f"{FRAMES} random frames, split in {len(longer_s)} ways: {np.count_nonzero(longer_s < 0)} end earlier than "
-        f"unsplit, the least later by {1e3 * longer_s.min():.1f} ms"
+        f"{FRAMES} random frames, {len(longer_s)} interleaved schedules: {np.count_nonzero(longer_s < 0)} end earlier "
+        f"than a single pulse per pixel, minimum added duration {1e3 * longer_s.min():.1f} ms"
     )
 
 

@@ -60,7 +60,7 @@ class OrderBenchmark:
         return compute_visiting_order(active, self.layout.row, self.layout.column, self.x_rad, self.y_rad, origin)
 
     def order_by_solver(self, active, origin):
-        """Return the shortest open path that LKH finds for the settling times; it starts at `origin` if there is one."""
+        """Return the shortest open path that LKH finds for the settling times, from `origin` if there is one."""
         if len(active) < 3:
             return active
         nodes = active if origin is None else np.concatenate([[origin], active])

@@ -1,8 +1,8 @@
-"""A long run: the real session, over pyserial and a pty, streams to the C core's process until every pulse is through.
+"""Soak test: a board session streams pulses over pyserial and a pty to the process of the C core.
 
-The pulses are short and the board's limits such that millions pass in minutes; each has a width that tells its number,
-so that one that is missing, doubled or out of order shows. Twice: in the board's own log, which a process of its own
-reads as it is written, and in the reports that the session gets. Exit 1 where a pulse is missing or the board ran dry.
+The pulses are short, so that millions take minutes. The width of each pulse encodes its number, which reveals missing,
+repeated and reordered pulses. Two records are checked: the board's log, read by a separate process, and the reports
+that the session receives. Exit status 1 where a pulse is missing or the board underran.
 """
 
 import argparse
@@ -40,15 +40,15 @@ queue_points = 32768
 """
 PERIOD_US, WIDTH_US, WIDTHS, POSITIONS, POSITION_CODES, DUTY = 200, 50, 16, 4, 1400, 1000
 PLAN_PULSES = 20_000
-"""Pulses of one plan; the next one follows it without a pause."""
+"""Pulses per plan; plans follow each other without a pause."""
 LEAD_S = 0.5
 STEP_S = 0.005
 MEMORY_SAMPLES = 20
-"""How often memory is looked at."""
+"""Number of memory samples."""
 
 
 def build_points(first, count):
-    """Points from number `first` on: a width and a place that tell their number."""
+    """Build points from number `first` on, with widths and positions that encode their number."""
     number = np.arange(first, first + count)
     width = WIDTH_US + number % WIDTHS
     table = np.empty((count, 5), dtype=np.uint16)
@@ -61,7 +61,7 @@ def build_points(first, count):
 
 
 def build_requirements(baud):
-    """What a host asks that has mirrors quick enough for it."""
+    """Build the board requirements of a scanner that is fast enough for the test."""
     config = load_config("display-437")
     scanner = config.scanner.model_copy(
         update={"bandwidth_hz": 1e5, "slew_rad_per_s": 1000.0, "delay_s": 1e-6},
@@ -73,11 +73,11 @@ def build_requirements(baud):
     )
 
 
-# --- the board's process, and the witness that reads its log ---------------------------------------------------------
+# --- the board process, and the process that checks its log ----------------------------------------------------------
 
 
 def check_log(log):
-    """Read the log to its end; as JSON: pulses, those that are not the next one in order, HOLDs, faults."""
+    """Read the log to its end, and print the counts of pulses, pulses out of order, HOLDs and faults as JSON."""
     pulses = out_of_order = holds = faults = 0
     pulse = re.compile(r'"index": (\d+).*"on_us": (\d+), "off_us": (\d+)')
     with Path(log).open() as lines:
@@ -89,11 +89,11 @@ def check_log(log):
             else:
                 holds += '"state": "HOLD"' in line
                 faults += '"event": "fault"' in line
-    print(json.dumps({"pulses": pulses, "astray": out_of_order, "holds": holds, "faults": faults}))
+    print(json.dumps({"pulses": pulses, "out_of_order": out_of_order, "holds": holds, "faults": faults}))
 
 
 class SoakBoard:
-    """The board's process on a pty and its witness; both ended whatever happens."""
+    """The board process on a pty, and the process that checks its log."""
 
     def __init__(self, folder):
         subprocess.run(["make", "-s", "-C", HOST_PORT, f"BUILD={folder}"], check=True)
@@ -101,7 +101,7 @@ class SoakBoard:
         limits.write_text(LIMITS)
         os.mkfifo(log)
         self._log_checker = subprocess.Popen(
-            [sys.executable, __file__, "--witness", log], stdout=subprocess.PIPE, text=True
+            [sys.executable, __file__, "--check-log", log], stdout=subprocess.PIPE, text=True
         )
         options = ["--pty", self.port, "--log", log, "--limits", limits, "--baud", str(BAUD)]
         self.board = subprocess.Popen([folder / "board", *options])
@@ -109,7 +109,7 @@ class SoakBoard:
             time.sleep(0.01)
 
     def finish(self):
-        """What the witness saw."""
+        """End the board, and return the counts of the log."""
         self.board.terminate()
         self.board.wait(timeout=10)
         return json.loads(self._log_checker.communicate(timeout=60)[0])
@@ -125,7 +125,7 @@ class SoakBoard:
 
 
 def read_memory_mib(process):
-    """Resident memory of a process."""
+    """Return the resident memory of a process, MiB."""
     status = Path(f"/proc/{process}/status").read_text()
     return int(re.search(r"VmRSS:\s+(\d+) kB", status)[1]) / 1024
 
@@ -134,7 +134,7 @@ def read_memory_mib(process):
 
 
 class ReportChecker:
-    """What the session was told of plans that are through: whether each pulse is there, in order and as asked."""
+    """Checks that the reports to the session contain every pulse, in order and as requested."""
 
     def __init__(self, scale):
         self._scale = scale
@@ -142,7 +142,7 @@ class ReportChecker:
         self.pulses = self.out_of_order = 0
 
     def check_plan(self, job, count):
-        """A plan that is finished, with so many pulses."""
+        """Check a finished plan of `count` pulses."""
         done = job.build_executed(SimpleNamespace(pixel=np.arange(count)), self._scale.full_power_w, self._scale.tick_s)
         on_us, width_us = done.on_tick, done.width_ticks
         ends_us = np.concatenate([[self._last_us], (on_us + width_us)[:-1]])
@@ -153,7 +153,7 @@ class ReportChecker:
 
 
 class SoakRun:
-    """Pulses through a session, plan after plan."""
+    """Streams pulses through a session, plan after plan."""
 
     def __init__(self, session, total, on_progress):
         self._session, self._total, self._on_progress = session, total, on_progress
@@ -162,22 +162,22 @@ class SoakRun:
         self.reports = ReportChecker(session.scale)
 
     def _submit_next(self):
-        """The next plan: behind the last one while that one is not wholly sent."""
+        """Submit the next plan once half of the last one is sent."""
         count = min(PLAN_PULSES, self._total - self._submitted)
         if not self._jobs:
             job = self._session.begin(build_points(self._submitted, count), self._session.board_s() + LEAD_S)
         else:
-            last, kept = self._jobs[-1]
+            last, last_count = self._jobs[-1]
             if last.end_index - last.next_to_send > PLAN_PULSES // 2:
                 return
-            job = self._session.splice(build_points(self._submitted, count), kept, float("inf"))
+            job = self._session.splice(build_points(self._submitted, count), last_count, float("inf"))
             if job is None:
-                raise RuntimeError("a plan came too late to follow the one before it")
+                raise RuntimeError("a plan was too late to follow the previous one")
         self._jobs.append((job, count))
         self._submitted += count
 
     def run(self):
-        """Until every pulse is reported, or the board is no longer armed."""
+        """Stream until every pulse is reported, or the board is no longer armed."""
         samples = 0
         while self._submitted < self._total or self._jobs:
             if self._submitted < self._total:
@@ -194,7 +194,7 @@ class SoakRun:
 
 
 def connect_and_arm(session):
-    """Until the board is armed."""
+    """Connect, and wait until the board is armed."""
     session.connect()
     session.arm()
     while session.board.state != BoardState.ARMED:
@@ -202,7 +202,7 @@ def connect_and_arm(session):
 
 
 def run_soak(total):
-    """Rows of the table, and what failed."""
+    """Run the test; return the rows of the table and the failures."""
     memory = []
     with tempfile.TemporaryDirectory() as folder, SoakBoard(Path(folder)) as board_process:
         session = BoardSession(SerialPort(str(board_process.port), BAUD), MonotonicClock(), build_requirements(BAUD))
@@ -218,62 +218,64 @@ def run_soak(total):
         except OptodriveError as error:
             print(error, file=sys.stderr)
         duration_s, cpu_s = time.monotonic() - start_s, time.process_time() - start_cpu_s
-        board, figures = session.board, session.collect_link_stats()
+        board, stats = session.board, session.collect_link_stats()
         session.close()
         log_result = board_process.finish()
     rows = [
-        ("pulses asked", total),
+        ("pulses requested", total),
         ("pulses in the board's log", log_result["pulses"]),
-        ("  of them not the next one in order, or of another width", log_result["astray"]),
+        ("  out of order, or of wrong width", log_result["out_of_order"]),
         ("pulses reported to the session", run.reports.pulses),
-        ("  of them not after the one before, or of another width", run.reports.out_of_order),
+        ("  overlapping, or of wrong width", run.reports.out_of_order),
         ("underruns; HOLDs in the log; faults", f"{board.underruns}; {log_result['holds']}; {log_result['faults']}"),
         (
-            "frames sent again; NAKs; bad frames",
-            f"{figures['retransmitted']}; {figures['naks']}; {_count_bad_frames(figures)}",
+            "retransmissions; NAKs; bad frames",
+            f"{stats['retransmitted']}; {stats['naks']}; {_count_bad_frames(stats)}",
         ),
-        ("longest time between two turns of the host, ms", f"{figures['longest_stall_ms']:.0f}"),
-        ("duration, s; pulses a second", f"{duration_s:.0f}; {run.reports.pulses / duration_s:.0f}"),
-        ("host's CPU time a thousand pulses, s", f"{1000 * cpu_s / max(1, run.reports.pulses):.3f}"),
+        ("longest stall of the host, ms", f"{stats['longest_stall_ms']:.0f}"),
+        ("duration, s; pulses per second", f"{duration_s:.0f}; {run.reports.pulses / duration_s:.0f}"),
+        ("host's CPU time per 1,000 pulses, s", f"{1000 * cpu_s / max(1, run.reports.pulses):.3f}"),
     ]
-    for name, at in (("host", 1), ("board", 2)):
-        rows.append((f"resident memory of the {name} at 5, 50, 100 %, MiB", _format_memory(memory, at)))
+    for name, column in (("host", 1), ("board", 2)):
+        rows.append((f"resident memory of the {name} at 5, 50, 100 %, MiB", _format_memory(memory, column)))
     failures = {
         "pulses are missing": {log_result["pulses"], run.reports.pulses} != {total},
-        "pulses are out of order, or not as asked": log_result["astray"] or run.reports.out_of_order,
-        "the board ran out of points": board.underruns or log_result["holds"],
-        "the board was in fault": log_result["faults"],
+        "pulses are out of order, or not as requested": log_result["out_of_order"] or run.reports.out_of_order,
+        "the board underran": board.underruns or log_result["holds"],
+        "the board was in FAULT": log_result["faults"],
     }
-    return rows, [what for what, failed in failures.items() if failed]
+    return rows, [message for message, failed in failures.items() if failed]
 
 
-def _count_bad_frames(figures):
-    return figures["host_bad_frames"] + figures["board_bad_frames"]
+def _count_bad_frames(stats):
+    return stats["host_bad_frames"] + stats["board_bad_frames"]
 
 
 def _format_memory(memory, column):
-    chosen = [min(memory, key=lambda look: abs(look[0] - share)) for share in (0.05, 0.5, 1.0)] if memory else []
-    return ", ".join(f"{look[column]:.1f}" for look in chosen)
+    if not memory:
+        return ""
+    samples = [min(memory, key=lambda sample: abs(sample[0] - share)) for share in (0.05, 0.5, 1.0)]
+    return ", ".join(f"{sample[column]:.1f}" for sample in samples)
 
 
 def main():
     parser = argparse.ArgumentParser(prog="scripts/bench soak")
     parser.add_argument("--pulses", type=int, default=2_000_000)
-    parser.add_argument("--witness", help=argparse.SUPPRESS)
+    parser.add_argument("--check-log", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.witness:
-        check_log(options.witness)
+    if options.check_log:
+        check_log(options.check_log)
         return 0
     if options.pulses < 1:
         parser.error(f"--pulses: got {options.pulses}, expected at least 1")
-    rows, failed = run_soak(options.pulses)
+    rows, failures = run_soak(options.pulses)
     table = Table("soak", "")
     for name, value in rows:
         table.add_row(name, str(value))
     Console(width=120).print(table)
-    for what in failed:
-        print(f"FAILED: {what}", file=sys.stderr)
-    return 1 if failed else 0
+    for message in failures:
+        print(f"FAILED: {message}", file=sys.stderr)
+    return 1 if failures else 0
 
 
 if __name__ == "__main__":

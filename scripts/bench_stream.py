@@ -111,7 +111,7 @@ class RequestLoad:
 
 
 def push_frames(url):
-    """Push frames at the rate; return round trips, s, the answers, the final state, and the plans of the last frames."""
+    """Push frames; return round trips, s, the answers, the final state, and the plans of the last frames."""
     rng = np.random.default_rng(7)
     trips, answers = [], []
     with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=30) as client:

@@ -60,6 +60,7 @@ def play_pattern(client: DaemonClient, pattern: str) -> Plan:
 
 
 def format_row(name: str, plan: Plan) -> list[str]:
+    """Format the result of one pattern as cells under COLUMNS."""
     target = plan.max_target
     heights = (
         [f"{target.target_um:.1f}", f"{target.simulated_um:.1f}"]
@@ -97,7 +98,7 @@ def main() -> int:
     daemon = None
     try:
         daemon, client = start_daemon(options.port)
-        print("arming: the board's indicator is lit for two seconds first", flush=True)
+        print("arming: the board's indicator is on for two seconds first", flush=True)
         client.call(ARM)
         started_s = time.monotonic()
         for pattern in itertools.cycle(PATTERNS):

@@ -1,4 +1,4 @@
-"""What `mkdocs build` takes from beside docs/: the protocols and all decisions."""
+"""Hook of `mkdocs build` that adds the protocol pages from outside docs/, and all decisions."""
 
 import posixpath
 import re
@@ -12,7 +12,7 @@ PROTOCOL_PAGES = ("PROTOCOL.md", "SENSOR.md")
 
 
 def on_config(config):
-    """Every decision is in the navigation."""
+    """Add every decision to the navigation."""
     decisions = sorted(
         path.relative_to(config.docs_dir).as_posix() for path in Path(config.docs_dir).glob("decisions/*")
     )
@@ -21,7 +21,7 @@ def on_config(config):
 
 
 def on_files(files, config):
-    """Pages that are no files of docs/."""
+    """Add the pages from outside docs/."""
     for name in PROTOCOL_PAGES:
         files.append(
             File.generated(
@@ -32,7 +32,7 @@ def on_files(files, config):
 
 
 def on_page_markdown(markdown, page, config, files):
-    """The protocols are pages here; what they link to beside docs/ is named, not linked."""
+    """Adapt links: to the protocol pages, and from them to files outside docs/, which become plain text."""
     if page.file.src_uri.removeprefix("reference/") in PROTOCOL_PAGES:
         return re.sub(r"\[([^\]]+)\]\((?!#|https?:)[^)]+\)", r"\1", markdown)
     folder = posixpath.relpath("reference", posixpath.dirname(page.file.src_uri) or ".")

@@ -37,9 +37,9 @@ def leave(*_):
     on = False
 signal.signal(signal.SIGTERM, leave)
 while on:
-    due_s = time.monotonic() + 0.002
+    wake_s = time.monotonic() + 0.002
     time.sleep(0.002)
-    late_s.append(time.monotonic() - due_s)
+    late_s.append(time.monotonic() - wake_s)
 print(json.dumps(late_s[:: max(1, len(late_s) // 100_000)] + [max(late_s)]))
 """
 """A process that only sleeps: its lateness is that of the computer, not of the daemon."""

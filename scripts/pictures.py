@@ -1,4 +1,4 @@
-"""A line of braille on the 437-pixel display: heights computed from pulses that went through the simulated board."""
+"""Draw a line of braille on the 437-pixel display, with heights computed from the pulses of the simulated board."""
 
 from pathlib import Path
 
@@ -19,10 +19,12 @@ DARK, COLD, WARM, TEXT, GRID = (24, 26, 33), (52, 56, 68), (255, 178, 64), (222,
 
 
 def mix_colours(share):
+    """Return the colour between COLD and WARM."""
     return tuple(round(a + (b - a) * share) for a, b in zip(COLD, WARM, strict=True))
 
 
 def draw_display(draw, font, layout, height_um, origin):
+    """Draw the display with one disc per pixel, and its colour scale."""
     radius = 0.40 * SCALE
     for index in range(len(layout)):
         x = origin[0] + layout.column[index] * SCALE
@@ -44,6 +46,7 @@ def draw_display(draw, font, layout, height_um, origin):
 
 
 def draw_trace(draw, font, pixel_trace, pulses, box):
+    """Draw height, absorber rise and pulses of one pixel over time."""
     left, top, right, bottom = box
     time, height_um, temperature = pixel_trace.t_s, pixel_trace.displacement_m[:, 0] * 1e6, pixel_trace.absorber_k[:, 0]
     end_s, height_max_um, rise_max_k = time[-1], height_um.max() * 1.1, temperature.max() * 1.1
@@ -60,7 +63,7 @@ def draw_trace(draw, font, pixel_trace, pulses, box):
     for values, value_max, colour in ((temperature, rise_max_k, (220, 90, 90)), (height_um, height_max_um, WARM)):
         points = [(compute_x(t), bottom - (bottom - top) * v / value_max) for t, v in zip(time, values, strict=True)]
         draw.line(points, fill=colour, width=3)
-    draw.text((left, top - 26), "one pixel of it: height in micrometres", font=font, fill=WARM)
+    draw.text((left, top - 26), "one of its pixels: height in micrometres", font=font, fill=WARM)
     draw.text((left + 290, top - 26), f"absorber rise, up to {temperature.max():.0f} K", font=font, fill=(220, 90, 90))
     draw.text((left, bottom + 14), "laser pulses", font=font, fill=(96, 140, 255))
     draw.text((right - 60, bottom + 14), f"{end_s:.2f} s", font=font, fill=TEXT)

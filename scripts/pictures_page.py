@@ -1,4 +1,4 @@
-"""The page in Chromium, on a desk and on a phone, light and dark, while a real daemon plays on the simulated board."""
+"""Take screenshots of the page in Chromium, desktop and phone, light and dark, while a daemon plays a drawing."""
 
 import sys
 import tempfile
@@ -16,7 +16,7 @@ PULSES_IN = 200
 
 
 def draw_heart(page):
-    """A heart in the middle of 21 x 21 pixels, stroke by stroke."""
+    """Draw a heart in the middle of 21 × 21 pixels by clicks."""
     page.locator("#display").scroll_into_view_if_needed()
     box = page.locator("#display").bounding_box()
     for down, line in enumerate(HEART):
@@ -28,6 +28,7 @@ def draw_heart(page):
 
 
 def take_screenshot(browser, daemon, name, viewport, scheme):
+    """Draw, play and save a screenshot while the pulses are executed."""
     window = Visit(browser, daemon.url, viewport=viewport, color_scheme=scheme, device_scale_factor=1)
     page = window.open()
     draw_heart(page)

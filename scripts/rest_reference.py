@@ -1,4 +1,4 @@
-"""The REST reference, from the application's own OpenAPI: `python scripts/rest_reference.py` prints it."""
+"""Print the REST reference, generated from the application's OpenAPI: `python scripts/rest_reference.py`."""
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
@@ -16,7 +16,7 @@ Generated from the daemon's OpenAPI, which it answers itself at `/openapi.json`.
 
 
 def build_openapi():
-    """The application's OpenAPI; nothing is connected for it."""
+    """Build the application's OpenAPI without connecting to a board."""
     config = load_config()
     engine = Engine(DisplayModel.from_config(config), find_transport_factory(config.board)(), MonotonicClock())
     try:
@@ -26,7 +26,7 @@ def build_openapi():
 
 
 def build_rest_reference():
-    """Markdown, a section a route."""
+    """Build the reference as Markdown, one section per route."""
     sections = [HEAD]
     for path, methods in build_openapi()["paths"].items():
         for method, route in methods.items():
@@ -35,7 +35,7 @@ def build_rest_reference():
 
 
 def format_section(title, route):
-    """One route: what it does, what it takes, what it answers."""
+    """Format one route: description, parameters, body and responses."""
     lines = [f"## {title}", "", route.get("description", ""), ""]
     rows = [
         f"| `{item['name']}` | {item['in']} | {format_type(item['schema'])} |"
@@ -51,7 +51,7 @@ def format_section(title, route):
 
 
 def format_type(schema):
-    """A parameter's type in words."""
+    """Format the type of a parameter."""
     text = schema.get("type", "any")
     if "enum" in schema:
         text = ", ".join(f"`{value}`" for value in schema["enum"])
@@ -59,7 +59,7 @@ def format_type(schema):
 
 
 def escape_cell(text):
-    """Text that does not end a table's cell."""
+    """Escape text for a cell of a table."""
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 

@@ -1,4 +1,4 @@
-"""Builds the wheel, installs it into an empty environment, and runs `optodrive serve` from it outside the checkout."""
+"""Build the wheel, install it into an empty environment, and run `optodrive serve` outside the checkout."""
 
 import argparse
 import json
@@ -19,27 +19,30 @@ PIP = (sys.executable, "-m", "pip", "--disable-pip-version-check")
 
 
 def build_wheel(folder):
-    """The wheel, built in isolation."""
+    """Build the wheel in isolation, and return its path."""
     subprocess.run([*PIP, "wheel", "-q", "--no-deps", "--wheel-dir", folder, ROOT], check=True)
     (wheel,) = folder.glob("optodrive-*.whl")
     return wheel
 
 
 def install_wheel(wheel, folder, quick):
-    """An environment with nothing but the wheel and what it asks for; quick: what it asks for is lent by this one."""
+    """Install the wheel and its dependencies into an empty environment; return the path of its `optodrive`.
+
+    With `quick`, the dependencies of the current environment are used.
+    """
     venv.create(folder, with_pip=False)
     python = folder / "bin" / "python"
     target = f"{wheel}" if quick else f"{wheel}[analysis]"
     subprocess.run([*PIP, "--python", python, "install", "-q", *(["--no-deps"] if quick else []), target], check=True)
     if quick:
         (site,) = folder.glob("lib/python*/site-packages")
-        # A plain line adds the folder after the environment's own, and does not follow what that folder leads to.
-        (site / "lent.pth").write_text(sysconfig.get_path("purelib") + "\n")
+        # A path line appends the folder to sys.path and ignores the .pth files in it.
+        (site / "shared.pth").write_text(sysconfig.get_path("purelib") + "\n")
     return folder / "bin" / "optodrive"
 
 
 def try_installation(optodrive, outside):
-    """What was found: the daemon from the wheel, asked by HTTP; the shipped configurations, read."""
+    """Check the shipped configurations, run the daemon, and return what it answers over HTTP."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment |= {"OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(outside)}
 
@@ -49,7 +52,7 @@ def try_installation(optodrive, outside):
 
     package_path = Path(run_python("-c", "import optodrive; print(optodrive.__file__)").strip())
     if optodrive.parent.parent not in package_path.parents:
-        raise SystemExit(f"scripts/wheel: {package_path} was tried, which is not the wheel")
+        raise SystemExit(f"scripts/wheel: {package_path} was imported, which is not the wheel")
     config_names = json.loads(
         run_python("-c", "import json; from optodrive.device.config import *; print(json.dumps(shipped_configs()))")
     )
@@ -82,8 +85,8 @@ def try_installation(optodrive, outside):
 
 def main():
     parser = argparse.ArgumentParser(prog="scripts/wheel", description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="lend the environment this one's libraries")
-    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="where the wheel goes")
+    parser.add_argument("--quick", action="store_true", help="use the libraries of the current environment")
+    parser.add_argument("--out", type=Path, default=ROOT / "dist", help="folder of the wheel")
     options = parser.parse_args()
     options.out.mkdir(parents=True, exist_ok=True)
     for old in options.out.glob("optodrive-*.whl"):
@@ -92,9 +95,9 @@ def main():
     with tempfile.TemporaryDirectory() as folder:
         outside = Path(folder) / "outside"
         outside.mkdir()
-        found = try_installation(install_wheel(wheel, Path(folder) / "environment", options.quick), outside)
-    print(json.dumps({"wheel": str(wheel), "bytes": wheel.stat().st_size, **found}))
-    return 0 if found["planned"] == 1 and found["status"] == 0 and len(found["configs"]) == 5 else 1
+        result = try_installation(install_wheel(wheel, Path(folder) / "environment", options.quick), outside)
+    print(json.dumps({"wheel": str(wheel), "bytes": wheel.stat().st_size, **result}))
+    return 0 if result["planned"] == 1 and result["status"] == 0 and len(result["configs"]) == 5 else 1
 
 
 if __name__ == "__main__":
