@@ -16,7 +16,7 @@ from rich.table import Table
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
 from optodrive.device.config import load_config
-from optodrive.planning.cold_heat import DisplayModel
+from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler import scheduler
 from optodrive.planning.scheduler.periodic_pulses import limit_pulse_width, solve_steady_state
@@ -38,12 +38,16 @@ def measure_last_cycles(display, result, train, period_s):
     """Return the mean peak and peak-to-peak of a train's last cycles, µm, and its energy per cycle, J."""
     plan = result.plan
     rows = np.flatnonzero(plan.pixel == train.pixel)
-    starts_s = train.pulse_starts_s()[-STEADY_CYCLES - 1 : -1] + result.lead_s
+    starts_s = train.pulse_starts_s()[-STEADY_CYCLES - 1 : -1] + result.lead_in_s
     t_s = np.linspace(starts_s[0], starts_s[0] + STEADY_CYCLES * period_s, 200 * STEADY_CYCLES + 1)
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w])[rows]
-    each = height_um(display.pixels.each[train.pixel], pulses, t_s)[:-1].reshape(STEADY_CYCLES, 200)
+    cycles_um = height_um(display.pixels.elements[train.pixel], pulses, t_s)[:-1].reshape(STEADY_CYCLES, 200)
     row_numbers = rows[(plan.start_s[rows] > starts_s[0] - 1e-6) & (plan.start_s[rows] < t_s[-1] - 1e-6)]
-    return each.max(axis=1).mean(), np.ptp(each, axis=1).mean(), plan.energy_j[row_numbers].sum() / STEADY_CYCLES
+    return (
+        cycles_um.max(axis=1).mean(),
+        np.ptp(cycles_um, axis=1).mean(),
+        plan.energy_j[row_numbers].sum() / STEADY_CYCLES,
+    )
 
 
 def compute_beam_time_us(display, count, period_s):
@@ -92,7 +96,7 @@ def measure_train(display, count, rate_hz, target_um):
     result = plan_sequence(display, FrameSequence(trains=trains), *display.build_cold_state())
     peak_um, simulated_peak_to_peak_um, train_j = measure_last_cycles(display, result, trains[0], period_s)
     width_s = result.plan.width_s[result.plan.pixel == PIXELS[0]][-1]
-    periods, duty = cold_heat.pulse_for_peak(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
+    periods, duty = cold_heat.solve_pulse(PIXELS[0], 0.0, first.target_m, drive, round(width_s / drive.period_s))
     cold = tuple(
         PulseTrain(
             item.pixel, item.start_s, duration_s, periods * drive.period_s,
@@ -117,8 +121,9 @@ def measure_train(display, count, rate_hz, target_um):
 
 def build_cycles_table(display):
     """Compare trains by height with trains whose pulses are planned from the cold state."""
-    table = Table("pixels", "Hz", "peak µm", "simulated", "peak-to-peak µm", "simulated", "mJ/cycle", "cold plan", "saved",
-                  "peak of cold plan", title="trains by height")  # fmt: skip
+    columns = ("pixels", "Hz", "peak µm", "simulated", "peak-to-peak µm", "simulated")
+    energy_columns = ("mJ/cycle", "cold plan", "saved", "peak of cold plan")
+    table = Table(*columns, *energy_columns, title="trains by height")
     for count, rate_hz, target_um in product((1, 4), (10, 25, 50), (100, 300)):
         try:
             table.add_row(*measure_train(display, count, rate_hz, target_um))

@@ -183,7 +183,7 @@ class SoakRun:
             if self._submitted < self._total:
                 self._submit_next()
             self._session.step(STEP_S, renew_lease=True)
-            while self._jobs and self._jobs[0][0].finished:
+            while self._jobs and self._jobs[0][0].is_finished:
                 self.reports.check_plan(*self._jobs.pop(0))
             if self._session.board.state in IDLE_STATES:
                 return

@@ -269,9 +269,8 @@ def print_report(stop_test, seconds):
     print(f"gate off   in the board's log, from gate on: {format_percentiles(stop_test.gate_off_s)}")
     third = max(1, len(stop_test.memory_mb) // 3)
     first, last = statistics.median(stop_test.memory_mb[:third]), statistics.median(stop_test.memory_mb[-third:])
-    print(
-        f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, max {max(stop_test.memory_mb):.1f} MB"
-    )
+    memory_max_mb = max(stop_test.memory_mb)
+    print(f"memory     {first:.1f} MB in the first third, {last:.1f} MB in the last, max {memory_max_mb:.1f} MB")
     print(f"underruns  {stop_test.underruns}; faults after STOP: {stop_test.faults}")
     print(f"engine     longest stall of its loop {stop_test.stall_ms:.0f} ms")
     print(

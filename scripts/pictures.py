@@ -84,7 +84,7 @@ def main():
     draw, font = ImageDraw.Draw(image), ImageFont.load_default(16)
     draw_display(draw, font, display.layout, peaks_um, (MARGIN, MARGIN))
     pulses = list(zip(executed.start_s[is_of_pixel], executed.width_s[is_of_pixel], strict=True))
-    box = (MARGIN + 21 * SCALE + 70, MARGIN + 40, image.width - MARGIN, image.height_factor - MARGIN - 40)
+    box = (MARGIN + 21 * SCALE + 70, MARGIN + 40, image.width - MARGIN, image.height - MARGIN - 40)
     draw_trace(draw, font, compute_traces(display.build_cold_heat(), executed, [pixel], 5e-4), pulses, box)
     OUT.mkdir(parents=True, exist_ok=True)
     image.save(OUT / "braille.png", optimize=True)
