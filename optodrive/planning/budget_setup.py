@@ -65,8 +65,8 @@ def build_galvo_model(config: Config) -> GalvoModel:
         slew_rad_per_s=scanner.slew_rad_per_s,
         lead_in_s=build_settling_table(config).lead_in_us * 1e-6,
         averaging_s=config.limits.galvo_mean_s,
-        code_step_rad=scanner.rad_per_code,
-        interval_shrink_s=config.board.timing_slack_s,
+        rad_per_code=scanner.rad_per_code,
+        timing_slack_s=config.board.timing_slack_s,
     )
 
 

@@ -48,8 +48,8 @@ def random_mirrors(rng):
         slew_rad_per_s=10 ** rng.uniform(2.0, 2.5),
         lead_in_s=rng.uniform(5e-4, 3e-3),
         averaging_s=rng.choice([0.1, 1.0, 3.0]),
-        code_step_rad=0.0,
-        interval_shrink_s=0.0,
+        rad_per_code=0.0,
+        timing_slack_s=0.0,
     )
 
 

@@ -1,6 +1,6 @@
-"""What the limiter counts with: caps, the model's upper corner, the mirrors. Plain numbers and arrays for kernels.
+"""Coefficients of the limiter: caps, worst-case thermal model and galvo model, as numbers and arrays for kernels.
 
-Written apart from `optodrive.physics` on purpose: what checks the limiter must not share its code.
+The limiter shares no code with `optodrive.physics`, because tests compare the two.
 """
 
 from typing import NamedTuple
@@ -13,21 +13,34 @@ TOLERANCE = 1e-9
 
 
 class HeatBound(NamedTuple):
-    """Coefficients of the bound on heat at the upper corner of the declared uncertainty; `corner` makes them.
+    """Worst-case coefficients of the thermal bound over the declared uncertainty; `build_heat_bound` computes them.
 
-    epsilon, r_k_per_w, c_low_j_per_k, c_high_j_per_k: [p] the absorber; r at reference temperature
-    knot_k, loss_k: [s] chords below the bridge's loss: rise over the wall, and loss × r there
-    absorber_wall: how far an absorber may lag above a wall that cools: rise ≤ own rise + this × the wall's bound
-    wall_w_per_k: [p] what leaves a wall per kelvin; wall_j_per_k: [2] least and greatest capacity
-    wall_k_per_j: [2] rise of a wall per incident joule, all of it at once; wall_spread: see `corner.spread`
-    beside: [p, 4] neighbours, −1 for none; side_w_per_k: conductance to one, as counted for the colder of two
-    step_s: walls exchange heat at such steps
-    touch_lag_s, touch_k_per_j: [2]; touch_per_wall_k: steady touch surface over the wall's bound; touch_spread
-    least_k_per_w: [p] steady rise of an absorber over its wall per incident watt, at least; least_rate_per_s: [p, 2]
-    towards it while it warms, and while it cools; lost_k: by how much neighbours' heat may bring the rise below that
-    wall_flight, touch_flight: kelvin that wall and touch surface are below their bounds for each kelvin an absorber is
-    over its wall, by heat that counts as arrived; touch_lost_k: by how much less, through the gas
-    power_max_w: the strongest pulse there can be
+    Absorber:
+    epsilon, r_k_per_w, c_low_j_per_k, c_high_j_per_k: [p] absorbed fraction, bridge resistance at the reference
+    temperature, smallest and largest heat capacity
+    knot_k, loss_k: [s] chords below the bridge's loss: rise over the wall, and loss × r at that rise
+    absorber_wall_factor: absorber rise ≤ its rise over the wall + this factor × the wall's bound
+
+    Wall:
+    wall_w_per_k: [p] conductance to the surroundings; wall_j_per_k: [2] smallest and largest capacity
+    wall_k_per_j: [2] rise per incident joule, delivered at once; wall_specht_ratio: see `worst_case.specht_ratio`
+    neighbours: [p, 4] neighbouring pixels, −1 for none
+    lateral_w_per_k: conductance to a neighbour, as counted for the colder of two walls
+    exchange_step_s: interval at which walls exchange heat
+
+    Touch surface:
+    touch_lag_s, touch_k_per_j: [2] smallest and largest lag, and rise per incident joule
+    touch_per_wall_k: steady rise of the touch surface over the wall's bound; touch_specht_ratio
+
+    In-transit heat credit:
+    lower_bound_k_per_w: [p] lower bound on the steady rise of an absorber over its wall per incident watt
+    lower_bound_rate_per_s: [p, 2] rate towards it, for warming and for cooling
+    deficit_k: largest amount by which heat from neighbours reduces the rise below that bound
+    wall_transit_credit, touch_transit_credit: difference between the bound of the wall or touch surface, which counts
+    the heat as arrived, and its temperature, per kelvin of the absorber's rise over its wall
+    touch_deficit_k: reduction of the touch surface's credit by the gas
+
+    power_max_w: largest power of a pulse
     """
 
     epsilon: FloatArray
@@ -58,11 +71,12 @@ class HeatBound(NamedTuple):
 
 
 class GalvoModel(NamedTuple):
-    """Servos of the second order, natural frequency omega_per_s; delay_s after a command their targets run at the slew.
+    """Second-order servos of both mirrors; their targets follow a command after delay_s, at the slew limit.
 
-    lead_s: from a plan's begin to its first pulse at least; mean_s: time constant of the mean
-    code_rad: one step of the converter, by which a move may come out longer
-    early_s: by how much two times of a plan may come nearer to each other on their way to points
+    omega_rad_per_s: natural frequency; lead_in_s: smallest time from the start of a plan to its first pulse
+    averaging_s: time constant of the mean-square acceleration
+    rad_per_code: one converter step, by which a move can be longer
+    timing_slack_s: largest reduction of an interval between two planned times by quantisation
     """
 
     omega_rad_per_s: float
@@ -71,12 +85,12 @@ class GalvoModel(NamedTuple):
     slew_rad_per_s: float
     lead_in_s: float
     averaging_s: float
-    code_step_rad: float
-    interval_shrink_s: float
+    rad_per_code: float
+    timing_slack_s: float
 
 
 class Budget(NamedTuple):
-    """Everything a plan is held against."""
+    """All coefficients that the limiter needs."""
 
     caps: CapValues
     heat: HeatBound

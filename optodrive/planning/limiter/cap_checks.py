@@ -1,4 +1,4 @@
-"""What each cap allows a pulse, and how much of each cap is in use. Kernels."""
+"""The computations of every cap: the largest power that it allows a pulse, and how much of it is in use. Kernels."""
 
 from math import exp
 from typing import NamedTuple
@@ -31,7 +31,11 @@ GALVO_ACCELERATION = CAP_NUMBERS["galvo_acceleration"]
 
 
 class PixelStartState(NamedTuple):
-    """A pixel as a pulse begins: absorber over wall, and that at least, K; bucket, J; light without a rest, s."""
+    """State of a pixel at the start of a pulse.
+
+    rise_k, lower_bound_k: upper and lower bound of the absorber's rise over its wall; bucket_j: energy bucket
+    merged_width_s: total width of earlier pulses without a gap
+    """
 
     rise_k: float
     lower_bound_k: float
@@ -43,7 +47,10 @@ class PixelStartState(NamedTuple):
 def max_power_w(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, before: PixelStartState
 ) -> tuple[float, int]:
-    """Largest power the caps allow a pulse, W, and the cap that binds; below zero for a pulse no power makes right."""
+    """Return the largest power that all caps allow a pulse, W, and the number of the binding cap.
+
+    A negative power marks a pulse that is infeasible at any power and under any policy.
+    """
     caps, width_s = budget.caps, request.width_s
     if request.start_s < workspace.budgets.end_s[0] - TOLERANCE:
         return -1.0, WRONG_ORDER
@@ -98,7 +105,7 @@ def max_power_w(
 def absorber_peak_k(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, rise_k: float, power_w: float
 ) -> float:
-    """Bound on the absorber during a pulse, above ambient."""
+    """Return the peak bound on the absorber's rise above ambient during a pulse."""
     own_k = max(rise_k, absorber_after_k(budget.heat, request.pixel, rise_k, power_w, request.width_s))
     return own_k + budget.heat.absorber_wall_factor * wall_peak_k(budget, workspace.nodes, request, power_w)
 
@@ -107,7 +114,7 @@ def absorber_peak_k(
 def _max_absorber_power_w(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, rise_k: float, requested_w: float
 ) -> float:
-    """wanted_w where the absorber bears it, else the largest power that it bears, W."""
+    """Return `requested_w` if it keeps the absorber within its cap, else the largest power that does, W."""
     cap_k = budget.caps.absorber_k
     if requested_w <= 0.0 or absorber_peak_k(budget, workspace, request, rise_k, requested_w) <= cap_k:
         return requested_w

@@ -1,6 +1,6 @@
-"""Energy within any window of a given length, exact for pulses of constant power in order of time. Kernels.
+"""Energy within every window of a given length, exact for pulses of constant power in order of time. Kernels.
 
-Pulses that may still lie inside a window form a chain: one for each pixel, one for the display.
+Pulses that may still lie inside a window form a linked chain: one chain per pixel and one for the display.
 """
 
 from math import inf
@@ -11,7 +11,7 @@ from optodrive.core.types.arrays import FloatArray, IntArray
 
 
 class PulseHistory(NamedTuple):
-    """Pulses fired lately, then those of the plan in hand, in order of time; fired [1] of them are valid. All [m]."""
+    """Recent pulses, followed by those of the current plan, in order of time, [m]; the first n_valid [1] rows are valid."""
 
     start_s: FloatArray
     width_s: FloatArray
@@ -21,9 +21,10 @@ class PulseHistory(NamedTuple):
 
 
 class WindowChains(NamedTuple):
-    """Chains through `Pulses`, one a row of c. first, last: [c] index, −1 where empty; total_j: [c] energy so far.
+    """Chains through `PulseHistory`, one per row of c.
 
-    following: [m] the chain's next pulse, −1 for none; before_j: [m] the chain's energy before a pulse.
+    first, last: [c] rows of the history, −1 for an empty chain; total_j: [c] energy of all pulses so far
+    next_row: [m] row of the chain's next pulse, −1 for none; energy_before_j: [m] the chain's energy before a pulse
     """
 
     first: IntArray
@@ -35,7 +36,7 @@ class WindowChains(NamedTuple):
 
 @kernel
 def append(chains: WindowChains, chain: int, history: PulseHistory, row: int) -> None:
-    """Count a pulse; it starts no earlier than the chain's last one ended."""
+    """Append a pulse, which starts no earlier than the end of the chain's last pulse."""
     chains.next_row[row] = -1
     chains.energy_before_j[row] = chains.total_j[chain]
     chains.total_j[chain] += history.width_s[row] * history.power_w[row]
@@ -56,13 +57,16 @@ def max_window_power_w(
     window_s: float,
     mean_w: float,
 ) -> float:
-    """Largest power of a next pulse that keeps every window ending within it at or below window × mean."""
+    """Return the largest power of a next pulse for which no window that ends within it exceeds window × mean, W.
+
+    window_s, mean_w: length of the window, and the cap of the mean power over it.
+    """
     row = chains.first[chain]
     while row >= 0 and history.start_s[row] + history.width_s[row] <= start_s - window_s:
         row = chains.next_row[row]
     chains.first[chain] = row
-    # The energy in a window that ends during the pulse is piecewise linear in its end: it can peak at the pulse's
-    # end, or where the window's far edge meets the start of an earlier pulse.
+    # The energy in a window is piecewise linear in the window's end. During the pulse it can peak at the pulse's end,
+    # or where the window's start meets the start of an earlier pulse.
     cap_j, total_j = window_s * mean_w, chains.total_j[chain]
     window_start_s = start_s + width_s - window_s
     expired_j = total_j if row < 0 else chains.energy_before_j[row]

@@ -1,7 +1,8 @@
-"""What moves warm the mirrors' coils with: a bound on their servos' mean-square acceleration. Kernels.
+"""Galvo load: an upper bound on the mean-square acceleration of the mirrors, which heats their coils. Kernels.
 
-A servo's target runs at the slew limit for T = d / slew, so its angle accelerates by slew × (h(t) − h(t − T)), h its
-answer to an impulse. Moves overlap; the norm of a sum is at most the sum of norms. See docs/decisions/0013.
+The target of a servo moves at the slew limit for T = d / slew, so that the mirror's acceleration is
+slew × (h(t) − h(t − T)), with the servo's impulse response h. Responses to successive moves overlap; the norm of their
+sum is at most the sum of their norms. See docs/decisions/0013.
 """
 
 from math import cos, exp, log, pi, sin, sqrt
@@ -12,10 +13,11 @@ from optodrive.planning.limiter.budget import GalvoModel
 
 
 class GalvoState(NamedTuple):
-    """x and y after a move. x2, y2: mean-square acceleration at most, rad²/s⁴; it wanes from `late_s` after at_s on.
+    """Upper bounds on the load of both mirrors after a move.
 
-    x_swing, y_swing: root of the integral of a² that is still to come after at_s at most, rad/s^1.5
-    at_s: when the servo's target arrived at the latest, not counting its delay
+    x_mean_square, y_mean_square: mean-square acceleration, rad²/s⁴; it decays from `effective_delay_s` after at_s on
+    x_ringing, y_ringing: root of the integral of a² over all time after at_s, rad/s^1.5
+    at_s: latest arrival time of the servo's target, without the servo's delay
     """
 
     x_mean_square: float
@@ -27,7 +29,11 @@ class GalvoState(NamedTuple):
 
 @kernel
 def move_energy(galvo: GalvoModel, move_rad: float) -> float:
-    """Integral of a² of a move by itself, rad²/s³: 2 slew² |h|² (1 − ρ(T)); at its most where ρ first turns."""
+    """Return an upper bound on the integral of a² over a single move, rad²/s³.
+
+    The integral is 2 slew² |h|² (1 − ρ(T)), with the autocorrelation ρ of h. Moves longer than the first minimum of ρ
+    are counted as that minimum.
+    """
     omega, damping = galvo.omega_rad_per_s, galvo.damping
     root = sqrt(1.0 - damping**2)
     phase_rad = min(omega * root * move_rad / galvo.slew_rad_per_s, pi)
@@ -37,7 +43,10 @@ def move_energy(galvo: GalvoModel, move_rad: float) -> float:
 
 @kernel
 def ringing_envelope_factor(galvo: GalvoModel, elapsed_s: float) -> float:
-    """What is left, later_s after, of the root of the integral of a² of a free swing; the worst of all phases."""
+    """Return an upper bound, over all phases, on the fraction of free ringing that remains after `elapsed_s`.
+
+    The fraction is that of the root of the remaining integral of a².
+    """
     damping = galvo.damping
     amplitude_ratio = sqrt((1.0 + damping) / (1.0 - damping))
     return min(1.0, amplitude_ratio * exp(-damping * galvo.omega_rad_per_s * elapsed_s))
@@ -45,7 +54,10 @@ def ringing_envelope_factor(galvo: GalvoModel, elapsed_s: float) -> float:
 
 @kernel
 def effective_delay_s(galvo: GalvoModel) -> float:
-    """How long after at_s a move may be counted as if all its a² came at once: what comes later weighs more."""
+    """Return the delay after `GalvoState.at_s` at which the whole a² of a move can be counted as one impulse.
+
+    In an exponentially weighted mean later parts weigh more, so the delay covers the tail of the response.
+    """
     rate_per_s = 2.0 * galvo.damping * galvo.omega_rad_per_s
     log_ratio = log((1.0 + galvo.damping) / (1.0 - galvo.damping))
     return galvo.delay_s + log_ratio / rate_per_s + 1.0 / (rate_per_s - 1.0 / galvo.averaging_s)
@@ -55,15 +67,15 @@ def effective_delay_s(galvo: GalvoModel) -> float:
 def apply_move(
     galvo: GalvoModel, state: GalvoState, dx_rad: float, dy_rad: float, previous_end_s: float, start_s: float
 ) -> GalvoState:
-    """After a move to a pulse at start_s, the last one having ended at from_s."""
-    dx_rad, dy_rad = abs(dx_rad) + galvo.code_step_rad, abs(dy_rad) + galvo.code_step_rad
-    # Mirrors are sent on when a pulse ends; those of a plan's first pulse no later than the plan's lead before it.
+    """Return the state after a move to a pulse at `start_s`; the previous pulse ends at `previous_end_s`."""
+    dx_rad, dy_rad = abs(dx_rad) + galvo.rad_per_code, abs(dy_rad) + galvo.rad_per_code
+    # The mirrors leave when a pulse ends; for the first pulse of a plan, at the start of its lead-in at the latest.
     at_s = max(previous_end_s, start_s - galvo.lead_in_s) + max(dx_rad, dy_rad) / galvo.slew_rad_per_s
-    envelope = ringing_envelope_factor(galvo, previous_end_s - galvo.interval_shrink_s - state.at_s)
+    envelope = ringing_envelope_factor(galvo, previous_end_s - galvo.timing_slack_s - state.at_s)
     x_ringing = sqrt(move_energy(galvo, dx_rad)) + envelope * state.x_ringing
     y_ringing = sqrt(move_energy(galvo, dy_rad)) + envelope * state.y_ringing
-    # Either place may be a code off.
-    decay = exp(-(at_s - state.at_s - 2.0 * galvo.code_step_rad / galvo.slew_rad_per_s) / galvo.averaging_s)
+    # Either end of the move may be off by one converter step.
+    decay = exp(-(at_s - state.at_s - 2.0 * galvo.rad_per_code / galvo.slew_rad_per_s) / galvo.averaging_s)
     return GalvoState(
         state.x_mean_square * decay + x_ringing**2 / galvo.averaging_s,
         state.y_mean_square * decay + y_ringing**2 / galvo.averaging_s,
@@ -75,12 +87,13 @@ def apply_move(
 
 @kernel
 def mean_square_bound(galvo: GalvoModel, state: GalvoState, end_s: float) -> float:
-    """Mean-square acceleration of either mirror, rad²/s⁴, at most from end_s on, whatever the next move is.
+    """Return an upper bound on the mean-square acceleration of both mirrors from `end_s` on, rad²/s⁴.
 
-    The next move begins when the pulse ends, though the next pulse may be far off: the greatest one is always counted.
+    The bound holds for any next move: that move begins when the pulse ends, even if the next pulse is much later, so the
+    largest possible move is always counted.
     """
-    # Times as planned telescope from move to move: that they may come nearer counts once, here.
-    elapsed_s = end_s - galvo.interval_shrink_s - state.at_s
+    # Planned times telescope from move to move, so their slack counts once, here.
+    elapsed_s = end_s - galvo.timing_slack_s - state.at_s
     decay = exp(-(elapsed_s - effective_delay_s(galvo)) / galvo.averaging_s)
     envelope = ringing_envelope_factor(galvo, elapsed_s)
     max_move_root = sqrt(move_energy(galvo, 1e9))

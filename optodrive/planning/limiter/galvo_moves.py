@@ -1,4 +1,4 @@
-"""The mirrors' moves from pulse to pulse, and their mean-square acceleration against its cap. Kernels."""
+"""Moves of the mirrors from pulse to pulse, checked against the galvo cap. Kernels."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
@@ -10,12 +10,13 @@ from optodrive.planning.limiter.workspace import PixelBudgets
 
 @kernel
 def is_move(budgets: PixelBudgets, request: PulseRequest) -> bool:
+    """Return whether a pulse needs a move of the mirrors."""
     return bool(request.x_rad != budgets.mirror_rad[0] or request.y_rad != budgets.mirror_rad[1])
 
 
 @kernel
 def galvo_after_move(budget: Budget, budgets: PixelBudgets, request: PulseRequest) -> GalvoState:
-    """The mirrors after the move to a pulse."""
+    """Return the state of the mirrors after the move to a pulse."""
     x_mean_square, y_mean_square = budgets.galvo_mean_square[0], budgets.galvo_mean_square[1]
     before = GalvoState(
         x_mean_square, y_mean_square, budgets.galvo_ringing[0], budgets.galvo_ringing[1], budgets.mirror_at_s[0]
@@ -26,6 +27,7 @@ def galvo_after_move(budget: Budget, budgets: PixelBudgets, request: PulseReques
 
 @kernel
 def store_move(budgets: PixelBudgets, request: PulseRequest, galvo_state: GalvoState) -> None:
+    """Store the state of the mirrors after the move to a pulse."""
     budgets.galvo_mean_square[0], budgets.galvo_mean_square[1] = galvo_state.x_mean_square, galvo_state.y_mean_square
     budgets.galvo_ringing[0], budgets.galvo_ringing[1] = galvo_state.x_ringing, galvo_state.y_ringing
     budgets.mirror_rad[0], budgets.mirror_rad[1] = request.x_rad, request.y_rad
@@ -41,7 +43,7 @@ def count_galvo_feasible(
     x_rad: FloatArray,
     y_rad: FloatArray,
 ) -> int:
-    """How many of a plan's first pulses [n] have moves that the mirrors bear; the mirrors' part of spots is written."""
+    """Count the pulses [n] before the first whose move exceeds the galvo cap; the mirrors' part of `budgets` is modified."""
     for row in range(len(start_s)):
         request = PulseRequest(0, start_s[row], width_s[row], x_rad[row], y_rad[row], 0.0)
         if is_move(budgets, request):

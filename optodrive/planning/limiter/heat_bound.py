@@ -1,7 +1,8 @@
-"""The bound on heat, node by node, each in closed form between two events. Kernels.
+"""Upper bounds on absorber, wall and touch surface temperatures, in closed form between two events. Kernels.
 
-Absorber, wall and touch surface form a system in which more heat anywhere never means less heat anywhere later. So
-a motion that starts above and never moves slower lies above for ever: each function here gives such a motion.
+The nodes form a cooperative system: a higher temperature of one node never lowers another one later. By the comparison
+principle a supersolution, which starts above the solution and never changes more slowly, stays above it. Every function
+here computes a supersolution, except the lower bound of the absorber's rise.
 """
 
 from math import exp, inf, log
@@ -12,17 +13,16 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.planning.limiter.budget import HeatBound
 
 COOLING_STEP_GROWTH = 1.1
-"""In the dark each exchange between walls may be so much longer than the one before."""
+"""Largest ratio of two successive exchange steps while the gate is off."""
 
 
 class ThermalNodes(NamedTuple):
-    """The bound while a plan is walked through; arrays are written to.
+    """Temperature bounds of all nodes while a plan is applied; the arrays are modified.
 
-    absorber_k: [p] rise over the wall at the end of the pixel's last pulse, dark_since_s [p]
-    wall_k, touch_k: [p, 2] with the least and the greatest capacity or lag, at nodes_at_s [p]
-    least_k: [p] the rise over the wall then, at least
-    inflow_w: [p] what neighbours send at most until the next exchange
-    exchanged_at_s: [1] when walls last exchanged heat; crude_k, firm_k: [p] scratch
+    absorber_k, lower_bound_k: [p] upper and lower bound of the absorber's rise over its wall at last_pulse_end_s [p]
+    wall_k, touch_k: [p, 2] bounds for the smallest and the largest capacity or lag, at nodes_at_s [p]
+    inflow_w: [p] upper bound on the heat flow from neighbours until the next exchange
+    exchanged_at_s: [1] time of the last exchange between walls; coarse_k, refined_k: [p] scratch arrays
     """
 
     absorber_k: FloatArray
@@ -39,9 +39,9 @@ class ThermalNodes(NamedTuple):
 
 @kernel
 def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float, time_s: float) -> float:
-    """Rise over the wall after time_s at constant power, along the chords below the loss.
+    """Return the absorber's rise over its wall after `time_s` at constant power, along the chords below the loss.
 
-    Warming counts with the least capacity, cooling with the greatest.
+    Warming uses the smallest heat capacity, cooling the largest.
     """
     r_k_per_w = heat.r_k_per_w[pixel]
     drive_w = heat.epsilon[pixel] * power_w
@@ -71,7 +71,7 @@ def absorber_after_k(heat: HeatBound, pixel: int, rise_k: float, power_w: float,
 
 @kernel
 def lower_bound_after_k(heat: HeatBound, pixel: int, lower_bound_k: float, power_w: float, time_s: float) -> float:
-    """Least rise over the wall after time_s at constant power."""
+    """Return the lower bound of the absorber's rise over its wall after `time_s` at constant power."""
     steady_k = heat.lower_bound_k_per_w[pixel] * power_w
     rate = heat.lower_bound_rate_per_s[pixel, 0 if steady_k > lower_bound_k else 1]
     return float(steady_k + (lower_bound_k - steady_k) * exp(-rate * time_s))
@@ -79,13 +79,13 @@ def lower_bound_after_k(heat: HeatBound, pixel: int, lower_bound_k: float, power
 
 @kernel
 def wall_bound_k(heat: HeatBound, nodes: ThermalNodes, pixel: int) -> float:
-    """The wall's rise at its own time, whatever its capacity."""
+    """Return the bound on the wall's rise at its own time for every capacity within the uncertainty."""
     return float(heat.wall_specht_ratio * max(nodes.wall_k[pixel, 0], nodes.wall_k[pixel, 1]))
 
 
 @kernel
 def wall_after_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, capacity: int, time_s: float) -> float:
-    """One of a wall's two values time_s after its own time, without light."""
+    """Return one of a wall's two bounds `time_s` after its own time, with the gate off."""
     steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel]
     rate = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[capacity]
     return float(steady_k + (nodes.wall_k[pixel, capacity] - steady_k) * exp(-rate * time_s))
@@ -93,13 +93,13 @@ def wall_after_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, capacity: int
 
 @kernel
 def touch_after_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, lag: int, drive_k: float, time_s: float) -> float:
-    """One of a touch surface's two values time_s later, driven towards drive_k."""
+    """Return one of a touch surface's two bounds `time_s` later, driven towards `drive_k`."""
     return float(drive_k + (nodes.touch_k[pixel, lag] - drive_k) * exp(-time_s / heat.touch_lag_s[lag]))
 
 
 @kernel
 def advance_pixel(heat: HeatBound, nodes: ThermalNodes, pixel: int, to_s: float) -> None:
-    """Bring a pixel's wall and touch surface to a later time, without light."""
+    """Advance a pixel's wall and touch surface to a later time, with the gate off."""
     time_s = to_s - nodes.nodes_at_s[pixel]
     if time_s <= 0.0:
         return
@@ -120,13 +120,13 @@ def advance_pixel(heat: HeatBound, nodes: ThermalNodes, pixel: int, to_s: float)
 def _relax(
     heat: HeatBound, nodes: ThermalNodes, pixel: int, wall_0: float, wall_1: float, touch_0: float, touch_1: float
 ) -> None:
-    """Let a pixel keep these shares of its distances from where it is driven to."""
+    """Reduce the distances of wall and touch surface from their steady values to the given fractions."""
     steady_k = nodes.inflow_w[pixel] / heat.wall_w_per_k[pixel]
     walls_k, touch_k = nodes.wall_k[pixel], nodes.touch_k[pixel]
     before_k = max(walls_k[0], walls_k[1])
     walls_k[0] = steady_k + (walls_k[0] - steady_k) * wall_0
     walls_k[1] = steady_k + (walls_k[1] - steady_k) * wall_1
-    # A wall moves one way between events: its largest value lies at an end.
+    # A wall is monotone between events, so its maximum lies at one end.
     drive_k = heat.touch_per_wall_k * heat.wall_specht_ratio * max(before_k, walls_k[0], walls_k[1])
     touch_k[0] = drive_k + (touch_k[0] - drive_k) * touch_0
     touch_k[1] = drive_k + (touch_k[1] - drive_k) * touch_1
@@ -134,7 +134,7 @@ def _relax(
 
 @kernel
 def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: float) -> None:
-    """Bring every wall to a later time; those that were not lit since from_s share their factors."""
+    """Advance every pixel to a later time; pixels without a pulse since `from_s` share their decay factors."""
     cached_w_per_k, wall_0, wall_1 = -1.0, 1.0, 1.0
     touch_0 = exp(-(to_s - from_s) / heat.touch_lag_s[0])
     touch_1 = exp(-(to_s - from_s) / heat.touch_lag_s[1])
@@ -153,7 +153,7 @@ def _advance_all(heat: HeatBound, nodes: ThermalNodes, from_s: float, to_s: floa
 
 @kernel
 def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_width_s: float) -> None:
-    """Let walls exchange heat up to to_s, in steps; afterwards inflow_w holds for one step and a pulse more."""
+    """Exchange heat between walls up to `to_s` in steps; `inflow_w` then holds for one step and one more pulse."""
     if heat.exchange_step_s == inf:  # no walls
         return
     if nodes.exchanged_at_s[0] == -inf:
@@ -175,10 +175,12 @@ def exchange_wall_heat(heat: HeatBound, nodes: ThermalNodes, to_s: float, pulse_
 
 @kernel
 def _update_inflow(heat: HeatBound, nodes: ThermalNodes, horizon_s: float, pulses_k: float) -> None:
-    """What neighbours send at most during ahead_s, in which all pulses together warm walls by pulses_k.
+    """Update the upper bound on the heat flow from neighbours during `horizon_s`.
 
-    No wall passes what its neighbours hold it to: first all of them are taken to be as warm as the warmest, then as
-    warm as that allows them to become.
+    pulses_k: total rise of the walls by all pulses in that time.
+
+    Two iterations of a fixed-point bound: all walls are first assumed as warm as the warmest one, then as warm as the
+    resulting inflow allows.
     """
     pixels = len(nodes.inflow_w)
     warmest_k = pulses_k
@@ -212,7 +214,7 @@ def _lateral_inflow_w(heat: HeatBound, walls_k: FloatArray, pixel: int, pulses_k
 
 @kernel
 def _max_wall_k(heat: HeatBound, nodes: ThermalNodes, pixel: int, inflow_w: float, time_s: float) -> float:
-    """The most a wall without light of its own reaches within time_s."""
+    """Return the largest rise that a wall reaches within `time_s` by its inflow alone."""
     wall_k = wall_bound_k(heat, nodes, pixel)
     steady_k = inflow_w / heat.wall_w_per_k[pixel]
     fraction = min(1.0, heat.wall_w_per_k[pixel] / heat.wall_j_per_k[0] * time_s)

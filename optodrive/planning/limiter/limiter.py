@@ -1,8 +1,8 @@
-"""(PulsePlan, BudgetState) → (LimitedPlan, BudgetState): no pulse passes that a cap does not allow.
+"""Limit the pulses of a plan to what the caps allow, given the budget state that earlier plans left.
 
-Caps bound a region of absorbers, walls and touch surfaces that the dark never leaves: walls are never let warmer than
-the touch surface bears for ever. So it is enough to look at each pulse's end; nothing already accepted can make a
-later moment too warm.
+The caps define a set of absorber, wall and touch temperatures that is invariant while the gate is off: no wall is
+allowed above the temperature at which the touch surface would reach its cap in steady state. It is therefore sufficient
+to check each pulse up to its end; accepted pulses cannot exceed a cap at any later time.
 """
 
 from dataclasses import fields, replace
@@ -28,7 +28,7 @@ from optodrive.planning.limiter.workspace import LimiterWorkspace, PixelBudgets,
 
 
 class _EncodedPulses(NamedTuple):
-    """Encoded pulses, and without power those that leave dark; all [n]."""
+    """Encoded pulses, together with the omitted pulses at zero power; all arrays [n]."""
 
     start_s: FloatArray
     width_s: FloatArray
@@ -38,36 +38,36 @@ class _EncodedPulses(NamedTuple):
 
 
 class TimedPulses(Protocol):
-    """What the beam does, pulse by pulse; all [n]."""
+    """Pulses of the beam in order of time; all arrays [n]."""
 
     @property
     def start_s(self) -> FloatArray:
-        """Gate on."""
+        """Gate-on time, s."""
 
     @property
     def width_s(self) -> FloatArray:
-        """Gate-on time."""
+        """Gate-on duration, s."""
 
     @property
     def x_rad(self) -> FloatArray:
-        """Mechanical mirror angle."""
+        """Mechanical angle of the x mirror, rad."""
 
     @property
     def y_rad(self) -> FloatArray:
-        """Mechanical mirror angle."""
+        """Mechanical angle of the y mirror, rad."""
 
     @property
     def power_w(self) -> FloatArray:
-        """Mean incident power while on."""
+        """Mean incident power while the gate is on, W."""
 
 
 MAX_WAIT_S = 3600.0
-"""What does not fit after an hour in the dark never does."""
+"""A plan that does not fit after this time with the gate off never fits."""
 WAIT_RESOLUTION_S = 1e-3
 
 
 def cold_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
-    """A display at rest, its mirrors in the middle."""
+    """Return the budget state of a cold display with its mirrors at their centre."""
 
     def zero() -> FloatArray:
         return np.zeros(pixel_count)
@@ -97,7 +97,7 @@ def cold_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
 
 
 def shift_state(state: BudgetState, offset_s: float) -> BudgetState:
-    """The same state on a time line whose zero lies offset_s earlier."""
+    """Return the same state on a time line whose zero lies `offset_s` earlier."""
     return replace(
         state,
         at_s=state.at_s + offset_s,
@@ -112,11 +112,12 @@ def shift_state(state: BudgetState, offset_s: float) -> BudgetState:
 def limit(
     plan: PulsePlan, state: BudgetState, budget: Budget, policy: Policy = "trim"
 ) -> tuple[LimitedPlan, BudgetState]:
-    """Take from each pulse's power what the caps do not allow; times and widths stay.
+    """Reduce the power of each pulse to what the caps allow; times and widths do not change.
 
-    plan.start_s and state.at_s share one time line. Raises OverBudgetError where a pulse would be trimmed under any
-    other policy than "trim", and RefusedError at any time where a pulse is wider than the cap or starts before the
-    state's time.
+    plan.start_s and state.at_s are on the same time line. Returns the limited plan and the state after it.
+
+    Raises OverBudgetError under every policy except "trim" if a pulse would be trimmed. Raises RefusedError under every
+    policy if a pulse is wider than the cap or starts before the state's time.
     """
     applied, power_w, cause, workspace = _apply_plan(
         plan.pixel, plan, 0.0, state, budget, TRIM if policy == "trim" else STOP
@@ -136,7 +137,7 @@ def limit(
 
 
 def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float:
-    """How much later the plan would have to come to fit untrimmed, s; infinite where it never does."""
+    """Compute the delay after which the plan fits without trimming, s; infinite if it never fits."""
 
     def fits(delay_s: float) -> bool:
         return _apply_plan(plan.pixel, plan, delay_s, state, budget, STOP)[0] == len(plan)
@@ -156,7 +157,7 @@ def compute_wait_s(plan: PulsePlan, state: BudgetState, budget: Budget) -> float
 
 
 def galvo_feasible_prefix(plan: PulsePlan, state: BudgetState, budget: Budget, delay_s: float = 0.0) -> int:
-    """How many of a plan's first pulses have moves that the mirrors bear, if the plan comes later_s later."""
+    """Count the pulses before the first one whose move exceeds the galvo cap, for a plan delayed by `delay_s`."""
     empty = np.zeros(0)
     budgets = PixelBudgets(
         bucket_j=empty,
@@ -173,18 +174,18 @@ def galvo_feasible_prefix(plan: PulsePlan, state: BudgetState, budget: Budget, d
 
 
 def concatenate(batches: list[LimitedPlan], state: BudgetState, budget: Budget) -> LimitedPlan:
-    """One plan of limited pieces, in order; without any, the empty plan of a display in `state`."""
+    """Concatenate limited batches in order; without batches, return the empty plan of a display in `state`."""
     if not batches:
         return limit(EMPTY_PLAN, state, budget)[0]
     columns = {
-        item.name: np.concatenate([getattr(piece, item.name) for piece in batches]) for item in fields(LimitedPlan)
+        item.name: np.concatenate([getattr(batch, item.name) for batch in batches]) for item in fields(LimitedPlan)
     }
-    columns["headroom_k"] = np.min([piece.headroom_k for piece in batches], axis=0)
+    columns["headroom_k"] = np.min([batch.headroom_k for batch in batches], axis=0)
     return LimitedPlan(**columns)
 
 
 def commit_until(plan: LimitedPlan, until_s: float, state: BudgetState, budget: Budget) -> BudgetState:
-    """What a plan leaves of which no pulse from until_s on was fired: the earlier ones count in full."""
+    """Return the state after the pulses of a plan that start before `until_s`, which count in full."""
     count = int(np.searchsorted(plan.start_s, until_s))
     columns = {item.name: getattr(plan, item.name)[:count] for item in fields(PulsePlan)}
     return close_workspace(
@@ -193,15 +194,17 @@ def commit_until(plan: LimitedPlan, until_s: float, state: BudgetState, budget: 
 
 
 def commit_executed(pixel: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget) -> BudgetState:
-    """What pulses [n] leave that were fired, in order of time, whatever the caps say."""
+    """Return the state after executed pulses [n] in order of time, regardless of the caps."""
     return close_workspace(_apply_plan(pixel, pulses, 0.0, state, budget, COUNT_ONLY)[3], budget)
 
 
 def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget) -> None:
-    """Check pulses [n] as decoded from the very bytes that are about to leave; row: the plan's pulse each is part of.
+    """Check pulses [n], decoded from the bytes that are about to be sent, against the caps.
 
-    Raises LocalProtocolError if any passes a cap. Every bound holds, but the heat between walls is bounded a little
-    otherwise the more often it is reckoned: so it is where the plan's own was, also where its pulses leave dark.
+    row: [n] row of the plan to which each pulse belongs. Raises LocalProtocolError if a pulse exceeds a cap.
+
+    The wall-exchange bound depends on its evaluation times. It is therefore evaluated at the plan's own times,
+    including those of pulses that were trimmed to zero power.
     """
     omitted = np.setdiff1d(np.arange(len(plan)), row)
     order = np.argsort(np.concatenate([pulses.start_s, plan.start_s[omitted]]), kind="stable")
@@ -211,7 +214,7 @@ def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetSta
     power_w = np.concatenate([pulses.power_w, np.zeros(len(omitted))])
     encoded = _EncodedPulses(*(column[order] for column in (*columns, power_w)))
     pixel = np.concatenate([plan.pixel[row], plan.pixel[omitted]])[order]
-    exact = budget._replace(galvo=budget.galvo._replace(code_step_rad=0.0, interval_shrink_s=0.0))
+    exact = budget._replace(galvo=budget.galvo._replace(rad_per_code=0.0, timing_slack_s=0.0))
     stop_row, allowed_w, cause, _ = _apply_plan(pixel, encoded, 0.0, state, exact, STOP)
     if stop_row < len(pixel):
         raise LocalProtocolError(
@@ -226,7 +229,7 @@ def _apply_plan(
     count = len(pixel)
     workspace = open_workspace(state, count)
     power_w, cause = np.zeros(count), np.zeros(count, dtype=np.int64)
-    # Copies, because a kernel is compiled for one layout of its arrays.
+    # Copies are contiguous: a kernel is compiled for one memory layout.
     applied = apply_pulses(
         budget,
         workspace,

@@ -36,9 +36,10 @@ def apply_pulses(
     granted_w: FloatArray,
     cause: IntArray,
 ) -> int:
-    """Walk n pulses in order of time; the ledger, given_w and cause [n] are written. Returns how many were walked.
+    """Apply n pulses in order of time; modifies the workspace, `granted_w` [n] and `cause` [n] (cap numbers).
 
-    Fewer than n under STOP: then given_w and cause of the next row say what would have been allowed, and by which cap.
+    Returns the number of applied pulses. Under STOP it can be less than n; granted_w and cause of the following row
+    then hold the power that would have been granted and the binding cap.
     """
     for row in range(len(pixel)):
         request = PulseRequest(pixel[row], start_s[row], width_s[row], x_rad[row], y_rad[row], power_w[row])
@@ -61,7 +62,7 @@ def apply_pulses(
 
 @kernel
 def _compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: PulseRequest) -> PixelStartState:
-    """The pixel as a pulse begins."""
+    """Advance a pixel to the start of a pulse and return its state there."""
     exchange_wall_heat(budget.heat, workspace.nodes, request.start_s, budget.caps.pulse_width_s)
     advance_pixel(budget.heat, workspace.nodes, request.pixel, request.start_s)
     budgets, pixel = workspace.budgets, request.pixel
@@ -77,7 +78,7 @@ def _compute_start_state(budget: Budget, workspace: LimiterWorkspace, request: P
 def _commit(
     budget: Budget, workspace: LimiterWorkspace, request: PulseRequest, power_w: float, before: PixelStartState
 ) -> None:
-    """Count a pulse as fired."""
+    """Add a pulse to all budgets."""
     heat, nodes, budgets, pixel = budget.heat, workspace.nodes, workspace.budgets, request.pixel
     rise_k, lower_bound_k, bucket_j, merged_width_s = before
     end_s = request.start_s + request.width_s

@@ -1,4 +1,8 @@
-"""What walls and touch surfaces bear of a pulse: as if its heat had arrived, and less the heat on its way. Kernels."""
+"""Largest power of a pulse for its wall and touch surface, with a credit for heat in transit. Kernels.
+
+The bounds of both nodes count the heat of a pulse as if it arrived at once. Where that is too strict, the heat that is
+certainly still in the absorber is subtracted.
+"""
 
 from math import exp, inf, log
 from typing import NamedTuple
@@ -15,12 +19,12 @@ from optodrive.planning.limiter.heat_bound import (
 
 BISECTIONS = 16
 LOOK_AHEAD_TAUS = 2.0
-"""How many of an absorber's own times a wall is looked ahead for its touch surface."""
+"""Number of absorber time constants over which the warming of a wall is added to its touch surface's drive."""
 WALL_NODE, TOUCH_NODE = range(2)
 
 
 class PulseRequest(NamedTuple):
-    """One pulse as asked for."""
+    """A pulse as requested."""
 
     pixel: int
     start_s: float
@@ -32,7 +36,7 @@ class PulseRequest(NamedTuple):
 
 @kernel
 def _wall_cap_k(budget: Budget) -> float:
-    """No wall may be warmer than the touch surface can bear for ever: then no later moment in the dark is too warm."""
+    """Return the wall's cap, or the smaller rise at which the touch surface reaches its cap in steady state."""
     per_wall = budget.heat.touch_per_wall_k * budget.heat.touch_specht_ratio
     return min(budget.caps.wall_k, budget.caps.touch_k / per_wall) if per_wall > 0.0 else budget.caps.wall_k
 
@@ -41,9 +45,10 @@ def _wall_cap_k(budget: Budget) -> float:
 def slow_node_limits_w(
     budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float
 ) -> tuple[float, float]:
-    """Largest power for wall and touch surface.
+    """Return the largest power of a pulse for the wall and for the touch surface, W.
 
-    First as if all its heat had arrived by the pulse's end; where that is too little, less the heat on its way.
+    The power is computed as if all heat arrived by the pulse's end. If that is less than requested, the in-transit heat
+    is credited.
     """
     heat, pixel, width_s = budget.heat, request.pixel, request.width_s
     wall_w = touch_w = inf
@@ -71,7 +76,7 @@ def slow_node_limits_w(
 def _max_node_power_w(
     budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, node: int, feasible_w: float
 ) -> float:
-    """The largest power, from sure_w up to what is asked for, that a wall or touch surface bears."""
+    """Bisect for the largest power, from `feasible_w` to the requested power, that keeps a node within its cap."""
     if _is_within_cap(budget, nodes, request, lower_bound_k, node, request.power_w):
         return request.power_w
     low_w, high_w = feasible_w, request.power_w
@@ -88,11 +93,11 @@ def _max_node_power_w(
 def _is_within_cap(
     budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, node: int, power_w: float
 ) -> bool:
-    """Whether a wall or touch surface stays within its cap during a pulse, and for ever in the dark after it.
+    """Return whether a wall or touch surface stays within its cap during a pulse and at all times after it, gate off.
 
-    In that dark its bound, y, falls towards what drives it, d, and the heat on its way, h, falls more quickly: y − h
-    may rise. Of h only so much counts that it does not: y falls at λ (y − d) at least, h at its rate at most. By the
-    time d is passed by a later one, y itself is below the cap.
+    After the pulse the node's bound y decays towards its drive d, and the in-transit heat h decays faster, so y − h
+    may rise. Only as much of h is credited as keeps y − h from rising: y falls at a rate of at least λ (y − d), h at
+    most at its own rate. By the time a larger drive replaces d, y itself is below the cap.
     """
     heat, pixel = budget.heat, request.pixel
     end_k = lower_bound_after_k(heat, pixel, lower_bound_k, power_w, request.width_s)
@@ -103,11 +108,8 @@ def _is_within_cap(
             neighbours_w += heat.lateral_w_per_k * _wall_cap_k(budget)
     wall_k = wall_peak_k(budget, nodes, request, power_w)
     if node == WALL_NODE:
-        cap_k, credit, deficit_k = (
-            _wall_cap_k(budget),
-            heat.wall_transit_credit,
-            heat.wall_transit_credit * heat.deficit_k,
-        )
+        cap_k, credit = _wall_cap_k(budget), heat.wall_transit_credit
+        deficit_k = credit * heat.deficit_k
         peak_k, after_k = wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w), wall_k
         rate, drive_k = heat.wall_w_per_k[pixel] / heat.wall_j_per_k[1], neighbours_w / heat.wall_w_per_k[pixel]
     else:
@@ -115,10 +117,8 @@ def _is_within_cap(
         deficit_k = credit * heat.deficit_k + heat.touch_deficit_k
         peak_k, after_k = _touch_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
         wall_warming_k = neighbours_w / heat.wall_j_per_k[0] * LOOK_AHEAD_TAUS * min_tau_s
-        rate, drive_k = (
-            1.0 / heat.touch_lag_s[1],
-            heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_warming_k),
-        )
+        rate = 1.0 / heat.touch_lag_s[1]
+        drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_warming_k)
     in_transit_k = min(credit * end_k - deficit_k, rate * min_tau_s * (after_k - drive_k))
     return bool(max(peak_k, after_k - max(0.0, in_transit_k)) <= cap_k)
 
@@ -127,7 +127,7 @@ def _is_within_cap(
 def wall_credited_peak_k(
     budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, power_w: float
 ) -> float:
-    """The pixel's wall at most during a pulse, less the heat still in the absorber."""
+    """Return the peak bound on the pixel's wall during a pulse, less the heat still in the absorber."""
     heat, pixel = budget.heat, request.pixel
     peak_k = 0.0
     for capacity in range(2):
@@ -154,7 +154,7 @@ def wall_credited_peak_k(
 def _touch_credited_peak_k(
     budget: Budget, nodes: ThermalNodes, request: PulseRequest, lower_bound_k: float, power_w: float
 ) -> tuple[float, float]:
-    """The pixel's touch surface at most during a pulse, less the heat on its way; and its bound at the pulse's end."""
+    """Return the peak bound on the touch surface during a pulse less in-transit heat, and its full bound at the end."""
     heat, pixel = budget.heat, request.pixel
     drive_k = heat.touch_per_wall_k * wall_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
     peak_k = bound_k = after_k = 0.0
@@ -191,7 +191,10 @@ def _credited_peak_k(
     rate: float,
     credit: float,
 ) -> float:
-    """Largest value of y − part × u during a pulse: y goes from before_k to steady_k, u is the absorber at least."""
+    """Return the largest value of y − credit × u during a pulse.
+
+    y relaxes from `before_k` to `steady_k`; u is the lower bound of the absorber's rise.
+    """
     lower_steady_k = heat.lower_bound_k_per_w[request.pixel] * power_w
     lower_rate = heat.lower_bound_rate_per_s[request.pixel, 0 if lower_steady_k > lower_bound_k else 1]
     peak_k = before_k - credit * lower_bound_k
@@ -201,7 +204,7 @@ def _credited_peak_k(
         y_k = steady_k + (before_k - steady_k) * exp(-rate * at_s)
         u_k = lower_steady_k + (lower_bound_k - lower_steady_k) * exp(-lower_rate * at_s)
         peak_k = max(peak_k, y_k - credit * u_k)
-        # Where both fall, the difference may peak in between.
+        # If both fall, the difference may peak in between.
         if credit_fall > node_fall > 0.0 and lower_rate > rate:
             at_s = min(at_s, log(credit_fall / node_fall) / (lower_rate - rate))
     return float(peak_k)
@@ -209,7 +212,7 @@ def _credited_peak_k(
 
 @kernel
 def wall_peak_k(budget: Budget, nodes: ThermalNodes, request: PulseRequest, power_w: float) -> float:
-    """Bound on the pixel's wall during a pulse."""
+    """Return the peak bound on the pixel's wall during a pulse."""
     heat = budget.heat
     max_k = wall_bound_k(heat, nodes, request.pixel)
     for capacity in range(2):

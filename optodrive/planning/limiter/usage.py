@@ -18,7 +18,7 @@ class Usage(NamedTuple):
 
 
 def compute_usage(state: BudgetState, budget: Budget, at_s: float) -> tuple[Usage, ...]:
-    """Return the use of every gauged cap at `at_s` on the state's time line, with the gate off since the state's time."""
+    """Return the use of every gauged cap at `at_s`, on the state's time line, with the gate off since the state."""
     levels = compute_levels(state, budget, at_s)
     usages = []
     for cap in CAPS:

@@ -1,4 +1,4 @@
-"""BudgetState, which is kept and never changes, to the ledger that a walk writes to, and back."""
+"""The mutable workspace of the kernels, built from an immutable `BudgetState` and converted back to one."""
 
 from typing import NamedTuple, TypeVar
 
@@ -16,11 +16,11 @@ T = TypeVar("T", bound=np.generic)
 
 
 class PixelBudgets(NamedTuple):
-    """What each pixel's own pulses leave, and the mirrors; arrays are written to.
+    """Budgets of the pixels, and the state of the mirrors; the arrays are modified.
 
-    bucket_j, on_s: [p] at the end of the pixel's last pulse; end_s: [1] end of the display's last pulse
-    peak_k: [p] largest bound on the absorber so far
-    mirror_rad: [2] where the mirrors stand; acceleration2, swing: [2], mirror_at_s: [1], see `mirrors.Motion`
+    bucket_j, merged_width_s: [p] energy bucket, and total width of pulses without a gap, after the pixel's last pulse
+    end_s: [1] end of the display's last pulse; peak_k: [p] largest bound on the absorber so far
+    mirror_rad: [2] mirror angles; galvo_mean_square, galvo_ringing: [2], mirror_at_s: [1], see `GalvoState`
     """
 
     bucket_j: FloatArray
@@ -34,7 +34,7 @@ class PixelBudgets(NamedTuple):
 
 
 class LimiterWorkspace(NamedTuple):
-    """Everything that changes while a plan is walked through."""
+    """Everything that changes while a plan is applied; pixel_chains: one chain per pixel."""
 
     nodes: ThermalNodes
     budgets: PixelBudgets
@@ -44,7 +44,7 @@ class LimiterWorkspace(NamedTuple):
 
 
 def open_workspace(state: BudgetState, capacity: int) -> LimiterWorkspace:
-    """A ledger at `state` with room for so many more pulses."""
+    """Return a workspace at `state` with capacity for that many more pulses."""
     pixels, past = len(state.rise_k), len(state.recent_start_s)
     nodes = ThermalNodes(
         absorber_k=state.rise_k.copy(),
@@ -97,7 +97,7 @@ def _build_chains(count: int, pulses: int) -> WindowChains:
 
 
 def close_workspace(workspace: LimiterWorkspace, budget: Budget) -> BudgetState:
-    """Everything a next plan must know; pulses that no window can reach any more are forgotten."""
+    """Return the state for the next plan, without pulses that no future window contains."""
     nodes, budgets, history = workspace.nodes, workspace.budgets, workspace.history
     at_s, count = float(budgets.end_s[0]), int(history.n_valid[0])
     horizon_s = at_s - max(budget.caps.pixel_window_s, budget.caps.display_window_s)

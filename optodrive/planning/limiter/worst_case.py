@@ -1,7 +1,8 @@
-"""From a declared model with its uncertainty to the coefficients of a bound that holds for all of it.
+"""Worst-case coefficients of the thermal bound over the declared parameter box.
 
-Heat here flows one way in every parameter but the capacities: more power, more resistance, more share, more heat.
-A capacity warms faster when small and remembers longer when large; each node is counted with both (`spread`).
+The temperatures are monotone in every parameter except the heat capacities: they increase with power, resistance and
+coupling. A smaller capacity warms faster and a larger one cools more slowly, so each node is bounded with both extremes
+(`specht_ratio`).
 """
 
 from dataclasses import dataclass
@@ -16,12 +17,12 @@ from optodrive.planning.limiter.caps import CapValues
 
 CHORDS = 8
 STEP_FRACTION = 0.07
-"""Walls exchange heat at steps of this share of the quickest wall's own time."""
+"""Step of the heat exchange between walls, as a fraction of the fastest wall's time constant."""
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Declared relative half-widths; exponent: absolute."""
+    """Declared relative half-widths of the parameters; the exponent's half-width is absolute."""
 
     absorbed_power: float
     bridge_resistance: float
@@ -37,7 +38,7 @@ class Uncertainty:
 
 @dataclass(frozen=True, eq=False)
 class NominalWalls:
-    """A wall node a pixel, K/W and J/K; side, frame: to a neighbour, to the frame, infinite for none."""
+    """One wall node per pixel: resistances to surroundings, neighbour and frame (infinite: none), and capacity."""
 
     r_k_per_w: float
     c_j_per_k: float
@@ -47,7 +48,7 @@ class NominalWalls:
 
 @dataclass(frozen=True)
 class NominalTouch:
-    """The touch surface: share of the gas's and of the wall's rise, and its lag."""
+    """The touch surface: its fractions of the gas's and of the wall's rise, and its lag."""
 
     gas_share: float
     wall_share: float
@@ -56,11 +57,14 @@ class NominalTouch:
 
 @dataclass(frozen=True, eq=False)
 class NominalThermalModel:
-    """The model in use. epsilon, r_k_per_w, c_j_per_k: [p]; exponent: of R = R₀ (T / T₀)ⁿ, T the bridge's mean.
+    """Nominal parameters of the thermal model.
 
-    beside, frame_edges: [p, 4], [p] the lattice; walls, touch: None where the model has none
-    hot_capacity: factor by which a hot absorber may hold more than C; warmer_k: taken off the caps beforehand for what
-    else may warm the display
+    epsilon, r_k_per_w, c_j_per_k: [p] absorbed fraction, bridge resistance and heat capacity of the absorber
+    exponent: n in R = R₀ (T / T₀)ⁿ, with the bridge's mean temperature T
+    neighbours: [p, 4] neighbouring pixels, −1 for none; frame_edges: [p] number of edges at the frame
+    walls, touch: None if the model has no such node
+    hot_capacity_factor: factor by which the capacity of a hot absorber may exceed C
+    extra_rise_k: rise by terms outside the bound, already subtracted from the caps
     """
 
     epsilon: FloatArray
@@ -78,12 +82,12 @@ class NominalThermalModel:
 
 
 def specht_ratio(ratio: float) -> float:
-    """By how much a sum of responses (1/c) e^(−t/rc) may exceed the larger of its values at both ends of c.
+    """Return the factor by which a sum of responses (1/c) e^(−t/rc) can exceed its larger value at the ends of c.
 
-    ratio: of the ends.
+    ratio: larger over smaller end of c.
 
-    With s = 1/c each is s e^(−xs). Between the ends let the weights follow s itself: then e^(−xs) is the geometric
-    mean of its values at the ends, and no mean of the values at the ends exceeds the larger. s itself exceeds the
+    With s = 1/c each response is s e^(−xs). For s between its ends, with weights linear in s, e^(−xs) is the weighted
+    geometric mean of its end values, and no mean of two values exceeds the larger one. s itself exceeds the weighted
     geometric mean of its ends by at most Specht's ratio.
     """
     if ratio == 1.0:
@@ -94,7 +98,10 @@ def specht_ratio(ratio: float) -> float:
 def build_heat_bound(
     model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues, power_max_w: float
 ) -> HeatBound:
-    """The upper corner; raises InputError where a wall or touch surface is too quick beside the absorber."""
+    """Compute the worst-case coefficients.
+
+    power_max_w: largest power of a pulse. Raises InputError if a wall or touch surface is too fast for the absorber.
+    """
     epsilon = model.epsilon * (1 + uncertainty.absorbed_power)
     r_high = model.r_k_per_w * (1 + uncertainty.bridge_resistance)
     c_low = model.c_j_per_k * (1 - uncertainty.absorber_capacity)
@@ -147,7 +154,10 @@ def build_heat_bound(
 def _compute_loss_chords(
     model: NominalThermalModel, uncertainty: Uncertainty, caps: CapValues
 ) -> tuple[FloatArray, FloatArray]:
-    """Chords of the loss u / R(u), times R₀, from 0 to the cap. The loss is concave, so they lie below it."""
+    """Return knots and values of chords of the loss u R₀ / R(u), from 0 to the cap.
+
+    The loss is concave, so the chords lie below it.
+    """
     exponent = model.exponent + uncertainty.exponent if model.exponent > 0 else 0.0
     knot_k = np.linspace(0.0, caps.absorber_k, (CHORDS if exponent > 0 else 1) + 1)
     wall_k = caps.wall_k if np.isfinite(caps.wall_k) and model.walls is not None else 0.0
@@ -157,6 +167,8 @@ def _compute_loss_chords(
 
 @dataclass(frozen=True, eq=False)
 class _WallBound:
+    """Worst-case coefficients of the walls; without walls, those that leave the bound at zero."""
+
     w_per_k: FloatArray
     j_per_k: FloatArray
     k_per_j: FloatArray
@@ -193,20 +205,20 @@ def _build_wall_bound(
     min_w_per_k = compute_conductance(1 + uncertainty.wall_resistance, 1 + uncertainty.side_resistance)
     max_w_per_k = compute_conductance(1 - uncertainty.wall_resistance, 1 - uncertainty.side_resistance)
     c_low = walls.c_j_per_k * (1 - uncertainty.wall_capacity)
-    # All heat of a pulse is put into the wall at once though it comes over the absorber's time: with 1 / (1 − rate ×
-    # time) more of it, the bound lies above the wall at every later moment.
+    # The bound puts all heat of a pulse into the wall at once, but the heat arrives over the absorber's time constant.
+    # With a factor of 1 / (1 − rate × time constant) the bound stays above the wall at all later times.
     retained_fraction = 1.0 - float(max_w_per_k.max()) / c_low * tau_max_s
     lag_retained_fraction = 1.0 - float(min_w_per_k.max()) / c_low * lag_max_s
     if min(retained_fraction, lag_retained_fraction) < 0.5:
         raise InputError(
             "terms.wall_heating",
-            f"a wall that cools in {c_low / float(max_w_per_k.max()):.3g} s",
+            f"a wall time constant of {c_low / float(max_w_per_k.max()):.3g} s",
             f"more than twice the absorber's {max(tau_max_s, lag_max_s):.3g} s",
         )
-    # A wall that cools takes its absorber's heat along.
+    # The absorber follows a cooling wall and adds its own heat capacity.
     carried_j_per_k = float(c_absorber_j_per_k.max()) / retained_fraction
     capacities = np.array([c_low, walls.c_j_per_k * (1 + uncertainty.wall_capacity) + carried_j_per_k])
-    # An absorber colder than its wall, because neighbours warm the wall, lags by more than a hot one does.
+    # An absorber that is colder than its wall, which neighbours warm, lags more than a hot one.
     cold_absorber_factor = 1 + carried_j_per_k / (c_low + carried_j_per_k) * (resistance_factor - 1)
     return _WallBound(
         w_per_k=min_w_per_k,
@@ -223,6 +235,8 @@ def _build_wall_bound(
 
 @dataclass(frozen=True, eq=False)
 class _TouchBound:
+    """Worst-case coefficients of the touch surface; gas_s: weight of the gas's rise over the wall."""
+
     lag_s: FloatArray
     k_per_j: FloatArray
     per_wall_k: float
@@ -238,11 +252,11 @@ def _build_touch_bound(
     tau_max_s: float,
     wall: _WallBound,
 ) -> _TouchBound:
-    """A bound on s + c₁ u + c₂ h: touch surface, absorber over its wall, gas over the wall.
+    """Bound s + c₁ u + c₂ h, with the touch surface s, the absorber over its wall u and the gas over the wall h.
 
-    Its rate is no more than (drive − itself) / lag + what the pulse brings, if c₂ = gas share × τ_g / (lag − τ_g) and
-    c₁ = gas share / 2 × τ / lag / ((1 − τ_g / lag) (1 − τ / lag)). A wall that cools leaves both behind: the drive is
-    the wall × (both shares + (c₁ + c₂) lag × the wall's quickest rate).
+    With c₂ = gas share × τ_g / (lag − τ_g) and c₁ = gas share / 2 × τ / lag / ((1 − τ_g / lag) (1 − τ / lag)), its rate
+    is at most (drive − value) / lag + the heating by the pulse. Absorber and gas lag behind a cooling wall, so the
+    drive is the wall × (both shares + (c₁ + c₂) lag × the wall's fastest rate).
     """
     touch = model.touch
     if touch is None:
@@ -269,6 +283,8 @@ def _build_touch_bound(
 
 @dataclass(frozen=True, eq=False)
 class _LowerBound:
+    """Coefficients of the lower bound of an absorber's rise over its wall."""
+
     k_per_w: FloatArray
     rate_per_s: FloatArray
     deficit_k: float
@@ -284,7 +300,7 @@ def _build_lower_bound(
     wall: _WallBound,
     touch: _TouchBound,
 ) -> _LowerBound:
-    """The lower corner of an absorber over its wall: a wall that nothing warms but the absorber's own heat."""
+    """Bound the absorber's rise over its wall from below: a wall that only the absorber's own heat warms."""
     r_low = model.r_k_per_w * (1 - uncertainty.bridge_resistance)
     coupling_factor = 1 + c_high / wall.j_per_k[0] if model.walls is not None else np.ones_like(c_high)
     rate_per_s = np.stack([coupling_factor / (r_low * c_high), coupling_factor / (r_low * c_low)], axis=1)

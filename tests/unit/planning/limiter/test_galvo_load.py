@@ -23,8 +23,8 @@ SERVO = GalvoModel(
     slew_rad_per_s=100.0,
     lead_in_s=5e-3,
     averaging_s=1.0,
-    code_step_rad=0.0,
-    interval_shrink_s=0.0,
+    rad_per_code=0.0,
+    timing_slack_s=0.0,
 )
 AT_REST = GalvoState(0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -92,8 +92,8 @@ def motions(draw):
         slew_rad_per_s=draw(st.floats(50, 500)),
         lead_in_s=draw(st.sampled_from([1e-3, 5e-3])),
         averaging_s=draw(st.sampled_from([0.05, 0.3, 1.0])),
-        code_step_rad=0.0,
-        interval_shrink_s=0.0,
+        rad_per_code=0.0,
+        timing_slack_s=0.0,
     )
     now_s, at_rad, rows = 0.0, 0.0, []
     for _ in range(draw(st.integers(1, 30))):

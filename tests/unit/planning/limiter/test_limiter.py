@@ -43,8 +43,8 @@ SERVO = GalvoModel(
     slew_rad_per_s=100.0,
     lead_in_s=1e-3,
     averaging_s=1.0,
-    code_step_rad=0.0,
-    interval_shrink_s=0.0,
+    rad_per_code=0.0,
+    timing_slack_s=0.0,
 )
 
 
