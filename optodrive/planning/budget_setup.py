@@ -1,4 +1,4 @@
-"""The budget of a configuration: its caps, and the model in use with the uncertainty declared for it."""
+"""Build the limiter's budget from a configuration: caps, worst-case thermal model and galvo model."""
 
 from collections.abc import Mapping
 
@@ -23,11 +23,11 @@ from optodrive.planning.limiter.worst_case import (
 )
 
 BOUNDED_TERMS = ("bridge_conductivity", "wall_heating", "lateral_conduction", "touch_surface")
-"""Terms that the bound on heat counts with."""
+"""Terms that the thermal bound models explicitly."""
 
 
 def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -> Budget:
-    """Caps, bound and mirrors; raises InputError where a bound cannot be given."""
+    """Build the budget; raises InputError if a cap is not above its base temperature or a term has no bound."""
     limits, ambient_c = config.limits, config.ambient_c
     heat_gain = compute_heat_gain_bound(parameters, pixels, config)
     base_c = ambient_c + heat_gain.uniform_rise_k
@@ -56,7 +56,7 @@ def build_budget(config: Config, parameters: ParameterSet, pixels: PixelArray) -
 
 
 def build_galvo_model(config: Config) -> GalvoModel:
-    """The mirrors' servo, and the lead that every plan keeps."""
+    """Build the model of the mirrors' servos, with the lead-in that every plan keeps."""
     scanner = config.scanner
     return GalvoModel(
         omega_rad_per_s=2.0 * np.pi * scanner.bandwidth_hz,
@@ -71,9 +71,9 @@ def build_galvo_model(config: Config) -> GalvoModel:
 
 
 def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config: Config) -> HeatGainBound:
-    """What all terms together that the bound does not follow add to heat, at the most.
+    """Bound the heat that all terms outside the thermal bound add together.
 
-    Raises InputError for a term that may make something warmer by nobody knows how much.
+    Raises InputError for a term without such a bound.
     """
     terms = {key: parameters.term_values(key) for key in parameters.terms}
     cap_k, full_w = config.limits.absorber_max_c - config.ambient_c, config.laser.max_power_w
@@ -86,40 +86,40 @@ def compute_heat_gain_bound(parameters: ParameterSet, pixels: PixelArray, config
         * r_k_per_w
         * _compute_uncertainty_factor(config, terms, heat_gain.capacity_factor)
     )
-    everywhere_k = _combine_heat_gains(terms, OperatingEnvelope(cap_k, display_rise_k, full_w)).uniform_rise_k
-    # Absorbers pass what warms them on to walls and touch surfaces, and hold it back for a while: a little each.
+    uniform_rise_k = _combine_heat_gains(terms, OperatingEnvelope(cap_k, display_rise_k, full_w)).uniform_rise_k
+    # A rise of the absorbers also warms walls and touch surfaces, with a delay; each adds a small part.
     factor = 1.0
     if "wall_heating" in terms:
         factor += 2.0 * c_j_per_k / terms["wall_heating"]["capacity"]
     if "touch_surface" in terms:
         touch = terms["touch_surface"]
         factor += touch["gas_share"] * r_k_per_w * c_j_per_k / touch["lag"]
-    return heat_gain._replace(uniform_rise_k=factor * everywhere_k)
+    return heat_gain._replace(uniform_rise_k=factor * uniform_rise_k)
 
 
 def _combine_heat_gains(terms: Mapping[str, TermValues], envelope: OperatingEnvelope) -> HeatGainBound:
+    """Combine the bounds of all terms outside the thermal bound."""
     power = capacity = 1.0
-    everywhere_k = 0.0
+    uniform_rise_k = 0.0
     for key in terms:
         if key in BOUNDED_TERMS:
             continue
         term_gain = discover_terms()[key].bound_heat_gain(terms[key], envelope)
         if term_gain is None:
             raise InputError(
-                f"terms.{key}", key, "a term that the limiter's bound holds for: it may warm what is capped"
+                f"terms.{key}", key, "a term that the limiter can bound: this one can warm capped nodes without limit"
             )
-        power, capacity, everywhere_k = (
-            power * term_gain.power_factor,
-            capacity * term_gain.capacity_factor,
-            everywhere_k + term_gain.uniform_rise_k,
-        )
-    return HeatGainBound(power, capacity, everywhere_k)
+        power *= term_gain.power_factor
+        capacity *= term_gain.capacity_factor
+        uniform_rise_k += term_gain.uniform_rise_k
+    return HeatGainBound(power, capacity, uniform_rise_k)
 
 
 def _compute_uncertainty_factor(config: Config, terms: Mapping[str, TermValues], capacity: float) -> float:
-    """By how much more than ε P R all absorbers together may rise: what is declared unsure, and hot bridges.
+    """Return the factor by which the summed rise of all absorbers can exceed ε P R.
 
-    Their heat stays below ε P × the longest R C; as rises, divided by the least C.
+    It covers the declared uncertainty and the higher resistance of hot bridges. The absorbers' heat stays below ε P ×
+    the largest R C; dividing it by the smallest C gives the rise.
     """
     uncertainty = config.limits.uncertainty
     temperature_ratio = (config.limits.absorber_max_c + ZERO_CELSIUS_K) / (config.ambient_c + ZERO_CELSIUS_K)
@@ -142,16 +142,19 @@ def build_nominal_model(
     ambient_k: float,
     heat_gain: HeatGainBound = NO_HEAT_GAIN,
 ) -> NominalThermalModel:
-    """What the limiter takes from a parameter set: everything that moves heat."""
+    """Build the limiter's thermal model from a parameter set.
+
+    ambient_k: ambient temperature, K; heat_gain: bound on the terms outside the model
+    """
     terms = {key: parameters.term_values(key) for key in parameters.terms}
-    wall, side, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
+    wall, lateral, touch = (terms.get(key) for key in ("wall_heating", "lateral_conduction", "touch_surface"))
     walls = None
     if wall is not None:
         walls = NominalWalls(
             r_k_per_w=wall["resistance"],
             c_j_per_k=wall["capacity"],
-            lateral_k_per_w=side["resistance"] if side else np.inf,
-            frame_k_per_w=side["frame_resistance"] if side else np.inf,
+            lateral_k_per_w=lateral["resistance"] if lateral else np.inf,
+            frame_k_per_w=lateral["frame_resistance"] if lateral else np.inf,
         )
     return NominalThermalModel(
         epsilon=pixels.epsilon * heat_gain.power_factor,

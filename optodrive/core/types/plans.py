@@ -1,4 +1,4 @@
-"""Pulse plans, the limiter's state between plans, and pulses reported as executed."""
+"""Pulse plans, the limiter's state between plans, and pulses that the board reports as executed."""
 
 from dataclasses import dataclass
 
@@ -9,16 +9,16 @@ from optodrive.core.types.arrays import FloatArray, IntArray, StrArray, freeze_a
 
 @dataclass(frozen=True, eq=False)
 class PulsePlan:
-    """Timed pulses before the limiter: one row a pulse, in order of time, one beam. All arrays [n].
+    """Timed pulses of one beam before the limiter: one row per pulse, in order of time; all arrays [n].
 
-    start_s: gate on, from the plan's start, whole microseconds; width_s: whole PWM periods
-    x_rad, y_rad: mechanical mirror angles (the beam turns by twice that)
-    power_w: mean incident power while on; pixel: index
-    settle_s: dark time kept before the pulse for the mirrors' move
-    target_m: peak displacement the pulse is meant to reach, NaN for pulses of a `PulseTrain`
-    and for slices of a frame's pulse before the last, which are to reach nothing by themselves
-    nominal_s: when the request wanted the pulse (frame: shown by; train: gate on); source: index of frame, or of
-    train counted on from the frames
+    start_s: gate-on time from the plan's start, whole microseconds; width_s: gate-on duration, whole PWM periods
+    x_rad, y_rad: mechanical mirror angles (the beam turns by twice the angle)
+    power_w: mean incident power while the gate is on; pixel: index
+    settling_s: gate-off time before the pulse for the mirrors' move
+    target_m: peak displacement that the pulse is planned to reach; NaN for pulses of a `PulseTrain` and for all
+    interleaved sub-pulses of a frame but the last
+    requested_start_s: time at which the request wants the pulse (frame: start of the frame; train: gate on)
+    source: index of the frame, or number of frames + index of the train
     """
 
     start_s: FloatArray
@@ -55,17 +55,16 @@ EMPTY_PLAN = PulsePlan(
     requested_start_s=_NO_FLOATS,
     source=_NO_INTS,
 )
-
 """A plan without pulses."""
 
 
 @dataclass(frozen=True, eq=False)
 class LimitedPlan(PulsePlan):
-    """A plan as the limiter passed it; only `optodrive.planning.limiter` makes one.
+    """A plan that the limiter has passed; only `optodrive.planning.limiter` creates one.
 
-    energy_j: incident energy of the pulse as passed [n]; trimmed_j: energy taken from it [n]
-    reason: why energy was taken, '' where none was [n]
-    headroom_k: least distance of each pixel's absorber bound from its cap during the plan [p]
+    energy_j: [n] incident energy of the pulse as passed; trimmed_j: [n] energy that the limiter removed
+    reason: [n] key of the binding cap, '' if no energy was removed
+    headroom_k: [p] smallest distance of each pixel's absorber bound from its cap during the plan
     """
 
     energy_j: FloatArray
@@ -76,16 +75,18 @@ class LimitedPlan(PulsePlan):
 
 @dataclass(frozen=True, eq=False)
 class BudgetState:
-    """What the limiter remembers between plans; pulses passed count as fired until shown otherwise.
+    """State of the limiter between plans; passed pulses count as executed until the board reports otherwise.
 
-    at_s: the time up to which the plan reached, on the budget's time line
-    dark_since_s: [p] end of each pixel's last pulse; rise_k, spot_j, on_s: [p] then: bound on the absorber's rise over
-    its wall, leaky bucket of energy, light without a rest; least_k: [p] that rise at least
-    wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]; inflow_w: [p] what neighbours send a
-    wall at most, as of exchanged_at_s
-    mirror_rad: [2] where the mirrors stand; acceleration2: [2] bound on their mean-square acceleration, rad²/s⁴, and
-    swing: [2] on the root of the integral of a² still to come, rad/s^1.5, at mirror_at_s, when their targets arrived
-    recent_*: [r] pulses still inside a sliding window: start_s, width_s, power_w, pixel
+    at_s: end of the last pulse, on the budget's time line
+    last_pulse_end_s: [p] end of each pixel's last pulse; the following [p] arrays hold at that time
+    rise_k, lower_bound_k: [p] upper and lower bound of the absorber's rise over its wall
+    bucket_j: [p] leaky bucket of energy; merged_width_s: [p] total width of the last pulses without a gap
+    wall_k, touch_k: [p, 2] bounds on wall and touch surface at nodes_at_s [p]
+    inflow_w: [p] upper bound on the heat flow from neighbouring walls since exchanged_at_s
+    mirror_rad: [2] mirror angles; galvo_mean_square, galvo_ringing: [2] bounds on the mirrors' mean-square
+    acceleration, rad²/s⁴, and on the root of the remaining integral of a², rad/s^1.5, at mirror_at_s, the arrival time
+    of their targets
+    recent_*: [r] start_s, width_s, power_w and pixel of pulses that a sliding window may still contain
     """
 
     at_s: float
@@ -114,10 +115,11 @@ class BudgetState:
 
 @dataclass(frozen=True, eq=False)
 class ExecutedPulses:
-    """What the board says it did, one row an executed pulse, in order; complete: none is missing. All arrays [n].
+    """Pulses that the board reports as executed, one row per pulse in order; all arrays [n].
 
-    on_tick: board tick of gate on; width_ticks: gate-on time; index: wire index of the point
-    pixel, power_w: of the plan's row; start_s: on_tick from the tick at which the plan was started, s
+    on_tick: board tick of gate on; width_ticks: gate-on duration; index: index of the point on the wire
+    pixel, power_w: of the plan's row; start_s: on_tick counted from the tick of the plan's start, s
+    complete: whether no report is missing
     """
 
     index: IntArray

@@ -9,11 +9,11 @@ from optodrive.core.types.arrays import FloatArray, freeze_arrays
 
 @dataclass(frozen=True, eq=False)
 class TactileFrame:
-    """One tactile picture: the peak displacement asked of each pixel while the frame is shown.
+    """One tactile image: the peak displacement that it requests of each pixel while it is shown.
 
-    target_m: [p], peak displacement asked for, m; 0 where the pixel is not driven.
-    together: the pixels shall stand up at one time rather than one after the other
-    priority: the larger, the later it is left out where not everything fits.
+    target_m: [p] requested peak displacement, m; 0 for inactive pixels
+    simultaneous: whether the pixels are raised at the same time instead of one after another
+    priority: frames with a higher priority are omitted later if not everything fits
     """
 
     frame_id: str
@@ -29,10 +29,10 @@ class TactileFrame:
 
 @dataclass(frozen=True)
 class PulseTrain:
-    """Cyclic stimulation of one pixel: pulses of `pulse_width_s` with `gap_s` between, for `duration_s`.
+    """Cyclic stimulation of one pixel by pulses of `pulse_width_s`, separated by `gap_s`, for `duration_s`.
 
-    power_w: incident power while on, W. The train holds every pulse that starts before its end; the last may end later.
-    priority: as a frame's.
+    power_w: incident power while the gate is on, W; priority: as for frames
+    The train contains every pulse that starts before its end; the last one may end later.
     """
 
     pixel: int
@@ -44,16 +44,17 @@ class PulseTrain:
     priority: int = 0
 
     def pulse_starts_s(self) -> FloatArray:
-        """Nominal start of each pulse, s: [n]."""
+        """Return the requested start of each pulse, s, [n]."""
         return _compute_cycle_starts_s(self.start_s, self.duration_s, self.pulse_width_s + self.gap_s)
 
 
 @dataclass(frozen=True)
 class HeightTrain:
-    """Cyclic stimulation of one pixel by what is felt: a peak of target_m every period_s, for `duration_s`.
+    """Cyclic stimulation of one pixel by displacement: a peak of `target_m` every `period_s`, for `duration_s`.
 
-    peak_to_peak_m: fall of the membrane between two peaks, m; None for as little energy as possible. Cycles as for a
-    `PulseTrain`; each pulse is planned from the heat that is there. priority: as a frame's.
+    peak_to_peak_m: fall of the membrane between two peaks, m; None for the smallest possible energy
+    priority: as for frames
+    Cycles are counted as for a `PulseTrain`; each pulse is planned from the residual heat.
     """
 
     pixel: int
@@ -65,7 +66,7 @@ class HeightTrain:
     priority: int = 0
 
     def pulse_starts_s(self) -> FloatArray:
-        """Nominal start of each pulse, s: [n]."""
+        """Return the requested start of each pulse, s, [n]."""
         return _compute_cycle_starts_s(self.start_s, self.duration_s, self.period_s)
 
 
@@ -79,7 +80,7 @@ def _compute_cycle_starts_s(start_s: float, duration_s: float, period_s: float) 
 
 @dataclass(frozen=True)
 class FrameSequence:
-    """What a caller asks to be felt: frames by height, trains by pulse or by height; times from the plan's start."""
+    """A request: frames by height and trains by pulse or by height; times count from the sequence's start."""
 
     frames: tuple[TactileFrame, ...] = ()
     trains: tuple[Train, ...] = ()

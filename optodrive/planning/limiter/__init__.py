@@ -1,1 +1,1 @@
-"""The thermal budget: pulses are passed, trimmed or refused, each with its reason."""
+"""The limiter: passes, trims or refuses pulses by the thermal, energy and galvo caps, each with its reason."""

@@ -89,8 +89,8 @@ def apply_move(
 def mean_square_bound(galvo: GalvoModel, state: GalvoState, end_s: float) -> float:
     """Return an upper bound on the mean-square acceleration of both mirrors from `end_s` on, rad²/s⁴.
 
-    The bound holds for any next move: that move begins when the pulse ends, even if the next pulse is much later, so the
-    largest possible move is always counted.
+    The bound holds for any next move: that move begins when the pulse ends, even if the next pulse is much later, so
+    the largest possible move is always counted.
     """
     # Planned times telescope from move to move, so their slack counts once, here.
     elapsed_s = end_s - galvo.timing_slack_s - state.at_s

@@ -1,1 +1,1 @@
-"""Tactile frames to timed pulses: mirror angles, move times, drive, order."""
+"""The scheduler: turns frames and trains into timed pulses, with visiting order, settling times and drive."""

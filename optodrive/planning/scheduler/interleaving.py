@@ -1,7 +1,7 @@
-"""A frame whose pixels shall stand up at one time: in how many rounds the beam goes through it.
+"""Interleaved rounds of a simultaneous frame: each pulse is split into sub-pulses, one per round of the beam.
 
-An absorber passes its heat on for 10 to 30 ms, so a pulse may come in slices. Every round costs a move a pixel; which
-number of rounds is best is reckoned, with the moves and the heat there are.
+An absorber releases its heat over 10 to 30 ms, so a pulse can be split. Every round costs one move per pixel. The
+number of rounds is chosen by planning each candidate with its settling times and the residual heat.
 """
 
 from collections.abc import Callable, Mapping
@@ -16,17 +16,18 @@ from optodrive.physics.thermal_state import ThermalState
 ROUND_COUNTS = (1, 2, 3, 4, 6, 8)
 SAMPLES = 400
 PEAK_WINDOW_TAU_G = 5.0
-"""So many gas lags after the last pulse every pixel is past its peak."""
+"""Number of gas lags after the last pulse by which every pixel is past its peak."""
 
 PeriodsByPixel = Mapping[int, int]
-"""PWM periods by pixel."""
+"""Width in PWM periods, by pixel."""
 
 
 @dataclass(frozen=True)
 class SimultaneousFrame:
-    """How a frame was split. simultaneity: as `simultaneity`, reckoned before the limiter; unsplit: in one round.
+    """How a frame was interleaved.
 
-    extra_s: how much later than in one round the frame ends
+    simultaneity, simultaneity_single_pulse: `compute_simultaneity` of the selected number of rounds and of one round,
+    before the limiter; extra_s: additional duration against one round
     """
 
     source: int
@@ -38,7 +39,7 @@ class SimultaneousFrame:
 
 @dataclass(frozen=True)
 class CandidateSchedule:
-    """What a number of rounds would come to. rested: whether a pixel's slices are far enough apart to count as such."""
+    """Result of one number of rounds; has_min_gaps: whether all sub-pulses of a pixel count separately."""
 
     rounds: int
     simultaneity: float
@@ -47,20 +48,23 @@ class CandidateSchedule:
 
 
 def split_pulses(single_pulses: Mapping[int, tuple[int, float]], rounds: int) -> PeriodsByPixel | None:
-    """Width of each pixel's pulse at full power in every round but the last; None where one is too short to share.
+    """Compute each pixel's sub-pulse width at full power; return None if a pulse is too short to be split.
 
-    single: periods and duty, by pixel, of the one pulse that would do.
+    single_pulses: by pixel, width in PWM periods and duty of the single pulse that reaches the target
     """
     periods_by_pixel = {pixel: int(periods * duty / rounds) for pixel, (periods, duty) in single_pulses.items()}
     return periods_by_pixel if rounds == 1 or all(periods_by_pixel.values()) else None
 
 
 MIN_SIMULTANEITY_GAIN = 0.01
-"""More rounds take longer: they must bring up so much more of every target at one time."""
+"""Gain in simultaneity by which more rounds justify their longer duration."""
 
 
 def select_schedule(candidates: list[CandidateSchedule], deadline_s: float) -> CandidateSchedule:
-    """Of those that end in time the one of fewest rounds within WORTH of the most simultaneous; else the first."""
+    """Select the candidate with the fewest rounds close to the best simultaneity among those that meet the deadline.
+
+    Returns the first candidate if none meets the deadline.
+    """
     feasible = [item for item in candidates if item.end_s <= deadline_s + 1e-9 and item.has_min_gaps]
     max_simultaneity = max((item.simultaneity for item in feasible), default=0.0)
     return next(
@@ -75,9 +79,9 @@ def compute_simultaneity(
     last_round_start_s: float,
     on_progress: Callable[[], None],
 ) -> float:
-    """The most, over time, of the least share of its target, over pixels, that the membranes stand at.
+    """Return the maximum over time of the minimum over pixels of displacement / target.
 
-    heat: as it is before the plan; last_round_s: when the last round begins, before which no pixel is up.
+    heat: before the plan; last_round_start_s: start of the last round, before which no pixel reaches its target
     """
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
     end_s = float(plan.start_s[-1] + plan.width_s[-1])
@@ -93,15 +97,15 @@ def compute_simultaneity(
 
 
 def concatenate_batches(batches: list[PulsePlan]) -> PulsePlan:
-    """One plan of pieces, in order."""
+    """Concatenate batches in order."""
     return PulsePlan(
-        **{item.name: np.concatenate([getattr(piece, item.name) for piece in batches]) for item in fields(PulsePlan)}
+        **{item.name: np.concatenate([getattr(batch, item.name) for batch in batches]) for item in fields(PulsePlan)}
     )
 
 
-def has_min_gaps(plan: PulsePlan, rest_s: float) -> bool:
-    """Whether every pulse comes rest_s or more after the last one on its pixel."""
+def has_min_gaps(plan: PulsePlan, min_gap_s: float) -> bool:
+    """Return whether every pulse starts at least `min_gap_s` after the previous one on its pixel."""
     order = np.lexsort((plan.start_s, plan.pixel))
     start_s, end_s, pixel = plan.start_s[order], (plan.start_s + plan.width_s)[order], plan.pixel[order]
     is_repeated = pixel[1:] == pixel[:-1]
-    return bool(np.all((start_s[1:] - end_s[:-1])[is_repeated] >= rest_s - 1e-9))
+    return bool(np.all((start_s[1:] - end_s[:-1])[is_repeated] >= min_gap_s - 1e-9))

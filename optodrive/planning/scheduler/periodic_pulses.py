@@ -1,12 +1,13 @@
-"""What a pulse must be for cycles of a wanted height and swing: the steady state, found with the display's own heat.
+"""Pulse recipes of trains by height, from the periodic steady state that the display's own thermal model computes.
 
-A cycle is planned for its peak. Where cycles are so short that the membrane still rises from one pulse when the next
-one comes, that peak is the last pulse's doing: planned for it, every other pulse would be left out for good. There
-only what comes after the steady cycle's own peak counts. Pulses whose width is free are planned for the height midway
-from that peak to the next pulse: for the peak itself, wide and narrow ones would take turns.
+A pulse is normally planned for the peak of its cycle. In short cycles the membrane still rises from one pulse when the
+next one starts, so the peak belongs to the previous pulse; planned for it, every other pulse would be omitted for good.
+Such pulses are planned for the displacement after the peak of the steady cycle. Pulses of free width are planned for
+the displacement midway between that peak and the next pulse, because planning for the peak itself would make wide and
+narrow pulses alternate.
 
-Widths are whole PWM periods, and where pulses leave little dark between them one more of those changes the swing by
-much. What lies between two widths is had by a pulse that begins with a weaker period, its head.
+Widths are whole PWM periods. If the gate-off time between pulses is short, one more period changes the peak-to-peak
+value considerably. A lead period, one weaker PWM period before the pulse, provides values between two widths.
 """
 
 from dataclasses import dataclass, replace
@@ -22,27 +23,30 @@ from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState
 
 SETTLING_TAUS = 10.0
-"""Cycles repeat after so many relaxation times of the pixel."""
+"""Number of the pixel's relaxation times after which cycles repeat."""
 SAMPLES = 400
-"""Of the steady cycle."""
+"""Samples per steady cycle."""
 EARLY_PEAK_FRACTION = 0.8
-"""A pulse from rest whose peak comes before this share of the period can be planned for its peak."""
+"""A pulse on a cold pixel that peaks before this fraction of the period can be planned for its peak."""
 MAX_POWER_CORRECTIONS, PEAK_TOLERANCE = 6, 1e-4
-"""The power of steady pulses is corrected at most so often, until the peak is this close, relative."""
+"""Number of corrections of a steady pulse's power, and the relative error of the peak at which they stop."""
 PEAK_TO_PEAK_TOLERANCE = 0.01
-"""A whole number of PWM periods will do where it brings the swing this close, relative."""
+"""Relative error of the peak-to-peak value up to which no lead period is needed."""
 WIDENING_THRESHOLD = 0.99
-"""A pulse that comes so near to its height is not made wider for it."""
+"""A pulse that reaches this fraction of its target at its present width is not widened."""
 BISECTIONS = 8
-"""Of the head's share, from none to all."""
+"""Bisections of the lead period's relative duty."""
 MIN_REFERENCE_S = 1e-9
+"""Smallest time after a pulse's start at which its displacement is taken."""
 
 
 @dataclass(frozen=True)
 class PulseRecipe:
-    """How each pulse of a train is planned: pulse_for_peak(…, goal_m, …, least_periods, from_s), after its head.
+    """Arguments of `ThermalState.solve_pulse` for every pulse of a train.
 
-    head_w: power of a PWM period before that pulse, 0 for none
+    target_m, min_periods: displacement to plan for, and smallest width in PWM periods
+    from_s: time after the pulse's start from which on the displacement counts
+    lead_period_w: power of the lead period, 0 for none
     """
 
     target_m: float
@@ -53,9 +57,11 @@ class PulseRecipe:
 
 @dataclass(frozen=True)
 class PeriodicSteadyState:
-    """A cycle that repeats: PWM periods and duty of its pulse and of a period before it; peak and least height, m.
+    """A cycle that repeats.
 
-    after_m: height so long after the pulse's start, after_s, that it tells this pulse's energy from the last one's
+    periods, duty, lead_duty: width in PWM periods and duty of the pulse, and duty of its lead period
+    peak_m, trough_m: largest and smallest displacement
+    reference_m, reference_s: displacement at a time after the pulse's start at which it depends on this pulse's energy
     """
 
     periods: int
@@ -73,9 +79,9 @@ class PeriodicSteadyState:
 
 
 def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> PulseRecipe:
-    """How the train's pulses are planned; drive.max_periods: the longest pulse its cycle has room for.
+    """Compute the recipe of a train's pulses; drive.max_periods is the longest pulse that fits into a cycle.
 
-    Raises InputError (target_unreachable, bad_train) where no steady cycle has the train's height or swing.
+    Raises InputError (target_unreachable, bad_train) if no steady cycle has the train's height or peak-to-peak value.
     """
     periods, lead_ratio = _find_min_periods(train, cold_heat, drive, where), 0.0
     min_periods = 1
@@ -93,9 +99,10 @@ def build_pulse_recipe(train: HeightTrain, cold_heat: ThermalState, drive: Drive
 def compute_next_pulse(
     train: HeightTrain, recipe: PulseRecipe, heat: ThermalState, start_s: float, drive: DriveRange
 ) -> tuple[int, float] | None:
-    """PWM periods and duty of the train's pulse at at_s, after its head, from the heat there; None: none is needed.
+    """Compute width (PWM periods) and duty of the train's next pulse at `start_s` from the residual heat.
 
-    A swing has its width: were a pulse wider for want of little, the next would be narrower, and so they would go on.
+    Returns None if the target is already reached. The width stays fixed for a given peak-to-peak value; adapting it per
+    pulse would cause a period-2 limit cycle.
     """
     shape = (drive, recipe.min_periods, recipe.from_s)
     pulse = heat.solve_pulse(train.pixel, start_s, recipe.target_m, *shape)
@@ -108,14 +115,14 @@ def compute_next_pulse(
 def compute_steady_state(
     train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float, lead_duty: float = 0.0
 ) -> PeriodicSteadyState:
-    """What the same pulse in every cycle comes to, after a period of duty `head` where there is one."""
+    """Simulate the steady state of identical pulses in every cycle; lead_duty: duty of the lead period, 0 for none."""
     pixel = cold_heat.pixels.elements[train.pixel]
     count = 2 + ceil(SETTLING_TAUS * (pixel.tau_s + pixel.tau_g_s) / train.period_s)
     lead_s = drive.period_s if lead_duty else 0.0
     shapes = [(lead_s, periods * drive.period_s, duty)] + ([(0.0, lead_s, lead_duty)] if lead_duty else [])
     pulses = np.zeros((count, len(shapes), 4))
-    for k, (reference_s, width_s, pulse_duty) in enumerate(reversed(shapes)):
-        pulses[:, k, 0] = train.period_s * np.arange(count) + reference_s
+    for k, (offset_s, width_s, pulse_duty) in enumerate(reversed(shapes)):
+        pulses[:, k, 0] = train.period_s * np.arange(count) + offset_s
         pulses[:, k, 1], pulses[:, k, 2] = width_s, pulse_duty * drive.max_power_w
     pulses[:, :, 3] = train.pixel
     earlier, last = pulses[:-1].reshape(-1, 4), pulses[-1]
@@ -134,15 +141,15 @@ def compute_steady_state(
 def solve_steady_state(
     train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, lead_ratio: float = 0.0
 ) -> PeriodicSteadyState:
-    """The steady cycle of pulses so wide whose peak is the target, or that of full power where none is.
+    """Solve for the duty of pulses of the given width whose steady peak is the target, or return full power.
 
-    share: duty of the period before the pulse, over the pulse's own
+    lead_ratio: duty of the lead period over the duty of the pulse.
     """
     steady_state = compute_steady_state(train, cold_heat, drive, periods, 1.0, lead_ratio)
     for _ in range(MAX_POWER_CORRECTIONS):
         if abs(steady_state.peak_m / train.target_m - 1.0) < PEAK_TOLERANCE:
             break
-        # Heights are all but proportional to power.
+        # Displacement is nearly proportional to power.
         duty = min(1.0, steady_state.duty * train.target_m / steady_state.peak_m)
         if duty == steady_state.duty:
             break
@@ -151,7 +158,7 @@ def solve_steady_state(
 
 
 def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, where: str) -> int:
-    """PWM periods of the shortest pulse whose steady cycle at full power reaches the target."""
+    """Return the width of the shortest pulse whose steady cycle at full power reaches the target, PWM periods."""
     low, high = 0, drive.max_periods
     max_m = compute_steady_state(train, cold_heat, drive, high, 1.0).peak_m
     if max_m < train.target_m:
@@ -174,7 +181,10 @@ def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveR
 def _find_peak_to_peak_shape(
     train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, min_periods: int, where: str
 ) -> tuple[int, float]:
-    """PWM periods of the pulse whose steady cycle swings by what is asked, and its head's share: wider swings less."""
+    """Find the width, PWM periods, and the lead ratio of the steady cycle with the requested peak-to-peak value.
+
+    The peak-to-peak value decreases with the width.
+    """
     target_m = train.peak_to_peak_m or 0.0
     peak_to_peak_m = {
         n: solve_steady_state(train, cold_heat, drive, n).peak_to_peak_m for n in (min_periods, drive.max_periods)
@@ -215,7 +225,7 @@ def _find_peak_to_peak_shape(
 def _find_first_peak_s(
     train: HeightTrain, cold_heat: ThermalState, drive: DriveRange, periods: int, duty: float
 ) -> float:
-    """When the first pulse's peak comes after its start, s."""
+    """Return the time from the start of a pulse on a cold pixel to its peak, s."""
     width_s = periods * drive.period_s
     t_s: FloatArray = np.linspace(0.0, 2.0 * train.period_s + width_s, 2 * SAMPLES + 1)
     pulse = np.array([[0.0, width_s, duty * drive.max_power_w, train.pixel]])
@@ -223,5 +233,5 @@ def _find_first_peak_s(
 
 
 def limit_pulse_width(drive: DriveRange, max_width_us: int) -> DriveRange:
-    """The drive with pulses no longer than room_us, and one PWM period at least."""
+    """Limit the drive's pulses to `max_width_us`, but to no less than one PWM period."""
     return replace(drive, max_periods=max(1, min(drive.max_periods, int(max_width_us * 1e-6 / drive.period_s + 1e-9))))

@@ -1,4 +1,4 @@
-"""Pulses of all trains in order of time, and what each of them is made of."""
+"""The pulses of all trains in order of time, and the shape of each pulse."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,11 +18,11 @@ from optodrive.planning.scheduler.periodic_pulses import (
 )
 
 SettlingTime = Callable[[int, int], int]
-"""Dark time of a move from one pixel to another, µs."""
+"""Returns the settling time of a move from one pixel to another, µs."""
 
 
 class TrainPulse(NamedTuple):
-    """One pulse as a train asks for it; width and power are zero where they follow from a height."""
+    """One requested pulse of a train; width and power are zero if they follow from a height."""
 
     requested_start_us: int
     source: int
@@ -32,12 +32,12 @@ class TrainPulse(NamedTuple):
 
     @property
     def is_by_height(self) -> bool:
-        """Whether its width and power follow from the heat there."""
+        """Whether width and power follow from a height and the residual heat."""
         return not self.width_us
 
 
 def list_train_pulses(trains: tuple[Train, ...], first_source: int) -> list[TrainPulse]:
-    """Every pulse of the trains, in order of time; sources count on from first_source."""
+    """List the pulses of all trains in order of time; first_source: source index of the first train."""
     pulses = []
     for source, train in enumerate(trains, start=first_source):
         width_s, power_w = (0.0, 0.0) if isinstance(train, HeightTrain) else (train.pulse_width_s, train.power_w)
@@ -50,9 +50,9 @@ def list_train_pulses(trains: tuple[Train, ...], first_source: int) -> list[Trai
 
 
 def compute_free_us(pulses: list[TrainPulse], index: int, gap_us: int, settling_us: SettlingTime) -> int:
-    """Beam time from the nominal start of a pulse to when the beam must leave for the next one of any train, µs.
+    """Return the beam time from a pulse's requested start until the beam must leave for the next train pulse, µs.
 
-    A pixel lit again at once is given gap_us in the dark. Very long after the last pulse.
+    gap_us: gate-off time before the next pulse on the same pixel. Practically unlimited for the last pulse.
     """
     if index + 1 >= len(pulses):
         return 2**40
@@ -64,7 +64,7 @@ def compute_free_us(pulses: list[TrainPulse], index: int, gap_us: int, settling_
 def compute_free_us_by_source(
     pulses: list[TrainPulse], sources: set[int], gap_us: int, settling_us: SettlingTime
 ) -> dict[int, tuple[int, int]]:
-    """The least, and the usual (median), beam time that the pulses of some trains have, µs, by source."""
+    """Return the minimum and the median beam time of the pulses of the given trains, µs, by source."""
     free: dict[int, list[int]] = {source: [] for source in sources}
     for k, pulse in enumerate(pulses):
         if pulse.source in free:
@@ -79,7 +79,10 @@ def add_lead_periods(
     gap_us: int,
     settling_us: SettlingTime,
 ) -> list[TrainPulse]:
-    """The pulses, those of some sources begun by a head of so much power where there is room for both."""
+    """Put a lead period before each pulse of the given sources, where the beam time suffices for both.
+
+    lead_periods_w: power of the lead period, by source; lead_period_us: its width.
+    """
     result = []
     for k, pulse in enumerate(pulses):
         if pulse.source in lead_periods_w and compute_free_us(pulses, k, gap_us, settling_us) >= 2 * lead_period_us:
@@ -90,10 +93,11 @@ def add_lead_periods(
 
 
 class TrainPulses:
-    """Every pulse of the trains in order of time, and how those by height are planned.
+    """The pulses of all trains in order of time, with the pulse recipes of trains by height.
 
-    at_rest: makes the display's heat before anybody lit it; tick: called again and again.
-    Raises InputError for a train whose height or swing its cycles cannot have, or that leaves the beam no time.
+    gap_us: gate-off time after which pulses on a pixel count separately
+    build_cold_heat: makes the heat of a cold display; on_progress: called repeatedly
+    Raises InputError for a train by height whose height or peak-to-peak value no cycle has, or that has no beam time.
     """
 
     def __init__(
@@ -127,11 +131,14 @@ class TrainPulses:
         return self._pulses[index]
 
     def get_target_m(self, source: int) -> float:
-        """The height that a train by height asks for."""
+        """Return the target height of a train by height, m."""
         return self._trains[source].target_m
 
     def plan_pulse(self, index: int, heat: ThermalState, start_us: int, late_us: int) -> tuple[int, float] | None:
-        """Width, µs, and power, W, of a pulse by height that starts at start_us, so much late; None: none is needed."""
+        """Compute width, µs, and power, W, of a pulse by height from the residual heat; None if no pulse is needed.
+
+        late_us: delay of `start_us` after the requested start.
+        """
         pulse = self._pulses[index]
         train, recipe = self._trains[pulse.source], self._recipes[pulse.source]
         max_width_us = self._compute_max_width_us(train) - (self._period_us if recipe.lead_period_w else 0)
@@ -159,7 +166,7 @@ class TrainPulses:
         if min(min_free_us, room_us) < self._drive.period_s * 1e6:
             expected = (
                 f"room for a PWM period of {self._drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of "
-                f"any train, with the mirrors' move or a rest of {self._gap_us * 1e-3:g} ms"
+                f"any train, with a move of the mirrors or a gap of {self._gap_us * 1e-3:g} ms"
             )
             raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")
         return build_pulse_recipe(train, cold_heat, limit_pulse_width(self._drive, room_us), where)

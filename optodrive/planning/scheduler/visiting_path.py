@@ -1,8 +1,8 @@
-"""The order in which one beam visits the pixels of a frame: a short open path, the farther axis deciding each move.
+"""The order in which the beam visits the pixels of a frame: a short open path in the maximum norm of mirror angles.
 
-Lattices that are full, or nearly, have a path of single steps, row by row or column by column. Others begin from the
-shorter of both and are improved by reversing and shifting pieces between near pixels (2-opt and Or-opt, Croes 1958,
-Or 1976).
+A full or nearly full lattice has a path of single steps, row by row or column by column. Other frames start from the
+shorter of both paths, which is improved by reversing and moving segments between near pixels (2-opt, Croes 1958;
+Or-opt, Or 1976).
 """
 
 import numpy as np
@@ -11,15 +11,18 @@ from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 
 NEIGHBOUR_COUNT = 10
-"""So many nearest pixels are tried as a pixel's next."""
+"""Number of nearest pixels tried as the next pixel."""
 GOOD_ENOUGH_RATIO = 1.02
-"""A path this near to one of its own shortest steps alone is left as it is."""
+"""A path within this ratio of a path of its own shortest steps alone is not improved."""
 MAX_SEGMENT = 3
-"""Pieces of so many pixels at most are shifted."""
+"""Largest number of pixels in a moved segment."""
 
 
 def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) -> IntArray:
-    """Pixels row by row, every other row backwards, so that most moves are one pitch. active: [k]; row, column: [p]."""
+    """Order pixels row by row, every other row backwards, so that most moves are one pitch.
+
+    active: [k] pixels; row, column: [p] positions on the lattice
+    """
     rows, columns = row[active], column[active]
     rank = np.unique(rows, return_inverse=True)[1]
     direction = np.where(rank % 2 == 0, columns, -columns)
@@ -29,9 +32,9 @@ def compute_serpentine_order(active: IntArray, row: IntArray, column: IntArray) 
 def compute_visiting_order(
     active: IntArray, row: IntArray, column: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int | None = None
 ) -> IntArray:
-    """A short path over pixels `active` [k], from the pixel `origin` if the mirrors stand on one.
+    """Return a short path over the pixels `active` [k], starting from the pixel `origin` if it is known.
 
-    row, column, x_rad, y_rad: [p] places on the lattice, and mirror angles.
+    row, column, x_rad, y_rad: [p] positions on the lattice, and mirror angles
     """
     if len(active) < 3:
         return active
@@ -48,14 +51,14 @@ def compute_visiting_order(
 
 
 def compile_kernels() -> None:
-    """Order pixels for nobody, so that every kernel is compiled and loaded."""
+    """Order sample pixels, so that every kernel is compiled and loaded."""
     place = np.array([0, 9, 1, 7, 2, 8])
     compute_visiting_order(np.arange(6), place, place[::-1].copy(), 0.01 * place, 0.01 * place[::-1])
 
 
 @kernel
 def _move_rad(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
-    """Length of a move; none where a path begins or ends, which is where −1 stands."""
+    """Return the length of a move, rad; 0 if either pixel is −1, which marks the end of a path."""
     if a < 0 or b < 0:
         return 0.0
     return float(max(abs(x_rad[a] - x_rad[b]), abs(y_rad[a] - y_rad[b])))
@@ -63,7 +66,7 @@ def _move_rad(x_rad: FloatArray, y_rad: FloatArray, a: int, b: int) -> float:
 
 @kernel
 def path_rad(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> float:
-    """Sum of all moves along a path, from the pixel `origin` or, for −1, from its own first."""
+    """Return the length of a path, rad, including the move from `origin` unless that is −1."""
     total = _move_rad(x_rad, y_rad, origin, tour[0])
     for place in range(1, len(tour)):
         total += _move_rad(x_rad, y_rad, tour[place - 1], tour[place])
@@ -72,7 +75,7 @@ def path_rad(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) 
 
 @kernel
 def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count: int) -> IntArray:
-    """[p, count] the nearest pixels of each pixel of a tour, nearest first; −1 for others."""
+    """Return the nearest pixels of each pixel of a tour, nearest first, [p, count]; −1 for pixels outside the tour."""
     neighbours = np.full((len(x_rad), count), -1)
     distance_rad = np.full(count, np.inf)
     for a in tour:
@@ -93,7 +96,7 @@ def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count
 
 @kernel
 def _improve(tour: IntArray, neighbours: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> None:
-    """Shorten a path in place until neither a reversal nor a shift between near pixels does."""
+    """Shorten a path in place until no reversal or move of a segment between near pixels shortens it."""
     place = np.full(len(x_rad), -1)
     for k in range(len(tour)):
         place[tour[k]] = k
@@ -115,7 +118,7 @@ def _improve(tour: IntArray, neighbours: IntArray, x_rad: FloatArray, y_rad: Flo
 
 @kernel
 def _pixel_at(tour: IntArray, k: int, origin: int) -> int:
-    """The pixel at a place of the path; the origin before it, nothing after it."""
+    """Return the pixel at a position of the path; the origin before its start, −1 after its end."""
     if k < 0:
         return origin
     return int(tour[k]) if k < len(tour) else -1
@@ -123,6 +126,7 @@ def _pixel_at(tour: IntArray, k: int, origin: int) -> int:
 
 @kernel
 def _reverse_segment(tour: IntArray, place: IntArray, first: int, last: int) -> None:
+    """Reverse the segment from `first` to `last` in place."""
     while first < last:
         tour[first], tour[last] = tour[last], tour[first]
         place[tour[first]], place[tour[last]] = first, last
@@ -141,7 +145,7 @@ def _try_reversal(
     min_gain_rad: float,
     pending: IntArray,
 ) -> bool:
-    """Reverse the piece that brings a near pixel beside this one, where that shortens the path."""
+    """Reverse the segment that puts a near pixel next to this one, if that shortens the path."""
     for after in (True, False):
         k = place[pixel]
         ahead = _pixel_at(tour, k + 1, origin) if after else _pixel_at(tour, k - 1, origin)
@@ -178,7 +182,7 @@ def _try_shift(
     min_gain_rad: float,
     pending: IntArray,
 ) -> bool:
-    """Shift the piece that begins at a pixel beside a near one, either way round, where that shortens the path."""
+    """Move a segment that starts at a pixel next to a near one, in either direction, if that shortens the path."""
     for length in range(1, MAX_SEGMENT + 1):
         first = place[pixel]
         last = first + length - 1
@@ -219,7 +223,7 @@ def _try_shift(
 
 @kernel
 def _move_segment(tour: IntArray, place: IntArray, first: int, last: int, after: int, is_reversed: bool) -> None:
-    """Move the piece first to last to stand behind the place `behind`, which is outside it."""
+    """Move the segment from `first` to `last` behind the position `after`, which is outside it."""
     segment = tour[first : last + 1].copy()
     if is_reversed:
         segment = segment[::-1].copy()

@@ -50,7 +50,7 @@ def test_every_term_has_a_bound_but_crosstalk_that_touch_surfaces_would_not_bear
 
 
 def test_light_absorbed_better_and_better_has_no_bound():
-    with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter's bound holds for"):
+    with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter can bound"):
         build_budget(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
 
 
