@@ -18,7 +18,7 @@ FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
 CONFIGURATION_HEAD = f"""# Configuration
 
 Generated from `optodrive/device/config.py` by `scripts/reference`. A configuration is one TOML file per display, format
-version {VERSION}. `optodrive config check` checks it completely, and `optodrive config show --json` prints it with every
+version {VERSION}. `optodrive config check` checks it, and `optodrive config show --json` prints it with every
 default and derived number. Quantities are in SI units, named by the suffix of the key.
 """
 TERMS_HEAD = """# Terms

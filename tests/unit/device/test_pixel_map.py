@@ -179,7 +179,7 @@ def test_the_dead_are_left_out_and_named(display):
 )
 def test_a_train_on_a_dead_pixel_is_refused(display, train):
     living = PulseTrain(LOW, 0.2, 0.1, 0.01, 0.01, 1.0)
-    with pytest.raises(InputError, match=r"trains\[1\]\.pixel: got 12, expected a pixel that lives") as caught:
+    with pytest.raises(InputError, match=r"trains\[1\]\.pixel: got 12, expected a live pixel") as caught:
         check_feasibility(display, FrameSequence((), (living, train)), *display.build_cold_state())
     assert caught.value.code == "dead_pixel"
 
