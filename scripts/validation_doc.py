@@ -1,4 +1,4 @@
-"""Writes docs/explanation/validation.md: the rows of `optodrive validate`, and what there is to say about them."""
+"""Write docs/explanation/validation.md: the rows of `optodrive validate` with their discussion."""
 
 import argparse
 from pathlib import Path
@@ -12,69 +12,71 @@ from optodrive.physics.paper_facts import load_paper_facts
 from optodrive.physics.parameters import load_parameters
 
 INTRODUCTION = """\
-# The models against the paper
+# Validation
 
-Made by `scripts/validation-doc`; `optodrive validate` prints the same rows.
+This page compares the models with the paper. `scripts/validation-doc` generates it; `optodrive validate` prints the
+same rows.
 
-`literal` is the set `paper_s1_literal`, Text S1 as it stands with nothing fitted. `calibrated` is what displays are
-driven with, fitted by `scripts/calibrate-parameters` on three facts, one a parameter: κ on `z_peak_w020`, τ_g on
-`dpp_200Hz`, φ on `F_peak_w020`. `eta_stroke` is made of two of them and counts as fitted. All else is predicted.
-`extended` is the model with terms, fitted by `scripts/calibrate-extended` on the same facts and the temperature of the
-same pixel; [extended-model.md](extended-model.md) says what each term gains.
+`literal` is the set `paper_s1_literal`, Text S1 without any fit. `calibrated` drives the displays; it is
+fitted by `scripts/calibrate-parameters` to three facts, one per parameter: κ to `z_peak_w020`, τ_g to
+`dpp_200Hz`, φ to `F_peak_w020`. `eta_stroke` follows from two of them and counts as fitted. All other rows are
+predictions. `extended` is the model with terms, fitted by `scripts/calibrate-extended` to the same facts and the
+temperature of the same pixel; [extended-model.md](extended-model.md) states what each term gains.
 
-- Full power is 2.45 W, what the bolometer read, also where a figure says 2.5 W.
-- Ratio is model over measured, of temperatures by their rises above 20 °C; an upper bound has none.
-- No power is given for `dpp_200Hz` and `z_tp8_w040`: both are read at full power. τ_g rests on it; a tenth less for the
-  ripple would make it 2.6 ms in place of 3.0.
-- `N_50um` alone would ask for τ_g = 17 ms. It contradicts the other displacements at every width, so neither the fit
-  nor τ_g's uncertainty takes it in.
-- `F_linear_in_P` and `z_repeat_w040` hold by construction: the model is linear and remembers nothing for 5 s.
-- The paper fitted R and C on the first 30 ms of the temperatures that are predicted here at 50 ms.
-- The extended set has the gas's rise from its force, by the gas law on the whole aperture, as the paper had it; the
-  other two say what their own gas does.
-- That the gas settles at half the absorber's rise is Text S1's; displacements fix only its product with κ.
+- Full power is 2.45 W, the reading of the bolometer, also where a figure says 2.5 W.
+- The ratio is model over measured, of temperatures by their rises above 20 °C; an upper bound has none.
+- No power is given for `dpp_200Hz` and `z_tp8_w040`: both are evaluated at full power. τ_g depends on it; 10 % less for
+  the ripple would make it 2.6 ms instead of 3.0.
+- `N_50um` alone would require τ_g = 17 ms. It contradicts the other displacements at every width, so neither the fit
+  nor the uncertainty of τ_g includes it.
+- `F_linear_in_P` and `z_repeat_w040` hold by construction: the model is linear and has no memory beyond 5 s.
+- The paper fitted R and C to the first 30 ms of the temperatures that are predicted here at 50 ms.
+- The extended set derives the gas's rise from its force, by the gas law on the whole aperture, as the paper did; the
+  other two state their own gas.
+- That the gas settles at half the absorber's rise is an assumption of Text S1; displacements determine only its product
+  with κ.
 """
 
 LITERAL_SECTION = """\
-## What the literal set tells
+## Results of the literal set
 
-Its gas lags by 64 ms. That takes the displacement of a 50 ms pulse to a half, of an 8 ms pulse to a quarter, and the
-200 Hz ripple to a twentieth, though its κ, 3.9 µm/K, lies within 3 % of the fitted one. The latter is chance: its
-formula has 3/1280 where a clamped plate has 3/16, and takes the pressure at constant volume under a membrane that rises
-by a millimetre. Its φ is ten times the fitted one: the force was not felt on the whole aperture at constant volume.
+Its gas lags by 64 ms. This halves the displacement of a 50 ms pulse and reduces that of an 8 ms pulse to a quarter and
+the 200 Hz ripple to a twentieth, although its κ, 3.9 µm/K, is within 3 % of the fitted one. That agreement is a
+coincidence: its formula has 3/1280 where a clamped plate has 3/16, and uses the pressure at constant volume under a
+membrane that rises by a millimetre. Its φ is ten times the fitted one: the force did not act on the whole aperture at
+constant volume.
 
-The two laws of Fig. 3D belong to opposite ends. In a linear pixel without lag the ripple follows 1 − exp(−t_g/τ) for
+The two laws of Fig. 3D belong to opposite limits. In a linear pixel without lag the ripple follows 1 − exp(−t_g/τ) for
 pulses much longer than τ, and the mean follows τ/t_g for pulses much shorter; at t_p = t_g = τ it gives 0.73 and 0.79.
 """
 
 DIAGNOSIS_SECTION = """\
-## What `optodrive validate --diagnose` makes of it
+## Results of `optodrive validate --diagnose`
 
-It takes the twelve measured outcomes for a recording and the literal set for the model, chooses among the causes of
-`optodrive/lab/validation/candidate_causes.py`, and redoes choice and fit without each group of facts to predict that
-group. It
-prints:
+The command treats the twelve measured outcomes as a recording and the literal set as the model, selects among the
+causes of `optodrive/lab/validation/candidate_causes.py`, and repeats selection and fit without each group of facts to
+predict that group. It prints:
 """
 
 DISCUSSION_SECTION = """\
-What to make of that:
+Interpretation:
 
-- The lag is beyond doubt: displacements and vibration each predict the other, with causes found without them.
-- So is that the force is wrong, but not why. A smaller area and a load cell that gives are nearly the same line through
-  two numbers. Without any force the extended model is worse than the literal one, for its gas is rightly warmer: two
-  errors had hidden each other.
-- That the membrane is no plate and the gas not at constant volume, no fit can tell. The two errors cancel in Text S1's
-  displacement per kelvin, so a fit finds nothing to mend. Volume and force tell it by arithmetic.
-- A dead time of 2.3 ms makes 50 µm at 217 pixels a second agree with everything else, and 400 µm at 26.5 besides. It
-  rests on the first; the second agrees but does not ask for it. The paper speaks of pulse times alone, and small steps
-  of cheap mirrors take 0.3 to 0.5 ms. So it is what that number would mean, not a finding.
-- χ² is below the degrees of freedom: errors of 11 % are wide for these facts. With 2 to 15 % from sample to sample in
-  place of 10 the same causes are named; with 25 % the dead time is not.
-- Facts of one paper share samples and instruments. The gain says that few causes carry many numbers, not how another
+- The lag is certain: displacements and vibration each predict the other, with causes found without them.
+- So is the error of the force, but not its reason. A smaller area and a compliant load cell are nearly the same line
+  through two numbers. Without any force the extended model is worse than the literal one, because its gas is correctly
+  warmer: two errors had compensated each other.
+- No fit can tell that the membrane is not a plate and the gas not at constant volume. The two errors cancel in Text S1's
+  displacement per kelvin, so a fit has nothing to correct. Volume and force reveal them by arithmetic.
+- A dead time of 2.3 ms makes 50 µm at 217 pixels per second agree with everything else, and 400 µm at 26.5 as well. It
+  depends on the first; the second agrees but does not require it. The paper mentions pulse times only, and small steps
+  of inexpensive mirrors take 0.3 to 0.5 ms. The dead time is therefore the meaning of that number, not a finding.
+- χ² is below the degrees of freedom: errors of 11 % are wide for these facts. With 2 to 15 % between samples
+  instead of 10 % the same causes are named; with 25 % the dead time is not.
+- Facts of one paper share samples and instruments. The gain shows that few causes explain many numbers, not how another
   display behaves.
 
-A rate is compared as the height in the time that it leaves a pixel: near the plateau 7 % of height is 24 % of time.
-Not data:
+A rate is compared as the height in the time that it leaves per pixel: near the plateau 7 % of height is 24 % of time.
+Excluded facts:
 """
 
 JSON_KEYS = """\
@@ -83,7 +85,7 @@ JSON_KEYS = """\
 - `parameter_set`: the parameter set that is diagnosed
 - `facts`: each `id`, `group`, `value`, `relative_error`, `reading` (`relative_error`, `source`), `nominal_ratio`,
   `extended_ratio`, `error_sigma`
-- `excluded`: outcome → why it is no measurement
+- `excluded`: outcome → reason why it is not a measurement
 - `chi2`, `factor`: `nominal`, `extended`; of χ² also `degrees_of_freedom`
 - `aicc_per_cause`, `aicc_indistinguishable`: thresholds
 - `causes`: each `cause`, `description`, `parameter`, `value`, `unit`, `ci95`, `chi2_reduction`, `evidence`,
@@ -101,28 +103,28 @@ them), `ruled out`, `not needed`, `not observable`.
 
 
 def build_page():
-    """The page, whole."""
+    """Return the page."""
     rows = build_validation_rows()
     parts = [
         INTRODUCTION,
         "## Outcomes\n",
         format_table(row for row in rows if row.role != "input"),
-        "## Where the calibrated set misses by more than 15 %\n",
+        "## Deviations of the calibrated set above 15 %\n",
         format_bullets((row.fact.id, row.remark) for row in rows if row.remark),
         LITERAL_SECTION,
         build_diagnosis_section(),
-        "## Inputs\n\nTaken from the paper, or followed from what was by arithmetic alone.\n",
+        "## Inputs\n\nTaken from the paper, or derived from it by arithmetic.\n",
         format_table(row for row in rows if row.role == "input"),
-        "## What each row is\n",
+        "## Rows\n",
         format_bullets((row.fact.id, describe_fact(row.fact)) for row in rows),
-        "## Facts that no set speaks to\n",
+        "## Facts outside the models\n",
         format_bullets(NOT_MODELLED.items()),
     ]
     return "\n".join(parts)
 
 
 def build_diagnosis_section():
-    """The story of the paper's facts, with its table."""
+    """Return the diagnosis of the paper's facts, with its table."""
     study_result = run_study(load_paper_facts(), load_parameters("paper_s1_literal"))
     lines = [narrative.HEADINGS, ("---",) * len(narrative.HEADINGS), *narrative.build_rows(study_result)]
     parts = [
@@ -140,23 +142,23 @@ def build_diagnosis_section():
 
 
 def format_quote(lines):
-    """As printed."""
+    """Return lines as a quotation."""
     return "".join(f"> {line}".rstrip() + "\n" for line in lines)
 
 
 def format_table(rows):
-    """Rows under their headings."""
+    """Return a table with its headings."""
     lines = [HEADINGS, ("---", "--:", "--:", "--:", "--:", "--:", "---", "--:", "--:", "---"), *map(format_cells, rows)]
     return "".join("| " + " | ".join(line) + " |\n" for line in lines)
 
 
 def format_bullets(items):
-    """Named remarks, one a line."""
+    """Return one bullet per named remark."""
     return "".join(f"- `{name}`: {text}\n" for name, text in items)
 
 
 def describe_fact(fact):
-    """Quantity, conditions and place."""
+    """Return quantity, conditions and place of a fact."""
     conditions = f" ({fact.conditions})" if fact.conditions else ""
     return f"{fact.quantity}{conditions}. {fact.where}"
 
