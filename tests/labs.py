@@ -1,4 +1,4 @@
-"""A small lab for unit tests of the analysis, by the package's own forward model: quick, and nothing is hidden."""
+"""Small synthetic recordings for unit tests of the diagnosis, made with the package's own pixel model."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ SIGNALS = (("absorber_temperature_K", 0.3), ("displacement_m", 2e-6))
 
 
 def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
-    """A recording of these groups, with white and coloured noise, jitters and a few missing samples."""
+    """Return a recording of these groups with white and coloured noise, jitters and a few missing samples."""
     rng = np.random.default_rng(seed)
     runs = []
     for name in groups:
@@ -30,11 +30,11 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
             real = pulses.copy()
             real[:, 2] *= np.exp(0.005 * rng.standard_normal())
             real[:, 0] += 2e-5 * rng.standard_normal()
-            told = simulate_signals(
+            readings = simulate_signals(
                 PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values(terms)
             )
             signals = {}
-            for (signal, white), value in zip(SIGNALS, told[:2], strict=True):
+            for (signal, white), value in zip(SIGNALS, readings[:2], strict=True):
                 keep, coloured = np.exp(-1.0 / rate / 0.01), np.zeros(len(t_s))
                 for row in range(1, len(t_s)):
                     kick = 0.4 * white * np.sqrt(1 - keep**2) * rng.standard_normal()

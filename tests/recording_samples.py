@@ -53,7 +53,7 @@ def assert_same(first, second):
 
 
 def sorted_attributes(measurement):
-    """HDF5 lists attributes by name."""
+    """Return the recording with attributes sorted by name, as HDF5 lists them."""
     runs = [
         Run(r.name, r.ambient_k, r.pulses, r.signals, dict(sorted(r.attributes.items())), r.commands)
         for r in measurement.runs

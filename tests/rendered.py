@@ -1,7 +1,7 @@
-"""Pictures of a grid and of the beam's spot, as a camera above the display would take them.
+"""Synthetic pictures of a grid and of the beam's spot, as taken by a camera above the display.
 
-No code of the camera's side. Light is worked out on the display for every pixel: the lens is undone step by step,
-then the ray meets the plane.
+Independent of the camera calibration. For every camera pixel the lens distortion is inverted iteratively and the ray
+is intersected with the display's plane.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ TURN_RAD = 0.006
 
 @dataclass(frozen=True)
 class Camera:
-    """Looks at the display's middle from off_m aside, away_m above; k1, k2 of its lens, with its own middle."""
+    """Camera aimed at the display's centre from lateral offset off_m and height away_m; k1, k2: lens distortion."""
 
     off_m: tuple = (0.06, -0.09)
     away_m: float = 0.42
@@ -30,7 +30,7 @@ class Camera:
     k2: float = 0.8
 
     def pose(self):
-        """Axes of the camera as rows, and where it stands; display: x right, y up, z to the front."""
+        """Return the axes of the camera as rows and its position; display: x right, y up, z to the front."""
         at = np.array([*self.off_m, self.away_m])
         ahead = -at / np.linalg.norm(at)
         right = np.cross(ahead, [0.0, 1.0, 0.0])
@@ -40,7 +40,7 @@ class Camera:
         return np.array([cos * right + sin * down, cos * down - sin * right, ahead]), at
 
     def pixel(self, places_m):
-        """Places [n, 2] to pixels [n, 2]."""
+        """Project positions [n, 2] to camera pixels [n, 2]."""
         axes, at = self.pose()
         seen = (np.column_stack([places_m, np.zeros(len(places_m))]) - at) @ axes.T
         flat = seen[:, :2] / seen[:, 2:]
@@ -48,18 +48,18 @@ class Camera:
         return self.focal_px * flat * (1 + self.k1 * square + self.k2 * square**2) + self.middle_px
 
     def places_m(self):
-        """Of every pixel, [rows, columns] each."""
+        """Return the positions x and y of every camera pixel, [rows, columns] each."""
         return _places_m(self)
 
 
 @cache
 def _places_m(camera):
     x, y = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    bent = (np.stack([x, y]) - np.array(camera.middle_px)[:, None, None]) / camera.focal_px
-    flat = bent.copy()
+    distorted = (np.stack([x, y]) - np.array(camera.middle_px)[:, None, None]) / camera.focal_px
+    flat = distorted.copy()
     for _ in range(12):
         square = (flat**2).sum(axis=0)
-        flat = bent / (1 + camera.k1 * square + camera.k2 * square**2)
+        flat = distorted / (1 + camera.k1 * square + camera.k2 * square**2)
     axes, at = camera.pose()
     rays = np.tensordot(axes.T, np.stack([*flat, np.ones_like(flat[0])]), 1)
     return tuple((at[axis] - rays[axis] * at[2] / rays[2]) for axis in (0, 1))
@@ -74,7 +74,7 @@ PIXEL_M = 0.08e-3
 
 
 def grid_axes(camera, grid):
-    """Every pixel's place in pitches from the first corner: to the right, down."""
+    """Return the position of every camera pixel in pitches from the first corner: to the right, down."""
     x, y = camera.places_m()
     x, y = x - FIRST_M[0], y - FIRST_M[1]
     cos, sin = np.cos(TURN_RAD), np.sin(TURN_RAD)
@@ -82,7 +82,7 @@ def grid_axes(camera, grid):
 
 
 def corners_m(grid=GRID):
-    """[rows, columns, 2]."""
+    """Return the corners of the grid, [rows, columns, 2]."""
     right, down = np.meshgrid(np.arange(grid["columns"]), np.arange(grid["rows"]))
     x, y = grid["pitch_m"] * right, -grid["pitch_m"] * down
     cos, sin = np.cos(TURN_RAD), np.sin(TURN_RAD)
@@ -95,7 +95,7 @@ def marks_px(grid=GRID, camera=CAMERA):
 
 
 def grid_light(camera=CAMERA, grid=GRID):
-    """0 black to 1 white; edges a pixel wide."""
+    """Return the brightness of the grid, 0 black to 1 white, with edges one pixel wide."""
     right, down = grid_axes(camera, grid)
     edge = 0.5 * PIXEL_M / grid["pitch_m"]
     if grid["kind"] == "circles":
@@ -114,13 +114,13 @@ def grid_light(camera=CAMERA, grid=GRID):
 
 
 def spot_light(place_m, camera=CAMERA, width_m=(0.25e-3, 0.15e-3)):
-    """A beam's spot, 1 in its middle; sigma of its light in x and y."""
+    """Return the brightness of a Gaussian beam spot, 1 at its centre; width_m: sigma in x and y."""
     x, y = camera.places_m()
     return np.exp(-0.5 * (((x - place_m[0]) / width_m[0]) ** 2 + ((y - place_m[1]) / width_m[1]) ** 2))
 
 
 def taken(light, random, noise=2.0, blur_px=0.8, full=np.uint8):
-    """The picture: blurred, darker to the edges, noisy, clipped; light in counts."""
+    """Return the camera picture of brightness in counts: blurred, with vignetting, noise and clipping."""
     x, y = np.meshgrid(np.linspace(-1, 1, SIZE[0]), np.linspace(-1, 1, SIZE[1]))
     shaded = cv2.GaussianBlur(light, (0, 0), blur_px) * (1.0 - 0.2 * (x**2 + y**2))
     noisy = shaded + noise * random.standard_normal(shaded.shape) + 6.0

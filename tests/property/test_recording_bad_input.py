@@ -1,4 +1,4 @@
-"""Whatever is done to a recording: it is read, or refused in one line; never another error, never a hang."""
+"""A modified recording is read or refused in one line, without any other error or a hang."""
 
 import shutil
 
@@ -71,7 +71,7 @@ def path(tmp_path_factory):
 
 
 def refused_in_one_line(read, path):
-    """What was read, or None."""
+    """Return the recording, or None if it is refused."""
     try:
         return read(path)
     except InputError as error:
@@ -82,7 +82,7 @@ def refused_in_one_line(read, path):
 
 
 def reads_or_refuses(path):
-    """Both ways into a recording: what the index refuses, reading refuses too."""
+    """Check that reading refuses what the index refuses."""
     index, measurement = refused_in_one_line(RecordingIndex.open, path), refused_in_one_line(read_recording, path)
     if measurement is None:
         return
@@ -184,13 +184,13 @@ def test_members_attributes_and_datasets_replaced(valid, path, data):
     shutil.copyfile(valid / "r.h5", path)
     with h5py.File(path, "r+") as file:
         for change in data.draw(st.lists(st.sampled_from(CHANGES), min_size=1, max_size=4)):
-            # What the library itself does not let happen cannot be in a file either.
+            # The library refuses to write what a file cannot hold.
             try:
                 change(file, data.draw)
             except (OSError, KeyError, ValueError, TypeError, RuntimeError, AttributeError, OverflowError):
                 continue
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(reader, "probe_in_sandbox", lambda path: None)  # written by the library itself, so no harm to it
+        patch.setattr(reader, "probe_in_sandbox", lambda path: None)  # written by the library, hence harmless
         reads_or_refuses(path)
 
 
@@ -205,8 +205,8 @@ def test_files_of_the_folder_changed(valid, tmp_path_factory, data):
         file = data.draw(st.sampled_from(files))
         content = bytearray(file.read_bytes() if file.exists() else b"")
         where = data.draw(st.integers(0, len(content)))
-        piece = data.draw(st.binary(max_size=3) | st.sampled_from(CELLS).map(str.encode))
-        content[where : where + data.draw(st.integers(0, 4))] = piece
+        inserted = data.draw(st.binary(max_size=3) | st.sampled_from(CELLS).map(str.encode))
+        content[where : where + data.draw(st.integers(0, 4))] = inserted
         file.unlink(missing_ok=True)
         if data.draw(st.integers(0, 9)):
             file.write_bytes(content)

@@ -1,4 +1,4 @@
-"""From a small recording to the answer: verdicts, words, JSON, model file, what is held out."""
+"""Diagnosis of a small recording: verdict, narrative, JSON, model file, held-out runs."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""Recordings of many pixels: each for itself, on processes that may die, told and mapped."""
+"""Diagnosis of many pixels on processes that may die, with narrative, answer and map."""
 
 import json
 import os
@@ -28,7 +28,7 @@ KILLER = 99
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """Six good pixels, and one whose samples are all behind the last; mirrors in one run."""
+    """Return a recording of six valid pixels, one pixel with an invalid time axis, and mirrors in one run."""
     path = tmp_path_factory.mktemp("display") / "display.h5"
     write_recording(path, Measurement((*display_lab(HIDDEN, **QUICK).runs, one_sample_run(), mirror_run())))
     spoil(path)
@@ -50,7 +50,7 @@ def mirror_run():
 
 
 def spoil(path):
-    """A time axis that goes back: only reading the samples shows it."""
+    """Make a time axis decrease, which only reading the samples reveals."""
     import h5py
 
     with h5py.File(path, "r+") as file:
@@ -62,8 +62,8 @@ def tasks_of(runs):
 
 
 @pytest.fixture(scope="module")
-def told(recording):
-    """All pixels on two processes, of which one is killed at work, and one more by a task each time it is tried."""
+def answers_by_pixel(recording):
+    """Diagnose all pixels on two processes, one of which is killed; one task kills its worker each time."""
     compile_kernels()
     runs = DisplayRuns.open([recording])
     killer = PixelTask(KILLER, partial(signal.raise_signal, signal.SIGKILL))
@@ -79,37 +79,37 @@ def told(recording):
 
 
 @pytest.mark.slow
-def test_every_pixel_has_its_answer_though_workers_were_killed(told):
-    assert sorted(told) == [*HIDDEN, BAD, KILLER]
+def test_every_pixel_has_its_answer_though_workers_were_killed(answers_by_pixel):
+    assert sorted(answers_by_pixel) == [*HIDDEN, BAD, KILLER]
     for pixel, terms in HIDDEN.items():
-        answer, error = told[pixel]
+        answer, error = answers_by_pixel[pixel]
         assert not error
         assert answer.found.causes == tuple(terms)
 
 
-def test_answers_are_those_of_one_process(told, recording):
+def test_answers_are_those_of_one_process(answers_by_pixel, recording):
     for task in tasks_of(DisplayRuns.open([recording]))[:2]:
-        alone, there = diagnose_pixel(task).discrepancy, told[task.pixel][0].discrepancy
+        alone, there = diagnose_pixel(task).discrepancy, answers_by_pixel[task.pixel][0].discrepancy
         assert alone.parameters == there.parameters
         assert alone.candidates == there.candidates
         assert alone.gain == there.gain
 
 
-def test_bad_data_are_that_pixels_error_alone(told):
-    answer, _ = told[BAD]
+def test_bad_data_are_that_pixels_error_alone(answers_by_pixel):
+    answer, _ = answers_by_pixel[BAD]
     assert answer.discrepancy is None
     assert "pixel31-run/displacement_m/t_s[7]" in answer.error
     assert "\n" not in answer.error
 
 
-def test_a_pixel_that_kills_its_workers_is_told_and_takes_no_other_with_it(told):
-    answer, error = told[KILLER]
+def test_a_pixel_that_kills_its_workers_is_told_and_takes_no_other_with_it(answers_by_pixel):
+    answer, error = answers_by_pixel[KILLER]
     assert answer is None
     assert "worker died" in error
 
 
-def test_what_is_told_of_a_display(told):
-    pixels = tuple(told[pixel][0] for pixel in [*HIDDEN, BAD])
+def test_what_is_told_of_a_display(answers_by_pixel):
+    pixels = tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD])
     found = DisplayAnswer(pixels, None, 1.0)
     lines = build_display_narrative(found)
     assert lines[0].startswith("Of 7 pixels, each diagnosed separately, 2 show an error of the nominal model")
@@ -125,8 +125,8 @@ def test_what_is_told_of_a_display(told):
     assert document["pixels"]["31"]["verdict"] is None
 
 
-def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(told):
-    found = DisplayAnswer(tuple(told[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
+def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(answers_by_pixel):
+    found = DisplayAnswer(tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
     html = build_display_report(found, "display.h5", load_config("display-437"))
     assert html.count("<title>pixel ") == 437
     assert "<title>pixel 21: the laser&#x27;s power falls while it is on (laser_droop); laser_droop.share 0." in html

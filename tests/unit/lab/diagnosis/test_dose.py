@@ -1,4 +1,4 @@
-"""A joule wears one pixel as it wears another: doses are shares of the most that any pixel had."""
+"""Doses are relative to the largest dose of any pixel."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The noise model against dense matrices, and what it recovers from repeats."""
+"""The noise model agrees with dense matrices and recovers known noise from repeats."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What repeats say: how surely the noise is known, whether the power is steady, what one cause may look like."""
+"""Evidence from repeats: certainty of the noise, steadiness of the power, forms of a cause."""
 
 from dataclasses import replace
 
@@ -28,18 +28,18 @@ CLOCKS = ("temperature", "displacement", "force", "mirrors")
 TEMPERATURE = "absorber_temperature_K"
 
 
-def pieces(rng, pulses, size):
-    """Pulses in pieces of about 10 ms, each stronger or weaker than it should be."""
+def split_pulses(rng, pulses, size):
+    """Split pulses into slices of about 10 ms with randomly higher or lower power."""
     rows = []
-    for start_s, width_s, power_w, lit in pulses:
+    for start_s, width_s, power_w, pixel in pulses:
         count = max(1, round(width_s / 0.01))
         powers = power_w * (1.0 + size * rng.choice([-1.0, 1.0], count))
-        rows += [(start_s + k * width_s / count, width_s / count, powers[k], lit) for k in range(count)]
+        rows += [(start_s + k * width_s / count, width_s / count, powers[k], pixel) for k in range(count)]
     return np.array(rows)
 
 
 def hopping_lab(seed, size=0.05):
-    """A clean lab whose power hops within pulses, in each run by chance."""
+    """Return a recording without hidden effects whose power fluctuates within pulses at random."""
     rng, runs = np.random.default_rng(seed), []
     for run in lab(seed, {}).runs:
         t_s = run.signals[TEMPERATURE].t_s
@@ -47,7 +47,7 @@ def hopping_lab(seed, size=0.05):
             simulate_signals(
                 PixelExperiment(pulses, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values({})
             )
-            for pulses in (pieces(rng, run.pulses, size), run.pulses)
+            for pulses in (split_pulses(rng, run.pulses, size), run.pulses)
         )
         signals = {
             name: Signal(0, t_s, signal.value + real[kind] - meant[kind])
@@ -90,18 +90,18 @@ def test_bins_of_pure_noise_have_their_degrees_and_repeats_set_the_scale():
     problem = replace(problem, noise=replace(noise, coloured=plain))
     shared = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
     rng = np.random.default_rng(3)
-    residual, swing = np.zeros(len(data.value)), np.zeros(len(data.value))
+    residual, oscillation = np.zeros(len(data.value)), np.zeros(len(data.value))
     for block in data.blocks:
         white = plain[block.kind].white
         residual[block.part] = white * rng.standard_normal(len(block.t_s))
-        swing[block.part] = white * np.sin(2.0 * np.pi * block.t_s / 0.03)
+        oscillation[block.part] = white * np.sin(2.0 * np.pi * block.t_s / 0.03)
     found = compute_omnibus(problem, residual[:, None], shared)
     assert found.degrees > 60
     for chi2, degrees in ((found.chi2, found.degrees), (found.noise_chi2, found.noise_degrees)):
         assert abs(chi2 - degrees) < 4.5 * np.sqrt(2.0 * degrees)
-    # Noise half as strong again as the model has it is no effect; what all repeats share is one.
+    # Noise 1.5 times that of the model is no effect; a residual common to all repeats is one.
     assert compute_omnibus(problem, 1.5 * residual[:, None], shared).p_value > 1e-3
-    assert compute_omnibus(problem, (residual + 1.5 * swing)[:, None], shared).p_value < 1e-4
+    assert compute_omnibus(problem, (residual + 1.5 * oscillation)[:, None], shared).p_value < 1e-4
 
 
 def test_power_that_hops_within_pulses_is_not_named(hopping):
@@ -118,7 +118,7 @@ def test_steady_power_is_steady_and_hops_are_far_from_it():
 
 
 def test_a_droop_that_does_not_follow_the_power_is_still_a_droop():
-    """Each rung with a share of its own: the diode warms the same whatever its power."""
+    """Each power has another share: the droop does not scale with power."""
     runs = []
     for group, share in (("short", 0.1), ("weak", 0.3), ("middle", 0.16), ("strong", 0.1), ("train", 0.1)):
         terms = {"laser_droop": {"share": share, "time": 0.04, "spread": 1.0}}
@@ -168,15 +168,15 @@ def test_a_lag_at_the_end_of_its_range_is_no_rival_of_a_late_clock():
 
 def test_the_experiment_says_which_pixel_and_no_size_is_said_twice(hopping):
     ask = NextExperiment("description", np.array([[0.0, 0.01, 1.0, 1.0]]), 4, 3, ("force_N",), 9.0, 6.0)
-    told = build_answer(replace(hopping, next_experiment=ask))["next_experiment"]
-    assert (told["pixel"], told["repeats"]) == (4, 3)
+    proposal = build_answer(replace(hopping, next_experiment=ask))["next_experiment"]
+    assert (proposal["pixel"], proposal["repeats"]) == (4, 3)
     twice = tuple(CandidateCause("gas_leak", "gas_leak", 1.0, 1.0, None, "", size) for size in ("rate 1", "rate 2"))
     lines = build_narrative(replace(hopping, verdict="none", candidates=twice))
     assert [line for line in lines if "gas_leak" in line] == ["- gas_leak: rate 1"]
 
 
 def rivals_of(runs, near, far):
-    """Two models beside one quiet recording, as candidates that fit it alike."""
+    """Propose an experiment for two models that fit one recording equally well."""
     problem, base = fit_nominal(build_dataset(runs))
     fits = []
     for terms in (near, far):
@@ -190,7 +190,7 @@ def test_an_experiment_is_asked_for_only_where_it_would_tell_and_as_often_as_it_
     quiet = lab(27, {}, ("short", "strong"))
     alike = rivals_of(quiet, {"gas_leak": {"rate": 0.1}}, {"gas_leak": {"rate": 0.1001}})
     assert alike is None
-    told = rivals_of(quiet, {"gas_leak": {"rate": 0.02}}, {"wall_heating": {"resistance": 6.0, "capacity": 0.05}})
-    assert told.separation >= 12.0
-    assert 3 <= told.repeats <= 30
-    assert f"{told.repeats} times" in told.description
+    proposal = rivals_of(quiet, {"gas_leak": {"rate": 0.02}}, {"wall_heating": {"resistance": 6.0, "capacity": 0.05}})
+    assert proposal.separation >= 12.0
+    assert 3 <= proposal.repeats <= 30
+    assert f"{proposal.repeats} times" in proposal.description

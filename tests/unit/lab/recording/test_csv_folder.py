@@ -1,4 +1,4 @@
-"""Recordings as a folder of CSV files: round trips, and what only this form can get wrong."""
+"""Recordings as a folder of CSV files: round trips, and errors specific to this form."""
 
 import numpy as np
 import pytest

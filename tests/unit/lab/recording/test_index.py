@@ -1,4 +1,4 @@
-"""Looking into a recording without reading its samples, and reading only some of its runs."""
+"""Indexing a recording without its samples, and reading selected runs."""
 
 import h5py
 import numpy as np

@@ -1,4 +1,4 @@
-"""Recordings as one HDF5 file: round trips, and every refusal by its place."""
+"""Recordings as one HDF5 file: round trips, and every refusal with its place."""
 
 import contextlib
 import dataclasses
@@ -182,7 +182,7 @@ def huge(file):
 def few(file):
     del file["runs/run10"]
     del file[f"{RUN}/absorber_temperature_K"]
-    file[f"{HEIGHT}/value"][5:] = np.nan  # one of the first five is missing already
+    file[f"{HEIGHT}/value"][5:] = np.nan  # one of the first five is missing as well
 
 
 def linked(file):
@@ -294,7 +294,7 @@ REFUSALS = {
 
 @pytest.mark.parametrize("kind", REFUSALS)
 def test_refused_in_one_line_that_names_the_place(kind, path, monkeypatch):
-    monkeypatch.setattr(reader, "probe_in_sandbox", lambda path: None)  # the library itself is sure of these files
+    monkeypatch.setattr(reader, "probe_in_sandbox", lambda path: None)  # these files do no harm to the library
     damage, words = REFUSALS[kind]
     with h5py.File(path, "r+") as file:
         damage(file)

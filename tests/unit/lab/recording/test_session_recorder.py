@@ -1,4 +1,4 @@
-"""A session's file and its writer, a process of its own, without a board."""
+"""The file of a session and its writer process, without a board."""
 
 import os
 import resource
@@ -58,7 +58,7 @@ def test_plans_are_kept_and_a_rest_begins_a_new_run(tmp_path):
         assert sorted(file["plans"]) == ["config", "p1", "p2", "p3", "p4", "p5"]
         assert file["plans/p2"].attrs["run"] == "run1"
         assert file["plans/p4"].attrs["run"] == "run2"
-        assert file["plans/p5"].attrs["run"] == "run3"  # the board's clock was set anew
+        assert file["plans/p5"].attrs["run"] == "run3"  # the clock of the board was reset
         assert (file["plans/p3"].attrs["status"], file["plans/p3"].attrs["error"]) == ("cancelled", "why")
         assert "run" not in file["plans/p3"].attrs
         np.testing.assert_allclose(file["plans/p1/simulated_m"], 1e-5)
@@ -99,7 +99,7 @@ def test_a_writer_that_ends_or_hangs_holds_nobody_up(tmp_path, number):
 
 
 def test_its_feeder_ending_ends_the_writer_with_all_that_came(tmp_path):
-    """As after kill -9 of the daemon: the pipe closes in the middle of a note."""
+    """As after kill -9 of the daemon: the pipe closes in the middle of an entry."""
     said = []
     recorder = SessionRecorder(tmp_path / "a.h5", ABOUT, said.append)
     recorder.record(lambda: note("p1", 0.0))
