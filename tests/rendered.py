@@ -1,6 +1,6 @@
 """Synthetic pictures of a grid and of the beam's spot, as taken by a camera above the display.
 
-Independent of the camera calibration. For every camera pixel the lens distortion is inverted iteratively and the ray
+Independent of the camera calibration. The lens distortion of each camera pixel is inverted iteratively and the ray
 is intersected with the display's plane.
 """
 

@@ -71,7 +71,7 @@ def _simulate_state_space(a, jump, spread, read, normals):
 
 @njit(cache=True)
 def _compute_innovations(a, jump, spread, read, variance, columns):
-    """Return the normalised innovations of a Kalman filter for every column, with common gains."""
+    """Return the normalised innovations of a Kalman filter with the same gains for all columns."""
     n, m = columns.shape
     result = np.empty((n, m))
     p = spread.copy()

@@ -22,7 +22,7 @@ def writer_of(daemon):
     return found[0]
 
 
-def test_asked_planned_executed_and_reckoned_and_a_merge(board, make_daemon, tmp_path):
+def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, make_daemon, tmp_path):
     path = tmp_path / "session.h5"
     daemon = make_daemon(board, options=("--record-session", str(path)))
     daemon.arm()
@@ -37,7 +37,7 @@ def test_asked_planned_executed_and_reckoned_and_a_merge(board, make_daemon, tmp
     with h5py.File(path) as file:
         runs, plans = file["runs"], file["plans"]
         assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "failed"]
-        np.testing.assert_allclose(plans["p1/asked_um"][0, [17, 18]], [90, 60])
+        np.testing.assert_allclose(plans["p1/target_um"][0, [17, 18]], [90, 60])
         for answer in answers:
             kept, told = plans[answer["plan"]], answer["executed_pulses"]
             np.testing.assert_allclose(1e6 * kept["simulated_m"][:], told["simulated_um"])

@@ -39,7 +39,7 @@ def describe_display(display: DisplayModel) -> dict[str, Any]:
 
 
 def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> PlanEntry:
-    """A plan that has ended: asked (frames, trains), planned, executed on the board's time, heights reckoned."""
+    """Return the entry of an ended plan: request, plan, execution on the board's clock, and simulated heights."""
     planned, plan = record.planned, record.planned.plan
     frames = planned.sequence.frames
     trains = [train_to_json(train) for train in planned.sequence.trains]
@@ -53,10 +53,10 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
         "trains": json.dumps(trains),
     }
     arrays = {
-        "asked_frames": np.array([(f.show_at_s, f.duration_s, f.simultaneous, f.priority) for f in frames]).reshape(
+        "requested_frames": np.array([(f.show_at_s, f.duration_s, f.simultaneous, f.priority) for f in frames]).reshape(
             -1, 4
         ),
-        "asked_um": 1e6 * np.array([frame.target_m for frame in frames]),
+        "target_um": 1e6 * np.array([frame.target_m for frame in frames]),
         "planned": np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel, plan.trimmed_j]),
         "predicted_m": planned.predicted_m,
     }
@@ -64,7 +64,7 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
     if executed is not None and len(executed):
         on_s = executed.on_tick * tick_s
         unix_s = time.time() - (board_now_s - float(on_s[0]))
-        attributes |= {"lit_unix_s": unix_s, "lit_at": datetime.fromtimestamp(unix_s, UTC).isoformat()}
+        attributes |= {"first_pulse_unix_s": unix_s, "first_pulse_at": datetime.fromtimestamp(unix_s, UTC).isoformat()}
         arrays["executed"] = np.column_stack([on_s, executed.width_s, executed.power_w, executed.pixel])
         heights_m = record.simulated_m if record.simulated_m is not None else compute_simulated_m(record)
         if heights_m is not None:

@@ -1,4 +1,4 @@
-"""Execution of many tasks on Dask, in local processes or on a cluster; losing a worker only costs time."""
+"""Execution of many tasks on Dask, in local processes or on a cluster, with recovery from lost workers."""
 
 import logging
 import re

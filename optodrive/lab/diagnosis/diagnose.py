@@ -1,4 +1,4 @@
-"""Diagnosis of a recording: pixels and mirrors separately, then combined; independent of files and output formats."""
+"""Diagnosis of a recording, separately for pixels and mirrors and then combined."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Validity checks of a recording; every function raises InputError that names the place of the violation."""
+"""Validity checks of a recording that raise InputError with the place of the violation."""
 
 import numpy as np
 

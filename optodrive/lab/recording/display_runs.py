@@ -1,7 +1,8 @@
-"""Recordings of a whole display grouped by pixel; the runs of a pixel are read where they are diagnosed.
+"""Recordings of a whole display grouped by pixel.
 
-A pixel gets the runs in which it was measured, with the whole drive of each run. Light on a pixel in a run that did not
-measure it is unknown to that pixel. Mirror signals belong to no pixel and form a group of their own.
+A worker reads the runs of a pixel where it diagnoses them. A pixel gets the runs in which it was measured, with the
+whole drive of each run. Light on a pixel in a run that did not measure it is unknown to that pixel. Mirror signals
+belong to no pixel and form a group of their own.
 """
 
 from dataclasses import dataclass, replace

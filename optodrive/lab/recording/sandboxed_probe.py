@@ -19,9 +19,9 @@ from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS, Unquoted
 
 CPU_LIMIT_S = 5
 RUN_BYTES_PER_CPU_S = 20_000_000
-"""CPU limit of one run: `CPU_LIMIT_S` plus one second per so many bytes of the file; reading is always faster."""
+"""Bytes per second of CPU time that a run may take beyond `CPU_LIMIT_S`; even compressed data is read faster."""
 FILE_BYTES_PER_CPU_S = 200_000
-"""CPU limit of the file: `CPU_LIMIT_S` plus one second per so many bytes; even a small run takes milliseconds."""
+"""Bytes per second of CPU time that the whole file may take beyond `CPU_LIMIT_S`; small runs take milliseconds."""
 MEMORY_BYTES = 2**32
 _PROGRAM = "from optodrive.lab.recording.sandboxed_probe import main; main()"
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore"}

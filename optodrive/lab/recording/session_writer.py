@@ -65,7 +65,10 @@ class SessionRecordingFile:
             group.attrs["ambient_K"] = self._metadata["ambient_K"]
             group.attrs["bridge_width_m"] = self._metadata["bridge_width_m"]
             group.attrs["sample"] = self._metadata["display"]
-            group.attrs["started_at"], group.attrs["started_unix_s"] = metadata["lit_at"], metadata["lit_unix_s"]
+            group.attrs["started_at"], group.attrs["started_unix_s"] = (
+                metadata["first_pulse_at"],
+                metadata["first_pulse_unix_s"],
+            )
             columns = len(TABLE_COLUMNS[PULSES])
             group.create_dataset(
                 PULSES, shape=(0, columns), maxshape=(None, columns), chunks=(256, columns), dtype="f8"

@@ -1,4 +1,4 @@
-"""Writing of a recording in either form; the target is replaced as a whole or stays unchanged."""
+"""Atomic writing of a recording in either form."""
 
 from dataclasses import replace
 from pathlib import Path

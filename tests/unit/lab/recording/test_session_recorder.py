@@ -21,7 +21,7 @@ ABOUT = {"display": "d", "optodrive": "0", "ambient_K": 293.15, "bridge_width_m"
 
 def note(plan, start_s, pulses=3, padding=0):
     about = {"plan": plan, "name": "n", "status": "done", "error": None, "summary": "{}", "trains": "[]"}
-    about |= {"lit_unix_s": 1e9 + start_s, "lit_at": "2001-09-09T01:46:40+00:00"}
+    about |= {"first_pulse_unix_s": 1e9 + start_s, "first_pulse_at": "2001-09-09T01:46:40+00:00"}
     begin_s = start_s + 0.02 * np.arange(pulses)
     columns = [begin_s, np.full(pulses, 0.01), np.full(pulses, 2.0), np.full(pulses, 17.0)]
     executed = np.column_stack(columns)
