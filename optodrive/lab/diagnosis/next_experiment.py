@@ -65,7 +65,8 @@ def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray,
 
 def _list_pulsed_pixels(data: Dataset) -> list[int]:
     """Return the pulsed pixels, most frequent first."""
-    return [pixel for pixel, _ in Counter(int(lit) for run in data.runs for lit in run.pulses[:, 3]).most_common()]
+    counts = Counter(int(pixel) for run in data.runs for pixel in run.pulses[:, 3])
+    return [pixel for pixel, _ in counts.most_common()]
 
 
 def _build_synthetic_dataset(pulses: FloatArray, pixel: int, span_s: float, kinds: tuple[int, ...]) -> Dataset:
