@@ -65,8 +65,8 @@ Interpretation:
 - So is the error of the force, but not its reason. A smaller area and a compliant load cell are nearly the same line
   through two numbers. Without any force the extended model is worse than the literal one, because its gas is correctly
   warmer: two errors had compensated each other.
-- No fit can tell that the membrane is not a plate and the gas not at constant volume. The two errors cancel in Text S1's
-  displacement per kelvin, so a fit has nothing to correct. Volume and force reveal them by arithmetic.
+- No fit can tell that the membrane is not a plate and the gas not at constant volume. The two errors cancel in
+  Text S1's displacement per kelvin, so a fit has nothing to correct. Volume and force reveal them by arithmetic.
 - A dead time of 2.3 ms makes 50 µm at 217 pixels per second agree with everything else, and 400 µm at 26.5 as well. It
   depends on the first; the second agrees but does not require it. The paper mentions pulse times only, and small steps
   of inexpensive mirrors take 0.3 to 0.5 ms. The dead time is therefore the meaning of that number, not a finding.
