@@ -1,1 +1,1 @@
-"""What the mirrors' servos really are: steps measured on them to delay, bandwidth, damping, slew, and how sure."""
+"""Identification of the galvo servos: bandwidth, damping, delay and slew limit from measured steps."""

@@ -1,4 +1,4 @@
-"""One servo that stands for both mirrors: never nearer to rest than either of them, as the gate opens by it."""
+"""One servo model for both mirrors that settles no sooner than either of them, since the gate timing relies on it."""
 
 from dataclasses import dataclass
 from math import cos, exp, pi, sin, sqrt
@@ -12,21 +12,22 @@ from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import IdentifiedServo
 
 DAMPING_MIN, DAMPING_MAX = 0.3, 0.9
-"""What a configuration may state."""
+"""Range of the configuration."""
 FREQUENCY_MIN_HZ = 100.0
 TOLERANCE_SHARES = (1.0, 0.75, 0.5)
-"""The gate keeps up to so much of its tolerance for former moves."""
+"""Shares of the gate's tolerance at which settling is compared; former moves may use the rest."""
 MOVE_SIZE_COUNT = 8
 FREQUENCY_STEP = 0.995
 SETTLING_SLACK = 1.001
-"""So much sooner is as late."""
+"""Permitted ratio of required to actual settling time."""
 
 
 @dataclass(frozen=True)
 class CommonServo:
-    """servo: for both; galvo_share: by how much the galvo cap must be lowered, as the quicker mirror accelerates more.
+    """A servo model for both mirrors.
 
-    later: of x and y, by what share the servo's mean settle time is longer than the mirror's own
+    galvo_share: factor on the galvo cap, since the faster mirror accelerates more than the model
+    settling_excess: of x and y, relative excess of the model's mean settling time over the mirror's own
     """
 
     servo: Servo
@@ -35,7 +36,10 @@ class CommonServo:
 
 
 def find_common_servo(mirrors: tuple[IdentifiedServo, IdentifiedServo], config: Config) -> CommonServo:
-    """For moves from a pitch to the whole display, at the gate's tolerances, with each mirror's 95 % interval."""
+    """Find the servo with the smallest mean settling time that covers the 95 % intervals of both mirrors.
+
+    Moves range from one pitch to the whole display, at the gate's tolerances.
+    """
     moves = [
         (step_rad, share * tolerance_rad, axis)
         for axis, tolerance_rad in enumerate(config.tolerance_rad)
@@ -55,7 +59,7 @@ def find_common_servo(mirrors: tuple[IdentifiedServo, IdentifiedServo], config: 
 
 
 def move_sizes_rad(config: Config, axis: int) -> list[float]:
-    """Moves along one axis from a pitch to the whole display, rad."""
+    """Return sizes of moves along one axis from one pitch to the whole display, rad."""
     display = config.display
     pitch_rad = display.pitch_m / (2.0 * config.scanner.focal_length_m)
     farthest = max(1, (display.columns, display.rows)[axis] - 1)
@@ -69,7 +73,7 @@ def _slow_to_required(
     moves: list[tuple[float, float, int]],
     required_s: FloatArray,
 ) -> Servo:
-    """A servo like this one, with the longer delay and the lower slew, as slow as both mirrors need."""
+    """Lower the frequency of a servo, with the longer delay and the lower slew, until it settles as required."""
     damping = min(max(start.damping, DAMPING_MIN), DAMPING_MAX)
     delay_s, slew = max(each.servo.delay for each in mirrors), min(each.servo.slew for each in mirrors)
     frequency = start.frequency
@@ -102,7 +106,7 @@ def _settling_excess(
 
 
 def _acceleration_energy(servo: Servo, move_rad: float) -> float:
-    """Integral of the squared acceleration of a move, rad²/s³, as the limiter counts it."""
+    """Return the integral of the squared acceleration of a move, rad²/s³, as the limiter computes it."""
     omega, damping = 2.0 * pi * servo.frequency, servo.damping
     root = sqrt(1.0 - damping**2)
     phase = min(omega * root * move_rad / servo.slew, pi)

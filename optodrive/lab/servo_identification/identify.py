@@ -1,4 +1,4 @@
-"""A servo out of its measured steps: least squares from the best of a grid of starts, and how sure the answer is."""
+"""Servo identification by least squares from the best of a grid of starting points, with covariance."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -15,18 +15,18 @@ from optodrive.lab.servo_identification.step_response import step_response_rad
 from optodrive.lab.servo_identification.step_trace import AXES, StepTrace, TraceSegment
 
 PARAMETER_NAMES = ("frequency", "damping", "delay", "slowness")
-"""What is fitted: the logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
+"""Fitted parameters: logarithm of the frequency, damping, delay in s, 1 / slew in s/rad."""
 LOWER_BOUNDS = np.array([np.log(50.0), 0.05, 0.0, 1e-6])
 UPPER_BOUNDS = np.array([np.log(3e4), 0.999, 0.01, 1.0])
 SCALE = np.array([0.1, 0.1, 1e-5, 1e-3])
 START_SAMPLES_MAX = 3000
-"""Samples that starts are tried on."""
+"""Maximum number of samples for the comparison of starting points."""
 FIT_SAMPLES_MAX = 100_000
 STARTS_REFINED = 4
 SLEW_SIGMAS_MIN = 5.0
-"""1 / slew must lie so many sigma above 0, else the steps were too small to show it."""
+"""Minimum distance of 1 / slew from 0 in sigmas; below it the steps were too small to identify the slew."""
 SAMPLE_SPACING_MAX = 0.4
-"""Samples a period of the servo at least, as its inverse."""
+"""Maximum sample spacing in periods of the servo."""
 FREQUENCY_UNCERTAINTY_MAX = 0.1
 SERVO_SAMPLES = 60
 CONFIDENCE = 0.95
@@ -39,10 +39,11 @@ DELAY_SHARES = (0.0, 0.3, 0.6, 0.9)
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedServo:
-    """A mirror's servo. sigma: of frequency (relative), damping, delay (s), 1/slew (s/rad); covariance likewise [4, 4].
+    """The identified servo of a mirror.
 
-    gain, offset_rad: of the measured angle; misfit: rms of what is left, in units of the noise
-    slew_seen: else servo.slew is assumed
+    covariance: [4, 4] of log frequency, damping, delay (s), 1/slew (s/rad)
+    gain, offset_rad: of the measured angle; misfit: rms residual in units of the noise
+    slew_identified: if not, servo.slew is assumed
     """
 
     trace: StepTrace
@@ -58,23 +59,23 @@ class IdentifiedServo:
 
     @property
     def residual_rad(self) -> float:
-        """Rms of what is left of the angles, as weighted by their noise, rad."""
+        """Rms residual of the angles, weighted by their noise, rad."""
         return self.misfit * self.trace.noise_rad
 
     @property
     def sigma(self) -> FloatArray:
-        """One sigma of each of NAMES, [4]."""
+        """Standard deviation of each of PARAMETER_NAMES, [4]."""
         sigma: FloatArray = np.sqrt(np.diag(self.covariance))
         return sigma
 
     def sample_servos(self) -> list[Servo]:
-        """Servos that the trace does not tell from this one, DRAWS of them."""
+        """Return SERVO_SAMPLES servos sampled from the covariance."""
         random = np.random.default_rng(0)
         packed = random.multivariate_normal(_pack(self.servo), self.covariance, SERVO_SAMPLES, method="eigh")
         return [_unpack(each) for each in np.clip(packed, LOWER_BOUNDS, UPPER_BOUNDS)]
 
     def settling_s(self, step_rad: float, tolerance_rad: float) -> tuple[float, float, float]:
-        """Settle time, as the gate counts it, and its 95 % interval, s."""
+        """Return the settling time by the gate's definition, and its 95 % interval, s."""
         times_s = [settling_s(servo, step_rad, tolerance_rad) for servo in self.sample_servos()]
         best_s = settling_s(self.servo, step_rad, tolerance_rad)
         low, high = np.quantile(times_s, [0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2]).tolist()
@@ -82,7 +83,10 @@ class IdentifiedServo:
 
 
 def identify(where: str, trace: StepTrace, assumed_slew_rad_per_s: float) -> IdentifiedServo:
-    """Fit a servo to a trace; where the slew does not show, the assumed one is kept. InputError names `where`."""
+    """Fit a servo to a trace; keep the assumed slew if the steps do not identify it.
+
+    Raise InputError, naming `where`, if sampling or noise do not permit an identification.
+    """
     start_trace, fit_trace = _decimate(trace, START_SAMPLES_MAX), _decimate(trace, FIT_SAMPLES_MAX)
     free = np.full(4, True)
     starts = sorted(_generate_starts(trace), key=lambda start: float((_residual(start_trace, start)[0] ** 2).sum()))[
@@ -119,7 +123,7 @@ def _pack(servo: Servo) -> FloatArray:
 
 
 def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, float]:
-    """What a servo leaves of the angles, in units of their noise, with the gain and offset that leave least."""
+    """Return the residual in units of the noise, with the gain and offset that minimise it."""
     servo = _unpack(packed)
     model = np.concatenate([step_response_rad(servo, piece.steps, piece.t_s) for piece in trace.segments])
     value = np.concatenate([piece.value_rad for piece in trace.segments])
@@ -132,7 +136,7 @@ def _residual(trace: StepTrace, packed: FloatArray) -> tuple[FloatArray, float, 
 
 
 def _fit(trace: StepTrace, start: FloatArray, free: BoolArray) -> tuple[FloatArray, float, FloatArray]:
-    """The best servo near a start, the sum of squares it leaves, and the covariance, 0 for what is not free."""
+    """Fit from a starting point; return parameters, cost, and covariance with zeros for fixed parameters."""
 
     def expand(part: FloatArray) -> FloatArray:
         packed = start.copy()
@@ -159,7 +163,7 @@ def _generate_starts(trace: StepTrace) -> Iterator[FloatArray]:
 
 
 def _rise_s(trace: StepTrace) -> float:
-    """The shortest time after which a mirror has gone a tenth of its step, s: its delay is less."""
+    """Return the median time in which the mirror covers a tenth of a step, s, an upper bound of the delay."""
     shortest_s = []
     for piece in trace.segments:
         steps = piece.steps
@@ -174,7 +178,7 @@ def _rise_s(trace: StepTrace) -> float:
 
 
 def _decimate(trace: StepTrace, max_samples: int) -> StepTrace:
-    """Samples chosen evenly, about so many at the most."""
+    """Decimate a trace evenly to about max_samples."""
     stride = -(-sum(len(piece.t_s) for piece in trace.segments) // max_samples)
     pieces = tuple(
         TraceSegment(each.steps, each.t_s[::stride], each.value_rad[::stride], each.noise_rad)

@@ -1,4 +1,4 @@
-"""What is to be said of two identified mirrors: in numbers, in words, and as mirrors.toml."""
+"""Report of two identified mirrors: as data, as text lines, and as mirrors.toml."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -15,26 +15,26 @@ from optodrive.lab.servo_identification.identify import IdentifiedServo
 from optodrive.lab.servo_identification.step_trace import AXES
 
 INTERVAL_SIGMAS = 1.96
-"""A 95 % interval to either side."""
+"""Half-width of a 95 % interval."""
 STEP_TOLERANCE = 0.02
-"""Of a step, the usual tolerance of a settle time."""
+"""Usual tolerance of a settling time, relative to the step."""
 RELATIVE_TOLERANCE = 0.05
-"""Steps whose sizes differ by less are shown as one."""
+"""Step sizes that differ by less are reported as one."""
 SIZES_MAX = 6
 BANDWIDTH_TOLERANCE, DELAY_TOLERANCE_S, SETTLING_TOLERANCE = 0.03, 1e-5, 0.05
 MISFIT_MAX = 1.5
-"""A residual so many times the noise is not noise alone."""
+"""A residual above this multiple of the noise shows an unmodelled response."""
 CRITICAL_DAMPING = 0.99
 
 
 def build_report(
     mirrors: tuple[IdentifiedServo, IdentifiedServo], common: CommonServo, config: Config
 ) -> dict[str, Any]:
-    """Figures for people and programs, SI; intervals are of 95 %."""
+    """Build the report in SI units; intervals are 95 %."""
     return {
         "scanner": scanner_table(common.servo),
         "galvo": {"share": common.galvo_share},
-        "later": dict(zip(AXES, common.settling_excess, strict=True)),
+        "settling_excess": dict(zip(AXES, common.settling_excess, strict=True)),
         "axes": {AXES[mirror.trace.axis]: _axis_report(mirror, config) for mirror in mirrors},
         "remarks": [remark for mirror in mirrors for remark in _axis_remarks(mirror, config)]
         + _common_servo_remarks(mirrors, common),
@@ -42,7 +42,7 @@ def build_report(
 
 
 def scanner_table(servo: Servo) -> dict[str, float]:
-    """A servo by the keys of a configuration's scanner."""
+    """Return a servo under the keys of the configuration's [scanner]."""
     return {
         "bandwidth_hz": servo.frequency,
         "damping": servo.damping,
@@ -52,20 +52,20 @@ def scanner_table(servo: Servo) -> dict[str, float]:
 
 
 def format_report_lines(report: dict[str, Any]) -> list[str]:
-    """The figures in plain words."""
+    """Format the report as text lines."""
     lines = []
     for name, axis in report["axes"].items():
         low, high = axis["bandwidth_interval_hz"]
-        slew = f"{axis['slew_rad_per_s']:.4g} rad/s" if axis["slew_seen"] else "not seen"
+        slew = f"{axis['slew_rad_per_s']:.4g} rad/s" if axis["slew_identified"] else "not identified"
         lines += [
             f"mirror {name}         bandwidth {axis['bandwidth_hz']:.1f} Hz ({low:.1f} to {high:.1f}), damping "
-            f"{axis['damping']:.3f} ± {axis['damping_half']:.3f}, delay {1e6 * axis['delay_s']:.1f} ± "
-            f"{1e6 * axis['delay_half_s']:.1f} µs, slew {slew}",
+            f"{axis['damping']:.3f} ± {axis['damping_half_width']:.3f}, delay {1e6 * axis['delay_s']:.1f} ± "
+            f"{1e6 * axis['delay_half_width_s']:.1f} µs, slew {slew}",
             f"                 residual {1e6 * axis['residual_rad']:.1f} µrad rms, "
             f"noise {1e6 * axis['noise_rad']:.1f}; "
             f"gain {axis['gain']:.4f}; {axis['steps']} steps",
         ]
-        for row in axis["settle"]:
+        for row in axis["settling"]:
             lines.append(f"  step {1e3 * row['step_rad']:8.3f} mrad  " + _describe_settling(row))
     scanner = report["scanner"]
     lines.append("[scanner]        " + ", ".join(f"{key} = {value:.5g}" for key, value in scanner.items()))
@@ -73,7 +73,7 @@ def format_report_lines(report: dict[str, Any]) -> list[str]:
 
 
 def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
-    """Write mirrors.toml, whole or not at all. source: what it was measured from, in words."""
+    """Write mirrors.toml atomically. source: description of the recording."""
     printable = "".join(letter for letter in source if letter.isprintable() and letter not in '"\\')
     text = [
         f'format = "{MIRRORS_FORMAT}"',
@@ -83,10 +83,10 @@ def write_mirrors(path: Path, report: dict[str, Any], source: str) -> None:
         f'source = "{printable}"',
         "",
     ]
-    text += ["[scanner] # for both mirrors, in place of the configuration's", *_format_pairs(report["scanner"])]
-    text += ["", "[galvo] # what the quicker mirror leaves of the galvo cap", *_format_pairs(report["galvo"])]
+    text += ["[scanner] # for both mirrors, instead of the configuration's", *_format_pairs(report["scanner"])]
+    text += ["", "[galvo] # factor on the galvo cap, for the faster mirror", *_format_pairs(report["galvo"])]
     for name, axis in report["axes"].items():
-        text += ["", f"[axes.{name}] # as measured, for people", *_format_pairs(axis)]
+        text += ["", f"[axes.{name}] # as measured, for information", *_format_pairs(axis)]
     with atomic_write(path) as temporary:
         temporary.write_text("\n".join(text) + "\n", encoding="utf-8")
 
@@ -108,21 +108,23 @@ def _axis_report(mirror: IdentifiedServo, config: Config) -> dict[str, Any]:
     return {
         **scanner_table(servo),
         "bandwidth_interval_hz": [servo.frequency * float(np.exp(sign * half_widths[0])) for sign in (-1, 1)],
-        "damping_half": float(half_widths[1]),
-        "delay_half_s": float(half_widths[2]),
-        "slew_seen": mirror.slew_identified,
+        "damping_half_width": float(half_widths[1]),
+        "delay_half_width_s": float(half_widths[2]),
+        "slew_identified": mirror.slew_identified,
         "slew_interval_rad_per_s": slew_interval if mirror.slew_identified else None,
         "gain": mirror.gain,
         "offset_rad": mirror.offset_rad,
         "residual_rad": mirror.residual_rad,
         "noise_rad": mirror.trace.noise_rad,
         "steps": len(mirror.trace.steps_rad),
-        "settle": [_settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)],
+        "settling": [
+            _settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)
+        ],
     }
 
 
 def _distinct_sizes_rad(steps_rad: "np.ndarray[Any, np.dtype[np.float64]]") -> list[float]:
-    """Sizes that differ; where there are many, some from the smallest to the largest."""
+    """Return distinct sizes, at most SIZES_MAX from the smallest to the largest."""
     sizes: list[float] = []
     for step_rad in np.sort(steps_rad).tolist():
         if not sizes or step_rad > (1.0 + RELATIVE_TOLERANCE) * sizes[-1]:
@@ -150,7 +152,7 @@ def _settling_row(mirror: IdentifiedServo, step_rad: float, config: Config) -> d
 
 def _describe_settling(row: dict[str, Any]) -> str:
     parts = []
-    for name, words in (("gate", "gate's tolerance"), ("share", f"{STEP_TOLERANCE:.0%} of it")):
+    for name, words in (("gate", "gate's tolerance"), ("share", f"{STEP_TOLERANCE:.0%} of the step")):
         each = row[name]
         low, high = (1e3 * value for value in each["interval_s"])
         excess = each["configured_s"] / each["measured_s"] - 1.0
@@ -167,29 +169,29 @@ def _axis_remarks(mirror: IdentifiedServo, config: Config) -> list[str]:
     if not mirror.slew_identified:
         configured = config.scanner.slew_rad_per_s
         remarks.append(
-            f"{name}: the slew cannot be told, no step was large enough to show it; the configuration's {configured:g} rad/s "
-            "is kept. Settle times of larger moves rest on it"
+            f"{name}: the slew is not identified, no step was large enough; the configuration's {configured:g} rad/s "
+            "is kept. Settling times of larger moves depend on it"
         )
     if half_widths[0] > BANDWIDTH_TOLERANCE or half_widths[2] > DELAY_TOLERANCE_S:
         remarks.append(
-            f"{name}: not sure enough: bandwidth ± {half_widths[0]:.1%}, delay ± {1e6 * half_widths[2]:.1f} µs; "
+            f"{name}: large uncertainty: bandwidth ± {half_widths[0]:.1%}, delay ± {1e6 * half_widths[2]:.1f} µs; "
             "measure more steps, or sample faster"
         )
     if mirror.misfit > MISFIT_MAX:
         remarks.append(
-            f"{name}: what is left is {mirror.misfit:.1f} times the noise: "
-            "the mirror does more than a servo of the second order with a delay and a slew limit"
+            f"{name}: the residual is {mirror.misfit:.1f} times the noise: "
+            "the response is not only a second-order servo with a delay and a slew limit"
         )
     if servo.damping + half_widths[1] > CRITICAL_DAMPING:
         remarks.append(
-            f"{name}: damped critically or more, as nearly as can be told; a configuration is underdamped always"
+            f"{name}: critically damped or overdamped within the uncertainty; a configuration is always underdamped"
         )
     for row in (_settling_row(mirror, step_rad, config) for step_rad in _distinct_sizes_rad(mirror.trace.steps_rad)):
         low_s, high_s = row["share"]["interval_s"]
         if high_s - low_s > 2.0 * SETTLING_TOLERANCE * row["share"]["measured_s"]:
             remarks.append(
-                f"{name}: a step of {1e3 * row['step_rad']:.3g} mrad is within {STEP_TOLERANCE:.0%} after {1e3 * low_s:.3f} to "
-                f"{1e3 * high_s:.3f} ms: an overshoot just touches it, or too few steps"
+                f"{name}: a step of {1e3 * row['step_rad']:.3g} mrad settles within {STEP_TOLERANCE:.0%} "
+                f"after {1e3 * low_s:.3f} to {1e3 * high_s:.3f} ms: an overshoot near the tolerance, or too few steps"
             )
     return remarks
 
@@ -200,11 +202,12 @@ def _common_servo_remarks(mirrors: tuple[IdentifiedServo, IdentifiedServo], comm
     difference = max(abs(x[key] - y[key]) / max(x[key], y[key], 1e-12) for key in ("frequency", "damping", "slew"))
     if difference > BANDWIDTH_TOLERANCE or max(common.settling_excess) > SETTLING_TOLERANCE:
         remarks.append(
-            "one servo stands for both mirrors and settles no sooner than either: at the gate it takes "
-            f"{common.settling_excess[0]:.1%} longer than x needs and {common.settling_excess[1]:.1%} longer than y"
+            "one servo model covers both mirrors and settles no sooner than either: at the gate it takes "
+            f"{common.settling_excess[0]:.1%} longer than x and {common.settling_excess[1]:.1%} longer than y"
         )
     if common.galvo_share < 1.0 - RELATIVE_TOLERANCE:
         remarks.append(
-            f"the quicker mirror accelerates more than that servo: the galvo cap is taken × {common.galvo_share:.3f}"
+            "the faster mirror accelerates more than that model: "
+            f"the galvo cap is multiplied by {common.galvo_share:.3f}"
         )
     return remarks

@@ -1,6 +1,7 @@
-"""The angle of a servo that was told steps, in closed form: between two bends of its target it swings freely.
+"""Closed-form response of a second-order servo with delay and slew limit to commanded steps.
 
-The target is a line from bend to bend; the error to it is what the slope leaves, −2ζ slope / ω, and Re(2 A exp(λ t)).
+The slew-limited target is piecewise linear. Between its breakpoints the error is the ramp lag −2ζ slope / ω plus the
+free oscillation Re(2 A exp(λ t)).
 """
 
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from optodrive.device.servo import Servo
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What one mirror was told: from each at_s, s, on command_rad; the first one from the beginning. All [k]."""
+    """Commands of one mirror: command_rad from at_s (s) on; the first one holds from the beginning. All [k]."""
 
     at_s: FloatArray
     command_rad: FloatArray
@@ -24,13 +25,13 @@ class Steps:
 
     @property
     def sizes_rad(self) -> FloatArray:
-        """How far each step leads, without its sign, [k − 1]."""
+        """Absolute size of each step, rad, [k − 1]."""
         sizes: FloatArray = np.abs(np.diff(self.command_rad))
         return sizes
 
 
 def step_response_rad(servo: Servo, steps: Steps, t_s: FloatArray) -> FloatArray:
-    """Angle at t_s, rad; at rest at the first command before. The servo's damping lies below 1."""
+    """Return the angle at t_s, rad, from steady state at the first command. The damping must be below 1."""
     pole = pole_per_s(servo)
     ramp_lag_s = -2.0 * servo.damping / (2.0 * np.pi * servo.frequency)
     breakpoints = _find_breakpoints(servo, steps)
@@ -54,7 +55,7 @@ def step_response_rad(servo: Servo, steps: Steps, t_s: FloatArray) -> FloatArray
 
 
 def _find_breakpoints(servo: Servo, steps: Steps) -> list[tuple[float, float, float]]:
-    """Where the target's line bends: time, target there and its slope from there on."""
+    """Return the breakpoints of the slew-limited target: time, target, and slope after it."""
     at_s, command = (steps.at_s + servo.delay).tolist(), steps.command_rad.tolist()
     target = command[0]
     breakpoints = [(at_s[0], target, 0.0)]

@@ -1,4 +1,4 @@
-"""Steps and angles of one mirror out of a recording, and what is wrong with them, named as what it is."""
+"""Extraction of one mirror's steps and angles from a recording, with checks of axes, sign and units."""
 
 from dataclasses import dataclass
 
@@ -12,20 +12,20 @@ from optodrive.lab.servo_identification.step_response import Steps
 AXES = ("x", "y")
 STEPS_MIN = 3
 STEPS_MAX = 400
-"""More steps than this teach nothing more."""
+"""Steps beyond this number add no information."""
 WINDOW_S = 0.02
-"""What comes later after a step says nothing of the servo."""
+"""Samples later than this after a step are not used."""
 STUCK_GAIN = 0.02
-"""A mirror that moves by less than this share of what was asked does not move."""
+"""A mirror with a smaller gain than this is stuck."""
 GAIN_TOLERANCE = 0.25
 NOISE_MIN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
 class TraceSegment:
-    """One run of one mirror: what it was told, and its measured angles value_rad at t_s, [m].
+    """One run of one mirror: its commands, and its measured angles value_rad at t_s, [m].
 
-    noise_rad: rms of a sample, found where the mirror rests; runs may be measured on ranges of their own
+    noise_rad: rms noise of a sample, from settled samples; runs may have different measuring ranges
     """
 
     steps: Steps
@@ -39,7 +39,7 @@ class TraceSegment:
 
 @dataclass(frozen=True, eq=False)
 class StepTrace:
-    """All runs of one mirror. axis: 0 is x; spacing_s: between samples."""
+    """All runs of one mirror. axis: 0 for x, 1 for y; spacing_s: median time between samples."""
 
     axis: int
     segments: tuple[TraceSegment, ...]
@@ -58,7 +58,7 @@ class StepTrace:
 
 
 def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
-    """What a recording says of mirror x or y; InputError, naming `where`, for one that says too little or is wrong."""
+    """Extract the trace of mirror x or y. Raise InputError, naming `where`, if it is incomplete or inconsistent."""
     name = f"mirror_{AXES[axis]}_rad"
     runs = [run for run in measurement.runs if name in run.signals and run.commands is not None and len(run.commands)]
     if not runs:
@@ -78,7 +78,7 @@ def extract_trace(where: str, measurement: Measurement, axis: int) -> StepTrace:
 
 
 def _extract_segment(run: Run, axis: int, steps_left: int) -> TraceSegment | None:
-    """The first steps of a run while there is room, and the samples near them; None for a run without a step."""
+    """Extract up to steps_left steps of a run and the samples near them; None for a run without steps."""
     signal, commands = run.signals[f"mirror_{AXES[axis]}_rad"], run.commands
     assert commands is not None  # noqa: S101
     finite = np.isfinite(signal.value)
@@ -101,7 +101,7 @@ def _extract_segment(run: Run, axis: int, steps_left: int) -> TraceSegment | Non
 
 
 def _find_settled_rows(at_s: FloatArray, t_s: FloatArray) -> FloatArray:
-    """The command's row at samples late in their hold, −1 at others, [m]."""
+    """Return the command's row for samples late in their hold, −1 for others, [m]."""
     row = np.clip(np.searchsorted(at_s, t_s, side="right") - 1, 0, None)
     end_s = np.append(at_s[1:], max(t_s[-1], at_s[-1]))
     late = t_s >= at_s[row] + 0.75 * (end_s[row] - at_s[row])
@@ -110,7 +110,7 @@ def _find_settled_rows(at_s: FloatArray, t_s: FloatArray) -> FloatArray:
 
 
 def _check_following(where: str, runs: list[Run], axis: int) -> None:
-    """Refuse a mirror that stands still, goes the other way, follows the other's commands, or is in other units."""
+    """Raise InputError for a mirror that is stuck, inverted, exchanged with the other one, or in other units."""
     commands_at, measured = [], []
     for run in runs:
         signal, commands = run.signals[f"mirror_{AXES[axis]}_rad"], run.commands
@@ -138,9 +138,9 @@ def _check_following(where: str, runs: list[Run], axis: int) -> None:
     if not spread[axis]:
         return
     if abs(own_gain) < STUCK_GAIN:
-        raise InputError(where, found, "a mirror that moves when it is told to: it stands still")
+        raise InputError(where, found, "a mirror that follows its commands: it is stuck")
     if own_gain < 0.0:
-        raise InputError(where, found, f"an angle that rises with {own_axis}_rad: axis inverted")
+        raise InputError(where, found, f"an angle that increases with {own_axis}_rad: axis inverted")
     if abs(own_gain - 1.0) > GAIN_TOLERANCE:
         unit = ": degrees?" if 40.0 < own_gain < 75.0 else ": optical angles?" if 1.7 < own_gain < 2.3 else ""
         raise InputError(
@@ -149,7 +149,7 @@ def _check_following(where: str, runs: list[Run], axis: int) -> None:
 
 
 def _noise_rad(steps: Steps, t_s: FloatArray, value_rad: FloatArray) -> float:
-    """Rms noise of a sample, from second differences late in each hold; at the least LEAST_NOISE of a step."""
+    """Return the rms noise of a sample from second differences late in each hold; at least NOISE_MIN of a step."""
     row = _find_settled_rows(steps.at_s, t_s)
     second_differences = np.abs(np.diff(value_rad, 2)[(row[:-2] == row[2:]) & (row[:-2] >= 0)])
     sigma_rad = 1.4826 * float(np.median(second_differences)) / np.sqrt(6.0) if len(second_differences) else 0.0

@@ -49,7 +49,7 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
     told = json.loads(capsys.readouterr().out)
     config = load_config()
     for axis, (name, servo) in enumerate(zip("xy", SERVOS, strict=True)):
-        rows = told["axes"][name]["settle"]
+        rows = told["axes"][name]["settling"]
         assert [row["step_rad"] for row in rows] == pytest.approx(SIZES_RAD)
         for row, size_rad in zip(rows, SIZES_RAD, strict=True):
             for key, tolerance_rad in (("gate", config.tolerance_rad[axis]), ("share", 0.02 * size_rad)):
@@ -58,7 +58,7 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
                 assert low_s <= row[key]["measured_s"] <= high_s
                 configured_s = settling_s(build_servo(config.scanner), size_rad, tolerance_rad)
                 assert row[key]["configured_s"] == pytest.approx(configured_s)
-    assert any("one servo stands for both" in remark for remark in told["remarks"])
+    assert any("one servo model covers both" in remark for remark in told["remarks"])
 
 
 def test_the_one_servo_settles_no_sooner_than_either_mirror(folder):

@@ -113,7 +113,7 @@ def test_too_few_steps_are_counted(measured):
     [
         (lambda x, y: (y, x), "axes exchanged"),
         (lambda x, y: (-x, y), "axis inverted"),
-        (lambda x, y: (1e-6 * np.sin(np.arange(len(x))), y), "it stands still"),
+        (lambda x, y: (1e-6 * np.sin(np.arange(len(x))), y), "it is stuck"),
         (lambda x, y: (np.degrees(x), y), "degrees"),
         (lambda x, y: (2.0 * x, y), "optical angles"),
     ],

@@ -31,7 +31,7 @@ def unlike():
 
 def test_a_mirror_damped_critically_is_said_and_planned_slower_by_what_may_be_stated(unlike):
     found, common = told(unlike)
-    assert any(remark.startswith("x: damped critically") for remark in found["remarks"])
+    assert any(remark.startswith("x: critically damped") for remark in found["remarks"])
     assert common.servo.damping <= DAMPING_MAX
     assert common.servo.frequency < SLOW.hz
     assert common.settling_excess[1] > common.settling_excess[0] >= -0.005
@@ -41,7 +41,7 @@ def test_a_mirror_damped_critically_is_said_and_planned_slower_by_what_may_be_st
 def test_the_quicker_mirrors_acceleration_lowers_the_galvo_cap(unlike):
     found, common = told(unlike)
     assert common.galvo_share < 0.8
-    assert any("the galvo cap is taken ×" in line for line in format_report_lines(found))
+    assert any("the galvo cap is multiplied by" in line for line in format_report_lines(found))
 
 
 def test_a_mirror_that_does_more_than_a_servo_is_said(unlike):
@@ -52,13 +52,13 @@ def test_a_mirror_that_does_more_than_a_servo_is_said(unlike):
         return replace(run, signals=run.signals | {"mirror_y_rad": Signal(0, signal.t_s.copy(), value)})
 
     found, _ = told(Measurement(tuple(ringing(run) for run in unlike.runs)))
-    assert any(remark.startswith("y: what is left is") for remark in found["remarks"])
+    assert any(remark.startswith("y: the residual is") for remark in found["remarks"])
 
 
 @pytest.mark.slow
 def test_small_steps_say_that_the_slew_cannot_be_told():
     small = recording((SLOW, QUICK), np.random.default_rng(8), 1e5, 0.01, (2e-4,))
     found, common = told(small)
-    assert sum("the slew cannot be told" in remark for remark in found["remarks"]) == 2
+    assert sum("the slew is not identified" in remark for remark in found["remarks"]) == 2
     assert common.servo.slew == pytest.approx(CONFIG.scanner.slew_rad_per_s)
-    assert any("slew not seen" in line for line in format_report_lines(found))
+    assert any("slew not identified" in line for line in format_report_lines(found))
