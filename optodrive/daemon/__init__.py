@@ -1,1 +1,1 @@
-"""The daemon: the engine that joins the stages, and its REST interface."""
+"""Daemon: the engine and its REST interface."""

@@ -1,7 +1,7 @@
-"""What the daemon has to say while it runs: lines on stderr, or entries with fields where stderr is the journal's.
+"""Log of the daemon: lines on stderr, or entries with fields if stderr is connected to the journal.
 
-The journal's own socket rather than lines with a priority in front: a datagram that does not wait. A pipe to a journal
-that stands still would hold up whoever writes to it, and the engine's loop is one of them.
+Entries go to the journal's socket as non-blocking datagrams. A pipe to a stalled journal would block its writers, the
+engine's loop among them.
 """
 
 import logging
@@ -19,7 +19,7 @@ PRIORITY: dict[LogLevel, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
 
 
 class DaemonLog:
-    """Where lines go. journal: the journal's socket, None for stderr."""
+    """Writer of log lines. journal: path of the journal's socket, None for stderr."""
 
     def __init__(self, journal: Path | None = None) -> None:
         self._journal = None if journal is None else str(journal)
@@ -27,8 +27,8 @@ class DaemonLog:
         self._socket.setblocking(False)
 
     def write(self, line: str, level: LogLevel = "info", **fields: object) -> None:
-        """Say a line; what cannot be said is lost. fields: upper-case names, for the journal only."""
-        with suppress(OSError):  # a log that cannot be written must not end what it is about
+        """Write a line, or drop it on failure. fields: additional upper-case fields, for the journal only."""
+        with suppress(OSError):  # a failing log must not end the daemon
             if self._journal is None:
                 sys.stderr.write(f"optodrive: {line}\n")
                 sys.stderr.flush()
@@ -36,22 +36,22 @@ class DaemonLog:
                 self._socket.sendto(format_entry(line, level, fields), self._journal)
 
     def warn(self, line: str) -> None:
-        """Say that something is not as it should be."""
+        """Write a line of level warning."""
         self.write(line, "warning")
 
     def close(self) -> None:
-        """Give the socket back."""
+        """Close the socket."""
         self._socket.close()
 
     def attach_to_root_logger(self) -> None:
-        """Say what libraries log, from warnings on."""
+        """Write the log records of libraries from level warning on."""
         handler = _Handler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
 
 
 def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes:
-    """An entry in the journal's own form; values of several lines are sent by their length."""
+    """Return an entry in the journal's native format, in which multi-line values are prefixed with their length."""
     entry_fields = {"MESSAGE": line, "PRIORITY": PRIORITY[level], "SYSLOG_IDENTIFIER": "optodrive"}
     entry_fields |= {f"OPTODRIVE_{name}": value for name, value in fields.items()}
     parts = []
@@ -65,7 +65,7 @@ def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes
 
 
 def open_daemon_log() -> DaemonLog:
-    """The journal where it says that stderr is its own ($JOURNAL_STREAM), else stderr."""
+    """Return a log to the journal if $JOURNAL_STREAM identifies stderr, else to stderr."""
     with suppress(OSError, ValueError):
         device, _, inode = os.environ.get("JOURNAL_STREAM", "").partition(":")
         stderr_stat = os.fstat(2)

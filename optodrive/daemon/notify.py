@@ -1,4 +1,4 @@
-"""What systemd is told: ready, reloading, leaving, and that the engine's loop is alive: datagrams, never waited for."""
+"""Notifications to systemd as non-blocking datagrams: ready, reloading, stopping and the watchdog."""
 
 import os
 import socket
@@ -8,11 +8,11 @@ from contextlib import suppress
 from optodrive.core.clock import Clock
 
 WATCHDOG_FRACTION = 0.2
-"""The watchdog is fed after this share of the time it allows."""
+"""Interval between watchdog notifications, as a fraction of the watchdog's timeout."""
 
 
 class Notifier:
-    """Tells whoever listens at $NOTIFY_SOCKET; tells nobody where there is none."""
+    """Sender of notifications to $NOTIFY_SOCKET. It does nothing if the variable is not set."""
 
     def __init__(self, clock: Clock, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
@@ -27,26 +27,26 @@ class Notifier:
 
     @property
     def is_enabled(self) -> bool:
-        """Whether a service manager started this process."""
+        """Whether a service manager receives the notifications."""
         return bool(self._address)
 
     def send(self, *lines: str) -> None:
-        """Say something, for example READY=1."""
+        """Send assignments such as READY=1."""
         if self._address:
             with suppress(OSError):
                 self._socket.sendto("\n".join(lines).encode(), self._address)
 
     def notify_reloading(self) -> None:
-        """Say that a reload begins; READY=1 ends it."""
+        """Notify the start of a reload, which READY=1 ends."""
         self.send("RELOADING=1", f"MONOTONIC_USEC={round(self._clock.now_s() * 1e6)}")
 
     def close(self) -> None:
-        """Tell nobody any more."""
+        """Stop sending and close the socket."""
         self._address = ""
         self._socket.close()
 
     def feed_watchdog(self) -> None:
-        """Feed the watchdog where it is time to; called at every turn of the engine's loop, by that loop alone."""
+        """Feed the watchdog if it is due. Only the engine's loop calls it, in every iteration."""
         if self._interval_s is None:
             return
         now_s = self._clock.now_s()

@@ -1,4 +1,4 @@
-"""A new configuration for a daemon that runs: what can be taken at once, and what waits for a restart."""
+"""Reload of the configuration of a running daemon: some keys apply at once, the others after a restart."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -16,35 +16,35 @@ from optodrive.link.protocol.states import LEASED_STATES
 from optodrive.planning.display_model import DisplayModel
 
 RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
-"""Keys of [daemon]; the file of tokens is read again too."""
+"""Keys of [daemon] that apply at once. The tokens file is also read again."""
 
 
 def require_disarmed(board_state: str) -> None:
-    """NotReadyError while the board may emit: what it runs under stays as it was when it was armed."""
+    """Raise NotReadyError while the board may emit, because an armed board keeps the configuration of its arming."""
     if board_state in LEASED_STATES:
-        raise NotReadyError(f"nothing is reloaded while the board is {board_state}; disarm it first")
+        raise NotReadyError(f"no reload while the board is {board_state}; disarm it first")
 
 
 def split_changed_keys(running: Config, new: Config) -> tuple[list[str], list[str]]:
-    """Keys that differ: those that are taken at once, and those that wait for a restart."""
+    """Return the changed keys: those that apply at once, and those that need a restart."""
     keys = _find_differences(running.model_dump(), new.model_dump(), "")
     reloaded = [key for key in keys if key in {f"daemon.{name}" for name in RELOADABLE_KEYS}]
     return reloaded, [key for key in keys if key not in reloaded]
 
 
 def merge_reloadable(running: Config, new: Config) -> Config:
-    """The configuration that runs, with what is taken at once from the new one."""
+    """Return the running configuration with the reloadable keys of the new one."""
     daemon = running.daemon.model_copy(update={name: getattr(new.daemon, name) for name in RELOADABLE_KEYS})
     return running.model_copy(update={"daemon": daemon})
 
 
 def describe_reload(reloaded: list[str], waiting: list[str], tokens_file: Path | None) -> str:
-    """What a reload did, in one line."""
-    parts = [f"taken: {', '.join(reloaded)}" if reloaded else "nothing to be taken at once"]
+    """Return the effect of a reload in one line."""
+    parts = [f"applied: {', '.join(reloaded)}" if reloaded else "nothing to apply at once"]
     if tokens_file is not None:
-        parts.append(f"tokens read again from {tokens_file}")
+        parts.append(f"tokens read from {tokens_file}")
     if waiting:
-        parts.append(f"WAITING FOR A RESTART: {', '.join(waiting)}")
+        parts.append(f"RESTART REQUIRED FOR: {', '.join(waiting)}")
     return "reloaded; " + "; ".join(parts)
 
 
@@ -60,7 +60,7 @@ def _find_differences(old: dict[str, Any], new: dict[str, Any], prefix: str) -> 
 
 
 class ConfigReloader:
-    """SIGHUP from a service manager: the configuration is read again, checked whole, and taken as far as can be."""
+    """Handler of SIGHUP from a service manager: reads, validates and applies the configuration."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class ConfigReloader:
         self._log = log
 
     def request_reload(self, *_: object) -> None:
-        """Reload soon, between two callbacks of the web server's loop; before that runs there is nothing to reload."""
+        """Schedule a reload in the web server's loop. Do nothing before that loop runs."""
         if self._server.loop is not None:
             self._server.loop.call_soon_threadsafe(self._reload)
 
@@ -90,15 +90,15 @@ class ConfigReloader:
         try:
             self._log.write(self._apply(), "notice", EVENT="reloaded")
         except OptodriveError as error:
-            self._log.write(f"not reloaded, all stays as it was: {error}", "err", EVENT="reload-refused")
+            self._log.write(f"not reloaded, nothing changed: {error}", "err", EVENT="reload-refused")
         finally:
             self._notifier.send("READY=1")
 
     def _apply(self) -> str:
-        assert self._read_config is not None  # noqa: S101 - else the signal ends the daemon
+        assert self._read_config is not None  # noqa: S101 - without it the signal ends the daemon
         require_disarmed(self._engine.board_state)
         new = self._read_config()
-        DisplayModel.from_config(new)  # finds what is wrong between the sections, as at a start
+        DisplayModel.from_config(new)  # validates the sections against each other, as at startup
         reloaded, waiting = split_changed_keys(self._running, new)
         self._running = merge_reloadable(self._running, new)
         daemon = self._running.daemon
@@ -107,5 +107,5 @@ class ConfigReloader:
         self._access_policy.update(tokens, daemon)
         self._server.config.ws_max_size = daemon.body_max_bytes
         if self._access_policy.audit is not None:
-            self._access_policy.audit.record({"event": "reloaded", "taken": reloaded, "waiting": waiting})
+            self._access_policy.audit.record({"event": "reloaded", "applied": reloaded, "waiting": waiting})
         return describe_reload(reloaded, waiting, file)

@@ -1,4 +1,4 @@
-"""The daemon's process: engine up, web server up, and both down again, dark, whatever ends it."""
+"""Main function of the daemon process: starts engine and web server, and stops both with the gate off."""
 
 import signal
 import sys
@@ -36,13 +36,14 @@ def run(
     read_config: Callable[[], Config] | None = None,
     session_path: Path | None = None,
 ) -> None:
-    """Serve until a signal; the board is told to stop on the way out, and goes dark by itself if that is not heard.
+    """Serve until a signal arrives. Then abort the board, whose lease turns the gate off if it does not receive that.
 
-    record: note every byte on the link in this file, which must be new. again: reads the configuration anew; a service
-    manager's SIGHUP asks for that, any other ends the daemon, for its terminal has gone.
-    record_session: note every plan in this HDF5 file, which must be new; else as the configuration says
+    capture_path: new file for a capture of the link
+    read_config: reads the configuration again on SIGHUP of a service manager; any other SIGHUP ends the daemon, because
+    its terminal has closed
+    session_path: new HDF5 file for a recording of every plan, instead of the configured one
     """
-    with ExitStack() as exit_stack:  # closed from the last to the first: the engine before all others
+    with ExitStack() as exit_stack:  # closes in reverse order: the engine first
         log = open_daemon_log()
         exit_stack.callback(log.close)
         make_transport = find_transport_factory(config.board)
@@ -70,7 +71,7 @@ def run(
             exit_stack.callback(_unlink, unix)
             exit_stack.callback(listeners[1].close)
         tokens, path = load_daemon_tokens(config.daemon.tokens, port)
-        if not config.daemon.tokens:  # made for this run
+        if not config.daemon.tokens:  # generated for this run
             exit_stack.callback(_unlink, path)
         exit_stack.callback(engine.close)
         engine.start()
@@ -82,7 +83,7 @@ def run(
                 log_config=None,
                 access_log=False,
                 server_header=False,
-                proxy_headers=False,  # a caller does not say by itself from where it calls
+                proxy_headers=False,  # a client must not set its own address
                 timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
                 ws="websockets-sansio",
                 ws_max_size=config.daemon.body_max_bytes,
@@ -91,7 +92,7 @@ def run(
         log.attach_to_root_logger()
 
         def shut_down(*_: object) -> None:
-            engine.stop()  # dark first: the server may wait for callers that are slow to go
+            engine.stop()  # gate off first, because the server may wait for slow clients
             app.state.telemetry.close()
             notifier.send("STOPPING=1")
             server.should_exit = True
@@ -105,9 +106,11 @@ def run(
         print(
             f"optodrive: {config.name} on http://{config.daemon.host}:{port}{socket_text}, token in {path}", flush=True
         )
-        if sys.stdout.isatty():  # a secret: to whoever sits there, never to a log
+        if sys.stdout.isatty():  # a secret: only on a terminal, never in a log
             secret = tokens.most_privileged.secret
-            print(f"optodrive: the page, for you alone: http://{config.daemon.host}:{port}/#token={secret}", flush=True)
+            print(
+                f"optodrive: personal link to the page: http://{config.daemon.host}:{port}/#token={secret}", flush=True
+            )
         print(f"optodrive: board at {engine.link_name}, {engine.board_state}; arm with `optodrive arm`", flush=True)
         if audit is not None:
             audit.record({"event": "started", "display": config.name})
@@ -115,7 +118,7 @@ def run(
         server.on_ready = lambda: notifier.send("READY=1", f"STATUS=board at {engine.link_name}")
         server.run(sockets=listeners)
         if engine.failure is not None:
-            raise LinkError(f"the engine failed, the board was told to abort: {engine.failure!r}")
+            raise LinkError(f"the engine failed and aborted the board: {engine.failure!r}")
 
 
 def _unlink(path: Path) -> None:

@@ -69,7 +69,7 @@ def test_the_queue_is_bounded_and_ended_plans_are_forgotten(armed, monkeypatch):
     first = armed.submit(lambda: train(1.0), "first").result(10)
     wait_for(lambda: armed.get_plan(first.plan).status == "running", "the first to run")
     waiting = [armed.submit(lambda: train(0.02), "waiting").result(10) for _ in range(2)]
-    with pytest.raises(NotReadyError, match="2 plans wait already"):
+    with pytest.raises(NotReadyError, match="2 plans are already waiting"):
         armed.submit(lambda: train(0.02), "too many").result(10)
     for answer in (first, *waiting):
         assert ended(armed, answer).status == "done"

@@ -113,7 +113,7 @@ def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
     engine.on_turn = notifier.feed_watchdog
     wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
     go_on = threading.Event()
-    standing = engine._submit_to_loop(lambda: go_on.wait(30))
+    standing = engine._commands.submit(lambda: go_on.wait(30))
     try:
         time.sleep(0.1)
         before = len(manager.listen())
@@ -149,14 +149,14 @@ def reload(daemon, manager, edit):
     return daemon.errors.read_text().removeprefix(lines)
 
 
-def test_sighup_takes_what_can_be_taken_and_says_what_waits(manager, board, make_daemon):
+def test_sighup_applies_reloadable_keys_and_reports_the_others(manager, board, make_daemon):
     daemon = make_daemon(board)
     daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab.example"})
     more = '\n[daemon]\nhosts = ["lab.example"]\nbody_max_bytes = 2000\n'
     said = reload(daemon, manager, lambda text: text.replace("ambient_c = 20.0", "ambient_c = 25.0") + more)
     assert said.count("\n") == 1
-    assert "taken: daemon.body_max_bytes, daemon.hosts" in said
-    assert "WAITING FOR A RESTART: ambient_c" in said
+    assert "applied: daemon.body_max_bytes, daemon.hosts" in said
+    assert "RESTART REQUIRED FOR: ambient_c" in said
     daemon.call("GET", "/v1/health", headers={"Host": "lab.example"})
     daemon.call("POST", "/v1/plans", status=413, content=b" " * 3000)
     assert daemon.call("GET", "/v1/config")["ambient_c"] == 20.0
@@ -170,7 +170,7 @@ def test_sighup_with_a_wrong_configuration_changes_nothing(manager, board, make_
     daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab"})
 
 
-def test_sighup_while_armed_changes_nothing_and_lights_nothing_out(manager, board, make_daemon):
+def test_sighup_while_armed_changes_nothing_and_keeps_the_board_armed(manager, board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
     said = reload(daemon, manager, lambda text: text + '\n[daemon]\nhosts = ["lab"]\n')

@@ -1,1 +1,1 @@
-"""The engine: planning, queueing and execution of plans on one board session."""
+"""Engine of the daemon: planning, queueing and execution of plans on one board session."""

@@ -1,6 +1,6 @@
-"""The display as it is now: heat and budget of what the board said it executed, on the board's time line.
+"""Present state of the display from the pulses that the board has reported, in board time.
 
-The planner's own heat is ahead of the light; this one follows it. One thread at a time.
+The planner's thermal state is ahead of emission; this one follows it. It is not thread-safe.
 """
 
 from typing import NamedTuple
@@ -18,7 +18,11 @@ from optodrive.planning.limiter.usage import Usage, compute_usage
 
 
 class ExecutedBatch(NamedTuple):
-    """Pulses [n] of a plan as executed; row: of the plan; start_s: board time; also what the limiter may count."""
+    """Executed pulses of a plan, [n], also as input for the limiter.
+
+    row: plan row
+    start_s: board time
+    """
 
     record: PlanRecord
     row: IntArray
@@ -31,7 +35,7 @@ class ExecutedBatch(NamedTuple):
 
     @classmethod
     def from_progress(cls, progress: PlanProgress, scale: WireScale) -> "ExecutedBatch":
-        """What the board reported."""
+        """Build the batch from the board's reports."""
         record, job = progress.run
         plan, reported = record.planned.plan, job.read_reported(progress.begin, progress.end)
         row = reported.row
@@ -48,9 +52,9 @@ class ExecutedBatch(NamedTuple):
 
 
 class LiveThermalState:
-    """Heat and budget as executed; from rest, because a daemon does not know what was before it.
+    """Heat and budget after the executed pulses. The initial state is cold, because the daemon knows no earlier one.
 
-    out_of_order: pulses that came with a time before one on their pixel already known, and were left out
+    out_of_order: number of pulses omitted from the heat because they precede another pulse on their pixel
     """
 
     def __init__(self, display: DisplayModel) -> None:
@@ -59,7 +63,7 @@ class LiveThermalState:
         self.out_of_order = 0
 
     def apply(self, executed: ExecutedBatch) -> None:
-        """Count pulses, in order of time."""
+        """Add pulses, in order of time."""
         columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
         try:
             self._heat.apply_pulses(*columns)
@@ -68,13 +72,13 @@ class LiveThermalState:
         self._budget = commit_executed(executed.pixel, executed, self._budget, self._display.budget)
 
     def shift_clock(self, delay_s: float) -> None:
-        """Everything happened delay_s later on a clock set anew."""
+        """Shift all past pulses by delay_s after a restart of the board's clock."""
         self._heat, self._budget = self._heat.copy_shifted(delay_s), shift_state(self._budget, delay_s)
 
     def state_at(self, board_s: float) -> DisplayState:
-        """Every pixel at a time of the board's, s."""
+        """Return the state of all pixels at a board time, s."""
         return self._heat.state_at(board_s)
 
     def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
-        """How near each cap is at a time of the board's, s."""
+        """Compute the usage of every cap at a board time, s."""
         return compute_usage(self._budget, self._display.budget, board_s)

@@ -1,7 +1,7 @@
-"""The engine: joins the stages, owns the board's session, and alone keeps the board's permit to emit alive.
+"""Engine of the daemon, which owns the board session and alone renews its lease.
 
-Two threads. The engine's own loop talks to the board and renews its lease; it does so only while the planner, which
-works in the second thread, is idle or making progress. Callers on any thread get futures.
+The engine's loop runs in its own thread, communicates with the board and renews the lease. It does so only while the
+planner, in a second thread, is idle or makes progress. Methods for other threads return futures.
 """
 
 import gc
@@ -9,7 +9,6 @@ import sys
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from queue import Empty, SimpleQueue
 from typing import TypeVar
 
 import numpy as np
@@ -18,22 +17,16 @@ from optodrive.core.clock import Clock, request_realtime_scheduling
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
 from optodrive.daemon.engine.planner import Planner, PlanningRequest
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
+from optodrive.daemon.engine.state_report import build_state_report
 from optodrive.daemon.engine.state_waiters import StateWaiters, uncancellable_future
 from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.responses.state import (
-    BoardReport,
-    LinkReport,
-    PlannerReport,
-    PulseTotals,
-    QueueReport,
-    RecentPlan,
-    StateReport,
-)
+from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
@@ -55,10 +48,12 @@ T = TypeVar("T")
 
 
 class Engine:
-    """Runs plans on a board. Methods that return futures may be called from any thread.
+    """Executor of plans on a board. Methods that return futures may be called from any thread.
 
-    failure: what ended the loop, None while it runs; on_failure is then called, after the board was told to abort.
-    say: gets a line whenever the link goes wrong, for the log. on_turn: called at every turn of the loop; must be quick
+    failure: exception that ended the loop, None while it runs
+    on_failure: called after such an exception, once the session has sent ABORT
+    on_warning: called with one line for the log when the link fails
+    on_loop: called in every loop iteration; must return quickly
     """
 
     def __init__(self, display: DisplayModel, transport: Transport, clock: Clock) -> None:
@@ -72,9 +67,9 @@ class Engine:
         self._plan_store = PlanStore()
         self._plan_counters = PlanCounters()
         self._plan_store.end_callbacks.append(self._plan_counters.record_end)
-        self._simulation_executor = ThreadPoolExecutor(1, thread_name_prefix="bookkeeper")
+        self._simulation_executor = ThreadPoolExecutor(1, thread_name_prefix="simulation")
         self._plan_queue = PlanQueue(display, self._session, self._plan_store, self._simulation_executor)
-        self._commands: SimpleQueue[Callable[[], None]] = SimpleQueue()
+        self._commands = LoopCommands()
         self._state_waiters = StateWaiters()
         self._closing = threading.Event()
         self._planner = Planner(display, self._session, self._plan_queue, clock, self._run_in_loop, self._require_armed)
@@ -83,23 +78,23 @@ class Engine:
         self._retry_at_s = 0.0
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
 
-    # --- life ---------------------------------------------------------------------------------------------------
+    # --- lifecycle ----------------------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Connect to the board and start; raises InputError or LinkError where the board cannot be reached."""
-        # The loop gives the interpreter up at every read and write; while the planner computes it would wait for it
-        # 5 ms each time, and a few of those are a lease.
+        """Connect to the board and start the loop. Raise InputError or LinkError if the board cannot be reached."""
+        # The loop releases the GIL at every read and write. While the planner computes, it would wait 5 ms each time to
+        # reacquire it, and a few such waits exceed the lease.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        # A planner that compiles shows no progress, and would cost the lease.
+        # Compilation in the planner reports no progress and would let the lease expire.
         warm_up(self.display)
-        # A collection that walks through everything imported would stop the loop for more than half a lease.
+        # A garbage collection over all imported modules would stall the loop for more than half a lease.
         gc.collect()
         gc.freeze()
         self._session.connect()
         self._thread.start()
 
     def close(self) -> None:
-        """Stop: the board is told to abort, the threads end."""
+        """Send ABORT to the board and end the threads."""
         self._closing.set()
         if self._thread.is_alive():
             self._thread.join(timeout=5.0)
@@ -126,7 +121,7 @@ class Engine:
                 self.on_failure()
 
     def _run_once(self) -> None:
-        self._run_commands()
+        self._commands.run_pending()
         if not self._session.connected:
             self._reconnect()
             return
@@ -137,15 +132,7 @@ class Engine:
         self._plan_queue.update_jobs(refusal)
         self._plan_queue.start_next()
 
-    def _run_commands(self) -> None:
-        while True:
-            try:
-                command = self._commands.get_nowait()
-            except Empty:
-                return
-            command()
-
-    # --- the link -----------------------------------------------------------------------------------------------
+    # --- link ---------------------------------------------------------------------------------------------------
 
     def _on_link_lost(self, error: OptodriveError) -> None:
         self._link_error = self._session.on_lost(error)
@@ -164,7 +151,7 @@ class Engine:
             self._link_error = str(error)
             self._retry_at_s = self._clock.now_s() + RECONNECT_INTERVAL_S
             return
-        # The board may have restarted its clock: what is known of heat moves onto the new one.
+        # The board may have restarted its clock: shift heat and budget to the new one.
         self._plan_queue.on_board_restarted(self._session.board_s() - previous_board_s)
         self._link_error = None
 
@@ -178,15 +165,15 @@ class Engine:
     # --- commands from any thread -------------------------------------------------------------------------------
 
     def arm(self) -> "Future[StateReport]":
-        """Arm the board; done when it is ARMED."""
+        """Arm the board. The future is done when it is ARMED."""
         return self._submit_command(self._session.arm, (BoardState.ARMED,), "arm")
 
     def disarm(self) -> "Future[StateReport]":
-        """Disarm, or acknowledge a fault; done when the board is DISARMED."""
+        """Disarm, or acknowledge a fault. The future is done when the board is DISARMED."""
         return self._submit_command(self._session.disarm, (BoardState.DISARMED,), "disarm")
 
     def stop(self) -> "Future[StateReport]":
-        """Abort: gate off, queue dropped; done when the board is dark for good."""
+        """Abort: turn the gate off and drop the queue. The future is done when the board has confirmed it."""
         return self._submit_command(self._session.abort, IDLE_STATES, "stop")
 
     def _submit_command(
@@ -205,7 +192,7 @@ class Engine:
                 self._plan_queue.fail_all(f"ended by {command}")
             self._state_waiters.add(states, command, self._clock.now_s(), future)
 
-        self._commands.put(run_command)
+        self._commands.post(run_command)
         return future
 
     def _require_link(self) -> None:
@@ -227,13 +214,13 @@ class Engine:
         streamed: bool = False,
         arrived_s: float | None = None,
     ) -> "Future[PlanReport]":
-        """Plan the sequence that `build` makes, and queue it unless dry_run; answers what will be shown when.
+        """Plan the sequence that `build` returns, and queue the plan unless dry_run.
 
-        streamed: it takes the place of everything that has not left yet, and gives way to the next such in turn.
-        arrived_s: board time at which it was asked for, if not now
+        streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
+        arrived_s: board time at which the request arrived, if not now
         """
         if streamed and fit != "as_is":
-            raise InputError("fit", fit, "as_is where the newest wins: a stream has no time to ask what else would fit")
+            raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
         arrived_s = self.board_s() if arrived_s is None else arrived_s
         return self._planner.submit(
             PlanningRequest(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s)
@@ -246,123 +233,97 @@ class Engine:
             fault = f" {board.fault}: {get_fault_hint(board.fault)}" if board.fault else ""
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
         if len(self._plan_queue.waiting) >= QUEUE_MAX:
-            raise NotReadyError(f"{QUEUE_MAX} plans wait already; wait for one to end, or cancel one")
-
-    def _submit_to_loop(self, action: Callable[[], T]) -> "Future[T]":
-        """Do something in the loop's thread, which owns the session."""
-        future: Future[T] = uncancellable_future()
-
-        def run_command() -> None:
-            try:
-                future.set_result(action())
-            except OptodriveError as error:
-                future.set_exception(error)
-
-        self._commands.put(run_command)
-        return future
+            raise NotReadyError(f"{QUEUE_MAX} plans are already waiting; wait for one to end, or cancel one")
 
     def _run_in_loop(self, action: Callable[[], T]) -> T:
-        """What comes of an action in the loop's thread; LinkError where the loop has ended."""
+        """Run an action in the loop's thread and return its result. Raise LinkError if the loop has ended."""
         try:
-            return self._submit_to_loop(action).result(LOOP_TIMEOUT_S)
+            return self._commands.submit(action).result(LOOP_TIMEOUT_S)
         except TimeoutError:
-            raise LinkError(f"the engine did not answer within {LOOP_TIMEOUT_S:g} s: {self.failure!r}") from None
+            raise LinkError(f"the engine did not respond within {LOOP_TIMEOUT_S:g} s: {self.failure!r}") from None
 
     def board_s(self) -> float:
-        """The board's time now, s."""
+        """Return the present board time, s."""
         return self._session.board_s()
 
     def get_end_future(self, plan_id: str) -> "Future[None]":
-        """Done when nothing more will happen to a plan; InputError (plan_not_found) where there is none."""
+        """Return a future that is done when a plan has ended. Raise InputError (plan_not_found) for an unknown plan."""
         return self._plan_store.find(plan_id).end_future
 
     def end_stream(self) -> "Future[PlanReport]":
-        """Let go what has not left of a stream's last plan: whoever sent it is gone."""
+        """Drop the unsent rest of a stream's last plan after its client has disconnected."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
         return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True)
 
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
-        """A plan by its id; InputError (plan_not_found) where there is none."""
+        """Report a plan. Raise InputError (plan_not_found) for an unknown plan."""
         return self._plan_store.find(plan_id).build_report(self._session.board_s(), pulses)
 
     def cancel(self, plan_id: str) -> "Future[PlanReport]":
-        """Take a plan out of the queue, or end it dark; the board stays armed."""
+        """Remove a waiting plan, or turn the gate off and end a running one. The board stays armed."""
 
         def end() -> PlanReport:
             record = self._plan_store.find(plan_id)
             self._plan_queue.cancel(record)
             return record.build_report(self._session.board_s())
 
-        return self._submit_to_loop(end)
+        return self._commands.submit(end)
 
     def add_plan_end_callback(self, callback: Callable[[PlanRecord], None]) -> None:
-        """Have each plan told when it has ended, by whichever thread ended it; `tell` must not wait."""
+        """Register a callback for every plan that ends. Any thread may call it; it must not block."""
         self._plan_store.end_callbacks.append(callback)
 
     @property
     def tick_s(self) -> float:
-        """The board's tick, s."""
+        """Tick of the board, s."""
         return self._session.scale.tick_s
 
-    # --- what can be seen from outside --------------------------------------------------------------------------
+    # --- state --------------------------------------------------------------------------------------------------
 
     @property
     def link_name(self) -> str:
-        """The board's port."""
+        """Port of the board."""
         return self._session.port
 
     @property
     def is_linked(self) -> bool:
-        """Whether there is a link to the board, and its clock is known."""
+        """Whether the link to the board is up and its clock synchronised."""
         return self._session.connected
 
     @property
     def scale(self) -> WireScale:
-        """How SI becomes codes on this board."""
+        """Scale factors between SI units and this board's integers."""
         return self._session.scale
 
     def drain_events(self) -> list[PlanProgress | ClockShift]:
-        """What was done since the last call, in order; for one reader."""
+        """Return and remove the events since the last call, in order. Only one reader may call it."""
         events, drained = self._plan_queue.events, []
         while events:
             drained.append(events.popleft())
         return drained
 
     def list_upcoming(self) -> list[PlanRecord]:
-        """The plans that run, and the first that waits."""
+        """Return the running plans and the first waiting one."""
         plan_queue = self._plan_queue
         waiting = plan_queue.waiting.copy()
         return [run.record for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
 
     @property
     def board_state(self) -> str:
-        """The board's state, or the link's."""
+        """State of the board, `no link` without a link."""
         return self._session.board.state if self._session.connected else "no link"
 
     def snapshot(self) -> StateReport:
         """Report everything that GET /v1/state sends."""
-        plan_queue, session = self._plan_queue, self._session
-        running = next(iter(plan_queue.running.copy()), None)
-        recent = self._plan_store.list_recent()
-        return StateReport(
-            display=self.display.config.name,
-            pixels=len(self.display.layout),
-            link=LinkReport(
-                port=session.port,
-                state="up" if session.connected else "down",
-                error=self._link_error,
-                **session.collect_link_stats(),
-            ),
-            board=BoardReport(**session.board.to_dict()),
-            queue=QueueReport(
-                waiting=len(plan_queue.waiting),
-                running=None if running is None else running.record.plan_id,
-                plans=[RecentPlan(plan=item.plan_id, name=item.name, status=item.status) for item in recent],
-            ),
-            totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
-            planner=PlannerReport(busy=self._planner.is_busy, alive=self._planner.is_alive),
+        return build_state_report(
+            self.display,
+            self._session,
+            self._plan_queue,
+            self._plan_store.list_recent(),
+            self._planner,
+            self._link_error,
         )
 
     def render_metrics(self) -> str:
-        """Everything GET /metrics answers."""
+        """Render the response of GET /metrics."""
         return render_metrics(self.snapshot(), self._plan_counters, self._session, self.display.config.board.lease_s)

@@ -1,4 +1,4 @@
-"""The stream: frames in over a WebSocket, the newest wins, and each is told what became of it."""
+"""Streamed frames over a WebSocket: the newest frame wins, and the client gets the result of every frame."""
 
 import asyncio
 from collections.abc import Callable
@@ -17,13 +17,13 @@ from optodrive.daemon.responses.stream import FrameResult
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
 OUTBOX_MAX = 1000
-"""A caller that leaves so many answers unread is cut off."""
+"""A client with this number of unread results is disconnected."""
 CLOSE_SLOW_READER = 1013
 ProblemFormatter = Callable[[OptodriveError], Problem]
 
 
 class LiveStream:
-    """One caller's stream. A frame that waits for the planner gives way to the next; so does what has not left."""
+    """Stream of one client. A new frame replaces one that waits for the planner, and all unsent pulses."""
 
     def __init__(self, engine: Engine, socket: WebSocket, policy: Policy, to_problem: ProblemFormatter) -> None:
         self._engine = engine
@@ -39,14 +39,14 @@ class LiveStream:
         self._last_end_future: Future[None] | None = None
 
     async def run(self) -> None:
-        """Serve until the caller leaves; what has not left of the last frame is then dropped."""
+        """Serve until the client disconnects. Then drop the unsent pulses of the last frame."""
         await self._socket.accept()
         tasks = [asyncio.create_task(work()) for work in (self._read, self._plan, self._write)]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             if self._last_end_future is not None and not self._last_end_future.done():
-                self._engine.end_stream()  # first: this coroutine may be cancelled while it waits for others
+                self._engine.end_stream()  # first, because this coroutine may be cancelled at its next await
             for task in (*tasks, *self._watchers):
                 task.cancel()
             await asyncio.gather(*tasks, *self._watchers, return_exceptions=True)

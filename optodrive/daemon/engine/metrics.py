@@ -1,4 +1,4 @@
-"""GET /metrics: figures for Prometheus, in its text format, version 0.0.4."""
+"""Metrics of GET /metrics in the Prometheus text format, version 0.0.4."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -18,7 +18,7 @@ Labels = Mapping[str, str]
 
 
 class PlanCounters:
-    """Ended plans, counted: by status, and how long after it was asked for the first light of each fell."""
+    """Counters of ended plans: number by status, and latency from request to first emission."""
 
     def __init__(self) -> None:
         self.ended: Counter[str] = Counter(dict.fromkeys(("done", "superseded", "failed", "cancelled"), 0))
@@ -26,7 +26,7 @@ class PlanCounters:
         self.min_headroom_k: float | None = None
 
     def record_end(self, record: PlanRecord) -> None:
-        """Count a plan that has ended; the loop's thread and the bookkeeper's, one plan each."""
+        """Count an ended plan. The loop's thread and the simulation thread call it, for different plans."""
         self.ended[record.status] += 1
         self.min_headroom_k = float(record.planned.plan.headroom_k.min())
         if record.first_light_after_s is not None:
@@ -34,7 +34,7 @@ class PlanCounters:
 
 
 def render_metrics(snapshot: StateReport, counters: PlanCounters, session: BoardSession, lease_s: float) -> str:
-    """The page. snapshot: as GET /v1/state answers it."""
+    """Render the metrics from a state report and the counters."""
     board, link, totals, queue = snapshot.board, snapshot.link, snapshot.totals, snapshot.queue
     page = _MetricsPage()
     page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot.display}, 1)])
@@ -42,31 +42,33 @@ def render_metrics(snapshot: StateReport, counters: PlanCounters, session: Board
         "board_state", "1 for the board's state", [({"state": s}, int(board.state == s)) for s in REPORTED_STATES]
     )
     page.add_counter(
-        "board_faults_total", "Times the board was seen to go into a fault", _label_counts("fault", session.faults)
+        "board_faults_total", "Number of transitions of the board to each fault", _label_counts("fault", session.faults)
     )
     page.add_counter("laser_on_seconds_total", "Gate-on time × duty since the board's power-up, s", board.laser_on_s)
-    page.add_counter("underruns_total", "Times the board ran out of points", board.underruns)
+    page.add_counter("underruns_total", "Number of times the board ran out of points", board.underruns)
     page.add_gauge("board_temperature_celsius", "The board's temperature", board.temperature_c)
-    page.add_gauge("link_up", "1 while there is a link to the board", int(link.state == "up"))
+    page.add_gauge("link_up", "1 while the link to the board is up", int(link.state == "up"))
     received, sent = {"at": "host"}, {"at": "board"}
     bad = [(received, link.host_bad_frames), (sent, link.board_bad_frames)]
     page.add_counter("link_bad_frames_total", "Damaged frames since the link was opened", bad)
-    page.add_counter("link_retransmitted_total", "Frames sent again since the link was opened", link.retransmitted)
+    page.add_counter("link_retransmitted_total", "Frames retransmitted since the link was opened", link.retransmitted)
     page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link.naks)
-    page.add_gauge("link_round_trip_seconds", "Least round trip to the board", _ms_to_s(link.round_trip_ms))
-    page.add_gauge("link_longest_stall_seconds", "Longest turn of the loop", _ms_to_s(link.longest_stall_ms))
+    page.add_gauge("link_round_trip_seconds", "Shortest recent round trip to the board", _ms_to_s(link.round_trip_ms))
+    page.add_gauge("link_longest_stall_seconds", "Longest iteration of the loop", _ms_to_s(link.longest_stall_ms))
     pulses = [({"stage": stage}, getattr(totals, stage)) for stage in ("planned", "sent", "executed")]
     page.add_counter("pulses_total", "Pulses planned, sent to the board, executed by it", pulses)
-    page.add_counter("plans_total", "Ended plans by how they ended", _label_counts("status", counters.ended))
-    page.add_gauge("plans_waiting", "Plans that wait for the beam", queue.waiting)
+    page.add_counter("plans_total", "Ended plans by status", _label_counts("status", counters.ended))
+    page.add_gauge("plans_waiting", "Plans waiting for the beam", queue.waiting)
     page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(snapshot.planner.alive))
     page.add_gauge(
-        "plan_headroom_kelvin", "Least distance of an absorber's bound from its cap, last plan", counters.min_headroom_k
+        "plan_headroom_kelvin",
+        "Minimum distance of an absorber's bound from its cap, last plan",
+        counters.min_headroom_k,
     )
-    page.add_histogram("first_light_seconds", "From a plan's arrival to its first light", counters.first_light)
-    page.add_histogram("lease_age_seconds", "Age of the lease when it was renewed", session.lease_ages)
-    page.add_gauge("lease_seconds", "Age at which the board goes dark", lease_s)
-    page.add_gauge("lease_slack_seconds", "Least of the lease that was ever left at a renewal", session.lease_slack_s)
+    page.add_histogram("first_light_seconds", "Time from a plan's arrival to its first emission", counters.first_light)
+    page.add_histogram("lease_age_seconds", "Age of the lease at its renewal", session.lease_ages)
+    page.add_gauge("lease_seconds", "Age of the lease at which the board turns the gate off", lease_s)
+    page.add_gauge("lease_slack_seconds", "Minimum remaining lease at a renewal", session.lease_slack_s)
     return page.render()
 
 
@@ -75,15 +77,15 @@ class _MetricsPage:
         self._lines: list[str] = []
 
     def add_gauge(self, name: str, help_text: str, value: "float | Iterable[tuple[Labels, float]] | None") -> None:
-        """What goes up and down; nothing where it is not known."""
+        """Add a gauge, or nothing if its value is unknown."""
         self._add_family(name, "gauge", help_text, value)
 
     def add_counter(self, name: str, help_text: str, value: "float | Iterable[tuple[Labels, float]]") -> None:
-        """What only goes up."""
+        """Add a counter."""
         self._add_family(name, "counter", help_text, value)
 
     def add_histogram(self, name: str, help_text: str, histogram: Histogram) -> None:
-        """Counts by size."""
+        """Add a histogram."""
         self._add_header(name, "histogram", help_text)
         bounds = [*(repr(bound) for bound in histogram.bounds), "+Inf"]
         counts, total = histogram.cumulative_counts(), histogram.sum
@@ -93,7 +95,7 @@ class _MetricsPage:
         self._add_sample(f"{name}_count", {}, counts[-1])
 
     def render(self) -> str:
-        """All of it."""
+        """Return the text of all metrics."""
         return "\n".join(self._lines) + "\n"
 
     def _add_family(self, name: str, kind: str, help_text: str, value: Any) -> None:
@@ -112,7 +114,9 @@ class _MetricsPage:
 
 
 def _label_counts(label: str, counts: Counter[str]) -> list[tuple[Labels, float]]:
-    return [({label: name}, count) for name, count in counts.copy().items()]  # another thread may add a name
+    return [
+        ({label: name}, count) for name, count in counts.copy().items()
+    ]  # a copy, because another thread may add a name
 
 
 def _ms_to_s(milliseconds: float | None) -> float | None:

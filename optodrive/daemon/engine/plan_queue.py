@@ -1,72 +1,47 @@
-"""What the board is to do: the plans that run and wait, and the heat and budget after them all.
+"""Queue of running and waiting plans, and the heat and budget after them.
 
-A plan that is streamed leaves little by little, so that a newer one may take the place of what has not left.
+The points of a streamed plan are sent shortly before they are due, so that a newer plan can replace the rest.
 """
 
 import threading
 from collections import deque
 from concurrent.futures import Executor
-from dataclasses import dataclass
 from math import inf
-from typing import NamedTuple
 
-import numpy as np
-
-from optodrive.core.types.arrays import BoolArray, FloatArray
-from optodrive.core.types.plans import BudgetState
 from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
+from optodrive.daemon.engine.plan_simulation import simulate_record
+from optodrive.daemon.engine.planning_snapshot import (
+    PlanningSnapshot,
+    RefreshCycle,
+    build_cut_snapshot,
+    mark_refreshed,
+)
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, apply_executed
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, rewind_estimate
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.session import BoardSession
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
-from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import commit_until, shift_state
 
 START_LEAD_S = 0.05
-"""A plan starts so long after it is ready and the one before it has ended: its first points must be there in time."""
+"""Minimum time from now, and from the end of the queue, to a plan's zero. Its first points must arrive in time."""
 STREAM_LEAD_S = 0.02
 STREAM_SEND_AHEAD_S = 0.04
-"""Points of a streamed plan leave so long before they begin; a host that stops for longer makes the board wait."""
+"""Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
 MIN_DELAY_S = 1e-5
 EVENTS_MAX = 20_000
-"""Where nobody takes away what was done: minutes of it. Notes are references, and cost the loop nothing."""
-
-
-@dataclass(frozen=True, eq=False)
-class PlanningSnapshot:
-    """From what a plan is made: its zero on the board's clock, heat and budget then, on its own time line.
-
-    thermal: what was known; a plan made from anything else is of no use
-    after: the running plan that it cuts short, before row `cut`; standing_on: the pixel the mirrors stand on then
-    seen: [p] pixels that a stream's sweep over the display has lit by then
-    """
-
-    thermal: ThermalEstimate
-    start_s: float
-    heat: ThermalState
-    budget: BudgetState
-    predecessor: PlanRecord | None = None
-    cut_row: int = 0
-    initial_pixel: int | None = None
-    refreshed: BoolArray | None = None
-
-
-class _RefreshCycle(NamedTuple):
-    """How far a sweep over the display had come when a stream was cut: it goes on if nothing came between."""
-
-    thermal: ThermalEstimate
-    refreshed: BoolArray
+"""Maximum number of events without a reader, several minutes. Events are references and cost little."""
 
 
 class PlanQueue:
-    """Any thread may ask for `basis`, `busy`, `in_the_way`; all else belongs to the loop that owns the session.
+    """Plans that run on the board or wait for it.
 
-    told: what was done, the newest last, for one reader in another thread who takes it away.
+    Any thread may call make_snapshot() and read is_busy and must_preempt. Everything else belongs to the loop that owns
+    the session.
+    events: executed pulses and clock shifts, newest last, for one reader in another thread that removes them
     """
 
     def __init__(self, display: DisplayModel, session: BoardSession, plan_store: PlanStore, executor: Executor) -> None:
@@ -82,25 +57,26 @@ class PlanQueue:
         self._executor = executor
         self._thermal = ThermalEstimate(*display.build_cold_state())
         self._queue_end_s = 0.0
-        self._refresh_cycle: _RefreshCycle | None = None
+        self._refresh_cycle: RefreshCycle | None = None
 
     @property
     def is_busy(self) -> bool:
         """Whether a plan runs or waits."""
         return bool(self.running or self.waiting)
 
-    # --- from what to plan --------------------------------------------------------------------------------------
+    # --- planning snapshots -------------------------------------------------------------------------------------
 
     def make_snapshot(self, streamed: bool, planning_time_s: float) -> PlanningSnapshot:
-        """Where the next plan begins; a streamed one cuts the running one short, allowance_s for planning from now."""
+        """Build the snapshot for the next plan.
+
+        A streamed plan truncates the running stream at the first pulse that is not yet sent after planning_time_s.
+        """
         with self.lock:
             thermal = self._thermal
             start_s = self._earliest_start_s(streamed, planning_time_s if streamed else 0.0)
             last = self._find_running_stream() if streamed else None
         if last is not None:
-            snapshot = self._snapshot_at_cut(
-                last, thermal, self._session.board_s() + STREAM_SEND_AHEAD_S + planning_time_s
-            )
+            snapshot = self._build_cut_snapshot(last, thermal, planning_time_s)
             if snapshot is not None:
                 return snapshot
         cycle = self._refresh_cycle
@@ -108,7 +84,7 @@ class PlanQueue:
         return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), refreshed=refreshed)
 
     def _find_running_stream(self) -> PlanRecord | None:
-        """The running plan that a newer one may follow without a pause."""
+        """Return the running streamed plan that a newer one may truncate, None without one."""
         if self.waiting or not self.running:
             return None
         record = self.running[-1].record
@@ -118,38 +94,18 @@ class PlanQueue:
         lead_s = STREAM_LEAD_S if streamed else START_LEAD_S
         return max(self._queue_end_s, self._session.board_s() + planning_time_s) + lead_s
 
-    def _snapshot_at_cut(
-        self, record: PlanRecord, thermal: ThermalEstimate, min_start_s: float
+    def _build_cut_snapshot(
+        self, record: PlanRecord, thermal: ThermalEstimate, planning_time_s: float
     ) -> PlanningSnapshot | None:
-        """What is known where a running plan is cut before its first pulse after from_s; None where none is left."""
-        plan = record.planned.plan
-        cut_row = int(np.searchsorted(plan.start_s, min_start_s - record.start_s))
-        # The mirrors stand on the last pulse's pixel only if that was lit.
-        while 0 < cut_row < len(plan) and plan.power_w[cut_row - 1] == 0.0:
-            cut_row += 1
-        if not 0 < cut_row < len(plan):
-            return None
-        end_s = float(plan.start_s[cut_row - 1] + plan.width_s[cut_row - 1])
-        heat = record.heat_before.copy()
-        heat.apply_pulses(plan.pixel[:cut_row], plan.start_s[:cut_row], plan.width_s[:cut_row], plan.power_w[:cut_row])
-        budget = commit_until(plan, float(plan.start_s[cut_row]), record.budget_before, self._display.budget)
-        return PlanningSnapshot(
-            thermal=thermal,
-            start_s=record.start_s + end_s,
-            heat=heat.copy_shifted(-end_s),
-            budget=shift_state(budget, -end_s),
-            predecessor=record,
-            cut_row=cut_row,
-            initial_pixel=int(plan.pixel[cut_row - 1]),
-            refreshed=_mark_refreshed(record, cut_row),
-        )
+        min_start_s = self._session.board_s() + STREAM_SEND_AHEAD_S + planning_time_s
+        return build_cut_snapshot(record, thermal, min_start_s, self._display.budget)
 
-    # --- taking plans on ----------------------------------------------------------------------------------------
+    # --- accepting plans ----------------------------------------------------------------------------------------
 
     def commit(self, record: PlanRecord, snapshot: PlanningSnapshot) -> bool:
-        """Take a plan on; False where what it was made from turned out otherwise meanwhile."""
+        """Accept a plan into the queue. Return False if its snapshot is stale."""
         with self.lock:
-            # A plan before this one came late or failed, the board restarted, or too much has left.
+            # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self._thermal is not snapshot.thermal:
                 return False
             if snapshot.predecessor is None:
@@ -177,12 +133,12 @@ class PlanQueue:
 
     @property
     def must_preempt(self) -> bool:
-        """Whether a plan that is newer must first have others give way."""
+        """Whether a newer streamed plan must preempt others first."""
         with self.lock:
             return bool(self.waiting) or any(not run.record.streamed for run in self.running)
 
     def preempt(self) -> None:
-        """Let what waits, and what runs as a whole, give way to a plan that is newer."""
+        """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
         with self.lock:
             if self.waiting:
                 first = self.waiting[0]
@@ -194,40 +150,43 @@ class PlanQueue:
                 record, job = self.running[0]
                 record.dropped = len(record.planned.plan) - job.sent_count
                 self._session.flush()
-                self.end_running("superseded", "a newer plan took its place")
+                self.end_running("superseded", "replaced by a newer plan")
 
     def truncate_stream(self) -> None:
-        """Cut the running streamed plan short by itself: what comes next begins anew after it, and need not hurry."""
+        """Truncate the running streamed plan at the first pulse not yet due to be sent.
+
+        The next plan then starts after it, without a splice deadline.
+        """
         with self.lock:
             last = self._find_running_stream()
             if last is None:
                 return
-            snapshot = self._snapshot_at_cut(last, self._thermal, self._session.board_s() + STREAM_SEND_AHEAD_S)
+            snapshot = self._build_cut_snapshot(last, self._thermal, planning_time_s=0.0)
             if snapshot is None or not self._session.truncate(last.points.count_before(snapshot.cut_row)):
                 return
             last.dropped = len(last.planned.plan) - snapshot.cut_row
             self._thermal = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
             self._queue_end_s = snapshot.start_s
-            self._refresh_cycle = _RefreshCycle(self._thermal, _mark_refreshed(last, snapshot.cut_row))
+            self._refresh_cycle = RefreshCycle(self._thermal, mark_refreshed(last, snapshot.cut_row))
 
     def _supersede(self, record: PlanRecord) -> None:
         record.dropped = len(record.planned.plan)
-        record.end("superseded", "a newer plan took its place")
+        record.end("superseded", "replaced by a newer plan")
 
     def cancel(self, record: PlanRecord) -> None:
-        """Take a plan out of the queue, or end it dark when it runs, with those that follow it at once."""
+        """Remove a waiting plan, or turn the gate off and end a running plan with its splices."""
         if record in self.waiting:
             with self.lock:
                 self.waiting.remove(record)
-            record.end("cancelled", "taken out of the queue")
+            record.end("cancelled", "removed from the queue")
         elif any(run.record is record for run in self.running):
             self._session.flush()
-            self.end_running("cancelled", "ended while it ran")
+            self.end_running("cancelled", "cancelled while running")
 
-    # --- running them -------------------------------------------------------------------------------------------
+    # --- running plans ------------------------------------------------------------------------------------------
 
     def start_next(self) -> None:
-        """Begin the next plan where the board is ready for it."""
+        """Start the next plan if the board is ready for it."""
         if self.running or not self.waiting or not self._session.is_ready:
             return
         with self.lock:
@@ -240,7 +199,7 @@ class PlanQueue:
             self.running.append(PlanRun(record, self._session.begin(record.points, record.start_s, ahead_s)))
 
     def update_jobs(self, refusal: str | None) -> None:
-        """Take over what the board did; refusal: what it refused since the last look."""
+        """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
         board = self._session.board
         if board.state in UNARMED_STATES and self.is_busy:
             cause = self._session.likely_cause if board.fault == "LINK" else None
@@ -259,10 +218,10 @@ class PlanQueue:
             self._finish_first()
         if self.running and refusal is not None:
             self._session.flush()
-            self.end_running("failed", f"the board refused a part of it ({refusal})")
+            self.end_running("failed", f"the board refused a part of the plan ({refusal})")
 
     def _finish_first(self) -> None:
-        """The first running plan is through: a delay moves everything after it."""
+        """End the first running plan. A delay of it shifts everything after it."""
         with self.lock:
             record, job = self.running.popleft()
             self._conclude(record, job, "superseded" if record.dropped else "done", None)
@@ -301,7 +260,7 @@ class PlanQueue:
                 run.job.delay(round(delay_s / self._session.scale.tick_s))
 
     def end_running(self, status: PlanStatus, error: str | None) -> None:
-        """End everything that runs; what was executed is taken over."""
+        """End all running plans and record what they executed."""
         with self.lock:
             ended = list(self.running)
             self.running.clear()
@@ -314,25 +273,12 @@ class PlanQueue:
                 self._rewind_thermal_state([record for record, _ in ended])
 
     def _rewind_thermal_state(self, ended: list[PlanRecord]) -> None:
-        """Nothing after these will run, nor what they have not fired: heat and budget forget both."""
         gate_off_s = self._session.board_s() + self._display.config.board.lease_s
-        first = ended[0]
-        heat, budget, zero_s = first.heat_before, first.budget_before, first.start_s
-        for record in ended:
-            plan = record.planned.plan
-            heat, budget = heat.copy_shifted(zero_s - record.start_s), shift_state(budget, zero_s - record.start_s)
-            zero_s = record.start_s
-            kept_pulses = len(plan) - record.dropped
-            if kept_pulses:
-                until_s = min(gate_off_s - record.start_s, float(np.nextafter(plan.start_s[kept_pulses - 1], inf)))
-                budget = commit_until(plan, until_s, budget, self._display.budget)
-            if record.executed is not None:
-                heat = apply_executed(heat, record.executed)
-        self._thermal = ThermalEstimate.from_plan(heat, budget, zero_s)
+        self._thermal = rewind_estimate(ended, gate_off_s, self._display.budget)
         self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
 
     def fail_all(self, reason: str) -> None:
-        """Nothing that runs or waits will go on."""
+        """Fail all running and waiting plans."""
         with self.lock:
             waiting = list(self.waiting)
             self.waiting.clear()
@@ -344,38 +290,8 @@ class PlanQueue:
             record.end("failed", reason)
 
     def on_board_restarted(self, delay_s: float) -> None:
-        """The board's clock was set anew: what is known of heat moves onto it."""
+        """Shift heat and budget to the restarted clock of the board."""
         self.events.append(ClockShift(delay_s))
         with self.lock:
             self._thermal = self._thermal.with_delay(delay_s)
             self._queue_end_s = 0.0
-
-
-def _mark_refreshed(record: PlanRecord, cut_row: int) -> BoolArray:
-    """What a sweep over the display has lit when a plan of it is cut; a sweep that is through begins anew."""
-    pixel = record.planned.plan.pixel
-    refreshed = (
-        np.zeros(len(record.heat_before.pixels), dtype=np.bool_)
-        if record.refreshed is None
-        else record.refreshed.copy()
-    )
-    refreshed[pixel[:cut_row]] = True
-    return refreshed if not refreshed[pixel[cut_row:]].all() else np.zeros_like(refreshed)
-
-
-def simulate_record(record: PlanRecord, status: PlanStatus, error: str | None) -> None:
-    """Heights of what was executed; a plan is done only then, so that whoever sees it done may read them."""
-    try:
-        record.simulated_m = compute_simulated_m(record)
-    finally:
-        if not record.has_ended:
-            record.end(status, error)
-
-
-def compute_simulated_m(record: PlanRecord) -> FloatArray | None:
-    """Heights of what was executed, [n]; None where nothing was reported."""
-    executed = record.executed
-    if executed is None:
-        return None
-    columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
-    return record.heat_before.copy().apply_pulses(*columns).displacement_m

@@ -1,4 +1,4 @@
-"""A submitted plan through its life: queued, running, then done, failed or cancelled."""
+"""Records of submitted plans, from queued to done, superseded, failed or cancelled."""
 
 import threading
 from collections.abc import Callable
@@ -22,20 +22,22 @@ from optodrive.planning.planned_sequence import PlannedSequence
 
 RECORDS_MAX = 200
 PULSES_MAX = 1_000_000
-"""Ended plans are forgotten beyond so many plans or pulses."""
+"""Beyond these numbers of plans or pulses the oldest ended plans are dropped."""
 RECENT_PLANS = 20
 
 
 @dataclass
 class PlanRecord:
-    """One plan.
+    """One plan with its progress.
 
-    start_s: board time of its zero; heat_before, budget_before: what it was planned from, on its own time line
-    executed_rows, simulated_m: [n executed] rows of the plan, and the displacement computed from the report
-    streamed: a newer plan may take the place of what has not left, dropped pulses then
-    arrived_s: board time at which it was asked for; *_after_s: what happened so long after that
-    seen: [p] pixels that a stream's sweep over the display had lit before it
-    ending: done when nothing more will happen to it; told_end: is then called with it, and must neither wait nor raise
+    heat_before, budget_before: initial state of the plan, on its own time line
+    start_s: board time of the plan's zero
+    arrived_s: board time of the request; *_after_s: time from the request to an event
+    streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
+    executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
+    refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
+    end_future: done when the plan has ended
+    on_end: called with the record at its end; must neither block nor raise
     """
 
     plan_id: str
@@ -67,11 +69,11 @@ class PlanRecord:
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing more will happen to it."""
+        """Whether the plan has ended."""
         return self.status in ("done", "superseded", "failed", "cancelled")
 
     def end(self, status: PlanStatus, error: str | None) -> None:
-        """Nothing more will happen to it."""
+        """End the plan with a final status."""
         self.status, self.error = status, error
         self.end_future.set_result(None)
         self.on_end(self)
@@ -139,9 +141,9 @@ def _list_executed(executed: ExecutedPulses, simulated_m: FloatArray | None) -> 
 
 
 class PlanStore:
-    """Plans by their id; ended ones are forgotten, the oldest first, beyond so many plans or pulses. Any thread.
+    """Records of plans by id, thread-safe. Beyond RECORDS_MAX or PULSES_MAX the oldest ended plans are dropped.
 
-    on_end: called with each plan when it has ended, by whichever thread ended it; must not wait
+    end_callbacks: called with every plan that ends, by any thread; must not block
     """
 
     def __init__(self) -> None:
@@ -150,7 +152,7 @@ class PlanStore:
         self._records: dict[str, PlanRecord] = {}
 
     def add(self, record: PlanRecord) -> None:
-        """Keep a plan."""
+        """Add a plan."""
         record.on_end = self._run_end_callbacks
         with self._lock:
             self._records[record.plan_id] = record
@@ -166,7 +168,7 @@ class PlanStore:
             callback(record)
 
     def find(self, plan_id: str) -> PlanRecord:
-        """A plan by its id; InputError (plan_not_found) where there is none."""
+        """Return a plan by its id. Raise InputError (plan_not_found) for an unknown plan."""
         with self._lock:
             record = self._records.get(plan_id)
         if record is None:
@@ -174,6 +176,6 @@ class PlanStore:
         return record
 
     def list_recent(self) -> list[PlanRecord]:
-        """The latest plans, oldest first."""
+        """Return the latest plans, oldest first."""
         with self._lock:
             return list(self._records.values())[-RECENT_PLANS:]

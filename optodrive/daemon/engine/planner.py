@@ -1,4 +1,4 @@
-"""The planner: a thread of its own that makes plans and proves their bytes; the engine's loop takes them on."""
+"""Planner thread that plans sequences and verifies the wire bytes before the engine's loop accepts them."""
 
 import threading
 from collections.abc import Callable
@@ -10,8 +10,9 @@ from optodrive.core.clock import Clock
 from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.daemon.engine.plan_queue import PlanningSnapshot, PlanQueue
+from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.session import BoardSession
@@ -24,24 +25,24 @@ from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
 STALL_TIMEOUT_S = 2.0
-"""A planner that shows no progress for this long counts as dead: the lease is no longer renewed."""
+"""A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
 INITIAL_PLANNING_S = 0.01
 PLANNING_TIME_FACTOR = 1.5
-"""A streamed plan is given so many times as long to be made as the last one took."""
+"""Planning time reserved for a streamed plan, as a multiple of the last one."""
 SPLICE_TRIES = 2
-"""A streamed plan that came too late so often waits for what runs to end, which then does so soon."""
+"""Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
 T = TypeVar("T")
 
 
 class LoopRunner(Protocol):
-    """Does something in the loop's thread, which owns the session, and hands back what comes of it."""
+    """Function that runs an action in the loop's thread, which owns the session."""
 
     def __call__(self, action: Callable[[], T]) -> T:
-        """Do it; LinkError where the loop has ended."""
+        """Return the result of the action. Raise LinkError if the loop has ended."""
 
 
 class PlanningRequest(NamedTuple):
-    """What a caller asks for; arrived_s: board time."""
+    """Request for a plan. build: returns the sequence; arrived_s: board time."""
 
     build: Callable[[], FrameSequence]
     name: str
@@ -53,7 +54,11 @@ class PlanningRequest(NamedTuple):
 
 
 class Planner:
-    """Makes one plan after the other. may_show: raises where nothing can be shown now; by_loop: see `ByLoop`."""
+    """Planner of one sequence at a time.
+
+    run_in_loop: runs an action in the loop's thread
+    require_armed: raises NotReadyError if the board accepts no plans
+    """
 
     def __init__(
         self,
@@ -79,21 +84,21 @@ class Planner:
 
     @property
     def is_busy(self) -> bool:
-        """Whether plans are made or wait to be."""
+        """Whether requests are in progress or waiting."""
         return self._pending_count > 0
 
     @property
     def is_alive(self) -> bool:
-        """Whether it is idle or making progress."""
+        """Whether the planner is idle or makes progress."""
         with self._lock:
             return self._pending_count == 0 or self._clock.now_s() - self._progress_at_s < STALL_TIMEOUT_S
 
     def close(self) -> None:
-        """Make no more plans."""
+        """Cancel the waiting requests."""
         self._executor.shutdown(wait=False, cancel_futures=True)
 
     def submit(self, request: PlanningRequest) -> "Future[PlanReport]":
-        """Make a plan and have it shown; answers what will be shown when. Any thread."""
+        """Queue a request and return the future of its plan's report. Any thread may call it."""
         with self._lock:
             if self._pending_count == 0:
                 self._progress_at_s = self._clock.now_s()
@@ -113,7 +118,7 @@ class Planner:
                 record = self._plan_once(sequence, request, planning_time_s)
                 if record is not None:
                     return record.build_report(self._session.board_s())
-                # What runs went on beyond where this would have followed.
+                # The snapshot is stale: a predecessor was late, or has sent points beyond the splice.
                 late_count += 1
                 planning_time_s = PLANNING_TIME_FACTOR * (1 + late_count) * self._last_planning_s
                 if request.streamed and late_count == SPLICE_TRIES:
@@ -129,7 +134,7 @@ class Planner:
     def _plan_once(
         self, sequence: FrameSequence, request: PlanningRequest, planning_time_s: float
     ) -> PlanRecord | None:
-        """Plan once; None where the heat it was planned from turned out otherwise meanwhile."""
+        """Plan once. Return None if the snapshot became stale meanwhile."""
         began_s = self._clock.now_s()
         snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
         heat, budget = snapshot.heat, snapshot.budget
@@ -157,7 +162,7 @@ class Planner:
     def _make_plan(
         self, sequence: FrameSequence, request: PlanningRequest, snapshot: PlanningSnapshot
     ) -> tuple[PlannedSequence, FeasibilityReport | None]:
-        """The plan; a stream has no time to ask what else would fit."""
+        """Plan the sequence, with a feasibility check unless it is streamed."""
         if not request.streamed:
             on_progress, initial_state = self._record_progress, (snapshot.heat, snapshot.budget)
             return check_feasibility(self._display, sequence, *initial_state, request.policy, on_progress, request.fit)
@@ -174,7 +179,7 @@ class Planner:
         ), None
 
     def _verify_points(self, record: PlanRecord, budget: BudgetState) -> None:
-        """Decode the very bytes that will leave, and hold them against the budget."""
+        """Decode the bytes to be sent and verify them against the budget."""
         points, plan = record.points, record.planned.plan
         decoded = decode(points.encode_payload(), self._session.scale)
         verify(plan, points.row[decoded.index], decoded, budget, self._display.budget)

@@ -1,4 +1,4 @@
-"""Plans on their way through the board, and notes of how far they came, for who looks on from another thread."""
+"""Running plans, and events on their progress for a reader in another thread."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -8,14 +8,14 @@ from optodrive.link.session.plan_job import PlanJob
 
 
 class PlanRun(NamedTuple):
-    """A plan, and its points on their way."""
+    """Running plan with its job."""
 
     record: PlanRecord
     job: PlanJob
 
 
 class PlanProgress(NamedTuple):
-    """Pulses begin to end of a run, in order of its points, are done, as far as they ever will be."""
+    """Event: pulses begin to end of a run, in order of its points, were executed or will never be."""
 
     run: PlanRun
     begin: int
@@ -23,13 +23,13 @@ class PlanProgress(NamedTuple):
 
 
 class ClockShift(NamedTuple):
-    """The board's clock was set anew: what was known happened so much later on it."""
+    """Event: the board's clock restarted, and earlier events happened delay_s later on it."""
 
     delay_s: float
 
 
 def merge_events(events: Iterable[PlanProgress | ClockShift]) -> list[PlanProgress | ClockShift]:
-    """The same notes, one for all that went on with a run: what is reckoned of them costs by the note."""
+    """Merge consecutive progress events of a run, because the cost of processing is per event."""
     merged: list[PlanProgress | ClockShift] = []
     for event in events:
         last = merged[-1] if merged else None

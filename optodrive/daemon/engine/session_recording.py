@@ -1,4 +1,4 @@
-"""What a session's recording holds of a plan, and of the display."""
+"""Recording of the plans of a session to HDF5."""
 
 import json
 import time
@@ -10,8 +10,8 @@ import numpy as np
 
 from optodrive import __version__
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.plan_queue import compute_simulated_m
 from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.plan_simulation import compute_simulated_m
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session_recorder import SessionRecorder
 from optodrive.planning.display_model import DisplayModel
@@ -23,12 +23,12 @@ PlanEntry = tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]
 
 
 def build_session_path(folder: Path) -> Path:
-    """A new name in a folder, by the time of day in UTC."""
+    """Return a file name with the present UTC time in a folder."""
     return folder / f"session-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.h5"
 
 
 def describe_display(display: DisplayModel) -> dict[str, Any]:
-    """What holds for the whole session."""
+    """Return the attributes of the session."""
     return {
         "display": display.config.name,
         "optodrive": __version__,
@@ -73,7 +73,7 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
 
 
 def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) -> SessionRecorder | None:
-    """Has every plan that ends noted in a file, where that is wanted."""
+    """Start to record every plan that ends. Return None if neither `path` nor the configuration requests it."""
     folder = engine.display.config.daemon.record
     if path is None and not folder:
         return None

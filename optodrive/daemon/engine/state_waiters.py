@@ -1,4 +1,4 @@
-"""Callers that wait for the board to reach a state."""
+"""Futures of callers that wait for a state of the board."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -15,7 +15,10 @@ TIMEOUT_S = 5.0
 
 
 def uncancellable_future() -> "Future[Any]":
-    """A future that whoever waits for it cannot cancel: a caller that gives up must not stop whoever keeps the word."""
+    """Return a future that its consumers cannot cancel.
+
+    A client that times out must not cancel the engine's pending operation.
+    """
     future: Future[Any] = Future()
     future.set_running_or_notify_cancel()
     return future
@@ -30,7 +33,7 @@ class _Waiter:
 
 
 class StateWaiters:
-    """Futures that end when the board is in one of the states asked for, refuses, or takes too long."""
+    """Futures that resolve when the board reaches a requested state, refuses the command or exceeds the timeout."""
 
     def __init__(self) -> None:
         self._waiters: list[_Waiter] = []
@@ -39,7 +42,7 @@ class StateWaiters:
         return bool(self._waiters)
 
     def add(self, states: tuple[str, ...], command: str, now_s: float, future: "Future[StateReport]") -> None:
-        """Let a future wait. what: the order, as the error names it."""
+        """Add a future for one of `states`. command: name of the command in error messages."""
         self._waiters.append(_Waiter(states, command, now_s + TIMEOUT_S, future))
 
     def resolve(
@@ -50,7 +53,7 @@ class StateWaiters:
         now_s: float,
         get_snapshot: Callable[[], StateReport],
     ) -> None:
-        """End the waits that are over. refusal: what the board refused since the last look."""
+        """Resolve the futures that have an outcome. refusal: reason of a refusal since the last call."""
         for waiter in list(self._waiters):
             error = self._find_error(waiter, session, refusal, link_error, now_s)
             if error is not None:

@@ -10,7 +10,7 @@ from optodrive.daemon.log import DaemonLog, format_entry, open_daemon_log
 
 
 def fields(data):
-    """Read an entry of the journal's native form."""
+    """Parse an entry of the journal's native format."""
     found = {}
     while data:
         name, _, rest = data.partition(b"\n")
@@ -50,14 +50,14 @@ def test_lines_go_to_the_journal(journal, tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_journal_that_is_gone_or_stands_still_holds_nothing_up(journal, tmp_path):
+def test_a_missing_or_stalled_journal_does_not_block(journal, tmp_path):
     for path in (tmp_path / "journal", tmp_path / "nowhere"):
         with closing(DaemonLog(path)) as log:
             for _ in range(5000):
                 log.warn("x" * 1000)
 
 
-def test_the_journal_is_used_only_where_stderr_is_its_own(monkeypatch, tmp_path):
+def test_the_journal_is_used_only_if_stderr_is_connected_to_it(monkeypatch, tmp_path):
     monkeypatch.setattr(log_module, "JOURNAL", tmp_path)
     there = os.fstat(2)
     for stream, expected in (
@@ -71,7 +71,7 @@ def test_the_journal_is_used_only_where_stderr_is_its_own(monkeypatch, tmp_path)
             assert log._journal == expected
 
 
-def test_what_libraries_log_is_said(capsys):
+def test_log_records_of_libraries_are_written(capsys):
     root = logging.getLogger()
     before = list(root.handlers)
     log = DaemonLog()

@@ -28,27 +28,27 @@ def manager(tmp_path):
         yield listener
 
 
-def heard(manager):
-    said = []
+def receive_all(manager):
+    received = []
     while True:
         try:
-            said.append(manager.recv(4096).decode())
+            received.append(manager.recv(4096).decode())
         except BlockingIOError:
-            return said
+            return received
 
 
-def test_nobody_listens(make_notifier):
+def test_without_a_socket_nothing_is_sent(make_notifier):
     notifier = make_notifier(ManualClock(), {})
     notifier.send("READY=1")
     notifier.feed_watchdog()
     assert not notifier.is_enabled
 
 
-def test_what_is_told(manager, make_notifier):
+def test_notifications(manager, make_notifier):
     notifier = make_notifier(ManualClock(2.5), {"NOTIFY_SOCKET": manager.getsockname()})
-    notifier.send("READY=1", "STATUS=well")
+    notifier.send("READY=1", "STATUS=ok")
     notifier.notify_reloading()
-    assert heard(manager) == ["READY=1\nSTATUS=well", "RELOADING=1\nMONOTONIC_USEC=2500000"]
+    assert receive_all(manager) == ["READY=1\nSTATUS=ok", "RELOADING=1\nMONOTONIC_USEC=2500000"]
 
 
 def test_an_abstract_address(manager, make_notifier):
@@ -57,27 +57,27 @@ def test_an_abstract_address(manager, make_notifier):
         abstract.bind("\0" + name)
         abstract.setblocking(False)
         make_notifier(ManualClock(), {"NOTIFY_SOCKET": "@" + name}).send("READY=1")
-        assert heard(abstract) == ["READY=1"]
+        assert receive_all(abstract) == ["READY=1"]
 
 
-def test_the_watchdog_is_fed_often_enough_and_only_by_turns(manager, make_notifier):
+def test_the_watchdog_is_fed_at_its_interval_and_only_by_calls(manager, make_notifier):
     clock = ManualClock()
     notifier = make_notifier(clock, {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "20000000"})
     for _ in range(2000):
         notifier.feed_watchdog()
         clock.sleep(0.01)
-    assert heard(manager) == ["WATCHDOG=1"] * 5
+    assert receive_all(manager) == ["WATCHDOG=1"] * 5
     clock.sleep(100.0)
-    assert heard(manager) == []
+    assert receive_all(manager) == []
 
 
 def test_another_process_watchdog_is_not_fed(manager, make_notifier):
     environment = {"NOTIFY_SOCKET": manager.getsockname(), "WATCHDOG_USEC": "1000", "WATCHDOG_PID": "1"}
     make_notifier(ManualClock(), environment).feed_watchdog()
-    assert heard(manager) == []
+    assert receive_all(manager) == []
 
 
-def test_a_manager_that_does_not_read_holds_nothing_up(manager, make_notifier):
+def test_a_manager_that_does_not_read_does_not_block(manager, make_notifier):
     notifier = make_notifier(ManualClock(), {"NOTIFY_SOCKET": manager.getsockname()})
     for _ in range(5000):
         notifier.send("WATCHDOG=1")

@@ -25,27 +25,27 @@ def test_nothing_changed(config):
     assert split_changed_keys(config, load_config()) == ([], [])
 
 
-def test_hosts_and_bounds_are_taken_the_rest_waits(config):
+def test_hosts_and_limits_apply_at_once_and_the_rest_needs_a_restart(config):
     new = with_(config, "daemon", hosts=("lab",), port=9000, body_max_bytes=2048)
     new = with_(new, "limits", absorber_max_c=300.0)
-    at_once, waiting = split_changed_keys(config, new)
-    assert at_once == ["daemon.body_max_bytes", "daemon.hosts"]
+    reloaded, waiting = split_changed_keys(config, new)
+    assert reloaded == ["daemon.body_max_bytes", "daemon.hosts"]
     assert waiting == ["daemon.port", "limits.absorber_max_c"]
     running = merge_reloadable(config, new)
     assert running.daemon.hosts == ("lab",)
     assert running.daemon.port == config.daemon.port
     assert running.limits == config.limits
-    # What waits is said again at the next reload.
+    # Keys that need a restart are reported again at the next reload.
     assert split_changed_keys(running, new) == ([], waiting)
-    assert "RESTART: daemon.port, limits.absorber_max_c" in describe_reload(at_once, waiting, None)
+    assert "RESTART REQUIRED FOR: daemon.port, limits.absorber_max_c" in describe_reload(reloaded, waiting, None)
 
 
 @pytest.mark.parametrize("state", LEASED_STATES)
-def test_nothing_is_reloaded_while_armed(state):
+def test_an_armed_board_prevents_a_reload(state):
     with pytest.raises(NotReadyError, match="disarm it first"):
         require_disarmed(state)
 
 
 @pytest.mark.parametrize("state", ["DISARMED", "FAULT", "BOOT", "no link"])
-def test_while_dark_it_may_be(state):
+def test_an_unarmed_board_permits_a_reload(state):
     require_disarmed(state)
