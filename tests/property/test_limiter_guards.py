@@ -1,4 +1,4 @@
-"""Each guard of the limiter: how near it lets a hostile sequence come, and mutants that it would not survive."""
+"""Each cap of the limiter: how close a hostile sequence comes, and mutants that exceed it."""
 
 import numpy as np
 import pytest
@@ -21,28 +21,28 @@ from reference_models.thermal_display import (
 )
 
 
-def hammer(span_s, width_s=0.010, rest_s=5.2e-4, pixel=0):
-    """One pixel, pulse after pulse."""
+def repeat_pulses(span_s, width_s=0.010, rest_s=5.2e-4, pixel=0):
+    """Return pulse after pulse on one pixel."""
     period_s = width_s + rest_s
     return [(pixel, round(k * period_s * 1e6) * 1e-6, width_s) for k in range(int(span_s / period_s))]
 
 
-def corners(span_s):
-    """Two pixels far apart in turn, as quickly as the mirrors go."""
+def alternate_pixels(span_s):
+    """Return alternating pulses on two distant pixels, as fast as the mirrors settle."""
     return [(8 * (k % 2), round(k * 1.2e3) * 1e-6, 2e-4) for k in range(int(span_s / 1.2e-3))]
 
 
-# display, caps that bind, sequence before the pause and after it, pause
+# display, binding caps, sequence before and after the pause, pause
 SCENARIOS = {
-    "absorber": ("display-1", dict(absorber_k=380.0), hammer(0.4), 0.015),
-    "wall": ("display-16", dict(wall_k=15.0), hammer(6.0), 0.2),
-    "touch": ("display-16", dict(touch_k=23.0), hammer(6.0), 0.2),
-    "diode": ("display-16", dict(display_mean_w=0.5), hammer(2.3), 0.2),
-    "galvo": ("display-16", dict(galvo_rad2_per_s4=5e4**2), corners(3.0), 0.05),
+    "absorber": ("display-1", dict(absorber_k=380.0), repeat_pulses(0.4), 0.015),
+    "wall": ("display-16", dict(wall_k=15.0), repeat_pulses(6.0), 0.2),
+    "touch": ("display-16", dict(touch_k=23.0), repeat_pulses(6.0), 0.2),
+    "diode": ("display-16", dict(display_mean_w=0.5), repeat_pulses(2.3), 0.2),
+    "galvo": ("display-16", dict(galvo_rad2_per_s4=5e4**2), alternate_pixels(3.0), 0.05),
 }
 
 
-def model_of(name):
+def build_model(name):
     display = DISPLAYS[name]
     parameters = load_parameters(display.config.pixel_model.parameters)
     return build_nominal_model(
@@ -50,29 +50,29 @@ def model_of(name):
     )
 
 
-def unchanged(budget):
+def keep_budget(budget):
     return budget
 
 
-def kept(state, before, at_s, pixels):
+def keep_state(state, before, at_s, pixels):
     return state
 
 
-def share(guard, factor=None, mutate=unchanged, carry=kept):
-    """Largest value that the sequence, a pause and the sequence again reach, over the guard's true cap."""
+def cap_fraction(guard, factor=None, mutate=keep_budget, carry=keep_state):
+    """Return the largest value, over the cap, that the sequence, a pause and the sequence again reach."""
     name, binding, rows, pause_s = SCENARIOS[guard]
-    display, model = DISPLAYS[name], model_of(name)
+    display, model = DISPLAYS[name], build_model(name)
     caps = NO_CAPS._replace(**binding)
     budget = Budget(caps, display.budget.heat, display.budget.galvo)
     pixels = len(model.epsilon)
     offset_s = rows[-1][1] + rows[-1][2] + pause_s
     again = [(pixel, start_s + offset_s, width_s) for pixel, start_s, width_s in rows]
-    state, passed = cold_state(pixels), []
+    state, limited = cold_state(pixels), []
     for part in (rows, again):
-        piece, after = limit(build_plan(part, 2.45, display.config.display), state, mutate(budget))
-        passed.append(piece)
+        batch, after = limit(build_plan(part, 2.45, display.config.display), state, mutate(budget))
+        limited.append(batch)
         state = carry(after, state, offset_s, pixels)
-    plan = build_plan(rows + again, np.concatenate([piece.power_w for piece in passed]), display.config.display)
+    plan = build_plan(rows + again, np.concatenate([batch.power_w for batch in limited]), display.config.display)
     if guard == "galvo":
         return galvo_peak(plan, budget) / caps.galvo_rad2_per_s4
     if guard == "diode":
@@ -86,29 +86,29 @@ def share(guard, factor=None, mutate=unchanged, carry=kept):
 
 
 @pytest.mark.parametrize("guard", SCENARIOS)
-def test_the_limiter_is_not_cowardly(guard):
-    """At the nominal parameters, with the uncertainty of the shipped configurations declared, ≥ 90 % is reached."""
-    assert 0.9 <= share(guard) <= 1 + 1e-9
+def test_the_limiter_is_not_overly_conservative(guard):
+    """At nominal parameters, with the shipped uncertainty declared, at least 90 % of each cap is reached."""
+    assert 0.9 <= cap_fraction(guard) <= 1 + 1e-9
 
 
-def worst(guard):
+def worst_factors(guard):
     unsure = Uncertainty(**DISPLAYS[SCENARIOS[guard][0]].config.limits.uncertainty.model_dump())
     slow = {name: 1 - getattr(unsure, name) for name in ("absorber_capacity", "wall_capacity", "touch_lag", "gas_lag")}
     return upper_factors(unsure) | slow
 
 
-def test_every_guard_holds_at_the_upper_corner():
+def test_every_cap_holds_in_the_worst_case():
     for guard in SCENARIOS:
-        assert 0.95 <= share(guard, worst(guard)) <= 1 + 1e-9, guard
+        assert 0.95 <= cap_fraction(guard, worst_factors(guard)) <= 1 + 1e-9, guard
 
 
 def cap_five_percent_off(guard):
     cap = next(iter(SCENARIOS[guard][1]))
 
     def mutate(budget):
-        # An acceleration is a square's root.
-        more = 1.05**2 if guard == "galvo" else 1.05
-        return budget._replace(caps=budget.caps._replace(**{cap: getattr(budget.caps, cap) * more}))
+        # The galvo cap is a squared acceleration.
+        factor_off = 1.05**2 if guard == "galvo" else 1.05
+        return budget._replace(caps=budget.caps._replace(**{cap: getattr(budget.caps, cap) * factor_off}))
 
     return dict(mutate=mutate)
 
@@ -143,7 +143,7 @@ MUTANTS = (cap_five_percent_off, wrong_constant, forgotten_over_a_pause, unackno
 
 
 LONGEST = {("absorber", wrong_constant), ("wall", wrong_constant), ("touch", wrong_constant)}
-"""By scripts/test --slow."""
+"""Cases that only scripts/test --slow runs."""
 CASES = [
     pytest.param(guard, mutant, marks=[pytest.mark.slow] if (guard, mutant) in LONGEST else [])
     for guard in SCENARIOS
@@ -153,11 +153,11 @@ CASES = [
 
 @pytest.mark.parametrize(("guard", "mutant"), CASES)
 def test_a_mutant_is_caught(guard, mutant):
-    assert share(guard, worst(guard), **mutant(guard)) > 1.0005
+    assert cap_fraction(guard, worst_factors(guard), **mutant(guard)) > 1.0005
 
 
-def on_its_way_counted_double(heat):
-    """Heat that counts as arrived is taken off twice, and thought to come twice as slowly."""
+def credit_transit_twice(heat):
+    """Return a bound that subtracts the in-transit heat credit twice and lets it arrive half as fast."""
     return heat._replace(
         wall_transit_credit=2 * heat.wall_transit_credit,
         touch_transit_credit=2 * heat.touch_transit_credit,
@@ -166,11 +166,13 @@ def on_its_way_counted_double(heat):
 
 
 @pytest.mark.parametrize("guard", [pytest.param("wall", marks=pytest.mark.slow), "touch"])
-def test_heat_on_its_way_taken_off_twice_is_caught(guard):
-    """With nothing unsure, so that no other margin hides it."""
+def test_in_transit_heat_credited_twice_is_caught(guard):
+    """Without uncertainty, so that no other margin hides it."""
     name, binding, _, _ = SCENARIOS[guard]
     exact = Uncertainty(**dict.fromkeys(Uncertainty.__dataclass_fields__, 0.0))
-    heat = build_heat_bound(model_of(name), exact, NO_CAPS._replace(**binding), DISPLAYS[name].config.laser.max_power_w)
-    assert 0.97 <= share(guard, mutate=lambda budget: budget._replace(heat=heat)) <= 1 + 1e-9
-    twice = on_its_way_counted_double(heat)
-    assert share(guard, mutate=lambda budget: budget._replace(heat=twice)) > 1.0005
+    heat = build_heat_bound(
+        build_model(name), exact, NO_CAPS._replace(**binding), DISPLAYS[name].config.laser.max_power_w
+    )
+    assert 0.97 <= cap_fraction(guard, mutate=lambda budget: budget._replace(heat=heat)) <= 1 + 1e-9
+    twice = credit_transit_twice(heat)
+    assert cap_fraction(guard, mutate=lambda budget: budget._replace(heat=twice)) > 1.0005

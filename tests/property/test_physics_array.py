@@ -1,4 +1,4 @@
-"""The compiled walk through a display's pulses is the closed forms, step by step."""
+"""The compiled pulse application equals the closed forms, step by step."""
 
 import numpy as np
 import pytest
@@ -21,37 +21,39 @@ widths_s = st.floats(1e-5, 0.1)
 one_pulse = st.tuples(st.sampled_from([0, 0, 0, 1, 2]), gaps_s, widths_s, st.floats(0.0, 2.45))
 
 
-def columns_of(rows):
+def build_columns(rows):
     pixel, gap_s, width_s, power_w = (np.array(column) for column in zip(*rows, strict=True))
     return pixel, np.cumsum(gap_s + width_s) - width_s, width_s, power_w
 
 
-def stepped(columns):
-    """Peaks [n] of displacement and absorber, and each pixel's last time and rises, by one call at a time."""
+def apply_stepwise(columns):
+    """Return peaks [n] of displacement and absorber, and each pixel's last time and rises, by single calls."""
     state = [(0.0, 0.0, 0.0)] * len(PIXELS)
-    moves, absorbers, last = [], [], {}
+    displacements, absorbers, last = [], [], {}
     for row, (index, start_s, width_s, power_w) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
         pixel, (at_s, *rises) = PIXELS[index], state[index]
-        dark_s = max(0.0, start_s - at_s)
+        off_s = max(0.0, start_s - at_s)
         if index in last:
-            moves[last[index]] = max(moves[last[index]], pixel.kappa_m_per_k * cooling_peak(pixel, *rises, dark_s)[0])
-        begin = advance(pixel, *rises, 0.0, dark_s)
+            displacements[last[index]] = max(
+                displacements[last[index]], pixel.kappa_m_per_k * cooling_peak(pixel, *rises, off_s)[0]
+            )
+        begin = advance(pixel, *rises, 0.0, off_s)
         end = advance(pixel, *begin, power_w, width_s)
-        moves.append(pixel.kappa_m_per_k * gas_peak(pixel, *begin, power_w, width_s)[0])
+        displacements.append(pixel.kappa_m_per_k * gas_peak(pixel, *begin, power_w, width_s)[0])
         absorbers.append(max(begin[0], end[0]))
         state[index], last[index] = (start_s + width_s, *end), row
     for index, row in last.items():
         pixel, (_, *rises) = PIXELS[index], state[index]
-        moves[row] = max(moves[row], pixel.kappa_m_per_k * cooling_peak(pixel, *rises)[0])
-    return moves, absorbers, state
+        displacements[row] = max(displacements[row], pixel.kappa_m_per_k * cooling_peak(pixel, *rises)[0])
+    return displacements, absorbers, state
 
 
 @given(st.lists(one_pulse, min_size=1, max_size=30))
-def test_the_walk_is_every_step(rows):
-    columns, heat = columns_of(rows), NominalThermalState(ARRAY)
+def test_compiled_application_equals_stepwise_application(rows):
+    columns, heat = build_columns(rows), NominalThermalState(ARRAY)
     peaks = heat.apply_pulses(*columns)
-    moves, absorbers, state = stepped(columns)
-    assert peaks.displacement_m == pytest.approx(np.array(moves), rel=1e-12, abs=1e-300)
+    displacements, absorbers, state = apply_stepwise(columns)
+    assert peaks.displacement_m == pytest.approx(np.array(displacements), rel=1e-12, abs=1e-300)
     assert peaks.absorber_k == pytest.approx(np.array(absorbers), rel=1e-12, abs=1e-300)
     for index, (at_s, *rises) in enumerate(state):
         assert heat.rises_k(index, at_s) == pytest.approx(tuple(rises), rel=1e-12, abs=1e-300)
@@ -59,7 +61,7 @@ def test_the_walk_is_every_step(rows):
 
 @given(st.lists(one_pulse, min_size=2, max_size=20), st.data())
 def test_pulses_in_two_lists_leave_the_same_heat(rows, data):
-    columns = columns_of(rows)
+    columns = build_columns(rows)
     cut = data.draw(st.integers(0, len(rows)))
     whole, parts = NominalThermalState(ARRAY), NominalThermalState(ARRAY)
     whole.apply_pulses(*columns)
@@ -76,7 +78,7 @@ def test_read_only_and_narrow_columns_are_taken():
     assert NominalThermalState(ARRAY).apply_pulses(pixel, start_s, half, half).displacement_m.min() > 0
 
 
-def test_pixels_that_are_not_there_and_torn_columns_are_refused():
+def test_unknown_pixels_and_ragged_columns_are_refused():
     one = np.ones(1)
     with pytest.raises(IndexError, match="3 to 3 of 3"):
         NominalThermalState(ARRAY).apply_pulses(np.array([3]), one, one, one)

@@ -1,4 +1,4 @@
-"""Laws that the closed forms keep for any pixel, also where the gas lag straddles RC."""
+"""Properties of the closed forms for any pixel, also with the gas lag near RC."""
 
 from math import exp
 
@@ -22,40 +22,44 @@ def pixels(draw):
     return Pixel(r, c, draw(st.floats(0.1, 1.0)), draw(st.floats(5e-4, 0.1) | near | st.just(r * c)), 4e-6, 2e-4)
 
 
-def close(got, expected):
-    assert got == pytest.approx(expected, rel=1e-9, abs=1e-9)
+def assert_close(value, expected):
+    assert value == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 @given(pixels(), rises, rises, powers, times, times)
 def test_two_steps_are_one(pixel, theta, gamma, power, first_s, second_s):
     halfway = advance(pixel, theta, gamma, power, first_s)
-    close(advance(pixel, *halfway, power, second_s), advance(pixel, theta, gamma, power, first_s + second_s))
+    assert_close(advance(pixel, *halfway, power, second_s), advance(pixel, theta, gamma, power, first_s + second_s))
 
 
 @given(pixels(), rises, rises, powers, times, st.floats(0.0, 4.0))
-def test_linear_in_heat_and_power_together(pixel, theta, gamma, power, t_s, factor):
+def test_advance_is_linear_in_state_and_power(pixel, theta, gamma, power, t_s, factor):
     once = advance(pixel, theta, gamma, power, t_s)
-    close(advance(pixel, factor * theta, factor * gamma, factor * power, t_s), [factor * value for value in once])
+    assert_close(
+        advance(pixel, factor * theta, factor * gamma, factor * power, t_s), [factor * value for value in once]
+    )
 
 
 @given(pixels(), rises, rises, powers, powers, times)
 def test_responses_superpose(pixel, theta, gamma, one_w, other_w, t_s):
     alone = advance(pixel, theta, gamma, one_w, t_s)
     driven = advance(pixel, 0.0, 0.0, other_w, t_s)
-    close(advance(pixel, theta, gamma, one_w + other_w, t_s), [a + b for a, b in zip(alone, driven, strict=True)])
+    assert_close(
+        advance(pixel, theta, gamma, one_w + other_w, t_s), [a + b for a, b in zip(alone, driven, strict=True)]
+    )
 
 
 @given(st.floats(5.0, 300.0), st.floats(-14.0, -4.0), st.sampled_from([-1.0, 1.0]), st.floats(0.0, 0.3))
-def test_nothing_jumps_where_the_lag_crosses_rc(a, magnitude, side, t_s):
+def test_the_divided_difference_is_continuous_where_the_lag_equals_rc(a, magnitude, side, t_s):
     b = a * (1 + side * 10.0**magnitude)
-    # Between rates the divided difference lies between its values at equal rates.
+    # The divided difference of two rates lies between its values at either rate alone.
     limits = sorted([t_s * exp(-a * t_s), t_s * exp(-b * t_s)])
-    got = divided_difference(a, b, t_s)
-    assert limits[0] * (1 - 1e-12) <= got <= limits[1] * (1 + 1e-12)
+    value = divided_difference(a, b, t_s)
+    assert limits[0] * (1 - 1e-12) <= value <= limits[1] * (1 + 1e-12)
 
 
 @given(pixels(), rises, rises, st.floats(0.0, 1.0))
-def test_no_moment_in_the_dark_passes_the_peak(pixel, theta, gamma, t_s):
+def test_no_state_with_the_gate_off_exceeds_the_peak(pixel, theta, gamma, t_s):
     peak, _ = cooling_peak(pixel, theta, gamma)
     assert advance(pixel, theta, gamma, 0.0, t_s)[1] <= peak * (1 + 1e-12) + 1e-12
     assert peak <= max(gamma, theta / 2) * (1 + 1e-12)
@@ -63,9 +67,9 @@ def test_no_moment_in_the_dark_passes_the_peak(pixel, theta, gamma, t_s):
 
 @given(pixels(), st.floats(1.0, 600.0), st.floats(0.0, 0.9))
 @example(Pixel(145.0, 100e-6, 0.66, 14.5e-3 * 1.005, 4e-6, 2e-4), 500.0, 0.1)
-def test_the_gas_turns_where_it_meets_half_the_absorber(pixel, theta, share):
-    peak, at_s = gas_peak(pixel, theta, share * theta / 2, 0.0, float("inf"))
-    theta_then, gamma_then = advance(pixel, theta, share * theta / 2, 0.0, at_s)
+def test_the_gas_peaks_where_it_equals_half_the_absorber(pixel, theta, fraction):
+    peak, at_s = gas_peak(pixel, theta, fraction * theta / 2, 0.0, float("inf"))
+    theta_then, gamma_then = advance(pixel, theta, fraction * theta / 2, 0.0, at_s)
     assert peak == gamma_then
     assert gamma_then == pytest.approx(theta_then / 2, rel=1e-7)
 
@@ -75,6 +79,6 @@ def test_rises_stay_between_start_and_steady(pixel, theta, gamma, power, t_s):
     steady = pixel.epsilon * power * pixel.r_k_per_w
     assume(theta + gamma + steady > 0)
     end_theta, end_gamma = advance(pixel, theta, gamma, power, t_s)
-    slack = 1e-9 * (theta + gamma + steady)
-    assert min(theta, steady) - slack <= end_theta <= max(theta, steady) + slack
-    assert min(gamma, theta / 2, steady / 2) - slack <= end_gamma <= max(gamma, theta / 2, steady / 2) + slack
+    tolerance = 1e-9 * (theta + gamma + steady)
+    assert min(theta, steady) - tolerance <= end_theta <= max(theta, steady) + tolerance
+    assert min(gamma, theta / 2, steady / 2) - tolerance <= end_gamma <= max(gamma, theta / 2, steady / 2) + tolerance

@@ -1,4 +1,4 @@
-"""A link that loses, doubles, flips and cuts bytes, a host that says anything: each point at most once, in order."""
+"""Each point executes at most once and in order, with a faulty link and a host that sends anything."""
 
 from itertools import pairwise
 
@@ -19,46 +19,46 @@ PATIENT = BoardSettings(limits=m.Limits(**{**vars(DEFAULT_LIMITS), "lease_ms": 6
 
 
 class Rig:
-    """The host's end and the board, with time between them."""
+    """A host's end and a board, with simulated time between them."""
 
     def __init__(self):
         self.log = []
         self.core = BoardCore(PATIENT, self.log.append, seed=1)
         self.host = HostConnection()
         self.now_us = 0
-        self.heard = []
+        self.received = []
         self.host.send_hello(1)
-        self.turn()
+        self.exchange()
         self.host.send(m.ArmReq(5))
-        self.turn()
-        (challenge,) = [x for x in self.heard if isinstance(x, m.ArmChallenge)]
+        self.exchange()
+        (challenge,) = [x for x in self.received if isinstance(x, m.ArmChallenge)]
         self.host.send(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
         self.host.send(m.Lease(60_000))
-        self.turn()
+        self.exchange()
         self.now_us += 2_000_000
-        self.turn()
+        self.exchange()
         assert self.core.state == "ARMED"
 
-    def turn(self, to_board=lambda data: data, to_host=lambda data: data):
-        """Bytes pass both ways, and a little time."""
+    def exchange(self, to_board=lambda data: data, to_host=lambda data: data):
+        """Exchange bytes both ways and advance time a little."""
         now_s = self.now_us * 1e-6
         self.core.receive(to_board(self.host.bytes_to_send(now_s, FLIGHT_BYTES)), self.now_us)
         self.now_us += TURN_US
         self.core.advance(self.now_us)
-        self.heard += self.host.receive_bytes(to_host(self.core.bytes_to_send()), self.now_us * 1e-6)
+        self.received += self.host.receive_bytes(to_host(self.core.bytes_to_send()), self.now_us * 1e-6)
 
     @property
-    def fired(self):
+    def executed(self):
         return [entry["index"] for entry in self.log if entry["event"] == "pulse"]
 
 
 @st.composite
-def damages(draw):
-    """What a link does to one portion of bytes."""
+def faults(draw):
+    """Sample a fault that a link applies to one portion of bytes."""
     kind = draw(st.sampled_from(["pass", "pass", "lose", "double", "flip", "cut", "cut both ends", "junk"]))
     where, bit = draw(st.floats(0, 1)), draw(st.integers(0, 7))
 
-    def damage(data):
+    def fault(data):
         at = int(where * (len(data) - 1))
         if kind == "lose":
             return b""
@@ -72,16 +72,16 @@ def damages(draw):
             return data[at // 2 : at]
         return data + bytes([bit] * at) if kind == "junk" else data
 
-    return damage
+    return fault
 
 
 @settings(max_examples=150)
 @given(
-    st.lists(st.tuples(damages(), damages()), min_size=5, max_size=80),
+    st.lists(st.tuples(faults(), faults()), min_size=5, max_size=80),
     st.sampled_from([1, POINTS, TOTAL]),
     st.integers(0, 2**16),
 )
-def test_each_point_at_most_once_in_order_and_all_after_repair(bad_turns, watermark, first_index):
+def test_each_point_at_most_once_in_order_and_all_after_repair(bad_exchanges, watermark, first_index):
     rig = Rig()
     for k in range(FRAMES):
         point = m.POINT.pack(32768, 32768, 900, 100, 3000)
@@ -89,20 +89,20 @@ def test_each_point_at_most_once_in_order_and_all_after_repair(bad_turns, waterm
         if k == 0:
             rig.host.send(m.Start(1, first_index, 0, watermark))
     rig.host.send(m.End(1, first_index + TOTAL))
-    for to_board, to_host in bad_turns:
-        rig.turn(to_board, to_host)
-        assert rig.fired == list(range(first_index, first_index + len(rig.fired)))
+    for to_board, to_host in bad_exchanges:
+        rig.exchange(to_board, to_host)
+        assert rig.executed == list(range(first_index, first_index + len(rig.executed)))
     for _ in range(300):
-        rig.turn()
+        rig.exchange()
     assert rig.host.outstanding == 0, "the link does not recover"
-    assert rig.fired == list(range(first_index, first_index + len(rig.fired)))
+    assert rig.executed == list(range(first_index, first_index + len(rig.executed)))
     event(f"{rig.core.state} {rig.core.fault}")
-    if rig.core.fault != "UNDERRUN":  # three holes in the stream are a fault, and meant to be
+    if rig.core.fault != "UNDERRUN":  # three gaps in the stream are an intended fault
         assert rig.core.state == "ARMED"
-        assert len(rig.fired) == TOTAL
+        assert len(rig.executed) == TOTAL
         rig.host.send(m.GetExecuted(first_index))
-        rig.turn()
-        report = rig.heard[-1]
+        rig.exchange()
+        report = rig.received[-1]
         assert (report.first_index, len(report.records)) == (first_index, m.RECORDS_MAX)
 
 
@@ -111,7 +111,7 @@ STREAM = st.lists(
     st.one_of(
         st.binary(max_size=300),
         FRAME.map(encode_frame),
-        st.tuples(FRAME.map(encode_frame), damages()).map(lambda pair: pair[1](pair[0])),
+        st.tuples(FRAME.map(encode_frame), faults()).map(lambda pair: pair[1](pair[0])),
     ),
     max_size=8,
 ).map(b"".join)
@@ -119,10 +119,10 @@ STREAM = st.lists(
 
 @given(STREAM, st.integers(1, 400))
 def test_decoder_never_raises_and_gives_only_frames_that_were_there(data, portion):
-    whole, pieces = FrameDecoder(), FrameDecoder()
+    whole, portions = FrameDecoder(), FrameDecoder()
     frames = list(whole.feed(data))
-    assert frames == [f for at in range(0, len(data), portion) for f in pieces.feed(data[at : at + portion])]
-    assert whole.counters == pieces.counters
+    assert frames == [f for at in range(0, len(data), portion) for f in portions.feed(data[at : at + portion])]
+    assert whole.counters == portions.counters
     padded = b"\0" + data
     for frame in frames:
         assert b"\0" + encode_frame(frame) in padded
@@ -138,10 +138,10 @@ def test_neither_end_raises_on_any_bytes(data):
 
 
 def bodies(kind):
-    """Bodies of a message with fields anywhere in their range, often at its ends."""
+    """Sample bodies of a message with fields anywhere in their range, often at its ends."""
     length = kind.LAYOUT.size + (m.POINT.size * 3 if kind is m.Data else 0)
-    dull = st.sampled_from([0, 0, 1, 2, 100, 255])
-    return st.lists(dull, min_size=length, max_size=length).map(bytes)
+    value = st.sampled_from([0, 0, 1, 2, 100, 255])
+    return st.lists(value, min_size=length, max_size=length).map(bytes)
 
 
 POINT = st.tuples(
@@ -162,8 +162,8 @@ STEPS = st.one_of(
 )
 
 
-def said(core, what, detail):
-    """Frames' types and bodies for a step, mostly such as the board may take in its state."""
+def encode_step(core, what, detail):
+    """Return types and bodies of a step's frames, mostly valid in the board's state."""
     first = core.machine.queue.first_index
     if what == "anything":
         return [(detail[0].TYPE, detail[1])]
@@ -187,7 +187,7 @@ def said(core, what, detail):
 
 @settings(max_examples=200)
 @given(st.lists(STEPS, min_size=5, max_size=60))
-def test_a_board_survives_a_host_that_says_anything(steps):
+def test_a_board_survives_a_host_that_sends_anything(steps):
     rig = Rig()
     core, link = rig.core, rig.core._link
     for what, detail in steps:
@@ -195,7 +195,7 @@ def test_a_board_survives_a_host_that_says_anything(steps):
             rig.now_us += detail
             core.advance(rig.now_us)
             continue
-        for kind, body in said(core, what, detail):
+        for kind, body in encode_step(core, what, detail):
             core.receive(encode_frame(Frame(kind, link.expected_seq, link.session, body)), rig.now_us)
         assert not core.gate or core.state == "RUNNING"
         for answer in FrameDecoder().feed(core.bytes_to_send()):

@@ -70,7 +70,7 @@ def path(tmp_path_factory):
     return tmp_path_factory.mktemp("damaged") / "r.h5"
 
 
-def refused_in_one_line(read, path):
+def read_or_refuse(read, path):
     """Return the recording, or None if it is refused."""
     try:
         return read(path)
@@ -83,7 +83,7 @@ def refused_in_one_line(read, path):
 
 def reads_or_refuses(path):
     """Check that reading refuses what the index refuses."""
-    index, measurement = refused_in_one_line(RecordingIndex.open, path), refused_in_one_line(read_recording, path)
+    index, measurement = read_or_refuse(RecordingIndex.open, path), read_or_refuse(read_recording, path)
     if measurement is None:
         return
     assert index is not None

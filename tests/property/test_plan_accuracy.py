@@ -1,4 +1,4 @@
-"""Random frames on every display: predicted, asked for, and the caps, held against an integrator written here."""
+"""Random frames on every display: prediction, target and cap against an independent integrator."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ STEP_S = 2e-5
 
 
 def integrate(pixel, pulses, until_s):
-    """Fourth-order Runge–Kutta of the pixel's two equations; returns times, absorber rise, displacement."""
+    """Integrate the pixel's two equations by fourth-order Runge–Kutta; return times, absorber rise, displacement."""
     steps = int(np.ceil(until_s / STEP_S))
     power = np.zeros(steps)
     time = np.arange(steps) * STEP_S
@@ -35,16 +35,16 @@ def integrate(pixel, pulses, until_s):
 
 @st.composite
 def sequences(draw, name):
-    """A few frames on a few pixels, close in time, and perhaps a train."""
+    """Sample a few frames on a few pixels, close in time, and possibly a train."""
     display = DISPLAYS[name]
     count = len(display.layout)
-    most_um = max_displacement_m(display.pixels.elements[0], display.scan_head.drive) * 1e6
-    chosen = draw(st.lists(st.integers(0, count - 1), min_size=1, max_size=4, unique=True))
+    height_max_um = max_displacement_m(display.pixels.elements[0], display.scan_head.drive) * 1e6
+    pixels = draw(st.lists(st.integers(0, count - 1), min_size=1, max_size=4, unique=True))
     frames, at_s = [], 0.0
     for k in range(draw(st.integers(1, 4))):
         target = np.zeros(count)
-        for pixel in chosen:
-            target[pixel] = 1e-6 * draw(st.one_of(st.just(0.0), st.floats(0.5, most_um * 0.999)))
+        for pixel in pixels:
+            target[pixel] = 1e-6 * draw(st.one_of(st.just(0.0), st.floats(0.5, height_max_um * 0.999)))
         duration = draw(st.sampled_from([0.02, 0.06, 0.15, 0.4]))
         frames.append(TactileFrame(f"f{k}", at_s, duration, target))
         at_s += duration
@@ -52,7 +52,7 @@ def sequences(draw, name):
     if draw(st.booleans()):
         width, gap = draw(st.sampled_from([(0.02, 0.06), (0.025, 0.025), (0.04, 0.01), (0.001, 0.001), (0.05, 0.0)]))
         start = draw(st.floats(0.0, 0.3))
-        trains = (PulseTrain(draw(st.sampled_from(chosen)), start, 0.3, width, gap, draw(st.floats(0.2, 2.45))),)
+        trains = (PulseTrain(draw(st.sampled_from(pixels)), start, 0.3, width, gap, draw(st.floats(0.2, 2.45))),)
     return FrameSequence(tuple(frames), trains)
 
 
@@ -61,7 +61,7 @@ def sequences(draw, name):
 )
 @settings(max_examples=12)
 @given(data=st.data())
-def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
+def test_prediction_target_and_cap_hold_in_an_independent_integrator(name, data):
     display = DISPLAYS[name]
     sequence = data.draw(sequences(name))
     result = plan_sequence(display, sequence, *display.build_cold_state())
@@ -77,10 +77,10 @@ def test_predicted_target_and_cap_hold_in_another_integrator(name, data):
         until = np.append(plan.start_s[rows[1:]], np.inf)
         for row, limit_s in zip(rows, until, strict=True):
             window = (time >= plan.start_s[row]) & (time <= limit_s)
-            # Gas that falls steeply is a few per cent higher a step earlier: its edges are taken where they are.
+            # The gas falls by a few per cent per step, so the window's edges are interpolated.
             edges = np.interp([plan.start_s[row], min(limit_s, time[-1])], time, height)
             measured = max(height[window].max(initial=0.0), *edges)
             assert measured == pytest.approx(result.predicted_m[row], rel=0.02, abs=2e-8)
-            crowded = limit_s - ends_s[row] < 0.008  # the gas lags: the next pulse came before this one's peak
-            if plan.source[row] < len(sequence.frames) and not plan.reason[row] and not crowded:
+            is_cut_short = limit_s - ends_s[row] < 0.008  # the gas lags: the next pulse starts before this one's peak
+            if plan.source[row] < len(sequence.frames) and not plan.reason[row] and not is_cut_short:
                 assert measured == pytest.approx(plan.target_m[row], rel=0.05)

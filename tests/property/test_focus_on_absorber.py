@@ -1,4 +1,4 @@
-"""While the gate is on the whole focus lies on the absorber: plans as the wire has them, by an exact servo."""
+"""While the gate is on the whole focus lies on the absorber, for encoded plans and an exact servo."""
 
 from dataclasses import dataclass, replace
 
@@ -27,58 +27,61 @@ ROUNDING_M = 1e-9
 
 
 @dataclass(frozen=True)
-class Exact:
-    """A servo by the exponential of its matrix: [angle, speed] about where it stands, or runs, in the long run."""
+class ExactServo:
+    """Servo by its matrix exponential; the state [angle, speed] is relative to the target, at rest or slewing."""
 
     scanner: object
 
-    def angles(self, at_s, goal_rad, t_s):
-        """Angle at t_s of one that rests at 0 and is sent to goal_rad at at_s."""
+    def angles(self, at_s, target_rad, t_s):
+        """Return the angle at t_s of a servo that starts at 0 and is commanded to target_rad at at_s."""
         omega, damping = 2 * np.pi * self.scanner.bandwidth_hz, self.scanner.damping
         rates, vectors = np.linalg.eig(np.array([[0.0, 1.0], [-(omega**2), -2 * damping * omega]]))
         inverse = np.linalg.inv(vectors)
 
-        def later(state, after_s):
+        def propagate(state, after_s):
             return ((vectors * (inverse @ state)) @ np.exp(np.outer(rates, after_s))).real
 
-        out, target, state = np.zeros(len(t_s)), 0.0, np.zeros(2)
+        angles_rad, target, state = np.zeros(len(t_s)), 0.0, np.zeros(2)
         begins_s = at_s + self.scanner.delay_s
         ends_s = np.append(begins_s[1:], np.inf)
-        for begin_s, end_s, goal in zip(begins_s, ends_s, goal_rad, strict=True):
-            run_s = min(abs(goal - target) / self.scanner.slew_rad_per_s, end_s - begin_s)
-            pace = self.scanner.slew_rad_per_s * np.sign(goal - target)
-            for from_s, to_s, rate in ((begin_s, begin_s + run_s, pace), (begin_s + run_s, end_s, 0.0)):
-                lasting = np.array([target - 2 * damping / omega * rate, rate])
+        for begin_s, end_s, step_target in zip(begins_s, ends_s, target_rad, strict=True):
+            run_s = min(abs(step_target - target) / self.scanner.slew_rad_per_s, end_s - begin_s)
+            slew_rate = self.scanner.slew_rad_per_s * np.sign(step_target - target)
+            for from_s, to_s, target_rate in ((begin_s, begin_s + run_s, slew_rate), (begin_s + run_s, end_s, 0.0)):
+                steady = np.array([target - 2 * damping / omega * target_rate, target_rate])
                 rows = slice(*np.searchsorted(t_s, [from_s, to_s]))
                 after_s = t_s[rows] - from_s
-                out[rows] = later(state - lasting, after_s)[0] + lasting[0] + rate * after_s
+                angles_rad[rows] = propagate(state - steady, after_s)[0] + steady[0] + target_rate * after_s
                 if np.isfinite(to_s):
-                    moved = later(state - lasting, np.array([to_s - from_s]))[:, 0]
-                    state = moved + lasting + np.array([rate * (to_s - from_s), 0.0])
-                    target += rate * (to_s - from_s)
-        return out
+                    transient = propagate(state - steady, np.array([to_s - from_s]))[:, 0]
+                    state = transient + steady + np.array([target_rate * (to_s - from_s), 0.0])
+                    target += target_rate * (to_s - from_s)
+        return angles_rad
 
 
-def ideal(display, x_rad, y_rad):
-    """Where the beam lands by an ideal lens."""
+def ideal_position_m(display, x_rad, y_rad):
+    """Return the beam's position with an ideal lens."""
     twice_f_m = 2.0 * display.config.scanner.focal_length_m
     return twice_f_m * x_rad, twice_f_m * y_rad
 
 
-def outside_m(display, plan, lands=ideal):
-    """How far the focus, with its aim error, reaches over an absorber's edge while lit, m; negative: it never does."""
+def overhang_m(display, plan, position_of=ideal_position_m):
+    """Return how far the focus, with its aim error, extends beyond an absorber's edge while the gate is on, m.
+
+    It is negative if the focus never does.
+    """
     scale = BoardRequirements.from_config(display.config).scale
     points = quantise(plan, scale)
     x, y, dark, on, _ = points.table.astype(np.int64).T
     begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s
-    lit = np.flatnonzero(on)
-    from_s, lit_s = begin_s[lit] + dark[lit] * scale.tick_s, on[lit] * scale.tick_s
+    gate_on = np.flatnonzero(on)
+    from_s, on_s = begin_s[gate_on] + dark[gate_on] * scale.tick_s, on[gate_on] * scale.tick_s
     angles_rad = scale.to_angles_rad(x), scale.to_angles_rad(y)
-    return reaches_over_m(display, begin_s, angles_rad, from_s, lit_s, plan.pixel[points.row[lit]], lands)
+    return compute_overhang_m(display, begin_s, angles_rad, from_s, on_s, plan.pixel[points.row[gate_on]], position_of)
 
 
-def outside_on_helios_m(display, plan):
-    """The same of a Helios' points, as decoded from the bytes of its frames."""
+def helios_overhang_m(display, plan):
+    """Return the same for a Helios' points, decoded from the bytes of its frames."""
     scale = PointScale.from_config(display.config)
     frames = [frame.data for frame in encode(plan, scale)]
     points = np.concatenate([parse_points(data)[0] for data in frames]).astype(np.int64)
@@ -87,39 +90,42 @@ def outside_on_helios_m(display, plan):
     angles = tuple(scale.to_angles_rad(code[begin]) for code in codes)
     pulses = decode(frames, scale)
     pixel = plan.pixel[np.searchsorted(plan.start_s, pulses.start_s + 1e-9, side="right") - 1]
-    return reaches_over_m(display, begin * scale.point_s, angles, pulses.start_s, pulses.width_s, pixel)
+    return compute_overhang_m(display, begin * scale.point_s, angles, pulses.start_s, pulses.width_s, pixel)
 
 
-def reaches_over_m(display, begin_s, angles_rad, from_s, width_s, pixel_of, lands=ideal):
-    """As `outside_m`: mirrors sent to angles_rad (x, y) at begin_s, light from from_s for width_s on pixel_of."""
+def compute_overhang_m(display, begin_s, angles_rad, from_s, width_s, pixel_of, position_of=ideal_position_m):
+    """Return the overhang of mirrors commanded to angles_rad (x, y) at begin_s, m.
+
+    The gate is on from from_s for width_s on pixel_of.
+    """
     config = display.config
     if not len(from_s):
         return -np.inf
-    # Edges of the gate and a grid between them, fine for as long as anything may still swing.
+    # Edges of the gate and a grid between them, fine while the servo may still ring.
     samples, row_of = [], []
-    for row, lit_s in enumerate(width_s):
-        inside_s = np.append(np.arange(0.0, min(lit_s, 3e-3), GRID_S), np.linspace(0.0, lit_s, 50))
+    for row, on_s in enumerate(width_s):
+        inside_s = np.append(np.arange(0.0, min(on_s, 3e-3), GRID_S), np.linspace(0.0, on_s, 50))
         samples.append(from_s[row] + np.sort(inside_s))
         row_of.append(np.full(len(inside_s), row))
     t_s, row_of = np.concatenate(samples), np.concatenate(row_of)
     pixel = pixel_of[row_of]
-    display_section, laser, servo = config.display, config.laser, Exact(config.scanner)
-    worst = []
-    landed_m = lands(display, *(servo.angles(begin_s, goal_rad, t_s) for goal_rad in angles_rad))
+    display_section, laser, servo = config.display, config.laser, ExactServo(config.scanner)
+    overhangs_m = []
+    landed_m = position_of(display, *(servo.angles(begin_s, target_rad, t_s) for target_rad in angles_rad))
     for at_m, place_m, absorber_m, focus_m in (
         (landed_m[0], display.layout.x_m, display_section.absorber_width_m, laser.focus_width_m),
         (landed_m[1], display.layout.y_m, display_section.absorber_height_m, laser.focus_height_m),
     ):
         off_m = np.abs(at_m - place_m[pixel])
-        worst.append((off_m + config.scanner.aim_error_m + focus_m / 2 - absorber_m / 2).max())
-    return max(worst)
+        overhangs_m.append((off_m + config.scanner.aim_error_m + focus_m / 2 - absorber_m / 2).max())
+    return max(overhangs_m)
 
 
-def planned(display, sequence):
+def plan_pulses(display, sequence):
     return plan_sequence(display, sequence, *display.build_cold_state()).plan
 
 
-def changed(name, **sections):
+def change_display(name, **sections):
     table = DISPLAYS[name].config.model_dump()
     for section, values in sections.items():
         table[section] |= values
@@ -128,10 +134,10 @@ def changed(name, **sections):
 
 @st.composite
 def displays(draw):
-    """Small lattices with any servo, focus and PWM there may be."""
+    """Sample small lattices with any admissible servo, focus and PWM."""
     name = "display-16"
     try:
-        return changed(
+        return change_display(
             name,
             display={
                 "rows": draw(st.integers(1, 4)),
@@ -156,8 +162,8 @@ def displays(draw):
         reject()
 
 
-def hops(draw, display):
-    """Pulses of all widths on random pixels, one after the other, as trains of one pulse each."""
+def random_pulses(draw, display):
+    """Sample pulses of all widths on random pixels, one after the other, as trains of one pulse each."""
     period_s = 1.0 / display.config.laser.pwm_hz
     trains, at_s = [], 0.0
     for _ in range(draw(st.integers(2, 40))):
@@ -172,22 +178,22 @@ def hops(draw, display):
 @given(data=st.data())
 def test_the_focus_lies_on_the_absorber_while_the_gate_is_on(data):
     display = data.draw(displays())
-    sequence = FrameSequence(trains=tuple(hops(data.draw, display)))
-    assert outside_m(display, planned(display, sequence)) <= ROUNDING_M
+    sequence = FrameSequence(trains=tuple(random_pulses(data.draw, display)))
+    assert overhang_m(display, plan_pulses(display, sequence)) <= ROUNDING_M
 
 
-def frame(display, height_m):
+def full_frame(display, height_m):
     return FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(len(display.layout), height_m)),))
 
 
 @pytest.mark.parametrize(("name", "height_m"), [("display-1511", 50e-6), ("display-437", 10e-6), ("display-1", 50e-6)])
 def test_in_a_full_frame(name, height_m):
     display = DISPLAYS[name]
-    assert outside_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
+    assert overhang_m(display, plan_pulses(display, full_frame(display, height_m))) <= ROUNDING_M
 
 
-def on_helios(display, points_per_s):
-    """The same display behind a Helios."""
+def helios_display(display, points_per_s):
+    """Return the same display behind a Helios."""
     table = display.config.model_dump()
     table["board"] |= {"transport": "helios", "points_per_s": points_per_s}
     table["scanner"]["half_range_codes"] = 2047
@@ -198,52 +204,55 @@ def on_helios(display, points_per_s):
 @given(data=st.data())
 def test_on_a_helios_whose_steps_are_coarse(data):
     try:
-        display = on_helios(data.draw(displays()), data.draw(st.sampled_from([20_000, 40_000, 50_000])))
+        display = helios_display(data.draw(displays()), data.draw(st.sampled_from([20_000, 40_000, 50_000])))
     except InputError:
         reject()
     except ValidationError:  # two coarse steps and the focus do not fit on the absorber
         reject()
-    sequence = FrameSequence(trains=tuple(hops(data.draw, display)))
-    assert outside_on_helios_m(display, planned(display, sequence)) <= ROUNDING_M
+    sequence = FrameSequence(trains=tuple(random_pulses(data.draw, display)))
+    assert helios_overhang_m(display, plan_pulses(display, sequence)) <= ROUNDING_M
 
 
 @pytest.mark.parametrize(("name", "height_m"), [("display-437", 10e-6), ("display-16", 50e-6)])
 def test_on_a_helios_in_a_full_frame(name, height_m):
-    display = on_helios(DISPLAYS[name], 40_000)
-    assert outside_on_helios_m(display, planned(display, frame(display, height_m))) <= ROUNDING_M
-    early = with_moves(display, Early(display.scan_head.settling))
-    assert outside_on_helios_m(early, planned(early, frame(early, 50e-6))) > 2e-5
+    display = helios_display(DISPLAYS[name], 40_000)
+    assert helios_overhang_m(display, plan_pulses(display, full_frame(display, height_m))) <= ROUNDING_M
+    early = with_settling(display, EarlySettling(display.scan_head.settling))
+    assert helios_overhang_m(early, plan_pulses(early, full_frame(early, 50e-6))) > 2e-5
 
 
 @pytest.mark.parametrize("number", range(1, 7))
 def test_in_the_experiments_of_the_paper(number):
     display = DISPLAYS["display-437"]
-    assert outside_m(display, planned(display, build_pattern(f"experiment-{number}", {}, display.config))) <= ROUNDING_M
+    assert (
+        overhang_m(display, plan_pulses(display, build_pattern(f"experiment-{number}", {}, display.config)))
+        <= ROUNDING_M
+    )
 
 
-def with_moves(display, moves):
-    return replace(display, scan_head=replace(display.scan_head, settling=moves))
+def with_settling(display, settling):
+    return replace(display, scan_head=replace(display.scan_head, settling=settling))
 
 
-class Early:
-    """The gate opens 15 % earlier."""
+class EarlySettling:
+    """Settling times that open the gate 15 % early."""
 
-    def __init__(self, moves):
-        self._moves, self.lead_in_us = moves, moves.lead_in_us
+    def __init__(self, settling):
+        self._settling, self.lead_in_us = settling, settling.lead_in_us
 
     def settling_us(self, *move):
-        return int(0.85 * self._moves.settling_us(*move))
+        return int(0.85 * self._settling.settling_us(*move))
 
 
 @pytest.mark.parametrize("name", ["display-16", "display-437"])
 def test_a_gate_that_opens_earlier_is_caught(name):
     display = DISPLAYS[name]
-    early = with_moves(display, Early(display.scan_head.settling))
-    assert outside_m(early, planned(early, frame(early, 50e-6))) > 2e-5
+    early = with_settling(display, EarlySettling(display.scan_head.settling))
+    assert overhang_m(early, plan_pulses(early, full_frame(early, 50e-6))) > 2e-5
 
 
-def there_and_back(display):
-    """The shortest pulses there are on pixels of the first row, as quickly as the mirrors go."""
+def shortest_pulses(display):
+    """Return the shortest pulses on pixels of the first row, as fast as the mirrors settle."""
     width_s = 1.0 / display.config.laser.pwm_hz
     pixels = [k % display.config.display.columns for k in range(60)] + [k % 2 for k in range(60)]
     return FrameSequence(
@@ -251,47 +260,47 @@ def there_and_back(display):
     )
 
 
-def test_hasty_moves_taken_for_calm_ones_are_caught():
+def test_moves_after_a_short_dwell_taken_for_long_ones_are_caught():
     """A servo that rings, and pulses of 20 µs."""
     ringing = {"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0}
-    display = changed(
+    display = change_display(
         "display-16",
         scanner=ringing,
         display={"pitch_m": 2.1e-3},
         laser={"pwm_hz": 5e4},
         limits={"galvo_acceleration_rms_max_rad_per_s2": 1e9},
     )
-    assert outside_m(display, planned(display, there_and_back(display))) <= 0
-    always_calm = with_moves(display, replace(display.scan_head.settling, long_dwell_us=0))
-    assert outside_m(always_calm, planned(always_calm, there_and_back(always_calm))) > 2e-5
+    assert overhang_m(display, plan_pulses(display, shortest_pulses(display))) <= 0
+    always_long_dwell = with_settling(display, replace(display.scan_head.settling, long_dwell_us=0))
+    assert overhang_m(always_long_dwell, plan_pulses(always_long_dwell, shortest_pulses(always_long_dwell))) > 2e-5
 
 
-def by_the_field(display, x_rad, y_rad):
-    """Where the beam lands by the calibrated field."""
+def field_position_m(display, x_rad, y_rad):
+    """Return the beam's position with the calibrated field."""
     step_rad = display.config.scanner.rad_per_code
     return display.scan_head.field.position_m(CENTRE_CODE + x_rad / step_rad, CENTRE_CODE + y_rad / step_rad)
 
 
 @pytest.fixture(scope="module")
-def in_a_field(tmp_path_factory):
+def field_display(tmp_path_factory):
     """Display-437 with a field calibrated on a hidden geometry."""
     _, config = calibrate_hidden_field(tmp_path_factory.mktemp("field") / "field.toml", seed=3)
     return DisplayModel.from_config(config)
 
 
-def anywhere(display):
-    """Short pulses on pixels at random."""
+def random_sequence(display):
+    """Return short pulses on random pixels."""
     pixels = np.random.default_rng(6).integers(0, len(display.layout), 300).tolist()
     return FrameSequence(trains=tuple(PulseTrain(p, 1e-6 * k, 2e-4, 2e-4, 0.0, 2.45) for k, p in enumerate(pixels)))
 
 
-def test_in_a_calibrated_field(in_a_field):
-    for sequence in (frame(in_a_field, 10e-6), there_and_back(in_a_field), anywhere(in_a_field)):
-        assert outside_m(in_a_field, planned(in_a_field, sequence), by_the_field) <= ROUNDING_M
+def test_in_a_calibrated_field(field_display):
+    for sequence in (full_frame(field_display, 10e-6), shortest_pulses(field_display), random_sequence(field_display)):
+        assert overhang_m(field_display, plan_pulses(field_display, sequence), field_position_m) <= ROUNDING_M
 
 
-def test_moves_of_the_ideal_lattice_in_a_calibrated_field_are_caught(in_a_field):
-    """What a nominal pitch needs, given to places a little farther apart."""
-    ideal_moves = SettlingTable.from_config(in_a_field.config)
-    loose = with_moves(in_a_field, replace(ideal_moves, pitch_rad=1.1 * ideal_moves.pitch_rad))
-    assert outside_m(loose, planned(loose, anywhere(loose)), by_the_field) > ROUNDING_M
+def test_settling_times_of_the_ideal_lattice_in_a_calibrated_field_are_caught(field_display):
+    """Settling times of the nominal pitch are applied to positions slightly farther apart."""
+    ideal_settling = SettlingTable.from_config(field_display.config)
+    loose = with_settling(field_display, replace(ideal_settling, pitch_rad=1.1 * ideal_settling.pitch_rad))
+    assert overhang_m(loose, plan_pulses(loose, random_sequence(loose)), field_position_m) > ROUNDING_M

@@ -1,4 +1,4 @@
-"""What the limiter gave is proven in its bytes, whatever was shown before."""
+"""The encoded bytes of limited plans pass the limiter's verification after any previous plans."""
 
 import numpy as np
 import pytest
@@ -16,13 +16,13 @@ CONFIG = load_config()
 DISPLAY = DisplayModel.from_config(CONFIG)
 SCALE = BoardRequirements.from_config(CONFIG).scale
 STRONG, BRISK = (0.040, 0.001, 2.4), (0.010, 0.010, 1.0)
-"""Width, gap, s, and power, W: the first is trimmed by three caps, at times to nothing."""
+"""Width, gap, s, and power, W: three caps trim the first, sometimes to zero."""
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_plans_that_follow_each_other_and_are_cut_short(seed):
+def test_truncated_plans_in_succession_are_verified(seed):
     random = np.random.default_rng(seed)
-    thermal, now_s, dark, touched = ThermalEstimate(*DISPLAY.build_cold_state()), 3.0, 0, 0
+    thermal, now_s, omitted, trimmed_by_touch = ThermalEstimate(*DISPLAY.build_cold_state()), 3.0, 0, 0
     for _ in range(40):
         start_s = round(now_s + random.uniform(0.05, 3.0), 6)
         _, budget = thermal.shift_to_plan(start_s)
@@ -32,20 +32,21 @@ def test_plans_that_follow_each_other_and_are_cut_short(seed):
         points = quantise(plan, SCALE)
         decoded = decode(points.encode_payload(), SCALE)
         verify(plan, points.row[decoded.index], decoded, budget, DISPLAY.budget)
-        dark += len(plan) - len(decoded.index)
-        touched += np.count_nonzero(plan.reason == "touch_temperature")
+        omitted += len(plan) - len(decoded.index)
+        trimmed_by_touch += np.count_nonzero(plan.reason == "touch_temperature")
         until_s = random.uniform(0.2, 4.0)
         thermal = ThermalEstimate.from_plan(
             DISPLAY.build_cold_heat(), commit_until(plan, until_s, budget, DISPLAY.budget), start_s
         )
         now_s = start_s + until_s
-    assert dark
-    assert touched
+    assert omitted
+    assert trimmed_by_touch
 
 
-def test_light_that_the_board_cannot_give_is_none():
+def test_power_below_the_board_s_minimum_is_not_committed():
     trains = tuple(
-        PulseTrain(200, 0.05 * k, 0.01, 0.01, 0.001, share * CONFIG.min_power_w) for k, share in enumerate((0.9, 1.0))
+        PulseTrain(200, 0.05 * k, 0.01, 0.01, 0.001, fraction * CONFIG.min_power_w)
+        for k, fraction in enumerate((0.9, 1.0))
     )
     heat, budget = DISPLAY.build_cold_state()
     plan = plan_sequence(DISPLAY, FrameSequence((), trains), heat, budget).plan
