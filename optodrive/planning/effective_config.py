@@ -2,7 +2,15 @@
 
 from typing import TYPE_CHECKING
 
-from optodrive.device.config import Config, DisplaySection, PixelModelSection, ScannerSection, Section
+from optodrive.device.config import (
+    Config,
+    DisplaySection,
+    LimitsSection,
+    PixelModelSection,
+    ScannerSection,
+    Section,
+)
+from optodrive.planning.limiter.caps import CAPS
 
 if TYPE_CHECKING:
     from optodrive.planning.display_model import DisplayModel
@@ -23,6 +31,20 @@ class EffectiveDisplay(DisplaySection):
     """The section [display] and its pixels, by index."""
 
     pixels: list[PixelPlace]
+
+
+class CapDescription(Section):
+    """A cap as shown to people: its label, its unit and its setting in the section [limits]."""
+
+    label: str
+    unit: str
+    setting: str
+
+
+class EffectiveLimits(LimitsSection):
+    """The section [limits] and descriptions of its caps, by the key that plans and telemetry use."""
+
+    caps: dict[str, CapDescription]
 
 
 class EffectiveScanner(ScannerSection):
@@ -48,6 +70,7 @@ class EffectiveConfig(Config):
     """The configuration as `optodrive config show --json` prints it and GET /v1/config sends it."""
 
     display: EffectiveDisplay
+    limits: EffectiveLimits
     scanner: EffectiveScanner
     pixel_model: EffectivePixelModel
 
@@ -62,10 +85,12 @@ def build_effective_config(display: "DisplayModel") -> EffectiveConfig:
         PixelPlace(index=index, x_m=x_m, y_m=y_m, bridge_width_m=config.display.bridge_width_m)
         for index, (x_m, y_m) in enumerate(zip(layout.x_m.tolist(), layout.y_m.tolist(), strict=True))
     ]
+    caps = {cap.key: CapDescription(label=cap.label, unit=cap.unit, setting=cap.setting) for cap in CAPS}
     return EffectiveConfig.model_validate(
         dict(config)
         | {
             "display": dict(config.display) | {"pixels": places},
+            "limits": dict(config.limits) | {"caps": caps},
             "scanner": dict(config.scanner) | {"settling_pitch_s": settling_us * 1e-6},
             "pixel_model": {
                 **dict(config.pixel_model),

@@ -8,7 +8,7 @@ import { Drawing } from "./draw.js";
 import { Gauges } from "./gauges.js";
 import { Grid, numbers } from "./grid.js";
 import { Library } from "./patterns.js";
-import { framesOf, Plans } from "./plans.js";
+import { framesOf, Plans, setCaps } from "./plans.js";
 import { Status } from "./status.js";
 import { Stop } from "./stop.js";
 import { Telemetry } from "./telemetry.js";
@@ -48,6 +48,7 @@ async function loaded(path) {
 }
 
 const [config, { patterns }] = [await loaded("/v1/config"), await loaded("/v1/patterns")];
+setCaps(config.limits.caps);
 const grid = new Grid(config);
 const view = new DisplayView(find("display"), grid);
 view.ambient = config.ambient_c;

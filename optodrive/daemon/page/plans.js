@@ -5,17 +5,15 @@ import { call } from "./api.js";
 const POLL_MS = 400;
 const FRAMES_MAX = 500;
 const ENDED = ["done", "superseded", "failed", "cancelled"];
-export const CAPS = {
-  absorber_temperature: "absorber temperature",
-  wall_temperature: "wall temperature",
-  touch_temperature: "touch surface",
-  spot_energy: "energy in one pixel",
-  pulse_energy: "energy of a pulse",
-  pulse_width: "width of a pulse",
-  pixel_mean_power: "mean power, one pixel",
-  display_mean_power: "mean power, display",
-  galvo_acceleration: "mirrors",
-};
+
+// Labels by cap, from the configuration.
+export const CAPS = {};
+
+export function setCaps(caps) {
+  for (const [key, { label }] of Object.entries(caps)) {
+    CAPS[key] = label;
+  }
+}
 
 // Frames of a drawing, once or so often a second.
 export function framesOf(heights, rateHz, seconds) {

@@ -2,7 +2,7 @@
 
 from base64 import b64encode
 from collections.abc import Iterable
-from math import isfinite, sqrt
+from math import isfinite
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PulseBatch
 from optodrive.device.config import LimitsSection
 from optodrive.physics.nominal_display import DisplayState
+from optodrive.planning.limiter.caps import CAPS_BY_KEY
 from optodrive.planning.limiter.usage import Usage
 
 HEIGHT_UNIT_M = 1e-7
 TEMPERATURE_UNIT_K = 0.1
-UNITS = {"spot_energy": "J", "galvo_acceleration": "rad/s²"}
 
 
 def build_display_event(board_s: float, warm: bool, state: DisplayState, ambient_c: float) -> DisplayEvent:
@@ -48,27 +48,20 @@ def build_pulse_batch(
 
 def describe_caps(usages: Iterable[Usage], limits: LimitsSection) -> list[CapUsage]:
     """Convert finite caps to display units: temperature in °C, energy in J, power in W, acceleration in rad/s² rms."""
-    max_c = {
-        "absorber_temperature": limits.absorber_max_c,
-        "wall_temperature": limits.wall_max_c,
-        "touch_temperature": limits.touch_max_c,
-    }
     caps = []
     for usage in usages:
         if not isfinite(usage.limit):
             continue
-        value, limit, unit = usage.used, usage.limit, UNITS.get(usage.cap, "W")
-        if usage.cap in max_c:
-            value, limit, unit = max_c[usage.cap] - (usage.limit - usage.used), max_c[usage.cap], "°C"
-        elif usage.cap == "galvo_acceleration":
-            value, limit = sqrt(value), sqrt(limit)
+        cap = CAPS_BY_KEY[usage.cap]
+        setting = getattr(limits, cap.setting)
+        value, limit = (cap.scale.to_setting(each, usage.limit, setting) for each in (usage.used, usage.limit))
         caps.append(
             CapUsage(
                 cap=usage.cap,
                 fraction=round(usage.used / usage.limit, 4),
                 value=float(f"{value:.5g}"),
                 limit=float(f"{limit:.5g}"),
-                unit=unit,
+                unit=cap.unit,
                 pixel=usage.pixel,
             )
         )

@@ -6,6 +6,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.device.config import LimitsSection
+from optodrive.planning.effective_config import build_effective_config
 from optodrive.planning.limiter import cap_checks
 from optodrive.planning.limiter.caps import CAP_NUMBERS, CAPS, REASONS, WRONG_ORDER, CapScale, CapValues
 
@@ -42,8 +43,10 @@ def test_a_value_is_shown_in_the_unit_of_its_setting(scale):
     assert scale.to_setting(0.0, limit, setting) == (20.0 if scale is CapScale.TEMPERATURE else 0.0)
 
 
-def test_the_manual_names_every_cap():
+def test_the_effective_configuration_and_the_manual_name_every_cap():
+    described = build_effective_config(DISPLAY).limits.caps
     manual = LIMITS_PAGE.read_text(encoding="utf-8")
+    assert list(described) == [cap.key for cap in CAPS]
     for cap in CAPS:
         assert f"`{cap.key}`" in manual
         assert f"`{cap.setting}`" in manual
