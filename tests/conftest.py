@@ -1,4 +1,4 @@
-"""Shared fixtures: displays of every shipped configuration, hypothesis without deadlines."""
+"""Shared fixtures and options of pytest, profiles of hypothesis, and the order of the tests."""
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -21,7 +21,7 @@ def pytest_addoption(parser):
 
 SLOW_FOLDERS = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
 SLOW_FILES = ("test_calibrate_loop.py", "test_home.py", "test_ends_dark.py")
-"""Folders and files that take long: begun last, one of them would keep one worker while the others have nothing."""
+"""Slow folders and files, which run first: started last, one would occupy a worker while the others are idle."""
 
 
 def pytest_collection_modifyitems(config, items):

@@ -1,4 +1,4 @@
-"""The whole circle of a pixel map, from the command line: sweep, hidden pixels, recordings, map."""
+"""Calibration of a pixel map by commands: sweep, recordings of hidden pixels, map."""
 
 import json
 from pathlib import Path
@@ -11,44 +11,44 @@ from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
 from optodrive.link.simulator.true_pixels import GroundTruthPixels
 
 COOLDOWN_S = 5.0
-"""Times between frames in which every pixel is cold again, s."""
+"""Duration after which every pixel is cold again, s."""
 
 
 def run_json(capsys, *arguments, status=0):
-    """What a command prints as JSON."""
+    """Run a command and return the JSON that it prints."""
     capsys.readouterr()
     assert run([str(each) for each in arguments]) == status
     return json.loads(capsys.readouterr().out)
 
 
 def record_sweep(capsys, folder, display, seed, noise=1.0, aims=None):
-    """Recordings of a sweep over hidden pixels, of some aims or all."""
-    asked = run_json(capsys, "calibrate", "pixels", "--sweep", folder / "sweep", "--config", display, "--json")
+    """Record a sweep over hidden pixels with the given aims or all; return the files."""
+    sweep = run_json(capsys, "calibrate", "pixels", "--sweep", folder / "sweep", "--config", display, "--json")
     recordings = []
-    for k, aim in enumerate(asked["aims"]):
+    for k, aim in enumerate(sweep["aims"]):
         if aims is not None and aim["name"] not in aims:
             continue
         played, out = folder / "sweep" / aim["name"], folder / f"{aim['name']}.h5"
-        told = run_json(
+        answer = run_json(
             capsys,
             *("simulate", f"{played}.json", "--pixel-map", f"{played}.pixels.toml", "--config", display),
             *("--pixel-seed", seed, "--pixels", "all", "--post-pulse", 0.1, "--noise", noise, "--seed", 100 * seed + k),
             *("--out", out, "--json"),
         )
-        assert not told["summary"]["trimmed"]["pulses"]
+        assert not answer["summary"]["trimmed"]["pulses"]
         recordings.append(out)
     return recordings
 
 
 def calibrate_map(capsys, folder, display, recordings):
-    """pixels.toml, and what was said."""
+    """Fit pixels.toml to recordings; return its path and the statistics."""
     out = folder / "pixels.toml"
-    told = run_json(capsys, "calibrate", "pixels", "--config", display, "--out", out, "--json", *recordings)
-    return out, told
+    answer = run_json(capsys, "calibrate", "pixels", "--config", display, "--out", out, "--json", *recordings)
+    return out, answer
 
 
-def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
-    """Heights that hidden pixels reach when all are asked for one, [p], and the answer."""
+def measured_um(capsys, folder, display, seed, height_um, pixel_map=None):
+    """Return the heights that the hidden pixels reach for one common target, µm, [p], and the answer."""
     count = len(GroundTruthPixels.sample(seed, load_config(display)).displacement_gain)
     frame = {
         "id": "all",
@@ -58,17 +58,17 @@ def measured_um(capsys, folder, display, seed, height_um, pixels_map=None):
     }
     frames = Path(folder / "frames.json")
     frames.write_text(json.dumps({"frames": [frame]}))
-    more = () if pixels_map is None else ("--pixel-map", pixels_map)
-    told = run_json(
+    more = () if pixel_map is None else ("--pixel-map", pixel_map)
+    answer = run_json(
         capsys,
         *("simulate", frames, "--config", display, "--pixel-seed", seed, "--pixels", "all"),
         *("--post-pulse", 0.1, "--dt", 2e-4, "--json", *more),
     )
-    return np.array([pixel["measured_max_um"] for pixel in told["pixels"]]), told
+    return np.array([pixel["measured_max_um"] for pixel in answer["pixels"]]), answer
 
 
 def map_errors(display, path, seed):
-    """Gains, relative, and offsets, m, off the truth over their stated sigmas too: [3, p] each, NaN where not known."""
+    """Return the errors of gains and offsets (m), and the errors over sigma: [3, p] each, NaN where unknown."""
     config = replace_pixel_map(load_config(display), path)
     known, truth = load_pixel_map(config), GroundTruthPixels.sample(seed, config)
     lives = ~known.dead

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
-from optodrive.cli.options import announce_compilation
+from optodrive.cli.output import announce_compilation
 from optodrive.core.errors import LinkError
 
 if TYPE_CHECKING:

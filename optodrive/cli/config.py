@@ -1,8 +1,9 @@
-"""`optodrive config show | check`."""
+"""`optodrive config show | check`: show or check a configuration."""
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
 
 
 def register(app: typer.Typer) -> None:
@@ -14,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Show the resolved configuration, with every pixel and number filled in."""
+    """Show the effective configuration with every pixel and number."""
     from optodrive.device.config import load_config
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.effective_config import build_effective_config
@@ -37,7 +38,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Check a configuration file whole."""
+    """Check a configuration file and the files that it names."""
     from optodrive.device.config import load_config
     from optodrive.planning.display_model import DisplayModel
 
@@ -45,4 +46,4 @@ def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     if json:
         print_json({"name": display.config.name, "pixels": len(display.layout), "ok": True})
     else:
-        print(f"{display.config.name}: {len(display.layout)} pixels, configuration in order")
+        print(f"{display.config.name}: {len(display.layout)} pixels, configuration valid")

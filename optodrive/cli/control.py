@@ -1,10 +1,11 @@
-"""`optodrive status | arm | disarm | stop`, against a running daemon."""
+"""`optodrive status | arm | disarm | stop`: control a running daemon."""
 
 from typing import TYPE_CHECKING
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, JsonOption, UrlOption, print_json
+from optodrive.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
     from optodrive.daemon.responses.state import StateReport
@@ -21,7 +22,7 @@ def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import READ_STATE
 
-    _print(DaemonClient(url).call(READ_STATE), json)
+    _print_state(DaemonClient(url).call(READ_STATE), json)
 
 
 def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -29,7 +30,7 @@ def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import ARM
 
-    _print(DaemonClient(url).call(ARM), json)
+    _print_state(DaemonClient(url).call(ARM), json)
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -37,7 +38,7 @@ def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import DISARM
 
-    _print(DaemonClient(url).call(DISARM), json)
+    _print_state(DaemonClient(url).call(DISARM), json)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -45,10 +46,10 @@ def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.http import DaemonClient
     from optodrive.client.requests import STOP
 
-    _print(DaemonClient(url).call(STOP), json)
+    _print_state(DaemonClient(url).call(STOP), json)
 
 
-def _print(state: "StateReport", as_json: bool) -> None:
+def _print_state(state: "StateReport", as_json: bool) -> None:
     if as_json:
         print_json(state)
         return

@@ -1,19 +1,16 @@
 """`optodrive diagnose`: find the errors of the model in a recording."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import ConfigOption, announce_compilation, print_json
+from optodrive.cli.options import ConfigOption
+from optodrive.cli.output import announce_compilation, print_json, show_step
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from optodrive.core.types.measurements import Measurement
     from optodrive.device.config import Config
     from optodrive.lab.recording import DisplayRuns
@@ -93,7 +90,7 @@ def _diagnose_jointly(recordings: list[Path], title: str, seed: int, config: "Co
     measurement = _read_recordings(recordings)
     prior, epsilon, width_m = build_prior(measurement, config)
     announce_compilation()
-    with _report_progress() as on_progress:
+    with show_step("reading") as on_progress:
         diagnosis = study(measurement, seed, prior, epsilon, on_progress)
     model = build_model_toml(diagnosis, title, width_m or DEFAULT_BRIDGE_WIDTH_M) if diagnosis.base else None
     return _DiagnosisOutput(build_answer(diagnosis), build_narrative(diagnosis), build_report(diagnosis, title), model)
@@ -183,20 +180,3 @@ def _write_text(path: Path, text: str) -> None:
 
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def _report_progress() -> "Iterator[Callable[[str], None]]":
-    """Show the current step on stderr where it is a terminal."""
-    import sys
-
-    if not sys.stderr.isatty():
-        yield lambda what: None
-        return
-    from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("reading", total=None)
-        yield lambda what: bar.update(task, description=what)

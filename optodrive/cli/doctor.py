@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
     from optodrive.cli.doctor_finding import Finding

@@ -1,4 +1,4 @@
-"""Checks of the board by a handshake; the board is never armed."""
+"""Checks of the board by a handshake, without arming it."""
 
 from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, report_warning
 from optodrive.core.clock import Clock

@@ -1,4 +1,4 @@
-"""`optodrive helios info | play`: a Helios laser DAC in place of the board."""
+"""`optodrive helios info | play`: play frames on a Helios laser DAC instead of the board."""
 
 import signal
 from collections.abc import Callable, Iterator
@@ -16,11 +16,9 @@ from optodrive.cli.options import (
     ModelOption,
     PolicyOption,
     StrictOption,
-    announce_compilation,
     load_run_config,
-    print_json,
-    show_progress,
 )
+from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import OptodriveError
 
@@ -38,9 +36,9 @@ TERMINATING_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _TerminatedError(OptodriveError):
-    """A signal came."""
+    """A signal requested the end of the process."""
 
-    code = "ended"
+    code = "terminated"
     exit_status = 130
 
 
@@ -55,7 +53,7 @@ def register(app: typer.Typer) -> None:
 
 
 def info(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Say which Helios is plugged in, and whether it may emit; it is stopped, and its shutter closed."""
+    """Show the connected Helios and whether it may emit; it is stopped, and its shutter closed."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
 
@@ -85,7 +83,7 @@ def play(
     fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
-    """Plan, limit and prove frames, play them on a Helios, and say what left; Ctrl-C ends the light."""
+    """Plan, limit and verify frames, play them on a Helios, and report what was sent; Ctrl-C switches the light off."""
     from optodrive.core.clock import MonotonicClock
     from optodrive.link.helios.dac import Helios
     from optodrive.link.helios.encoding import PointScale
@@ -132,15 +130,15 @@ def play(
 
 @contextmanager
 def _defer_signals() -> Iterator[Callable[[], None]]:
-    """Signals that end a process only leave a note here, so that none comes in the way of a stop; heed raises it."""
+    """Defer terminating signals, so that none interrupts a stop; yield the function that raises for a received one."""
     received: list[int] = []
 
     def raise_if_signalled() -> None:
         if received:
-            raise _TerminatedError(f"ended by {signal.Signals(received[0]).name}")
+            raise _TerminatedError(f"terminated by {signal.Signals(received[0]).name}")
 
     previous_handlers = {
-        number: signal.signal(number, lambda which, _frame: received.append(which)) for number in TERMINATING_SIGNALS
+        number: signal.signal(number, lambda signum, _frame: received.append(signum)) for number in TERMINATING_SIGNALS
     }
     try:
         yield raise_if_signalled
@@ -162,7 +160,7 @@ def _combine_progress(
 def _recall_budget(
     memory: "HeatMemory", cold_budget: "BudgetState", clock: "Clock", raise_if_signalled: Callable[[], None]
 ) -> "BudgetState":
-    """The budget now, once all pulses of an earlier play have had their time."""
+    """Return the present budget state, once the pulses of an earlier playback have ended."""
     budget = memory.load(time_of_day(), cold_budget)
     while budget.at_s > 0.0:
         raise_if_signalled()
@@ -179,7 +177,7 @@ def _play_and_store_heat(
     clock: "Clock",
     on_progress: Callable[[float], None],
 ) -> "PlaybackReport":
-    """Play, the memory written before the first light, and again after the last: a killed play counts in full."""
+    """Play, and save the heat before the first pulse and after the last: a killed playback counts in full."""
     from optodrive.link.helios.heat_memory import ZERO_OFFSET_S
     from optodrive.link.helios.player import play
 
@@ -215,7 +213,7 @@ def _format_playback(playback: dict[str, Any]) -> list[str]:
     lines = [
         f"sent             {playback['frames']} frames at {playback['points_per_s']:.1f} points/s",
         f"light            {playback['energy_j']:.4f} J of {playback['energy_planned_j']:.4f} J planned",
-        f"tallest so       {playback['predicted_max_um']:.1f} µm predicted of the light sent",
+        f"highest          {playback['predicted_max_um']:.1f} µm predicted of the light sent",
     ]
     if playback["underruns"]:
         lines.append(

@@ -4,7 +4,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
 from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:

@@ -1,4 +1,7 @@
-"""The command line: one line per error; exit status 0 done, 1 failed, 2 bad input."""
+"""The command line `optodrive`.
+
+An error is one line on stderr. Exit status: 0 done, 1 failed, 2 bad input, 130 interrupted.
+"""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""`optodrive plan`: plan and limit without a daemon."""
+"""`optodrive plan`: plan and limit frames without a daemon."""
 
 from pathlib import Path
 from typing import Annotated
@@ -15,11 +15,9 @@ from optodrive.cli.options import (
     PixelMapOption,
     PolicyOption,
     StrictOption,
-    announce_compilation,
     load_run_config,
-    print_json,
-    show_progress,
 )
+from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 
 FramesArgument = Annotated[Path, typer.Argument(metavar="FRAMES.json", help="Frames and trains.")]
@@ -32,7 +30,7 @@ def register(app: typer.Typer) -> None:
 
 def plan(
     frames: FramesArgument,
-    out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row a pulse.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="plan.csv", help="Write one row per pulse.")] = None,
     config: ConfigOption = None,
     model: ModelOption = None,
     field: FieldOption = None,
@@ -43,7 +41,7 @@ def plan(
     fit: FitOption = "as_is",
     json: JsonOption = False,
 ) -> None:
-    """Plan and limit frames: whether they fit, pulses, beam time, what was trimmed and why, predicted displacement."""
+    """Plan and limit frames; report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.pipeline import resolve_policy

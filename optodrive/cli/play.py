@@ -7,16 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import (
-    DEFAULT_URL,
-    FitOption,
-    JsonOption,
-    PolicyOption,
-    StrictOption,
-    UrlOption,
-    print_json,
-    show_progress,
-)
+from optodrive.cli.options import DEFAULT_URL, FitOption, JsonOption, PolicyOption, StrictOption, UrlOption
+from optodrive.cli.output import print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import InputError
 
@@ -26,8 +18,8 @@ if TYPE_CHECKING:
 
 POLL_S = 0.1
 
-DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Plan and limit only; nothing moves.")]
-WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until it was shown.")]
+DryRunOption = Annotated[bool, typer.Option("--dry-run", help="Plan and limit only; do not show.")]
+WaitOption = Annotated[bool, typer.Option("--wait/--no-wait", help="Wait until the plan has been shown.")]
 
 
 def register(app: typer.Typer) -> None:
@@ -60,7 +52,7 @@ def push(
 
 def play(
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="A name that `optodrive patterns` lists.")],
-    values: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]…", help="Its parameters.")] = None,
+    values: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]…", help="Pattern parameters.")] = None,
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
@@ -103,7 +95,7 @@ def _parse_parameters(pattern: str, values: list[str]) -> dict[str, str]:
         key, equals, content = value.partition("=")
         if not equals or key not in {p.name for p in known}:
             if known and known[0].name not in parsed and not equals:
-                key, content = known[0].name, value  # a bare word is the first parameter: play text "hello"
+                key, content = known[0].name, value  # a value without a key sets the first parameter: play text "hello"
             elif not equals:
                 raise InputError(f"play {pattern}", value, "key=value")
         parsed[key] = content

@@ -5,15 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import (
-    ConfigOption,
-    FieldOption,
-    MirrorsOption,
-    ModelOption,
-    PixelMapOption,
-    announce_compilation,
-    load_run_config,
-)
+from optodrive.cli.options import ConfigOption, FieldOption, MirrorsOption, ModelOption, PixelMapOption, load_run_config
+from optodrive.cli.output import announce_compilation
 
 if TYPE_CHECKING:
     from optodrive.device.config import Config

@@ -1,4 +1,4 @@
-"""`optodrive service install | remove | show`: manage the files of the systemd service; nothing is started."""
+"""`optodrive service install | remove | show`: manage the files of the systemd service without starting it."""
 
 import sys
 from pathlib import Path
@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
 
 RootOption = Annotated[
     Path, typer.Option("--root", metavar="DIR", help="Install below this folder instead of /, for packages and tests.")

@@ -1,4 +1,4 @@
-"""`optodrive simulate`: a plan on the simulated board, and what instruments would have measured."""
+"""`optodrive simulate`: run a plan on the simulated board and write the simulated measurements."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,11 +12,9 @@ from optodrive.cli.options import (
     MirrorsOption,
     ModelOption,
     PixelMapOption,
-    announce_compilation,
     load_run_config,
-    print_json,
-    show_progress,
 )
+from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.cli.plan import FramesArgument
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import InputError
@@ -34,7 +32,7 @@ if TYPE_CHECKING:
     from optodrive.planning.planned_sequence import PlannedSequence
 
 PIXELS_RECORDED_MAX = 16
-"""Without --pixels, so many of the driven pixels are looked at, the tallest first."""
+"""Maximum number of pixels recorded without --pixels; those with the highest displacements are selected."""
 
 
 def register(app: typer.Typer) -> None:
@@ -45,9 +43,9 @@ def register(app: typer.Typer) -> None:
 def simulate(
     frames: FramesArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="recording.h5", help="Write the recording.")] = None,
-    pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to look at, or all.")] = None,
+    pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to record, or all.")] = None,
     dt: Annotated[float, typer.Option("--dt", metavar="SECONDS", help="Time between samples.")] = 1e-3,
-    noise: Annotated[float, typer.Option("--noise", help="Instrument noise, in units of what each states.")] = 0.0,
+    noise: Annotated[float, typer.Option("--noise", help="Instrument noise as a factor of the stated noise.")] = 0.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
     config: ConfigOption = None,
     model: ModelOption = None,
@@ -56,12 +54,12 @@ def simulate(
     pixel_map: PixelMapOption = None,
     truth: Annotated[
         Path | None,
-        typer.Option("--truth", metavar="model.toml", help="What the simulated display really is; else as planned."),
+        typer.Option("--truth", metavar="model.toml", help="Ground truth of the display; default: the planned model."),
     ] = None,
     pixel_seed: Annotated[
         int | None,
         typer.Option(
-            "--pixel-seed", min=0, help="Pixels as drawn from this seed: gains, offsets and dead ones, not as planned."
+            "--pixel-seed", min=0, help="Sample gains, offsets and dead pixels of the simulated display from this seed."
         ),
     ] = None,
     post_pulse_s: Annotated[
@@ -74,7 +72,7 @@ def simulate(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Plan frames, run them on the simulated board, and measure what the pixels do."""
+    """Plan frames, run them on the simulated board, and simulate the measurement of the pixels."""
     from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
@@ -106,7 +104,7 @@ def simulate(
     with show_progress("simulating") as on_progress:
         executed = execute(display, planned_sequence, on_progress)
     incident = executed if sampled_pixels is None else sampled_pixels.attenuate(executed, display.config)
-    recorded = _select_tallest(planned_sequence) if selected is None else selected
+    recorded = _select_highest(planned_sequence) if selected is None else selected
     traces = (
         [compute_traces(true_display, incident, recorded, dt)]
         if post_pulse_s is None
@@ -131,7 +129,7 @@ def simulate(
 
 
 def _build_true_display(config: "Config", sampled_pixels: "GroundTruthPixels | None") -> "ThermalState":
-    """The display as it is: of the configuration's model, its pixels as drawn, or all alike; no map says what is."""
+    """Build the ground truth of the display: the configured model with sampled or equal pixels, without a pixel map."""
     from optodrive.device.pixel_map import remove_pixel_map
     from optodrive.physics.parameters import build_display_pixels, load_parameters
     from optodrive.physics.thermal_state import build_cold_state
@@ -156,7 +154,7 @@ def _parse_pixels(pixels: str | None, count: int) -> list[int] | None:
     return list(dict.fromkeys(selected))
 
 
-def _select_tallest(planned_sequence: "PlannedSequence") -> list[int]:
+def _select_highest(planned_sequence: "PlannedSequence") -> list[int]:
     order = planned_sequence.plan.pixel[planned_sequence.predicted_m.argsort()[::-1]]
     return sorted(list(dict.fromkeys(order.tolist()))[:PIXELS_RECORDED_MAX])
 
@@ -164,7 +162,7 @@ def _select_tallest(planned_sequence: "PlannedSequence") -> list[int]:
 def _write_recording(
     out: Path, display: "DisplayModel", executed: "ExecutedPulses", traces: "list[PixelTrace]", noise: float, seed: int
 ) -> None:
-    """One recording of all traces; each with the pulses that fall into its time."""
+    """Write one recording with a run per trace, each with the pulses during the trace."""
     import numpy as np
 
     from optodrive.core.types.measurements import Measurement, Run

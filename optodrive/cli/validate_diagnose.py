@@ -1,10 +1,8 @@
 """`optodrive validate --diagnose`: diagnose the model of Text S1 with the facts of the paper as data."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from optodrive.cli.options import announce_compilation, print_json
+from optodrive.cli.output import announce_compilation, print_json, show_step
 
 if TYPE_CHECKING:
     from optodrive.lab.validation.study import StudyResult
@@ -22,7 +20,7 @@ def diagnose_paper_facts(json: bool = False) -> None:
     from optodrive.physics.parameters import load_parameters
 
     announce_compilation()
-    with _report_progress() as on_progress:
+    with show_step("reading the facts") as on_progress:
         study_result = run_study(load_paper_facts(), load_parameters(LITERAL_SET), on_progress)
     if json:
         print_json(build_study_answer(study_result))
@@ -57,16 +55,3 @@ def _print_narrative(study_result: "StudyResult") -> None:
     print_lines([""])
     console.print(table)
     print_lines([*describe_predictions(study_result), "", *describe_assumptions(study_result)])
-
-
-@contextmanager
-def _report_progress() -> Iterator[Callable[[str], None]]:
-    """Show the current step on stderr where it is a terminal."""
-    from rich.console import Console
-
-    console = Console(stderr=True)
-    if not console.is_terminal:
-        yield lambda what: None
-        return
-    with console.status("reading the facts") as status:
-        yield lambda what: status.update(what)

@@ -102,7 +102,7 @@ def print_validation(json: bool = False, model: Path | None = None) -> None:
     """Print the table, or one JSON object; `model` is a further parameter set to compare."""
     rows = build_validation_rows(model)
     if json:
-        from optodrive.cli.options import print_json
+        from optodrive.cli.output import print_json
 
         print_json(build_document(rows))
     else:

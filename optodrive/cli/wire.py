@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import JsonOption, print_json
+from optodrive.cli.options import JsonOption
+from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
     from optodrive.link.protocol.transcript import TranscriptEntry

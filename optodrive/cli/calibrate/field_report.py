@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from optodrive.cli.options import print_json
+from optodrive.cli.output import print_json
 
 if TYPE_CHECKING:
     from optodrive.lab.calibration.field_fit import FieldFit

@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from optodrive.cli.options import load_run_config, print_json
+from optodrive.cli.options import load_run_config
+from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
 
 if TYPE_CHECKING:

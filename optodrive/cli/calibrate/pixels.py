@@ -6,15 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from optodrive.cli.calibrate.pixel_sweep import write_sweep
-from optodrive.cli.options import (
-    ConfigOption,
-    JsonOption,
-    ModelOption,
-    announce_compilation,
-    load_run_config,
-    print_json,
-    show_progress,
-)
+from optodrive.cli.options import ConfigOption, JsonOption, ModelOption, load_run_config
+from optodrive.cli.output import announce_compilation, print_json, show_progress
 from optodrive.core.errors import InputError
 
 PIXELS_LISTED_MAX = 20

@@ -6,7 +6,8 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.options import ConfigOption, JsonOption, print_json
+from optodrive.cli.options import ConfigOption, JsonOption
+from optodrive.cli.output import print_json
 from optodrive.core.errors import InputError
 
 

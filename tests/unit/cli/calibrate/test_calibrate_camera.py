@@ -20,29 +20,29 @@ TRUTH = GroundTruthGeometry.sample(4, CONFIG)
 CODES = grid_codes(5)
 PLACES = np.column_stack(TRUTH.position_m(*CODES.T))
 OUTLIER = 7
-"""This spot's picture was taken of another place."""
+"""Index of the spot whose picture shows another position."""
 PEAKS = (180.0, 700.0, 60.0)
 AMBIENT_LIGHT = 20.0
 
 
 def spot_picture(place_m, peak, random, share=0.0):
-    """With a reflection that has a share of its light, well aside."""
+    """Render a spot and a distant reflection that has a share of its light."""
     light = AMBIENT_LIGHT + peak * spot_light(place_m)
-    aside = np.add(place_m, (0.012 if place_m[0] < 0 else -0.012, random.uniform(-5e-3, 5e-3)))
-    return taken(light + share * peak * spot_light(aside), random)
+    reflection = np.add(place_m, (0.012 if place_m[0] < 0 else -0.012, random.uniform(-5e-3, 5e-3)))
+    return taken(light + share * peak * spot_light(reflection), random)
 
 
 @pytest.fixture(scope="module")
 def shared(tmp_path_factory):
-    """A laboratory's folder: every third spot saturated, every third faint, every other with a reflection."""
+    """A folder of pictures: every third spot saturated, every third faint, every second with a reflection."""
     at, random = tmp_path_factory.mktemp("pictures"), np.random.default_rng(11)
     save(at / "grid.png", taken(180.0 * grid_light(), random))
     save(at / "dark.png", taken(np.full((1200, 1600), AMBIENT_LIGHT), random))
     rows = ["file,x_code,y_code"]
     for index, (codes, place) in enumerate(zip(CODES, PLACES, strict=True)):
-        seen = np.add(place, (2e-3, 0.0)) if index == OUTLIER else place
+        position_m = np.add(place, (2e-3, 0.0)) if index == OUTLIER else place
         name = f"spot_{codes[0]:.0f}_{codes[1]:.0f}.png"
-        save(at / name, spot_picture(seen, PEAKS[index % 3], random, 0.3 * (index % 2)))
+        save(at / name, spot_picture(position_m, PEAKS[index % 3], random, 0.3 * (index % 2)))
         rows.append(f"{name},{codes[0]:.0f},{codes[1]:.0f}")
     (at / "pictures.csv").write_text("\n".join(rows) + "\n")
     describe(at)
@@ -51,7 +51,7 @@ def shared(tmp_path_factory):
 
 @pytest.fixture
 def folder(shared, tmp_path):
-    """The same to be spoilt."""
+    """A copy of the shared folder that a test may change."""
     at = tmp_path / "pictures"
     shutil.copytree(shared, at, copy_function=lambda a, b: (tmp_path / "pictures" / b).hardlink_to(a))
     for name in ("pictures.toml", "pictures.csv"):
@@ -69,16 +69,16 @@ def replace_picture(folder, name, picture):
 def test_spots_within_10_um_and_a_field_as_good_as_from_a_file_of_spots(shared, capsys, tmp_path):
     assert PIXEL_M <= 0.1e-3
     assert run(["calibrate", "camera", str(shared), "--out", f"{tmp_path}/field.toml", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    stats = json.loads(capsys.readouterr().out)
     spots = read_spots(shared / "spots.csv")
     true = np.arange(len(CODES)) != OUTLIER
     off = (np.column_stack([spots.x_m, spots.y_m]) - PLACES)[true]
     assert np.sqrt((off**2).sum(axis=1).mean()) < 10e-6
-    assert told["pixel_um"] < 100
-    assert told["outlier_pictures"] == [f"spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png"]
-    assert len(told["saturated_pictures"]) == 8
-    assert told["outside_pictures"] == []
-    assert told["spots_file"] == f"{shared}/spots.csv"
+    assert stats["pixel_um"] < 100
+    assert stats["outlier_pictures"] == [f"spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png"]
+    assert len(stats["saturated_pictures"]) == 8
+    assert stats["outside_pictures"] == []
+    assert stats["spots_file"] == f"{shared}/spots.csv"
     missed, _ = field_errors_m(TRUTH, load_field(tmp_path / "field.toml"))
     noisy = np.random.default_rng(12).normal(PLACES, 10e-6)
     by_file, _ = field_errors_m(
@@ -90,8 +90,8 @@ def test_spots_within_10_um_and_a_field_as_good_as_from_a_file_of_spots(shared, 
 @pytest.mark.slow
 def test_what_it_wrote_gives_the_same_field_by_spots(shared, tmp_path, capsys):
     assert run(["calibrate", "camera", str(shared), "--out", f"{tmp_path}/a.toml"]) == 0
-    said = capsys.readouterr().out
-    assert f"outlier pictures spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png\n" in said
+    output = capsys.readouterr().out
+    assert f"outlier pictures spot_{CODES[OUTLIER][0]:.0f}_{CODES[OUTLIER][1]:.0f}.png\n" in output
     assert run(["calibrate", "field", f"{shared}/spots.csv", "--out", f"{tmp_path}/b.toml"]) == 0
     a, b = (load_field(tmp_path / name).position_m(*CODES.T) for name in ("a.toml", "b.toml"))
     assert np.allclose(a, b, rtol=0.0, atol=1e-8)
@@ -109,15 +109,15 @@ def test_codes_from_names_and_no_dark_picture_give_the_same_spots(shared, folder
 
 
 def test_a_spot_outside_the_grid_is_warned_of(folder, capsys):
-    """The grid said to be smaller than what was asked for: its upper rows only."""
+    """pictures.toml describes only the upper rows of the grid, so that a spot lies outside it."""
     small = GRID | {"rows": 7}
     replace_picture(folder, "grid.png", taken(180.0 * grid_light(grid=small), np.random.default_rng(13)))
     describe(folder, small)
     assert run(["calibrate", "camera", str(folder)]) == 0
-    said = capsys.readouterr().out
+    output = capsys.readouterr().out
     name = f"spot_{CODES[0][0]:.0f}_{CODES[0][1]:.0f}.png"
-    assert f"warning          {name}" in said
-    assert "outside the grid" in said
+    assert f"warning          {name}" in output
+    assert "outside the grid" in output
 
 
 def remove_grid(folder):

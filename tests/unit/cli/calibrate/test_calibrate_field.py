@@ -23,29 +23,29 @@ SPOTS, IS_OUTLIER = measure_spots(TRUTH, grid_codes(17), np.random.default_rng(2
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """With spots.csv and the field.toml made from it."""
+    """A folder with spots.csv and the field.toml fitted to it."""
     at = tmp_path_factory.mktemp("calibrated")
     write_spots(at / "spots.csv", SPOTS)
     assert run(["calibrate", "field", f"{at}/spots.csv", "--out", f"{at}/field.toml"]) == 0
     return at
 
 
-def test_it_says_what_is_left_how_sure_it_is_and_which_spots_are_false(folder, capsys):
+def test_json_gives_residual_sigma_and_outliers(folder, capsys):
     assert IS_OUTLIER.any()
     assert run(["calibrate", "field", f"{folder}/spots.csv", "--json"]) == 0
-    figures = json.loads(capsys.readouterr().out)
-    assert figures["outlier_rows"] == np.flatnonzero(IS_OUTLIER).tolist()
-    assert 12 < figures["residual_rms_um"] < 16
-    assert figures["residual_max_um"] < 60
-    assert np.shape(figures["sigma_um"]) == (3, 3)
-    assert figures["sigma_um"][1][1] < figures["sigma_um"][0][0] < 10
+    stats = json.loads(capsys.readouterr().out)
+    assert stats["outlier_rows"] == np.flatnonzero(IS_OUTLIER).tolist()
+    assert 12 < stats["residual_rms_um"] < 16
+    assert stats["residual_max_um"] < 60
+    assert np.shape(stats["sigma_um"]) == (3, 3)
+    assert stats["sigma_um"][1][1] < stats["sigma_um"][0][0] < 10
 
 
-def test_in_words_the_false_ones_are_named_by_their_line(folder, capsys):
+def test_text_names_the_outliers_by_line(folder, capsys):
     assert run(["calibrate", "field", f"{folder}/spots.csv"]) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     lines = (folder / "spots.csv").read_text().splitlines()
-    named = [int(word) for word in told.splitlines()[1].replace(",", " ").split()[2:]]
+    named = [int(word) for word in output.splitlines()[1].replace(",", " ").split()[2:]]
     assert named == (np.flatnonzero(IS_OUTLIER) + 2).tolist()
     for line in named:
         x_code, y_code, x_m, y_m = map(float, lines[line - 1].split(","))
@@ -62,8 +62,8 @@ def test_the_report_stands_alone(folder):
 
 
 def test_codes_lead_to_within_the_figures_and_back_within_a_tenth_of_a_code(folder, capsys):
-    wanted = np.random.default_rng(0).uniform(-HALF_M, HALF_M, (500, 2))
-    rows = "".join(f"{x:.12f},{y:.12f}\n" for x, y in wanted)
+    targets = np.random.default_rng(0).uniform(-HALF_M, HALF_M, (500, 2))
+    rows = "".join(f"{x:.12f},{y:.12f}\n" for x, y in targets)
     (folder / "points.csv").write_text("x_m,y_m\n" + rows)
     there = ["field", "--calibration", f"{folder}/field.toml", "--points", f"{folder}/points.csv"]
     assert run([*there, "--out", f"{folder}/codes.csv", "--json"]) == 0
@@ -72,12 +72,12 @@ def test_codes_lead_to_within_the_figures_and_back_within_a_tenth_of_a_code(fold
     assert done["outside"] == 0
     codes = np.loadtxt(folder / "codes.csv", delimiter=",", skiprows=1)
     landed = np.column_stack(TRUTH.position_m(codes[:, 0], codes[:, 1]))
-    assert np.hypot(*(landed - wanted).T).max() < 25e-6
+    assert np.hypot(*(landed - targets).T).max() < 25e-6
     back = ["field", "--calibration", f"{folder}/field.toml", "--points", f"{folder}/codes.csv", "--inverse"]
     assert run([*back, "--out", f"{folder}/back.csv"]) == 0
     again = np.loadtxt(folder / "back.csv", delimiter=",", skiprows=1)
     code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
-    assert np.abs(again - wanted).max() < 0.1 * code_m
+    assert np.abs(again - targets).max() < 0.1 * code_m
 
 
 def test_a_grid_there_and_back_within_a_code(folder):
@@ -87,13 +87,13 @@ def test_a_grid_there_and_back_within_a_code(folder):
     assert np.array_equal(moved, compute_corrections(field))
     assert scale == pytest.approx(1e-3 / (2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code))
     assert run(["field", "--import", f"{folder}/grid.cor", "--out", f"{folder}/again.toml"]) == 0
-    wanted = np.random.default_rng(1).uniform(-HALF_M, HALF_M, (2, 500))
-    assert np.abs(np.subtract(load_field(folder / "again.toml").codes(*wanted), field.codes(*wanted))).max() < 1.0
-    assert np.abs(np.subtract(interpolate_grid(scale, moved, *wanted), field.codes(*wanted))).max() < 1.0
+    targets = np.random.default_rng(1).uniform(-HALF_M, HALF_M, (2, 500))
+    assert np.abs(np.subtract(load_field(folder / "again.toml").codes(*targets), field.codes(*targets))).max() < 1.0
+    assert np.abs(np.subtract(interpolate_grid(scale, moved, *targets), field.codes(*targets))).max() < 1.0
 
 
 def interpolate_grid(scale, moved, x_m, y_m):
-    """Codes by the grid alone, straight between its nodes."""
+    """Return codes by bilinear interpolation of the grid."""
     codes = np.array([x_m, y_m]) * 1e3 * scale + 32768
     column, row = np.minimum((codes / NODE_SPACING_CODES).astype(int), NODES_PER_SIDE - 2)
     x, y = codes / NODE_SPACING_CODES - [column, row]
@@ -116,9 +116,9 @@ def test_a_grid_that_is_none_is_refused(folder, capsys, spoil, named):
     (folder / "spoilt.cor").write_bytes(spoil((folder / "whole.cor").read_bytes()))
     capsys.readouterr()
     assert run(["field", "--import", f"{folder}/spoilt.cor", "--out", f"{folder}/none.toml"]) == 2
-    told = capsys.readouterr().err
-    assert named in told
-    assert told.count("\n") == 1
+    output = capsys.readouterr().err
+    assert named in output
+    assert output.count("\n") == 1
     assert not (folder / "none.toml").exists()
 
 

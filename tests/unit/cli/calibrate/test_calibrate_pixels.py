@@ -1,4 +1,4 @@
-"""The circle of a pixel map as run from a shell: sweep, hidden pixels, recordings, map, heights as asked.
+"""`optodrive calibrate pixels`, from a sweep over hidden pixels to heights on target.
 
 Tuned on seeds 100 to 200 of hidden pixels, tested on others.
 """
@@ -16,7 +16,7 @@ from pixel_lab import calibrate_map, map_errors, measured_um, record_sweep, run_
 
 TARGET_UM = 80.0
 NOISE = 1.0
-"""Times what the interferometer states, a quarter of a micrometre."""
+"""Factor of the stated noise of the interferometer, 0.25 µm."""
 
 
 @pytest.mark.parametrize(
@@ -27,16 +27,16 @@ NOISE = 1.0
         pytest.param("display-437", 7, marks=pytest.mark.slow),
     ],
 )
-def test_heights_as_asked_once_the_pixels_are_known(capsys, tmp_path, display, seed):
+def test_heights_reach_their_targets_with_the_map(capsys, tmp_path, display, seed):
     truth = GroundTruthPixels.sample(seed, load_config(display))
     lives = np.setdiff1d(np.arange(len(truth.displacement_gain)), truth.dead)
     before_um, plain = measured_um(capsys, tmp_path, display, seed, TARGET_UM)
     assert np.abs(before_um[lives] / TARGET_UM - 1.0).max() > 0.15
     assert plain["summary"]["dead"]["count"] == 0
 
-    path, told = calibrate_map(capsys, tmp_path, display, record_sweep(capsys, tmp_path, display, seed, NOISE))
-    assert told["dead"] == truth.dead.tolist()
-    assert told["not_measured"] == []
+    path, stats = calibrate_map(capsys, tmp_path, display, record_sweep(capsys, tmp_path, display, seed, NOISE))
+    assert stats["dead"] == truth.dead.tolist()
+    assert stats["not_measured"] == []
     off, sigmas = map_errors(display, path, seed)
     assert np.nanmax(np.abs(off[1:])) < 30e-6
     known = np.isfinite(sigmas)
@@ -49,19 +49,19 @@ def test_heights_as_asked_once_the_pixels_are_known(capsys, tmp_path, display, s
     assert after_um[truth.dead].max() == 0.0
 
 
-def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
-    told = run_json(capsys, "calibrate", "pixels", "--sweep", tmp_path / "sweep", "--config", "display-437", "--json")
-    assert len(told["aims"]) == 9
-    assert all(aim["pulse_width_s"] * aim["power_w"] <= 0.0126 for aim in told["aims"])
-    assert all(aim["power_w"] < 0.05 for aim in told["aims"] if (aim["x_m"], aim["y_m"]) != (0, 0))
+def test_a_sweep_lists_pulses_and_recordings(capsys, tmp_path):
+    sweep = run_json(capsys, "calibrate", "pixels", "--sweep", tmp_path / "sweep", "--config", "display-437", "--json")
+    assert len(sweep["aims"]) == 9
+    assert all(aim["pulse_width_s"] * aim["power_w"] <= 0.0126 for aim in sweep["aims"])
+    assert all(aim["power_w"] < 0.05 for aim in sweep["aims"] if (aim["x_m"], aim["y_m"]) != (0, 0))
     readme = (tmp_path / "sweep" / "README.txt").read_text()
-    for aim in told["aims"]:
+    for aim in sweep["aims"]:
         played = json.loads((tmp_path / "sweep" / f"{aim['name']}.json").read_text())
         assert sorted(train["pixel"] for train in played["trains"]) == list(range(437))
         assert f"{aim['name']}: aim_x_m = {aim['x_m']!r}, aim_y_m = {aim['y_m']!r}" in readme
-    far = {(np.sign(aim["x_m"]), np.sign(aim["y_m"])) for aim in told["aims"]}
+    far = {(np.sign(aim["x_m"]), np.sign(aim["y_m"])) for aim in sweep["aims"]}
     assert far == {(0, 0), (1, 0), (-1, 0), (0, 1), (0, -1)}
-    name = told["aims"][1]["name"]
+    name = sweep["aims"][1]["name"]
     played = tmp_path / "sweep" / name
     plan = run_json(
         capsys, "plan", f"{played}.json", "--pixel-map", f"{played}.pixels.toml", "--config", "display-437", "--json"
@@ -70,14 +70,14 @@ def test_a_sweep_says_what_to_play_and_to_record(capsys, tmp_path):
     assert plan["feasibility"]["fits"]
 
 
-def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):
+def test_text_units_and_a_display_that_does_not_answer(capsys, tmp_path):
     (middle,) = record_sweep(capsys, tmp_path, "display-16", 11, aims=("middle",))
     assert run(["calibrate", "pixels", "--config", "display-16", str(middle)]) == 0
-    told = capsys.readouterr().out
+    output = capsys.readouterr().out
     dead = GroundTruthPixels.sample(11, load_config("display-16")).dead.tolist()
-    assert f"dead             1: {dead[0]}\n" in told
-    assert "offset x" in told
-    assert "aims across both edges" in told
+    assert f"dead             1: {dead[0]}\n" in output
+    assert "offset x" in output
+    assert "aims across both edges" in output
     for scale, says in ((1e3, "these look like millimetres"), (0.0, "a pixel that responds")):
         spoiled = tmp_path / f"x{scale:g}.h5"
         spoiled.write_bytes(middle.read_bytes())
@@ -99,7 +99,7 @@ def test_words_units_and_a_display_that_does_not_answer(capsys, tmp_path):
         (["--sweep", "f", "--out", "p.toml"], "--out: got 'p.toml', expected no such argument together with --sweep"),
         (["--sweep", "f", "--model", "m.toml"], "--model: got 'm.toml'"),
         ([], "RECORDING: got None, expected at least one recording of a sweep, or --sweep FOLDER"),
-        (["none.h5"], "none.h5: got nothing of this name"),
+        (["none.h5"], "none.h5: got no file of this name"),
     ],
 )
 def test_wrong_arguments_are_one_line(capsys, arguments, says):

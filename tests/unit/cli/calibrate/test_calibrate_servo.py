@@ -20,7 +20,7 @@ CAP = "galvo_acceleration_rms_max_rad_per_s2"
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """With the recording r.h5 and mirrors.toml made from it."""
+    """A folder with the recording r.h5 and the mirrors.toml identified from it."""
     at = tmp_path_factory.mktemp("mirrors")
     write_recording(at / "r.h5", recording(SERVOS, np.random.default_rng(20)))
     assert run(["calibrate", "servo", f"{at}/r.h5", "--out", f"{at}/mirrors.toml"]) == 0
@@ -28,10 +28,10 @@ def folder(tmp_path_factory):
 
 
 def write_config(folder, name="mirrors.toml"):
-    own = folder / "own.toml"
+    config_path = folder / "own.toml"
     text = locate_shipped("display-437.toml").read_text()
-    own.write_text(text.replace("[scanner]\n", f'[scanner]\nmirrors = "{name}"\n'))
-    return own
+    config_path.write_text(text.replace("[scanner]\n", f'[scanner]\nmirrors = "{name}"\n'))
+    return config_path
 
 
 def test_the_file_says_both_axes_and_one_servo_for_them(folder):
@@ -46,10 +46,10 @@ def test_the_file_says_both_axes_and_one_servo_for_them(folder):
 
 def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, capsys):
     assert run(["calibrate", "servo", f"{folder}/r.h5", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    report = json.loads(capsys.readouterr().out)
     config = load_config()
     for axis, (name, servo) in enumerate(zip("xy", SERVOS, strict=True)):
-        rows = told["axes"][name]["settling"]
+        rows = report["axes"][name]["settling"]
         assert [row["step_rad"] for row in rows] == pytest.approx(SIZES_RAD)
         for row, size_rad in zip(rows, SIZES_RAD, strict=True):
             for key, tolerance_rad in (("gate", config.tolerance_rad[axis]), ("share", 0.02 * size_rad)):
@@ -58,7 +58,7 @@ def test_settle_times_are_held_against_the_configured_ones_step_by_step(folder, 
                 assert low_s <= row[key]["measured_s"] <= high_s
                 configured_s = settling_s(build_servo(config.scanner), size_rad, tolerance_rad)
                 assert row[key]["configured_s"] == pytest.approx(configured_s)
-    assert any("one servo model covers both" in remark for remark in told["remarks"])
+    assert any("one servo model covers both" in remark for remark in report["remarks"])
 
 
 def test_the_one_servo_settles_no_sooner_than_either_mirror(folder):
@@ -110,6 +110,6 @@ def test_a_wrong_file_of_mirrors_is_one_line(folder, capsys, old, new, words):
     assert old in text
     (folder / "wrong.toml").write_text(text.replace(old, new, 1))
     assert run(["config", "check", "--config", str(write_config(folder, "wrong.toml"))]) == 2
-    said = capsys.readouterr().err
-    assert words in said
-    assert "wrong.toml" in said
+    errors = capsys.readouterr().err
+    assert words in errors
+    assert "wrong.toml" in errors
