@@ -1,4 +1,4 @@
-"""Terms and the limiter: what a set's terms may warm is counted, or the set is refused by name."""
+"""Terms and the limiter: the heat that a term can add is bounded, or the parameter set is refused by name."""
 
 import numpy as np
 import pytest
@@ -37,35 +37,35 @@ def with_term(key, base="surroundings", **values):
     return below.model_copy(update={"terms": {**below.terms, key: own}, "planner_terms": (key,)})
 
 
-def budget_with(key, base="surroundings"):
+def build_budget_with(key, base="surroundings"):
     return build_budget(CONFIG, with_term(key, base, **LARGE.get(key, {})), DISPLAY.pixels)
 
 
 @pytest.mark.parametrize("key", sorted(discover_terms()))
-def test_every_term_has_a_bound_but_crosstalk_that_touch_surfaces_would_not_bear(key):
+def test_every_term_has_a_bound_except_crosstalk_above_the_touch_cap(key):
     if key == "neighbour_crosstalk":
         with pytest.raises(InputError, match=r"limits\.touch_max_c: got 43\.0, expected more than .* may warm it"):
             build_budget(CONFIG, with_term(key, share=0.15), DISPLAY.pixels)
-    budget_with(key)
+    build_budget_with(key)
 
 
-def test_light_absorbed_better_and_better_has_no_bound():
+def test_increasing_absorption_has_no_bound():
     with pytest.raises(InputError, match=r"terms\.absorber_ageing: .* a term that the limiter can bound"):
         build_budget(CONFIG, with_term("absorber_ageing", share=-0.05), DISPLAY.pixels)
 
 
-def test_terms_that_never_warm_change_no_bound():
+def test_terms_that_cannot_add_heat_change_no_bound():
     plain = build_budget(CONFIG, load_parameters("surroundings"), DISPLAY.pixels)
     for key, term in discover_terms().items():
         if term.cannot_add_heat and key not in BOUNDED_TERMS:
-            with_it = budget_with(key)
+            with_it = build_budget_with(key)
             assert with_it.caps == plain.caps
             for ours, theirs in zip(with_it.heat, plain.heat, strict=True):
                 assert np.array_equal(ours, theirs), key
 
 
-def hostile(power_w, seed):
-    """The beam on one pixel and those beside it, all it takes, at this power."""
+def build_hostile_plan(power_w, seed):
+    """Build pulses that stress one pixel and its neighbours at the given power."""
     generator = np.random.default_rng(seed)
     count = 120
     width_s = generator.integers(25, 250, count) * 2e-4
@@ -80,8 +80,8 @@ def hostile(power_w, seed):
     )
 
 
-def hottest_share(key, budget, plan):
-    """How near the pixel's absorber comes to its cap, by the pixel with that term alone; 1 is the cap."""
+def compute_peak_fraction(key, budget, plan):
+    """Return the peak of the absorber over its cap, simulated with that term alone."""
     limited, _ = limit(plan, cold_state(len(DISPLAY.pixels)), budget)
     pulses = np.column_stack([limited.start_s, limited.width_s, limited.power_w, limited.pixel])
     t_s = np.arange(0.0, float(plan.start_s[-1]) + 0.3, 1e-4)
@@ -97,39 +97,39 @@ def hottest_share(key, budget, plan):
 @pytest.mark.parametrize("key", sorted(LARGE))
 @pytest.mark.parametrize("power_w", [2.45, 1.2])
 def test_no_term_takes_an_absorber_above_its_cap(key, power_w):
-    budget = budget_with(key, base="calibrated")
+    budget = build_budget_with(key, base="calibrated")
     for seed in range(3):
-        assert hottest_share(key, budget, hostile(power_w, seed)) <= 1.0
+        assert compute_peak_fraction(key, budget, build_hostile_plan(power_w, seed)) <= 1.0
 
 
 @pytest.mark.parametrize("key", ["power_nonlinearity", "ambient_drift"])
-def test_a_limiter_that_forgot_the_term_would_be_caught(key, monkeypatch):
-    """Without what the term adds, and with nothing else declared unsure, the cap is passed."""
+def test_a_limiter_that_ignores_the_term_is_caught(key, monkeypatch):
+    """Mutant: without the term's bound, and without any declared uncertainty, the cap is exceeded."""
     sure = dict.fromkeys(CONFIG.limits.uncertainty.model_dump(), 0.0)
     limits = CONFIG.limits.model_copy(update={"uncertainty": CONFIG.limits.uncertainty.model_copy(update=sure)})
-    # A wide energy bucket, so that the absorber's own cap is what stops the beam.
+    # A wide energy bucket makes the absorber's own cap the binding one.
     limits = limits.model_copy(update={"pixel_mean_power_max_w": 2.45, "display_mean_power_max_w": 2.45})
     config = CONFIG.model_copy(update={"limits": limits.model_copy(update={"absorber_max_c": 160.0})})
     parameters = with_term(key, "calibrated", **LARGE[key])
 
     def share(budget):
         scale = (CONFIG.limits.absorber_max_c - CONFIG.ambient_c) / (160.0 - CONFIG.ambient_c)
-        return max(hottest_share(key, budget, hostile(1.2, seed)) for seed in range(3)) * scale
+        return max(compute_peak_fraction(key, budget, build_hostile_plan(1.2, seed)) for seed in range(3)) * scale
 
     assert share(build_budget(config, parameters, DISPLAY.pixels)) <= 1.0
     monkeypatch.setattr(budget_setup, "compute_heat_gain_bound", lambda *_: HeatGainBound())
     assert share(build_budget(config, parameters, DISPLAY.pixels)) > 1.0
 
 
-def test_hot_graphite_that_stores_more_cools_more_slowly_in_the_bound():
+def test_a_larger_heat_capacity_when_hot_slows_the_cooling_of_the_bound():
     plain = build_budget(CONFIG, load_parameters("calibrated"), DISPLAY.pixels).heat
-    hot = budget_with("heat_capacity", "calibrated").heat
+    hot = build_budget_with("heat_capacity", "calibrated").heat
     cap_k = CONFIG.limits.absorber_max_c - CONFIG.ambient_c
     assert hot.c_low_j_per_k.tolist() == plain.c_low_j_per_k.tolist()
     assert hot.c_high_j_per_k == pytest.approx(plain.c_high_j_per_k * (1 + 3e-3 * cap_k))
 
 
-def test_what_warms_everything_is_taken_off_every_cap_with_what_walls_and_touch_surfaces_pass_on():
+def test_a_uniform_rise_is_subtracted_from_every_cap_with_its_effect_on_walls_and_touch_surfaces():
     parameters = with_term("ambient_drift", **LARGE["ambient_drift"])
     warming = compute_heat_gain_bound(parameters, DISPLAY.pixels, CONFIG)
     assert 4.5 < warming.uniform_rise_k < 4.7

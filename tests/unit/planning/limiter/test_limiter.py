@@ -1,4 +1,4 @@
-"""Each cap has a test that its removal breaks: `test_a_cap_taken_away_is_noticed` proves it."""
+"""Every cap trims a case that nothing else trims: the same case without the cap passes."""
 
 from dataclasses import replace
 from math import inf
@@ -48,17 +48,17 @@ SERVO = GalvoModel(
 )
 
 
-def roomy(**caps):
-    """No cap binds but those given."""
+def build_budget(**caps):
+    """Build a budget in which only the given caps bind."""
     caps = NO_CAPS._replace(**caps)
     return Budget(caps, build_heat_bound(MODEL, CERTAIN, caps, 2.45), SERVO)
 
 
-ROOMY = roomy()
+WITHOUT_CAPS = build_budget()
 
 
 def pulses(*rows):
-    """Rows of (pixel, start_s, width_s, power_w); a pixel's number is also where it lies, in units of 10 mrad."""
+    """Build a plan from rows of (pixel, start_s, width_s, power_w); a pixel lies at its number times 10 mrad."""
     pixel, start, width, power = (np.array(column, dtype=float) for column in zip(*rows, strict=True))
     zero = np.zeros(len(rows))
     return PulsePlan(
@@ -108,7 +108,7 @@ def test_every_cap_has_a_case():
 @pytest.mark.parametrize("cause", CASES)
 def test_each_cap_trims_the_last_pulse_and_gives_its_reason(cause):
     caps, rows = CASES[cause]
-    limited = run(roomy(**caps), *rows)
+    limited = run(build_budget(**caps), *rows)
     assert limited.reason[-1] == cause
     assert limited.trimmed_j[-1] > 0
     assert limited.energy_j[-1] + limited.trimmed_j[-1] == pytest.approx(rows[-1][2] * rows[-1][3])
@@ -116,26 +116,26 @@ def test_each_cap_trims_the_last_pulse_and_gives_its_reason(cause):
 
 
 @pytest.mark.parametrize("cause", CASES)
-def test_a_cap_taken_away_is_noticed(cause):
+def test_without_its_cap_the_last_pulse_is_not_trimmed(cause):
     rows = CASES[cause][1]
     if cause == "pulse_width":
-        assert run(roomy(pulse_gap_s=1e-6), *rows).reason[-1] == ""
+        assert run(build_budget(pulse_gap_s=1e-6), *rows).reason[-1] == ""
     else:
-        assert run(ROOMY, *rows).reason[-1] == ""
+        assert run(WITHOUT_CAPS, *rows).reason[-1] == ""
 
 
 @pytest.mark.parametrize("cause", CASES)
 def test_refuse_names_pixel_and_cap(cause):
     caps, rows = CASES[cause]
     with pytest.raises(OverBudgetError, match=rf"pulse {len(rows) - 1} on pixel {rows[-1][0]} .*cap|bucket") as caught:
-        run(roomy(**caps), *rows, policy="refuse")
+        run(build_budget(**caps), *rows, policy="refuse")
     refusal = caught.value
     assert (refusal.pixel, refusal.cap) == (rows[-1][0], cause)
     assert 0 < refusal.margin_j <= rows[-1][2] * rows[-1][3]
 
 
-def test_refuse_says_when_the_whole_would_fit():
-    budget = roomy(touch_k=2.0)
+def test_refuse_reports_the_delay_after_which_the_plan_fits():
+    budget = build_budget(touch_k=2.0)
     _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), cold_state(3), budget)
     again = pulses((1, 0.1, 0.05, 2.45))
     later_s = compute_wait_s(again, warm, budget)
@@ -147,24 +147,24 @@ def test_refuse_says_when_the_whole_would_fit():
         limit(pulses((1, 0.1 + later_s - 0.002, 0.05, 2.45)), warm, budget, "refuse")
 
 
-def test_what_no_rest_makes_fit_is_said_to_fit_never():
+def test_a_plan_that_no_delay_makes_feasible_reports_an_infinite_delay():
     with pytest.raises(OverBudgetError, match="does not fit at any later time") as caught:
-        run(roomy(absorber_k=100.0), (0, 0.0, 0.05, 2.45), policy="refuse")
+        run(build_budget(absorber_k=100.0), (0, 0.0, 0.05, 2.45), policy="refuse")
     assert caught.value.earliest_s == inf
 
 
-def test_nothing_is_trimmed_inside_the_caps():
-    limited = run(ROOMY, (0, 0.0, 0.02, 2.45), (1, 0.03, 0.02, 2.45))
+def test_nothing_is_trimmed_within_the_caps():
+    limited = run(WITHOUT_CAPS, (0, 0.0, 0.02, 2.45), (1, 0.03, 0.02, 2.45))
     assert limited.trimmed_j.sum() == 0
     assert limited.reason.tolist() == ["", ""]
 
 
 def test_the_absorber_cap_is_met_exactly_and_headroom_reaches_zero():
-    budget = roomy(absorber_k=150.0)
+    budget = build_budget(absorber_k=150.0)
     limited = run(budget, (1, 0.0, 0.050, 2.45))
     own_k = 120.0 * limited.power_w[0] * (1 - np.exp(-0.050 / 0.023))
     wall_k = budget.heat.wall_k_per_j[0] * limited.energy_j[0] * budget.heat.absorber_wall_factor
-    assert 149.95 < own_k + wall_k < 150.0  # the rest is what neighbours may send
+    assert 149.95 < own_k + wall_k < 150.0  # the remainder is the bound on heat from neighbours
     assert limited.headroom_k == pytest.approx([150.0, 0.0, 150.0], abs=1e-6)
 
 
@@ -181,11 +181,11 @@ def test_a_model_without_walls_is_bounded_by_its_absorber_alone():
 
 def test_a_pulse_wider_than_the_cap_is_refused_under_any_policy():
     with pytest.raises(RefusedError, match=r"60\.000 ms wide, the cap is 50\.000 ms"):
-        run(ROOMY, (0, 0.0, 0.060, 1.0))
+        run(WITHOUT_CAPS, (0, 0.0, 0.060, 1.0))
 
 
-def test_state_goes_on_over_plans_and_pauses():
-    budget = roomy(absorber_k=200.0, display_mean_w=0.5)
+def test_state_carries_over_plans_and_pauses():
+    budget = build_budget(absorber_k=200.0, display_mean_w=0.5)
     rows = [(k % 3, 0.06 * k + (0.3 if k > 5 else 0.0), 0.05, 2.45) for k in range(12)]
     whole = run(budget, *rows)
     state, power = cold_state(3), []
@@ -195,35 +195,35 @@ def test_state_goes_on_over_plans_and_pauses():
     assert power == pytest.approx(whole.power_w.tolist(), rel=1e-12, abs=1e-12)
 
 
-def test_a_state_moved_in_time_limits_the_same():
-    budget = roomy(absorber_k=150.0, pixel_mean_w=0.6)
+def test_a_shifted_state_gives_the_same_limits():
+    budget = build_budget(absorber_k=150.0, pixel_mean_w=0.6)
     _, state = limit(pulses((0, 0.0, 0.05, 2.45)), cold_state(3), budget)
     here, _ = limit(pulses((0, 0.07, 0.05, 2.45)), state, budget)
     there, _ = limit(pulses((0, 5.07, 0.05, 2.45)), shift_state(state, 5.0), budget)
     assert there.power_w == pytest.approx(here.power_w)
 
 
-def test_a_plan_may_not_start_in_the_past_of_the_budget():
-    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), cold_state(3), ROOMY)
+def test_a_plan_must_not_start_before_the_budgets_time():
+    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), cold_state(3), WITHOUT_CAPS)
     with pytest.raises(RefusedError, match="before the budget's time"):
-        limit(pulses((1, 0.5, 0.05, 1.0)), state, ROOMY)
+        limit(pulses((1, 0.5, 0.05, 1.0)), state, WITHOUT_CAPS)
 
 
-def beam(plan, power_w):
+def build_timed_pulses(plan, power_w):
     columns = {name: getattr(plan, name) for name in ("start_s", "width_s", "x_rad", "y_rad")}
     return SimpleNamespace(**columns, power_w=power_w)
 
 
-def test_proof_before_emission_passes_what_was_limited_and_catches_what_was_not():
-    budget = roomy(absorber_k=150.0)
+def test_verification_passes_limited_pulses_and_rejects_others():
+    budget = build_budget(absorber_k=150.0)
     plan = run(budget, (0, 0.0, 0.05, 2.45), (1, 0.06, 0.05, 2.45))
-    verify(plan, np.arange(2), beam(plan, plan.power_w), cold_state(3), budget)
+    verify(plan, np.arange(2), build_timed_pulses(plan, plan.power_w), cold_state(3), budget)
     with pytest.raises(LocalProtocolError, match="encoded pulse 1 on pixel 1 passes a cap"):
-        verify(plan, np.arange(2), beam(plan, plan.power_w * [1.0, 1.001]), cold_state(3), budget)
+        verify(plan, np.arange(2), build_timed_pulses(plan, plan.power_w * [1.0, 1.001]), cold_state(3), budget)
 
 
-def test_pulses_that_were_not_fired_are_forgotten_and_the_others_count():
-    budget = roomy(touch_k=5.0)
+def test_only_executed_pulses_count():
+    budget = build_budget(touch_k=5.0)
     plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), cold_state(3), budget)
     first_only = commit_until(plan, 0.1, cold_state(3), budget)
     assert first_only.touch_k[0].max() > 0.5
@@ -231,8 +231,8 @@ def test_pulses_that_were_not_fired_are_forgotten_and_the_others_count():
     assert after.touch_k[1].max() > 0.5
 
 
-def test_state_stays_as_large_however_many_pulses_went_by():
-    budget, state = roomy(pixel_mean_w=1.3, touch_k=20.0), cold_state(3)
+def test_the_state_does_not_grow_with_the_number_of_pulses():
+    budget, state = build_budget(pixel_mean_w=1.3, touch_k=20.0), cold_state(3)
     sizes = []
     for k in range(30):
         train = pulses(*[(n % 3, 100.0 * k + 0.01 * n, 0.005, 2.45) for n in range(1000)])
@@ -241,7 +241,7 @@ def test_state_stays_as_large_however_many_pulses_went_by():
     assert max(sizes[1:]) == min(sizes[1:])
 
 
-def test_a_sum_of_decays_never_exceeds_its_ends_by_more_than_the_spread():
+def test_a_sum_of_decays_exceeds_its_ends_by_at_most_the_specht_ratio():
     rng = np.random.default_rng(3)
     for half in (0.05, 0.3, 0.5):
         capacities = np.linspace(1 - half, 1 + half, 201)
@@ -251,8 +251,8 @@ def test_a_sum_of_decays_never_exceeds_its_ends_by_more_than_the_spread():
             assert rise.max() <= specht_ratio((1 + half) / (1 - half)) * max(rise[0], rise[-1])
 
 
-def brute_allowed(window_s, cap_j, rows, start, width):
-    """Largest power found by trying every window end on a fine grid."""
+def search_max_power_w(window_s, cap_j, rows, start, width):
+    """Find the largest power by checking every window end on a fine grid."""
     ends = np.linspace(start, start + width, 4001)[1:]
     best = np.inf
     for end in ends:
@@ -261,7 +261,7 @@ def brute_allowed(window_s, cap_j, rows, start, width):
     return best
 
 
-def test_energy_window_agrees_with_trying_every_window():
+def test_the_energy_window_agrees_with_an_exhaustive_search():
     rng = np.random.default_rng(5)
     for _ in range(15):
         fired_pulses = PulseHistory(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
@@ -271,7 +271,7 @@ def test_energy_window_agrees_with_trying_every_window():
             time += rng.uniform(0.0, 0.1)
             width, power = rng.uniform(0.001, 0.05), rng.uniform(0.0, 4.0)
             exact = max_window_power_w(chain, 0, fired_pulses, time, width, 0.5, 1.0)
-            tried = brute_allowed(0.5, 0.5, rows, time, width)
+            tried = search_max_power_w(0.5, 0.5, rows, time, width)
             assert exact <= tried * (1 + 1e-9) + 1e-9
             assert exact == pytest.approx(tried, rel=2e-2, abs=2e-2)
             power = max(0.0, min(power, exact))

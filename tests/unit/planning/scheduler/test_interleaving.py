@@ -1,4 +1,4 @@
-"""Frames whose pixels shall stand up together: how many rounds, and that every pixel still reaches its height."""
+"""Simultaneous frames: the number of interleaved rounds, and that every pixel still reaches its target."""
 
 from dataclasses import replace
 
@@ -26,18 +26,18 @@ DISPLAY = DISPLAYS["display-437"]
 FOUR = {200: 100, 201: 100, 221: 100, 222: 100}
 
 
-def frame(heights_um, duration_s=0.5, together=True, show_at_s=0.0):
+def frame(heights_um, duration_s=0.5, simultaneous=True, show_at_s=0.0):
     target_m = np.zeros(len(DISPLAY.layout))
     target_m[list(heights_um)] = np.array(list(heights_um.values())) * 1e-6
-    return TactileFrame("f", show_at_s, duration_s, target_m, together)
+    return TactileFrame("f", show_at_s, duration_s, target_m, simultaneous)
 
 
-def prepared(*frames, trains=(), display=DISPLAY):
+def plan_frames(*frames, trains=(), display=DISPLAY):
     return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state())
 
 
-def shares(result, heights_um):
-    """Height over target [times, pixels] from the first pulse to well after the last."""
+def simulate_ratios(result, heights_um):
+    """Simulate displacement over target, [times, pixels], from the first pulse to well after the last."""
     plan = result.plan
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
     t_s = np.arange(plan.start_s[0], result.duration_s + 0.03, 5e-5)
@@ -45,15 +45,15 @@ def shares(result, heights_um):
     return height_um / np.array(list(heights_um.values()))
 
 
-def test_four_pixels_stand_up_together_better_in_rounds():
-    split, plain = prepared(frame(FOUR)), prepared(frame(FOUR, together=False))
-    (told,) = split.simultaneous
-    assert told.interleaved_rounds > 1
-    assert len(split.plan) == 4 * told.interleaved_rounds
-    assert shares(split, FOUR).min(axis=1).max() == pytest.approx(told.simultaneity, rel=0.01)
-    assert shares(plain, FOUR).min(axis=1).max() == pytest.approx(told.simultaneity_single_pulse, rel=0.01)
-    assert told.simultaneity > 1.15 * told.simultaneity_single_pulse
-    assert told.extra_s == pytest.approx(split.duration_s - plain.duration_s, abs=1e-6)
+def test_interleaved_rounds_raise_the_simultaneity_of_four_pixels():
+    split, plain = plan_frames(frame(FOUR)), plan_frames(frame(FOUR, simultaneous=False))
+    (reported,) = split.simultaneous
+    assert reported.interleaved_rounds > 1
+    assert len(split.plan) == 4 * reported.interleaved_rounds
+    assert simulate_ratios(split, FOUR).min(axis=1).max() == pytest.approx(reported.simultaneity, rel=0.01)
+    assert simulate_ratios(plain, FOUR).min(axis=1).max() == pytest.approx(reported.simultaneity_single_pulse, rel=0.01)
+    assert reported.simultaneity > 1.15 * reported.simultaneity_single_pulse
+    assert reported.extra_s == pytest.approx(split.duration_s - plain.duration_s, abs=1e-6)
     assert not plain.simultaneous
 
 
@@ -61,67 +61,67 @@ def test_four_pixels_stand_up_together_better_in_rounds():
 @given(
     st.dictionaries(st.sampled_from([200, 201, 202, 221, 222, 223, 300]), st.floats(20, 300), min_size=1, max_size=7)
 )
-def test_sliced_pixels_reach_their_heights(heights_um):
-    result = prepared(frame(heights_um, duration_s=2.0))
-    assert shares(result, heights_um).max(axis=0) == pytest.approx(np.ones(len(heights_um)), rel=0.03)
+def test_pixels_with_sub_pulses_reach_their_targets(heights_um):
+    result = plan_frames(frame(heights_um, duration_s=2.0))
+    assert simulate_ratios(result, heights_um).max(axis=0) == pytest.approx(np.ones(len(heights_um)), rel=0.03)
     last = np.isfinite(result.plan.target_m)
     assert sorted(result.plan.pixel[last]) == sorted(heights_um)
     assert has_min_gaps(result.plan, DISPLAY.scan_head.pulse_gap_s)
 
 
-def test_it_ends_in_time_or_is_not_split():
-    plain_s = prepared(frame(FOUR, together=False)).duration_s
-    roomy, tight, late = (prepared(frame(FOUR, duration_s=plain_s + more_s)) for more_s in (0.1, 0.005, -0.01))
+def test_an_interleaved_frame_meets_its_deadline_or_is_not_split():
+    plain_s = plan_frames(frame(FOUR, simultaneous=False)).duration_s
+    roomy, tight, late = (plan_frames(frame(FOUR, duration_s=plain_s + more_s)) for more_s in (0.1, 0.005, -0.01))
     assert roomy.simultaneous[0].interleaved_rounds > tight.simultaneous[0].interleaved_rounds > 1
     assert tight.frames[0].late_s == 0.0
     assert late.simultaneous[0].interleaved_rounds == 1
     assert late.frames[0].late_s > 0.0
 
 
-def test_slices_have_no_height_of_their_own_to_answer_for():
-    result = prepared(frame(FOUR))
-    told = summarize_plan(result)
+def test_sub_pulses_have_no_target_of_their_own():
+    result = plan_frames(frame(FOUR))
+    reported = summarize_plan(result)
     assert np.isnan(result.plan.target_m[:4]).all()
-    assert told.target_max_um == pytest.approx(100.0)
-    assert told.predicted_max_um == pytest.approx(100.0, rel=0.01)
+    assert reported.target_max_um == pytest.approx(100.0)
+    assert reported.predicted_max_um == pytest.approx(100.0, rel=0.01)
     split = result.simultaneous[0]
-    assert told.frames[0].simultaneous == SimultaneitySummary(
+    assert reported.frames[0].simultaneous == SimultaneitySummary(
         interleaved_rounds=split.interleaved_rounds,
         simultaneity=split.simultaneity,
         simultaneity_single_pulse=split.simultaneity_single_pulse,
         extra_s=split.extra_s,
     )
-    assert summarize_plan(prepared(frame(FOUR, together=False))).frames[0].simultaneous is None
+    assert summarize_plan(plan_frames(frame(FOUR, simultaneous=False))).frames[0].simultaneous is None
 
 
-def test_heat_that_is_there_counts_and_a_frame_after_another_is_split_too():
+def test_residual_heat_is_used_and_a_second_frame_is_split_too():
     first, second = frame(FOUR, duration_s=0.06), frame(FOUR, duration_s=0.5, show_at_s=0.06)
-    result = prepared(first, second)
+    result = plan_frames(first, second)
     assert [item.source for item in result.simultaneous] == [0, 1]
     last = np.isfinite(result.plan.target_m)
     assert result.predicted_m[last] == pytest.approx(np.full(8, 100e-6), rel=0.01)
     assert result.plan.energy_j[result.plan.source == 1].sum() < result.plan.energy_j[result.plan.source == 0].sum()
 
 
-def test_a_train_keeps_its_times_through_the_rounds():
+def test_a_train_keeps_its_times_during_the_rounds():
     train = HeightTrain(30, 0.0, 0.2, 0.01, 20e-6)
-    result = prepared(frame(FOUR), trains=[train])
+    result = plan_frames(frame(FOUR), trains=[train])
     assert result.simultaneous[0].interleaved_rounds > 1
     assert result.train_lateness_max_s < 1e-9
     last = np.isfinite(result.plan.target_m) & (result.plan.source == 0)
     assert result.predicted_m[last] == pytest.approx(np.full(4, 100e-6), rel=0.01)
 
 
-def test_one_pixel_is_together_by_itself():
-    result = prepared(frame({7: 200}))
+def test_a_frame_of_one_pixel_is_not_split():
+    result = plan_frames(frame({7: 200}))
     assert len(result.plan) == 1
     assert not result.simultaneous
 
 
-def test_what_the_limiter_takes_from_a_slice_the_last_round_makes_up():
+def test_the_last_round_compensates_for_trimmed_sub_pulses():
     caps = DISPLAY.budget.caps._replace(pulse_energy_j=0.002)
     cold = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
-    result = prepared(frame(FOUR), display=cold)
+    result = plan_frames(frame(FOUR), display=cold)
     heat, plan = DISPLAY.build_cold_heat(), result.plan
     last = np.flatnonzero(np.isfinite(plan.target_m))
     assert plan.trimmed_j[: last[0]].any()
@@ -133,14 +133,14 @@ def test_what_the_limiter_takes_from_a_slice_the_last_round_makes_up():
         heat.apply_pulse(int(plan.pixel[row]), plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 
-def test_shares_are_whole_periods_and_never_none():
+def test_sub_pulses_are_whole_periods_and_never_empty():
     assert split_pulses({1: (10, 1.0), 2: (7, 0.9)}, 3) == {1: 3, 2: 2}
     assert split_pulses({1: (10, 1.0), 2: (3, 0.9)}, 3) is None
     assert split_pulses({1: (1, 0.1)}, 1) is not None
     assert ROUND_COUNTS[0] == 1
 
 
-def test_the_best_that_ends_in_time_and_rests():
+def test_the_best_candidate_meets_the_deadline_and_has_gaps():
     one, two, four = (CandidateSchedule(k, 0.1 * k, 0.1 * k, True) for k in (1, 2, 4))
     assert select_schedule([one, two, four], 1.0) == four
     assert select_schedule([one, two, four], 0.3) == two
@@ -148,14 +148,14 @@ def test_the_best_that_ends_in_time_and_rests():
     assert select_schedule([one, two, replace(four, has_min_gaps=False)], 1.0) == two
 
 
-def test_a_short_rest_between_slices_is_no_rest():
-    far = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_gap_s=0.01))
+def test_sub_pulses_without_a_gap_are_not_selected():
+    wide_gap = replace(DISPLAY, scan_head=replace(DISPLAY.scan_head, pulse_gap_s=0.01))
     two = frame({200: 100, 201: 100})
-    assert prepared(two).simultaneous[0].interleaved_rounds > 1
-    assert prepared(two, display=far).simultaneous[0].interleaved_rounds == 1
+    assert plan_frames(two).simultaneous[0].interleaved_rounds > 1
+    assert plan_frames(two, display=wide_gap).simultaneous[0].interleaved_rounds == 1
 
 
-def test_together_is_read_written_and_checked():
+def test_simultaneous_is_read_written_and_checked():
     entry = {"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}, "simultaneous": True}
     once = parse_sequence({"frames": [entry, {**entry, "show_at_s": 1.0, "simultaneous": False}]}, DISPLAY.config, "f")
     again = parse_sequence(sequence_to_json(once), DISPLAY.config, "f")

@@ -1,4 +1,4 @@
-"""Trains by height: cycles that are what was asked, each pulse planned from the heat that is there."""
+"""Trains by height: every cycle has the requested shape, and each pulse is planned from the residual heat."""
 
 from dataclasses import replace
 
@@ -24,12 +24,12 @@ DISPLAY = DISPLAYS["display-437"]
 SAMPLES = 400
 
 
-def prepared(*trains, frames=(), display=DISPLAY, policy="trim"):
+def plan_trains(*trains, frames=(), display=DISPLAY, policy="trim"):
     return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state(), policy)
 
 
-def felt(result, train, display=DISPLAY):
-    """Peak and trough of each cycle, µm, [cycles] each, by the traces of a display that starts at rest."""
+def simulate_cycles(result, train, display=DISPLAY):
+    """Simulate peak and trough of each cycle on a cold display, µm, [cycles] each."""
     plan = result.plan
     pulses = np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel])
     starts_s = train.pulse_starts_s() + result.lead_in_s
@@ -39,70 +39,70 @@ def felt(result, train, display=DISPLAY):
     return each.max(axis=1), each.min(axis=1)
 
 
-def refusal(*trains):
+def plan_refused(*trains):
     with pytest.raises(InputError) as caught:
-        prepared(*trains)
+        plan_trains(*trains)
     assert "\n" not in str(caught.value)
     return caught.value.code, str(caught.value)
 
 
-def test_every_cycle_peaks_at_its_height_and_falls_as_asked():
+def test_every_cycle_has_its_peak_and_its_peak_to_peak_value():
     train = HeightTrain(17, 0.0, 1.0, 0.04, 300e-6, 120e-6)
-    result = prepared(train)
-    peaks_um, troughs_um = felt(result, train)
+    result = plan_trains(train)
+    peaks_um, troughs_um = simulate_cycles(result, train)
     assert len(result.plan) == 25
     assert peaks_um == pytest.approx(np.full(25, 300.0), rel=0.01)
     assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(23, 120.0), rel=0.03)
-    assert (peaks_um - troughs_um)[1] == pytest.approx(120.0, rel=0.05)  # the gas still lags behind the first cycle
+    assert (peaks_um - troughs_um)[1] == pytest.approx(120.0, rel=0.05)  # the gas still lags in the first cycle
     assert result.plan.target_m == pytest.approx(np.full(25, 300e-6))
     assert result.predicted_m == pytest.approx(np.full(25, 300e-6), rel=0.01)
 
 
-def test_the_slow_part_does_not_grow():
-    """With pulses of fixed energy the level grows with 1 − exp(−t/τ); here it is there from the first cycle on."""
+def test_the_mean_level_does_not_grow():
+    """With pulses of fixed energy the level grows with 1 − exp(−t/τ); here it is constant from the first cycle on."""
     train = HeightTrain(17, 0.0, 0.5, 0.02, 200e-6, 40e-6)
-    _, troughs_um = felt(prepared(train), train)
+    _, troughs_um = simulate_cycles(plan_trains(train), train)
     assert troughs_um[1] == pytest.approx(160.0, rel=0.03)
     assert troughs_um[2:] == pytest.approx(np.full(23, 160.0), rel=0.02)
-    steady_j = prepared(train).plan.energy_j[-1]
-    fixed = PulseTrain(17, 0.0, 0.5, prepared(train).plan.width_s[-1], 0.0, 0.0)
+    steady_j = plan_trains(train).plan.energy_j[-1]
+    fixed = PulseTrain(17, 0.0, 0.5, plan_trains(train).plan.width_s[-1], 0.0, 0.0)
     fixed = replace(fixed, gap_s=0.02 - fixed.pulse_width_s, power_w=steady_j / fixed.pulse_width_s)
-    _, growing_um = felt(prepared(fixed), train)
+    _, growing_um = simulate_cycles(plan_trains(fixed), train)
     assert growing_um[1] < 120.0
 
 
-def test_without_a_swing_pulses_are_the_shortest_there_are():
+def test_without_a_peak_to_peak_value_pulses_are_as_short_as_possible():
     train = HeightTrain(17, 0.0, 1.0, 0.04, 200e-6)
-    plan = prepared(train).plan
+    plan = plan_trains(train).plan
     assert plan.width_s[0] > plan.width_s[1]
     assert plan.width_s[-1] == plan.width_s[-2]
     assert plan.power_w[-1] > 0.95 * DISPLAY.config.laser.max_power_w
-    wide = prepared(replace(train, peak_to_peak_m=50e-6)).plan
+    wide = plan_trains(replace(train, peak_to_peak_m=50e-6)).plan
     assert wide.energy_j[5:].sum() > 1.2 * plan.energy_j[5:].sum()
 
 
-@pytest.mark.parametrize(("period_s", "swing_um"), [(0.005, None), (0.005, 2.5), (0.01, None), (0.01, 2.0)])
-def test_no_pulse_is_left_out_where_the_membrane_still_rises_as_the_next_one_comes(period_s, swing_um):
-    train = HeightTrain(17, 0.0, 0.5, period_s, 100e-6, None if swing_um is None else swing_um * 1e-6)
-    result = prepared(train)
-    peaks_um, troughs_um = felt(result, train)
-    assert np.count_nonzero(np.isfinite(result.plan.target_m)) == len(peaks_um)  # a head has no height of its own
+@pytest.mark.parametrize(("period_s", "peak_to_peak_um"), [(0.005, None), (0.005, 2.5), (0.01, None), (0.01, 2.0)])
+def test_no_pulse_is_omitted_while_the_membrane_still_rises_at_the_next_pulse(period_s, peak_to_peak_um):
+    train = HeightTrain(17, 0.0, 0.5, period_s, 100e-6, None if peak_to_peak_um is None else peak_to_peak_um * 1e-6)
+    result = plan_trains(train)
+    peaks_um, troughs_um = simulate_cycles(result, train)
+    assert np.count_nonzero(np.isfinite(result.plan.target_m)) == len(peaks_um)  # a lead period has no target
     assert peaks_um[3:] == pytest.approx(np.full(len(peaks_um) - 3, 100.0), rel=0.01)
-    if swing_um is not None:
-        assert (peaks_um - troughs_um)[10:] == pytest.approx(np.full(len(peaks_um) - 10, swing_um), rel=0.03)
+    if peak_to_peak_um is not None:
+        assert (peaks_um - troughs_um)[10:] == pytest.approx(np.full(len(peaks_um) - 10, peak_to_peak_um), rel=0.03)
 
 
-def test_planned_for_their_peaks_such_cycles_leave_out_every_other_pulse(monkeypatch):
+def test_planned_for_the_peak_such_cycles_omit_every_other_pulse(monkeypatch):
     monkeypatch.setattr(periodic_pulses, "EARLY_PEAK_FRACTION", np.inf)
     train = HeightTrain(17, 0.0, 0.5, 0.01, 100e-6, 2e-6)
-    peaks_um, troughs_um = felt(prepared(train), train)
+    peaks_um, troughs_um = simulate_cycles(plan_trains(train), train)
     assert (peaks_um - troughs_um)[10:].min() > 4.0
 
 
-def test_a_height_beyond_one_cycle_builds_up_over_several():
+def test_a_height_beyond_one_cycle_builds_up_over_several_cycles():
     train = HeightTrain(17, 0.0, 0.2, 0.01, 380e-6)
-    result = prepared(train)
-    peaks_um, _ = felt(result, train)
+    result = plan_trains(train)
+    peaks_um, _ = simulate_cycles(result, train)
     assert not result.plan.trimmed_j.any()
     assert peaks_um[0] < 160.0
     assert np.all(np.diff(peaks_um[:3]) > 60.0)
@@ -114,19 +114,19 @@ def test_four_interleaved_trains_keep_their_times_and_heights():
         HeightTrain(200 + 3 * k, 0.01 * k, 0.6, 0.04, (150 + 5 * k) * 1e-6, 0.67 * (150 + 5 * k) * 1e-6)
         for k in range(4)
     ]
-    result = prepared(*trains)
+    result = plan_trains(*trains)
     assert result.train_lateness_max_s < 1e-9
     for train in trains:
-        peaks_um, troughs_um = felt(result, train)
+        peaks_um, troughs_um = simulate_cycles(result, train)
         assert peaks_um[1:] == pytest.approx(np.full(14, train.target_m * 1e6), rel=0.02)
         assert (peaks_um - troughs_um)[2:] == pytest.approx(np.full(13, 0.67e6 * train.target_m), rel=0.03)
 
 
-def test_a_pulse_never_grows_beyond_its_slot():
-    """Asked too late to be refused for it: one slot of many is short, and the pulse in it with it."""
+def test_a_pulse_never_exceeds_its_slot():
+    """Only one slot of many is short, so the train is not refused; the pulse in that slot is short as well."""
     tall = HeightTrain(17, 0.0, 0.4, 0.04, 300e-6)
     other = PulseTrain(300, 0.205, 0.001, 0.002, 0.001, 1.0)
-    result = prepared(tall, other)
+    result = plan_trains(tall, other)
     plan = result.plan
     assert result.train_lateness_max_s < 1e-9
     (short,) = np.flatnonzero(np.isclose(plan.start_s - result.lead_in_s, 0.2))
@@ -135,11 +135,11 @@ def test_a_pulse_never_grows_beyond_its_slot():
     assert result.predicted_m[short + 2 :] == pytest.approx(300e-6, rel=0.01)
 
 
-def test_what_the_limiter_takes_is_known_to_the_next_pulse():
+def test_the_next_pulse_compensates_for_a_trimmed_one():
     caps = DISPLAY.budget.caps._replace(pulse_energy_j=0.012)
-    cold = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
+    capped = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
     train = HeightTrain(17, 0.0, 0.4, 0.04, 200e-6)
-    plan = prepared(train, display=cold).plan
+    plan = plan_trains(train, display=capped).plan
     assert plan.reason[0] == "pulse_energy"
     heat = DISPLAY.build_cold_heat()
     drive = limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
@@ -150,20 +150,20 @@ def test_what_the_limiter_takes_is_known_to_the_next_pulse():
         heat.apply_pulse(17, plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 
-def test_under_delay_a_train_by_height_waits_and_peaks_no_lower():
+def test_under_delay_a_train_by_height_is_delayed_and_reaches_its_peaks():
     caps = DISPLAY.budget.caps._replace(touch_k=2.5)
-    cold = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
-    result = prepared(HeightTrain(200, 0.0, 1.0, 0.04, 300e-6), display=cold, policy="delay")
+    capped = replace(DISPLAY, budget=DISPLAY.budget._replace(caps=caps))
+    result = plan_trains(HeightTrain(200, 0.0, 1.0, 0.04, 300e-6), display=capped, policy="delay")
     assert result.delays
     assert not result.plan.trimmed_j.any()
     assert result.predicted_m == pytest.approx(np.full(len(result.plan), 300e-6), rel=0.01)
 
 
-def test_frames_fill_the_gaps_and_share_a_pixel():
+def test_frames_fill_the_gaps_and_share_a_pixel_with_a_train():
     target_m = np.zeros(len(DISPLAY.layout))
     target_m[[17, 30, 31, 32]] = 60e-6
     train = HeightTrain(17, 0.0, 0.4, 0.1, 80e-6)
-    result = prepared(train, frames=[TactileFrame("f", 0.0, 0.4, target_m)])
+    result = plan_trains(train, frames=[TactileFrame("f", 0.0, 0.4, target_m)])
     plan = result.plan
     assert result.train_lateness_max_s < 1e-9
     assert len(plan) + len(result.skipped) == 8
@@ -172,46 +172,48 @@ def test_frames_fill_the_gaps_and_share_a_pixel():
     assert result.predicted_m[plan.source == 1] == pytest.approx(80e-6, rel=0.01)
 
 
-def test_a_cycle_whose_height_is_still_there_has_no_pulse_and_is_named():
-    """A frame leaves the pixel higher than the train's first cycle wants it."""
+def test_a_cycle_with_enough_residual_heat_is_skipped_and_named():
+    """A frame leaves the pixel above the target of the train's first cycle."""
     target_m = np.zeros(len(DISPLAY.layout))
     target_m[17] = 400e-6
     train = HeightTrain(17, 0.06, 0.2, 0.04, 40e-6)
-    result = prepared(train, frames=[TactileFrame("f", 0.0, 0.06, target_m)])
+    result = plan_trains(train, frames=[TactileFrame("f", 0.0, 0.06, target_m)])
     assert [(item.source, item.pixel) for item in result.skipped] == [(1, 17)]
     assert summarize_plan(result).skipped[0].frame == "train 0"
     assert len(result.plan) == 5
 
 
-def test_a_height_out_of_reach_is_refused_with_the_most_there_is():
-    code, message = refusal(HeightTrain(17, 0.0, 1.0, 0.04, 5e-3))
+def test_an_unreachable_height_is_refused_with_the_maximum():
+    code, message = plan_refused(HeightTrain(17, 0.0, 1.0, 0.04, 5e-3))
     assert code == "target_unreachable"
     assert message.startswith("trains[0].target_um: got 5000.0, expected at most ")
-    most_um = float(message.split("at most ")[1].split()[0])
-    train = HeightTrain(17, 0.0, 0.08, 0.04, (most_um - 1) * 1e-6)
-    prepared(train)
-    assert refusal(replace(train, target_m=(most_um + 1) * 1e-6))[0] == "target_unreachable"
+    max_um = float(message.split("at most ")[1].split()[0])
+    train = HeightTrain(17, 0.0, 0.08, 0.04, (max_um - 1) * 1e-6)
+    plan_trains(train)
+    assert plan_refused(replace(train, target_m=(max_um + 1) * 1e-6))[0] == "target_unreachable"
 
 
-@pytest.mark.parametrize(("swing_um", "word", "kind"), [(199.0, "at most", "shortest"), (0.01, "at least", "longest")])
-def test_a_swing_out_of_reach_is_refused_with_the_bound(swing_um, word, kind):
-    train = HeightTrain(17, 0.0, 1.0, 0.04, 200e-6, swing_um * 1e-6)
-    code, message = refusal(train)
+@pytest.mark.parametrize(
+    ("peak_to_peak_um", "word", "kind"), [(199.0, "at most", "shortest"), (0.01, "at least", "longest")]
+)
+def test_an_unreachable_peak_to_peak_value_is_refused_with_the_bound(peak_to_peak_um, word, kind):
+    train = HeightTrain(17, 0.0, 1.0, 0.04, 200e-6, peak_to_peak_um * 1e-6)
+    code, message = plan_refused(train)
     assert code == "bad_train"
     assert f"{word} " in message
     assert kind in message
     bound_um = float(message.split(f"{word} ")[1].split()[0])
-    prepared(replace(train, peak_to_peak_m=bound_um * (0.999 if word == "at most" else 1.001) * 1e-6))
+    plan_trains(replace(train, peak_to_peak_m=bound_um * (0.999 if word == "at most" else 1.001) * 1e-6))
 
 
 def test_starts_too_close_for_a_move_are_refused():
     trains = HeightTrain(17, 0.0, 1.0, 0.04, 50e-6), HeightTrain(300, 0.0005, 1.0, 0.04, 50e-6)
-    code, message = refusal(*trains)
+    code, message = plan_refused(*trains)
     assert code == "overlapping_trains"
     assert "trains[0].period_s: got 0.04" in message
 
 
-def test_the_steady_cycle_is_where_many_cycles_end():
+def test_many_cycles_converge_to_the_steady_state():
     at_rest, drive = DISPLAY.build_cold_heat(), limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
     train = HeightTrain(17, 0.0, 1.0, 0.04, 250e-6, 100e-6)
     shape = build_pulse_recipe(train, at_rest, drive, "t")
@@ -251,21 +253,23 @@ source = "for tests"
 
 
 @pytest.mark.parametrize(
-    ("period_s", "swing_um", "terms"),
+    ("period_s", "peak_to_peak_um", "terms"),
     [
         (0.04, 60.0, '["laser_turn_on", "bridge_conductivity"]'),
         (0.01, 8.0, '["laser_turn_on", "bridge_conductivity"]'),
         (0.01, None, '["laser_turn_on", "gas_leak"]'),
     ],
 )
-def test_cycles_planned_with_terms(period_s, swing_um, terms, tmp_path):
+def test_cycles_planned_with_terms(period_s, peak_to_peak_um, terms, tmp_path):
     path = tmp_path / "model.toml"
     path.write_text(MODEL.replace("{terms}", terms))
     config = load_config("display-16")
     model = config.pixel_model.model_copy(update={"parameters": str(path)})
     display = DisplayModel.from_config(config.model_copy(update={"pixel_model": model}))
-    train = HeightTrain(5, 0.0, 12 * period_s, period_s, 100e-6, None if swing_um is None else swing_um * 1e-6)
-    peaks_um, troughs_um = felt(prepared(train, display=display), train, display)
+    train = HeightTrain(
+        5, 0.0, 12 * period_s, period_s, 100e-6, None if peak_to_peak_um is None else peak_to_peak_um * 1e-6
+    )
+    peaks_um, troughs_um = simulate_cycles(plan_trains(train, display=display), train, display)
     assert peaks_um[4:] == pytest.approx(np.full(8, 100.0), rel=0.03)
-    if swing_um is not None:
-        assert (peaks_um - troughs_um)[6:] == pytest.approx(np.full(6, swing_um), rel=0.03)
+    if peak_to_peak_um is not None:
+        assert (peaks_um - troughs_um)[6:] == pytest.approx(np.full(6, peak_to_peak_um), rel=0.03)

@@ -12,7 +12,7 @@ def frame(display, heights_um, show_at=0.0, duration=1.0, name="f"):
     return TactileFrame(name, show_at, duration, target)
 
 
-def prepared(display, *frames, trains=()):
+def plan_frames(display, *frames, trains=()):
     return plan_sequence(display, FrameSequence(tuple(frames), tuple(trains)), *display.build_cold_state())
 
 
@@ -20,8 +20,8 @@ def gaps(plan):
     return plan.start_s[1:] - (plan.start_s + plan.width_s)[:-1]
 
 
-def test_one_beam_with_time_for_every_move(any_display):
-    result = prepared(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
+def test_every_move_has_its_settling_time(any_display):
+    result = plan_frames(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
     plan = result.plan
     moves = any_display.scan_head.settling
     lit_us = np.rint(plan.width_s[:-1] * 1e6)
@@ -32,14 +32,14 @@ def test_one_beam_with_time_for_every_move(any_display):
 
 
 def test_times_are_whole_microseconds_and_widths_whole_pwm_periods(display):
-    plan = prepared(display, frame(display, {3: 77.7, 99: 12.3, 400: 311})).plan
+    plan = plan_frames(display, frame(display, {3: 77.7, 99: 12.3, 400: 311})).plan
     assert np.allclose(plan.start_s * 1e6, np.round(plan.start_s * 1e6), atol=1e-6)
     assert np.allclose(plan.width_s / 2e-4, np.round(plan.width_s / 2e-4), atol=1e-9)
 
 
 def test_a_train_keeps_its_times_and_a_frame_fills_the_gaps(display):
     train = PulseTrain(200, 0.0, 0.4, 0.020, 0.030, 1.0)
-    result = prepared(display, frame(display, dict.fromkeys(range(20), 100), duration=0.4), trains=[train])
+    result = plan_frames(display, frame(display, dict.fromkeys(range(20), 100), duration=0.4), trains=[train])
     of_train = result.plan.source == 1
     assert of_train.sum() == 8
     assert result.train_lateness_max_s < 1e-9
@@ -47,49 +47,49 @@ def test_a_train_keeps_its_times_and_a_frame_fills_the_gaps(display):
     assert (~of_train).sum() == 20
 
 
-def test_abutting_trains_slip_by_the_moves_only(display):
+def test_abutting_trains_are_delayed_by_settling_times_only(display):
     trains = [PulseTrain(200 + k, 0.015 * k, 0.06, 0.015, 0.045, 2.45) for k in range(4)]
-    result = prepared(display, trains=trains)
+    result = plan_frames(display, trains=trains)
     plan = result.plan
     assert np.allclose(gaps(plan), plan.settling_s[1:])
     assert result.train_lateness_max_s == pytest.approx(plan.settling_s[1:].sum(), abs=1e-9)
 
 
-def test_a_frame_that_does_not_fit_says_by_how_much(display):
-    result = prepared(display, frame(display, dict.fromkeys(range(100), 100), duration=0.1))
+def test_a_late_frame_reports_its_delay(display):
+    result = plan_frames(display, frame(display, dict.fromkeys(range(100), 100), duration=0.1))
     timing = result.frames[0]
     assert timing.late_s == pytest.approx(timing.end_s - timing.deadline_s)
     assert 0 < timing.on_time < timing.pulses == 100
 
 
-def test_heat_left_in_a_pixel_is_used(display):
+def test_residual_heat_is_used(display):
     first, second = frame(display, {7: 200}, 0.0, 0.03, "a"), frame(display, {7: 200}, 0.03, 0.03, "b")
-    plan = prepared(display, first, second).plan
+    plan = plan_frames(display, first, second).plan
     assert plan.energy_j[1] < 0.9 * plan.energy_j[0]
 
 
 def test_a_pixel_still_above_its_target_is_skipped_and_named(display):
     first, second = frame(display, {7: 300}, 0.0, 0.04, "a"), frame(display, {7: 20, 8: 20}, 0.04, 0.04, "b")
-    result = prepared(display, first, second)
+    result = plan_frames(display, first, second)
     assert [(item.source, item.pixel) for item in result.skipped] == [(1, 7)]
     assert result.plan.pixel.tolist() == [7, 8]
 
 
-def test_a_blank_frame_plans_no_pulse(display):
-    assert len(prepared(display, frame(display, {})).plan) == 0
+def test_an_empty_frame_has_no_pulse(display):
+    assert len(plan_frames(display, frame(display, {})).plan) == 0
 
 
-def test_a_plan_leaves_time_to_come_from_any_pixel_to_its_first(any_display):
+def test_the_lead_in_suffices_for_a_move_from_any_pixel(any_display):
     layout, field, moves = any_display.layout, any_display.scan_head.field, any_display.scan_head.settling
     last = len(layout) - 1
-    result = prepared(any_display, frame(any_display, {last: 40}))
+    result = plan_frames(any_display, frame(any_display, {last: 40}))
     x_rad, y_rad = field.angles_rad(layout.x_m, layout.y_m)
     longest = max(moves.settling_us(x_rad[last] - x, y_rad[last] - y) for x, y in zip(x_rad, y_rad, strict=True))
     assert result.plan.start_s[0] >= longest * 1e-6 - 1e-12
     assert result.lead_in_s == pytest.approx(result.plan.start_s[0])
 
 
-def test_an_order_that_is_given_is_kept(display):
+def test_a_given_visiting_order_is_kept(display):
     sequence = FrameSequence((frame(display, dict.fromkeys((3, 4, 5), 50)),))
     result = plan_sequence(display, sequence, *display.build_cold_state(), visiting_orders={0: np.array([4, 3, 5])})
     assert result.plan.pixel.tolist() == [4, 3, 5]

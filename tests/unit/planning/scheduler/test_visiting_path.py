@@ -1,4 +1,4 @@
-"""The visiting order: every pixel once, never longer than row by row, and near the shortest there is."""
+"""The visiting order: every pixel once, never longer than row by row, and close to the shortest path."""
 
 from itertools import pairwise, permutations
 
@@ -23,12 +23,12 @@ PITCH_RAD = float(np.diff(np.unique(X_RAD)).min())
 COUNT = len(LAYOUT)
 
 
-def ordered(active, origin=None):
+def compute_order(active, origin=None):
     return compute_visiting_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column, X_RAD, Y_RAD, origin)
 
 
-def length(tour, origin=None):
-    """Of a path in pitches, by plain Python."""
+def path_length(tour, origin=None):
+    """Compute the length of a path in pitches, in plain Python."""
     whole = ([] if origin is None else [origin]) + list(tour)
     moves = (max(abs(X_RAD[a] - X_RAD[b]), abs(Y_RAD[a] - Y_RAD[b])) for a, b in pairwise(whole))
     return sum(moves) / PITCH_RAD
@@ -39,14 +39,14 @@ def length(tour, origin=None):
     origin=st.none() | st.integers(0, COUNT - 1),
 )
 def test_every_pixel_once_and_never_longer_than_row_by_row(active, origin):
-    tour = ordered(active, origin)
+    tour = compute_order(active, origin)
     assert sorted(tour.tolist()) == sorted(active)
     rows = compute_serpentine_order(np.array(sorted(active)), LAYOUT.row, LAYOUT.column)
-    # Two pixels have nothing to choose but which comes first, which no frame says.
+    # Paths of two pixels are not improved.
     if len(active) > 2:
-        assert length(tour, origin) <= length(rows, origin) + 1e-9
+        assert path_length(tour, origin) <= path_length(rows, origin) + 1e-9
     begin = -1 if origin is None else origin
-    assert path_rad(tour, X_RAD, Y_RAD, begin) / PITCH_RAD == pytest.approx(length(tour, origin))
+    assert path_rad(tour, X_RAD, Y_RAD, begin) / PITCH_RAD == pytest.approx(path_length(tour, origin))
 
 
 @settings(max_examples=60)
@@ -55,17 +55,17 @@ def test_every_pixel_once_and_never_longer_than_row_by_row(active, origin):
     origin=st.none() | st.integers(0, COUNT - 1),
 )
 def test_small_sets_against_every_order(active, origin):
-    shortest = min(length(tour, origin) for tour in permutations(active))
-    assert length(ordered(active, origin), origin) <= 1.35 * shortest + 1e-9
+    shortest = min(path_length(tour, origin) for tour in permutations(active))
+    assert path_length(compute_order(active, origin), origin) <= 1.35 * shortest + 1e-9
 
 
-def test_small_sets_are_near_the_shortest_on_the_whole():
+def test_small_sets_are_close_to_the_shortest_on_average():
     generator = np.random.default_rng(4)
     ours = best = 0.0
     for _ in range(60):
         active = generator.choice(COUNT, 7, replace=False).tolist()
-        ours += length(ordered(active))
-        best += min(length(tour) for tour in permutations(active))
+        ours += path_length(compute_order(active))
+        best += min(path_length(tour) for tour in permutations(active))
     assert ours <= 1.03 * best
 
 
@@ -74,33 +74,33 @@ def test_full_lattices_diagonals_and_columns_are_single_steps():
     diagonal = [pixel for pixel in every if LAYOUT.row[pixel] == LAYOUT.column[pixel]]
     column = [pixel for pixel in every if LAYOUT.column[pixel] == 3]
     for active in (every, diagonal, column):
-        assert length(ordered(active)) <= 1.02 * (len(active) - 1)
+        assert path_length(compute_order(active)) <= 1.02 * (len(active) - 1)
 
 
 def test_clusters_are_left_once():
-    """Two clusters far apart: one long move between them."""
+    """Two distant clusters need one long move between them."""
     here = [p for p in range(COUNT) if LAYOUT.row[p] < 4 and 2 <= LAYOUT.column[p] < 6]
     there = [p for p in range(COUNT) if LAYOUT.row[p] >= 16 and 14 <= LAYOUT.column[p] < 18]
-    tour = ordered([*here, *there])
+    tour = compute_order([*here, *there])
     jumps = [a for a, b in pairwise(tour.tolist()) if (a in here) != (b in here)]
     assert len(jumps) == 1
 
 
-def test_the_path_begins_where_the_mirrors_stand():
+def test_the_path_starts_where_the_mirrors_stand():
     active = [0, 10, 18, 200, 210, 420, 436]
     for origin in (0, 436):
-        assert ordered(active, origin)[0] == origin
+        assert compute_order(active, origin)[0] == origin
 
 
-def test_after_warming_up_nothing_is_left_to_compile():
-    """A planner that compiles shows no progress, and would cost the lease."""
+def test_compile_kernels_leaves_nothing_to_compile():
+    """A planner that compiles reports no progress, so the lease could expire."""
     compile_kernels()
     compiled = (
         visiting_path.path_rad,
         visiting_path._find_neighbours,
         visiting_path._improve,
-    )  # those that Python calls
+    )  # the kernels that Python calls
     before = [len(kernel.signatures) for kernel in compiled]
     assert min(before) > 0
-    ordered(np.random.default_rng(1).choice(COUNT, 60, replace=False).tolist(), 7)
+    compute_order(np.random.default_rng(1).choice(COUNT, 60, replace=False).tolist(), 7)
     assert [len(kernel.signatures) for kernel in compiled] == before

@@ -7,7 +7,7 @@ from optodrive.device.scan_field import IdealField
 from optodrive.planning.scheduler.visiting_path import compute_serpentine_order
 
 
-def test_the_beam_turns_by_twice_the_mirror_s_angle():
+def test_the_beam_turns_by_twice_the_mirrors_angle():
     x_rad, y_rad = IdealField(0.22).angles_rad(np.array([0.044, 0.0]), np.array([0.0, -0.022]))
     assert x_rad == pytest.approx([0.1, 0.0])
     assert y_rad == pytest.approx([0.0, -0.05])
