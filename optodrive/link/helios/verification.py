@@ -1,4 +1,4 @@
-"""Verification before emission: the decoded frame bytes emit only what the plan permits and exceed no cap."""
+"""Verification of the frame bytes before emission, against the plan and the caps."""
 
 from dataclasses import dataclass
 

@@ -3,6 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.states import BoardState
 from optodrive.link.session.fault_hints import get_fault_hint
 
 
@@ -24,6 +26,23 @@ class BoardView:
     temperature_c: float | None = None
     uid: str = ""
     firmware: int = 0
+
+    def apply_status(self, message: m.Status) -> None:
+        """Update all fields that STATUS reports."""
+        self.inputs, self.done_index, self.queued = message.inputs, message.done_index, message.queued
+        self.underruns, self.crc_errors = message.underruns, message.crc_errors
+        self.format_errors, self.seq_errors = message.format_errors, message.seq_errors
+        self.laser_on_s = message.laser_on_us * 1e-6
+        self.temperature_c = message.temperature_dc / 10.0
+        self.set_state(m.STATES[message.state], m.FAULTS[message.fault])
+
+    def set_state(self, state: str, fault: str | None = None) -> None:
+        """Set the state, and the fault if the message reported one. Only FAULT has a fault."""
+        self.state = state
+        if fault is not None:
+            self.fault = fault
+        if state != BoardState.FAULT:
+            self.fault = ""
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields of the REST response, with a hint on the fault's likely cause."""

@@ -1,6 +1,12 @@
-"""Clock synchronisation: every exchange brackets a board tick, and the narrowest recent bracket is used."""
+"""Synchronisation with the board's clock by the narrowest of the recent exchanges.
+
+Every exchange brackets a board tick between its request and its reply.
+"""
+
+import secrets
 
 SAMPLES_MAX = 16
+PENDING_MAX = 64
 DRIFT_MAX = 2e-4
 """Maximum relative drift of two crystals. A bracket widens at this rate with age."""
 
@@ -9,11 +15,23 @@ class ClockSync:
     """Map from host time to board time (ticks / tick_hz). One thread adds samples, any thread may read."""
 
     def __init__(self) -> None:
+        self._request_s: dict[int, float] = {}
         # An immutable tuple, because another thread may be reading it.
         self._samples: tuple[tuple[float, float, float], ...] = ()
 
-    def add(self, request_s: float, reply_s: float, board_s: float) -> None:
-        """Add an exchange: request at request_s, reply at reply_s, board clock board_s in between."""
+    def start_exchange(self, request_s: float) -> int:
+        """Record a request sent at request_s and return its random stamp."""
+        if len(self._request_s) > PENDING_MAX:
+            self._request_s.clear()
+        stamp = secrets.randbits(32)
+        self._request_s[stamp] = request_s
+        return stamp
+
+    def finish_exchange(self, stamp: int, reply_s: float, board_s: float) -> None:
+        """Add the sample of a reply received at reply_s. Ignore an unknown stamp. board_s: board clock in the reply."""
+        request_s = self._request_s.pop(stamp, None)
+        if request_s is None:
+            return
         sample = (reply_s - request_s, (request_s + reply_s) / 2, board_s)
         self._samples = (*self._samples[1 - SAMPLES_MAX :], sample)
 

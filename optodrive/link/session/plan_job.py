@@ -1,4 +1,4 @@
-"""Job: the points of one plan, how many were sent, and what the board reported as executed."""
+"""Points of one plan on their way through the board, with the board's report of their execution."""
 
 from math import inf
 from typing import NamedTuple

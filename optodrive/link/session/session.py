@@ -13,7 +13,6 @@ from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
-from optodrive.core.histogram import Histogram
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
@@ -21,13 +20,12 @@ from optodrive.link.protocol.states import IDLE_STATES, LEASED_STATES, BoardStat
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
+from optodrive.link.session.lease_renewal import LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.point_stream import PointStream
 from optodrive.link.transport.base import Transport
 
-LEASE_RENEWAL_FRACTION = 0.2
-"""Interval between renewals as a fraction of the lease."""
 HELLO_RETRY_S = 0.25
 CONNECT_TIMEOUT_S = 6.0
 STATUS_INTERVAL_S = 0.2
@@ -37,15 +35,14 @@ SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
 SPLICE_LEAD_S = 0.01
 """Minimum time between a splice and the end of the points before it."""
-LEASE_AGE_BUCKETS_S = (0.01, 0.02, 0.025, 0.03, 0.04, 0.05, 0.06, 0.08, 0.1, 0.2, 0.5, 1.0)
 
 
 class BoardSession:
     """Session with a board over a transport.
 
     faults: number of times that the board reported each fault
-    lease_ages: distribution of the time between lease renewals, s
-    lease_slack_s: minimum remaining lease at a renewal, None before the second renewal
+    lease: schedule and statistics of the lease renewals
+    board: latest reported state of the board
     """
 
     def __init__(self, transport: Transport, clock: Clock, requirements: BoardRequirements) -> None:
@@ -54,17 +51,14 @@ class BoardSession:
         self._requirements = requirements
         self._connection = HostConnection()
         self._clock_sync = ClockSync()
-        self._clock_requests_s: dict[int, float] = {}
         self._points = PointStream()
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
         self._arm_nonce: int | None = None
-        self._lease_sent_s = self._status_requested_s = self._clock_sent_s = self._last_received_s = 0.0
+        self._status_requested_s = self._clock_requested_s = self._last_received_s = 0.0
         self._queue_points = self._reset_code = 0
-        self._lease_active = False
         self.faults: Counter[str] = Counter()
-        self.lease_ages = Histogram(LEASE_AGE_BUCKETS_S)
-        self.lease_slack_s: float | None = None
+        self.lease = LeaseRenewal(requirements.lease_s)
         self._watch = LinkWatch(transport.name, requirements.lease_s)
         self.board = BoardView()
         self.connected = False
@@ -160,7 +154,6 @@ class BoardSession:
     def _reset(self) -> None:
         self._connection = HostConnection(self._requirements.rto_s)
         self._clock_sync = ClockSync()
-        self._clock_requests_s.clear()
         self._arm_nonce = None
         self._refusal = None
         self.board = BoardView()
@@ -208,12 +201,12 @@ class BoardSession:
         now_s = self._clock.now_s()
         self._watch.on_loop(now_s, renew_lease, self._count_errors())
         if self.board.state not in LEASED_STATES:
-            self._lease_active = False
-        elif renew_lease and now_s - self._lease_sent_s >= LEASE_RENEWAL_FRACTION * self._requirements.lease_s:
-            self._renew_lease(now_s)
+            self.lease.pause()
+        elif renew_lease:
+            self._send_lease(now_s)
         if now_s - self._status_requested_s >= STATUS_INTERVAL_S:
             self._request_status()
-        if now_s - self._clock_sent_s >= CLOCK_INTERVAL_S:
+        if now_s - self._clock_requested_s >= CLOCK_INTERVAL_S:
             self._request_clock()
         self._retry_hello()
         self._stream_points()
@@ -223,14 +216,10 @@ class BoardSession:
                 f"{self.port}: the board sent nothing for {SILENCE_TIMEOUT_S:g} s; {self._describe_errors()}"
             )
 
-    def _renew_lease(self, now_s: float) -> None:
-        lease_s, age_s = self._requirements.lease_s, now_s - self._lease_sent_s
-        self._connection.send(m.Lease(ms=round(lease_s * 1e3)))
-        self._lease_sent_s = now_s
-        if self._lease_active:
-            self.lease_ages.add(age_s)
-            self.lease_slack_s = min(lease_s if self.lease_slack_s is None else self.lease_slack_s, lease_s - age_s)
-        self._lease_active = True
+    def _send_lease(self, now_s: float) -> None:
+        renewal = self.lease.renew(now_s)
+        if renewal is not None:
+            self._connection.send(renewal)
 
     def _exchange(self, wait_s: float) -> None:
         out = self._connection.bytes_to_send(self._clock.now_s(), self._requirements.max_in_flight_bytes)
@@ -248,11 +237,8 @@ class BoardSession:
         self._connection.send(m.Get())
 
     def _request_clock(self) -> None:
-        self._clock_sent_s = self._clock.now_s()
-        stamp = secrets.randbits(32)
-        if len(self._clock_requests_s) > 64:
-            self._clock_requests_s.clear()
-        self._clock_requests_s[stamp] = self._clock_sent_s
+        self._clock_requested_s = self._clock.now_s()
+        stamp = self._clock_sync.start_exchange(self._clock_requested_s)
         self._connection.send(m.ClockRequest(host_t=stamp))
 
     def _on_message(self, message: m.Message, now_s: float) -> None:
@@ -272,7 +258,7 @@ class BoardSession:
 
     def _on_ack(self, message: m.Ack, now_s: float) -> None:
         self.board.free_points, self.board.done_index = message.free_points, message.done_index
-        self._set_state(m.STATES[message.state])
+        self.board.set_state(m.STATES[message.state])
 
     def _on_nak(self, message: m.Nak, now_s: float) -> None:
         reason = m.NAK_REASONS[message.reason]
@@ -280,37 +266,25 @@ class BoardSession:
             self._refusal = reason
 
     def _on_status(self, message: m.Status, now_s: float) -> None:
-        board = self.board
-        board.inputs, board.done_index, board.queued = message.inputs, message.done_index, message.queued
-        board.underruns, board.crc_errors = message.underruns, message.crc_errors
-        board.format_errors, board.seq_errors = message.format_errors, message.seq_errors
-        board.laser_on_s = message.laser_on_us * 1e-6
-        board.temperature_c = message.temperature_dc / 10.0
-        self._record_fault(m.FAULTS[message.fault])
-        self._watch.on_status(board.fault, now_s, self._count_errors())
-        self._set_state(m.STATES[message.state])
+        fault = m.FAULTS[message.fault]
+        self._count_fault(fault)
+        self.board.apply_status(message)
+        self._watch.on_status(fault, now_s, self._count_errors())
 
     def _on_event(self, message: m.Event, now_s: float) -> None:
-        self.abort_confirmed |= self._connection.peer is None and m.EVENT_REASONS[message.reason] == "abort"
-        self._record_fault(m.FAULTS[message.fault])
-        self._watch.on_status(self.board.fault, now_s, self._count_errors())
         self.last_event_reason = m.EVENT_REASONS[message.reason]
-        self._set_state(m.STATES[message.state])
+        self.abort_confirmed |= self._connection.peer is None and self.last_event_reason == "abort"
+        fault = m.FAULTS[message.fault]
+        self._count_fault(fault)
+        self.board.set_state(m.STATES[message.state], fault)
+        self._watch.on_status(fault, now_s, self._count_errors())
 
-    def _record_fault(self, fault: str) -> None:
+    def _count_fault(self, fault: str) -> None:
         if fault and fault != self.board.fault:
             self.faults[fault] += 1
-        self.board.fault = fault
-
-    def _set_state(self, state: str) -> None:
-        self.board.state = state
-        if state != BoardState.FAULT:
-            self.board.fault = ""
 
     def _on_clock_reply(self, message: m.ClockReply, now_s: float) -> None:
-        sent_s = self._clock_requests_s.pop(message.host_t, None)
-        if sent_s is not None:
-            self._clock_sync.add(sent_s, now_s, message.tick * self.scale.tick_s)
+        self._clock_sync.finish_exchange(message.host_t, now_s, message.tick * self.scale.tick_s)
 
     def _on_arm_challenge(self, message: m.ArmChallenge, now_s: float) -> None:
         if message.host_nonce == self._arm_nonce:

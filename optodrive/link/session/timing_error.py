@@ -1,4 +1,4 @@
-"""How far the board's times lie from the planned ones; the only place that reckons it."""
+"""Timing error of executed pulses against their plan."""
 
 from dataclasses import asdict, dataclass
 
@@ -11,8 +11,10 @@ from optodrive.core.types.arrays import FloatArray
 class TimingError:
     """Executed start − planned start of a plan's pulses, both from the plan's zero on the board's clock, s.
 
-    start_delay_s: the first pulse's, which shifts the whole plan; median_s; max_abs_s: the one largest either way
-    drift_ppm: slope of what is left without the delay over the plan's time; 0 where all pulses start at one time
+    start_delay_s: error of the first pulse, which shifts the whole plan
+    median_s: median error
+    max_abs_s: signed error of largest magnitude
+    drift_ppm: slope over planned time of the error without the start delay, 0 if all pulses start at one time
     """
 
     pulses: int
@@ -23,7 +25,7 @@ class TimingError:
 
 
 def compute_timing_error(planned_s: FloatArray, executed_s: FloatArray) -> TimingError | None:
-    """From starts of the same pulses, [n] each; None where there is none."""
+    """Compute the error from planned and executed starts of the same pulses, [n] each; None without pulses."""
     if not len(planned_s):
         return None
     error_s = executed_s - planned_s
@@ -39,13 +41,16 @@ def compute_timing_error(planned_s: FloatArray, executed_s: FloatArray) -> Timin
 
 
 class TimingTotals:
-    """Over all plans: pulses, and of each figure the one that was largest either way."""
+    """Totals over all plans.
+
+    worst: number of pulses, and the error of largest magnitude of every kind; None before the first pulse
+    """
 
     def __init__(self) -> None:
         self.worst: TimingError | None = None
 
     def add(self, error: TimingError) -> None:
-        """Take a plan's in."""
+        """Add the error of a plan."""
         previous = self.worst
         if previous is None:
             self.worst = error

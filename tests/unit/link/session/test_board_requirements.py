@@ -1,4 +1,4 @@
-"""What the board is asked to keep the gate closed for lies below the plan, and not far below."""
+"""The board's settling time is below the planned one, but close to it."""
 
 import numpy as np
 import pytest
@@ -10,12 +10,12 @@ from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 
 
 def board_us(limits, codes):
-    """B7."""
+    """Return the settling time of the board, rule B7, µs."""
     return np.where(codes > 0, limits.settle_us + -(-codes * limits.settle_ns_per_code // 1000), 0)
 
 
-def moves_between(display, rng, count=400):
-    """Codes and planned times of calm moves between pixels, straight and diagonal, and of the first from the middle."""
+def list_moves(display, rng, count=400):
+    """Return codes and planned times of moves after long dwell, between pixels and from the centre."""
     scale, moves = BoardRequirements.from_config(display.config).scale, display.scan_head.settling
     x_rad, y_rad = display.scan_head.field.angles_rad(display.layout.x_m, display.layout.y_m)
     pairs = rng.integers(len(display.layout), size=(count, 2))
@@ -28,10 +28,10 @@ def moves_between(display, rng, count=400):
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
-def test_the_board_settles_no_longer_than_planned_and_nearly_as_long(name):
+def test_the_boards_settling_time_is_just_below_the_planned_one(name):
     display = DISPLAYS[name]
     limits = tighten(DEFAULT_LIMITS, BoardRequirements.from_config(display.config).build_limits())
-    codes, planned_us = moves_between(display, np.random.default_rng(1))
+    codes, planned_us = list_moves(display, np.random.default_rng(1))
     assert np.all(board_us(limits, codes) <= planned_us)
     pitch = (
         BoardRequirements.from_config(display.config).scale.to_codes(np.array([display.scan_head.settling.pitch_rad]))[
@@ -43,16 +43,16 @@ def test_the_board_settles_no_longer_than_planned_and_nearly_as_long(name):
     assert board_us(limits, pitch) >= moves.settling_us(moves.pitch_rad, 0.0, moves.long_dwell_us) - 20
 
 
-def test_a_single_pixel_beside_the_middle_is_planned_with_the_way_to_it():
+def test_a_single_off_centre_pixel_includes_the_move_from_the_centre():
     table = DISPLAYS["display-16"].config.model_dump()
     table["display"] |= {"rows": 2, "columns": 2, "missing": [[0, 0], [0, 1], [1, 0]]}
     display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
-    codes, planned_us = moves_between(display, np.random.default_rng(1), 1)
+    codes, planned_us = list_moves(display, np.random.default_rng(1), 1)
     assert np.all(board_us(BoardRequirements.from_config(display.config).build_limits(), codes) <= planned_us)
 
 
-def test_the_simulated_board_is_quick_enough_for_every_shipped_display():
+def test_the_simulated_board_settles_fast_enough_for_every_display():
     for display in DISPLAYS.values():
-        asked = BoardRequirements.from_config(display.config).build_limits()
-        assert DEFAULT_LIMITS.settle_us <= asked.settle_us
-        assert DEFAULT_LIMITS.settle_ns_per_code <= asked.settle_ns_per_code
+        requested = BoardRequirements.from_config(display.config).build_limits()
+        assert DEFAULT_LIMITS.settle_us <= requested.settle_us
+        assert DEFAULT_LIMITS.settle_ns_per_code <= requested.settle_ns_per_code

@@ -1,4 +1,4 @@
-"""What the user is told when the link goes: produced for real on the simulated board, in virtual time."""
+"""Likely causes of link failures, provoked on the simulated board in virtual time."""
 
 import os
 import subprocess
@@ -28,8 +28,8 @@ LEASE_S = CONFIG.board.lease_s
 QUIET = LinkEvidence("/dev/ttyACM0", PortState("available"), silent=True, lease_s=LEASE_S)
 
 
-class Damaged(Rig):
-    """A line that flips bits both ways."""
+class NoisyRig(Rig):
+    """Rig with a line that can flip bits in both directions."""
 
     def __init__(self):
         super().__init__()
@@ -39,124 +39,124 @@ class Damaged(Rig):
         self.link.read = lambda timeout_s: self.faults.transmit(read(timeout_s))
 
 
-def cause(rig):
+def get_cause(rig):
     return rig.session.collect_link_stats()["likely_cause"]
 
 
-def lost(rig, lease=True):
-    """Run until the link is given up; what is told."""
+def run_until_lost(rig, lease=True):
+    """Run until the link is lost and return the message."""
     with pytest.raises(LinkError) as caught:
         rig.run(30.0, lease)
-    told = rig.session.on_lost(caught.value)
-    assert told.endswith(cause(rig))
-    return told
+    message = rig.session.on_lost(caught.value)
+    assert message.endswith(get_cause(rig))
+    return message
 
 
-def test_a_link_that_stands_has_no_cause_and_counts_its_turns():
+def test_a_working_link_has_no_cause_and_records_its_longest_iteration():
     rig = Rig().connect().arm()
     rig.run(1.0)
-    figures = rig.session.collect_link_stats()
-    assert figures["likely_cause"] is None
-    assert figures["likely_cause_age_s"] is None
-    assert 1.9 < figures["longest_stall_ms"] < 3.0
+    stats = rig.session.collect_link_stats()
+    assert stats["likely_cause"] is None
+    assert stats["likely_cause_age_s"] is None
+    assert 1.9 < stats["longest_stall_ms"] < 3.0
 
 
-def test_a_host_that_stood_still_is_told_so():
+def test_a_stalled_host_is_reported():
     rig = Rig().connect().arm()
     rig.play(plan(500))
     rig.run(0.3)
     rig.clock.sleep(0.35)
     rig.until(lambda: rig.session.board.state == "FAULT")
-    assert "this computer stalled for 35" in cause(rig)
-    assert f"the lease is {LEASE_S * 1e3:.0f} ms" in cause(rig)
+    assert "this computer stalled for 35" in get_cause(rig)
+    assert f"the lease is {LEASE_S * 1e3:.0f} ms" in get_cause(rig)
     assert rig.session.collect_link_stats()["longest_stall_ms"] == pytest.approx(350, abs=5)
 
 
-def test_a_host_that_stood_still_as_it_waited_for_the_very_bytes_that_say_so():
+def test_a_stall_within_the_read_that_reports_it():
     rig = Rig().connect().arm()
     rig.run(0.3)
     read = rig.link.read
 
-    def stopped(timeout_s):
+    def stalled_read(timeout_s):
         rig.clock.sleep(0.35)
         rig.link.read = read
         return read(timeout_s)
 
-    rig.link.read = stopped
+    rig.link.read = stalled_read
     rig.session.step(0.002, renew_lease=True)
     assert rig.session.board.fault == "LINK"
-    assert "this computer stalled for 35" in cause(rig)
+    assert "this computer stalled for 35" in get_cause(rig)
 
 
-def test_a_stall_of_long_ago_explains_nothing():
+def test_an_old_stall_is_no_evidence():
     rig = Rig().connect()
     rig.clock.sleep(0.5)
     rig.run(EVIDENCE_WINDOW_S + 1.0)
     rig.arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
-    assert "stalled" not in cause(rig)
+    assert "stalled" not in get_cause(rig)
 
 
-def test_a_planner_that_hangs_is_told_so():
+def test_a_stalled_planner_is_reported():
     rig = Rig().connect().arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
-    assert "planner made no progress" in cause(rig)
+    assert "planner made no progress" in get_cause(rig)
 
 
-def test_a_board_that_was_reset_is_silent_at_first_and_then_tells():
+def test_a_reset_board_is_silent_and_then_reports_the_cause():
     for code, word in enumerate(("power-up", "reset", "brown-out", "watchdog")):
         rig = Rig().connect().arm()
         rig.core.reset(round(rig.clock.now_s() * 1e6), code)
-        assert "hangs, restarts, has no power" in lost(rig)
+        assert "hangs, restarts, has no power" in run_until_lost(rig)
         rig.connect()
-        assert "restarted 2." in cause(rig)
-        assert f"({word})" in cause(rig)
+        assert "restarted 2." in get_cause(rig)
+        assert f"({word})" in get_cause(rig)
 
 
-def test_a_link_that_comes_back_to_the_same_board_does_not_blame_a_restart():
+def test_a_reconnect_without_a_restart_does_not_report_one():
     rig = Rig().connect().arm()
     rig.link.cut = True
-    assert "hangs, restarts, has no power" in lost(rig)
+    assert "hangs, restarts, has no power" in run_until_lost(rig)
     rig.link.cut = False
     rig.connect()
-    assert "restarted" not in cause(rig)
+    assert "restarted" not in get_cause(rig)
     assert rig.session.collect_link_stats()["likely_cause_age_s"] > 0
 
 
-def test_damage_of_what_the_board_sends_is_told_at_once():
-    rig = Damaged().connect()
+def test_damage_of_received_frames_is_reported_at_once():
+    rig = NoisyRig().connect()
     rig.link.write = lambda data: super(type(rig.link), rig.link).write(data)
     rig.faults.inject_fault("flip_bits", 0.3)
-    told = lost(rig)
-    assert "bytes arrive damaged" in told
-    assert "cable" in told
+    message = run_until_lost(rig)
+    assert "bytes arrive damaged" in message
+    assert "cable" in message
 
 
-def test_damage_of_what_the_board_hears_is_told_when_it_answers_again():
-    rig = Damaged().connect()
+def test_damage_of_sent_frames_is_reported_after_the_reconnect():
+    rig = NoisyRig().connect()
     rig.faults.inject_fault("flip_bits", 0.3)
-    assert "receives only damaged frames" in lost(rig)
+    assert "receives only damaged frames" in run_until_lost(rig)
     rig.faults.repair()
     rig.connect()
-    assert "reached the board damaged" in cause(rig)
+    assert "reached the board damaged" in get_cause(rig)
 
 
-def test_a_board_that_hears_only_damage_lets_the_lease_lapse():
-    rig = Damaged().connect().arm()
+def test_damage_of_sent_frames_lets_the_lease_expire():
+    rig = NoisyRig().connect().arm()
     rig.faults.inject_fault("flip_bits", 0.04)
     rig.until(lambda: rig.session.board.state == "FAULT")
     assert rig.session.board.fault == "LINK"
-    assert "bytes arrive damaged" in cause(rig)
+    assert "bytes arrive damaged" in get_cause(rig)
 
 
-def test_lost_frames_without_damage_are_told_as_lost_bytes():
+def test_lost_frames_without_damage_are_reported_as_lost_bytes():
     evidence = replace(QUIET, naks=3, retransmitted=9)
     assert "bytes are lost on the link (9 frames retransmitted, 3 refused)" in diagnose_link_loss(evidence)
     assert diagnose_lease_expiry(evidence) == diagnose_link_loss(evidence)
     assert "was on time" in diagnose_lease_expiry(QUIET)
 
 
-def test_the_port_tells_first():
+def test_the_port_state_has_precedence():
     missing = PortState("missing", other_ports=("/dev/ttyACM1",))
     evidence = replace(QUIET, port_state=missing, host_bad_frames=5, stall_s=9.0)
     assert diagnose_link_loss(evidence).startswith("/dev/ttyACM0 is missing")
@@ -168,17 +168,17 @@ def test_the_port_tells_first():
     assert "is available again: replugged" in diagnose_link_loss(replace(QUIET, silent=False))
 
 
-def test_a_stall_counts_from_where_it_costs_the_lease():
+def test_a_stall_counts_if_it_lets_the_lease_expire():
     enough_s = STALL_LEASE_FRACTION * LEASE_S
     assert "stalled" in diagnose_lease_expiry(replace(QUIET, stall_s=enough_s))
     assert "stalled" not in diagnose_lease_expiry(replace(QUIET, stall_s=0.99 * enough_s))
 
 
-def test_an_unknown_reset_cause_is_said_as_it_is():
+def test_an_unknown_reset_cause_is_reported_as_a_number():
     assert "(unknown cause 9)" in describe_restart(9, 1.0)
 
 
-def test_counters_of_an_earlier_link_do_not_count():
+def test_counters_of_an_earlier_link_are_ignored():
     watch = LinkWatch("/dev/none", LEASE_S)
     watch.on_loop(1.0, True, LinkErrorCounts(host_bad_frames=50))
     watch.on_opened()
@@ -187,10 +187,10 @@ def test_counters_of_an_earlier_link_do_not_count():
     assert "was on time" in watch.cause.message
     before = watch.cause
     watch.on_status("LINK", 2.2, LinkErrorCounts(host_bad_frames=9))
-    assert watch.cause is before, "told once a fault"
+    assert watch.cause is before, "explained once per fault"
 
 
-def test_a_board_found_in_a_fault_of_another_time_is_not_explained():
+def test_a_fault_from_before_the_connection_is_not_explained():
     rig = Rig().connect().arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
     rig.session.close()
@@ -201,14 +201,14 @@ def test_a_board_found_in_a_fault_of_another_time_is_not_explained():
     assert other.likely_cause is None
 
 
-def test_a_board_that_does_not_fit_is_no_failure_of_the_link():
+def test_an_incompatible_board_is_no_link_failure():
     rig = Rig().connect()
-    told = rig.session.on_lost(InputError("board.uid", "1", "2", "board"))
-    assert "likely cause" not in told
-    assert cause(rig) is None
+    message = rig.session.on_lost(InputError("board.uid", "1", "2", "board"))
+    assert "likely cause" not in message
+    assert get_cause(rig) is None
 
 
-def test_a_pty_that_is_taken_away_is_gone(tmp_path):
+def test_a_removed_pty_is_missing(tmp_path):
     master, slave = os.openpty()
     name = tmp_path / "tty"
     name.symlink_to(os.ttyname(slave))
@@ -228,7 +228,7 @@ def test_a_pty_that_is_taken_away_is_gone(tmp_path):
     assert "is available again: replugged" in watch.cause.message
 
 
-def test_a_port_that_another_program_took_names_it(tmp_path):
+def test_a_port_in_use_names_the_program(tmp_path):
     master, slave = os.openpty()
     watch = LinkWatch(os.ttyname(slave), LEASE_S)
     os.close(slave)

@@ -1,4 +1,4 @@
-"""A session recorded on the simulated board and replayed into a fresh one, both in virtual time."""
+"""Replay of a capture of the simulated board to another simulated board, in virtual time."""
 
 import pytest
 from test_session import CONFIG, Rig, plan
@@ -25,20 +25,20 @@ from optodrive.link.transport.link_capture import (
 SEED = 2
 
 
-class Recorded(Rig):
-    """The rig of the session's tests with a tape in its line."""
+class CapturedRig(Rig):
+    """Rig of the session tests with a link capture."""
 
     def __init__(self, path):
         super().__init__()
-        self.tape = LinkCaptureWriter(path, self.clock.now_s(), pytest.fail)
-        link = CapturingTransport(MemoryLink(self.core, self.clock), self.tape, self.clock)
+        self.capture = LinkCaptureWriter(path, self.clock.now_s(), pytest.fail)
+        link = CapturingTransport(MemoryLink(self.core, self.clock), self.capture, self.clock)
         self.session = BoardSession(link, self.clock, BoardRequirements.from_config(CONFIG))
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Armed, a plan, a reconnect that leaves the board DISARMED, armed again, a plan cut by ABORT."""
-    rig = Recorded(tmp_path_factory.mktemp("tape") / "a")
+    """Capture of a plan, a reconnect to DISARMED, and a plan that ABORT ends."""
+    rig = CapturedRig(tmp_path_factory.mktemp("capture") / "capture")
     rig.connect().arm()
     job = rig.play(plan(300))
     rig.until(lambda: job.is_finished)
@@ -50,25 +50,25 @@ def recorded(tmp_path_factory):
     rig.session.abort()
     rig.run(0.2)
     rig.session.close()
-    rig.path = rig.tape.path
+    rig.path = rig.capture.path
     return rig
 
 
-def replayed(path, seed, may_arm=True, link=MemoryLink):
-    tape, log, clock = LinkCapture(path), [], ManualClock(5.0)
+def replay_capture(path, seed, may_arm=True, link=MemoryLink):
+    capture, log, clock = LinkCapture(path), [], ManualClock(5.0)
     replay = Replay(
-        link(BoardCore(sink=log.append, seed=seed), clock), clock, clock_shift_s(tape.read_entries()), may_arm
+        link(BoardCore(sink=log.append, seed=seed), clock), clock, clock_shift_s(capture.read_entries()), may_arm
     )
-    replay.run(tape.read_entries())
+    replay.run(capture.read_entries())
     return replay, log
 
 
-def stays_dark(log):
+def stays_off(log):
     return not any(e["event"] == "gate" or e.get("state") == "ARMED" for e in log)
 
 
 def test_the_same_seed_gives_the_same_states_gate_edges_and_reports(recorded):
-    replay, log = replayed(recorded.path, SEED)
+    replay, log = replay_capture(recorded.path, SEED)
     assert log == recorded.log
     verdict = compare_traces(replay.recorded, replay.replayed)
     assert verdict["identical"], verdict
@@ -78,33 +78,33 @@ def test_the_same_seed_gives_the_same_states_gate_edges_and_reports(recorded):
 
 
 def test_another_seed_never_arms(recorded):
-    replay, log = replayed(recorded.path, SEED + 1)
-    assert stays_dark(log)
+    replay, log = replay_capture(recorded.path, SEED + 1)
+    assert stays_off(log)
     verdict = compare_traces(replay.recorded, replay.replayed)
     assert not verdict["identical"]
     assert verdict["executed"]["missing"] == verdict["executed"]["recorded"]
     assert verdict["states"]["first_difference"] is not None
 
 
-def test_a_real_board_never_hears_the_confirmation_even_if_its_nonces_repeat(recorded):
-    _, log = replayed(recorded.path, SEED, may_arm=False)
+def test_a_real_board_never_receives_the_confirmation(recorded):
+    _, log = replay_capture(recorded.path, SEED, may_arm=False)
     assert "ARMING" in [e["state"] for e in log if e["event"] == "state"]
-    assert stays_dark(log)
-    _, mutant = replayed(recorded.path, SEED, may_arm=True)
-    assert not stays_dark(mutant), "the check would see a board that armed"
+    assert stays_off(log)
+    _, mutant = replay_capture(recorded.path, SEED, may_arm=True)
+    assert not stays_off(mutant), "the check detects a board that armed"
 
 
-def test_what_is_no_frame_of_a_host_never_leaves(tmp_path):
+def test_only_frames_of_a_host_are_sent(tmp_path):
     sent = []
 
-    class Heard(MemoryLink):
+    class RecordingLink(MemoryLink):
         def write(self, data):
             sent.append(data)
             super().write(data)
 
     hello = encode_frame(Frame(m.Hello.TYPE, 0, 0, m.Hello(1, 0, 9).encode_body()))
     reply = encode_frame(Frame(m.Ack.TYPE, 0, 0, m.Ack(0, 0, 0, 0).encode_body()))
-    path = tmp_path / "a"
+    path = tmp_path / "capture"
     writer = LinkCaptureWriter(path, 5.0, pytest.fail)
     for entry in (
         CaptureEntry("opened", 5.0),
@@ -113,31 +113,31 @@ def test_what_is_no_frame_of_a_host_never_leaves(tmp_path):
     ):
         writer.record(entry)
     writer.close()
-    replayed(path, 1, link=Heard)
+    replay_capture(path, 1, link=RecordingLink)
     assert sent == [b"\0" + hello]
 
 
-def test_the_board_that_began_at_another_time_is_replayed_on_its_own_clock(tmp_path):
-    """The board's counter runs 3.2 s ahead of the host's clock: START names ticks of the board's."""
+def test_a_replay_follows_the_captured_clock_offset(tmp_path):
+    """The captured board clock is 3.2 s ahead of the host, and START refers to board ticks."""
 
     class Ahead(MemoryLink):
         def _now_us(self):
             return super()._now_us() + 3_200_000
 
-    rig = Recorded(tmp_path / "a")
-    link = CapturingTransport(Ahead(rig.core, rig.clock), rig.tape, rig.clock)
+    rig = CapturedRig(tmp_path / "capture")
+    link = CapturingTransport(Ahead(rig.core, rig.clock), rig.capture, rig.clock)
     rig.session = BoardSession(link, rig.clock, BoardRequirements.from_config(CONFIG))
     rig.connect().arm()
     job = rig.play(plan(50))
     rig.until(lambda: job.is_finished)
     rig.session.close()
-    tape = LinkCapture(rig.tape.path)
-    assert clock_shift_s(tape.read_entries()) == pytest.approx(3.2, abs=1e-3)
+    capture = LinkCapture(rig.capture.path)
+    assert clock_shift_s(capture.read_entries()) == pytest.approx(3.2, abs=1e-3)
     log, clock = [], ManualClock(8.2)
     replay = Replay(
-        MemoryLink(BoardCore(sink=log.append, seed=SEED), clock), clock, clock_shift_s(tape.read_entries()), True
+        MemoryLink(BoardCore(sink=log.append, seed=SEED), clock), clock, clock_shift_s(capture.read_entries()), True
     )
-    replay.run(tape.read_entries())
+    replay.run(capture.read_entries())
     assert compare_traces(replay.recorded, replay.replayed)["identical"]
     edges = [[(e["t_us"], e["on"]) for e in events if e["event"] == "gate"] for events in (log, rig.log)]
     assert edges[0] == edges[1]
@@ -145,8 +145,8 @@ def test_the_board_that_began_at_another_time_is_replayed_on_its_own_clock(tmp_p
 
 
 @pytest.mark.parametrize("what", ["state", "width", "missing"])
-def test_a_board_that_does_otherwise_is_found_out(recorded, what):
-    replay, _ = replayed(recorded.path, SEED)
+def test_a_different_behaviour_is_detected(recorded, what):
+    replay, _ = replay_capture(recorded.path, SEED)
     if what == "state":
         replay.replayed.states[3] = ("FAULT", "LINK", "fault")
     elif what == "width":
@@ -161,27 +161,27 @@ def test_a_board_that_does_otherwise_is_found_out(recorded, what):
     assert (verdict["executed"]["changed"], verdict["executed"]["missing"]) == (what == "width", what == "missing")
 
 
-def test_the_transcript_counts_as_the_host_did(tmp_path):
-    """Frames are lost on purpose; what the tape says of that is what the host's own counters say."""
+def test_the_transcript_counts_agree_with_the_host(tmp_path):
+    """With dropped frames, the counts from the capture equal those of the host."""
     rig = Rig()
-    tape = LinkCaptureWriter(tmp_path / "a", 5.0, pytest.fail)
+    capture = LinkCaptureWriter(tmp_path / "capture", 5.0, pytest.fail)
     rig.session = BoardSession(
-        CapturingTransport(rig.link, tape, rig.clock), rig.clock, BoardRequirements.from_config(CONFIG)
+        CapturingTransport(rig.link, capture, rig.clock), rig.clock, BoardRequirements.from_config(CONFIG)
     )
     count = iter(range(10**9))
     rig.connect().arm()
-    rig.link.keep_back = lambda frame: frame.type == m.Data.TYPE and next(count) % 5 == 2
+    rig.link.drop_frame = lambda frame: frame.type == m.Data.TYPE and next(count) % 5 == 2
     job = rig.play(plan(300))
     rig.until(lambda: job.is_finished)
-    figures = rig.session.collect_link_stats()
+    stats = rig.session.collect_link_stats()
     rig.session.close()
     transcript, received = Transcript(), 0
-    for entry in LinkCapture(tmp_path / "a").read_entries():
+    for entry in LinkCapture(tmp_path / "capture").read_entries():
         if entry.kind in (TO_BOARD, FROM_BOARD):
             received += len(transcript.feed(entry.host_s, entry.kind == TO_BOARD, entry.data))
     totals = transcript.totals
-    assert totals.retransmissions == figures["retransmitted"] > 0
-    assert totals.naks == figures["naks"] > 0
-    assert min(totals.round_trips_s) * 1e3 == pytest.approx(figures["round_trip_ms"], rel=1e-6)
+    assert totals.retransmissions == stats["retransmitted"] > 0
+    assert totals.naks == stats["naks"] > 0
+    assert min(totals.round_trips_s) * 1e3 == pytest.approx(stats["round_trip_ms"], rel=1e-6)
     assert totals.bad_bytes == 0
     assert received == totals.frames_to_board + totals.frames_from_board

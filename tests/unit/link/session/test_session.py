@@ -1,4 +1,4 @@
-"""The session against the simulated board, both real, over a link in memory and a clock moved by hand."""
+"""Session with the simulated board, over an in-memory link and a manual clock."""
 
 import sys
 import threading
@@ -28,12 +28,12 @@ STEP_S = 0.002
 
 
 class Wire(MemoryLink):
-    """The link in memory, where messages can be kept from arriving."""
+    """In-memory link that can drop frames."""
 
     def __init__(self, core, clock):
         super().__init__(core, clock)
         self.cut = False
-        self.keep_back = lambda frame: False
+        self.drop_frame = lambda frame: False
         self.sent = []
         self._up, self._down = FrameDecoder(), FrameDecoder()
 
@@ -41,13 +41,13 @@ class Wire(MemoryLink):
         frames = list(self._up.feed(data))
         self.sent += frames
         if not self.cut:
-            super().write(b"".join(encode_frame(frame) for frame in frames if not self.keep_back(frame)))
+            super().write(b"".join(encode_frame(frame) for frame in frames if not self.drop_frame(frame)))
 
     def read(self, timeout_s):
         data = super().read(timeout_s)
         if self.cut:
             return b""
-        return b"".join(encode_frame(frame) for frame in self._down.feed(data) if not self.keep_back(frame))
+        return b"".join(encode_frame(frame) for frame in self._down.feed(data) if not self.drop_frame(frame))
 
 
 class Rig:
@@ -70,7 +70,7 @@ class Rig:
     def until(self, condition, patience_s=20.0, lease=True):
         give_up_s = self.clock.now_s() + patience_s
         while not condition():
-            assert self.clock.now_s() < give_up_s, f"in vain: {self.session.board}"
+            assert self.clock.now_s() < give_up_s, f"timed out: {self.session.board}"
             self.session.step(STEP_S, lease)
 
     def arm(self):
@@ -89,7 +89,7 @@ class Rig:
 
 
 def plan(n=100, width_s=0.002, period_s=0.004, power_w=0.5):
-    """A limited plan: n pulses on four places in turn."""
+    """Return a limited plan: n pulses that alternate between four positions."""
     pixel = np.arange(n) % 4
     ones = np.ones(n)
     columns = {
@@ -112,7 +112,7 @@ def rig():
 # --- connecting -----------------------------------------------------------------------------------------------------
 
 
-def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
+def test_the_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     session = rig.session
     assert session.connected
     assert session.is_acknowledged
@@ -123,22 +123,22 @@ def test_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     assert session.collect_link_stats()["round_trip_ms"] > 0
 
 
-def test_hello_is_repeated_until_the_board_hears():
+def test_hello_is_repeated_until_the_board_answers():
     rig = Rig()
-    rig.link.keep_back = lambda frame: frame.type == m.Hello.TYPE and rig.clock.now_s() < 6.3
+    rig.link.drop_frame = lambda frame: frame.type == m.Hello.TYPE and rig.clock.now_s() < 6.3
     rig.connect()
     hellos = [frame for frame in rig.link.sent if frame.type == m.Hello.TYPE]
     assert 5 <= len(hellos) <= 8
-    assert len({frame.body for frame in hellos}) == len(hellos), "each with a nonce of its own"
+    assert len({frame.body for frame in hellos}) == len(hellos), "each has its own nonce"
 
 
 @pytest.mark.parametrize(
     ("kinds", "says"),
     [(range(256), "is open, but no board answers"), ((0x90, 0x98, 0x83), "answers HELLO but nothing else")],
 )
-def test_no_answer_is_a_link_error_in_its_time(kinds, says):
+def test_a_missing_answer_is_a_link_error_within_the_timeout(kinds, says):
     rig = Rig()
-    rig.link.keep_back = lambda frame: frame.type in kinds
+    rig.link.drop_frame = lambda frame: frame.type in kinds
     with pytest.raises(LinkError, match=says):
         rig.connect()
     assert rig.clock.now_s() < 5.0 + CONNECT_TIMEOUT_S + 0.1
@@ -169,7 +169,7 @@ def changed(section, **values):
         (BoardSettings(replace(DEFAULT_LIMITS, y_max=33_000)), CONFIG, "display y"),
     ],
 )
-def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config, says):
+def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):
     rig = Rig(settings, config)
     with pytest.raises(InputError, match=says) as caught:
         rig.connect()
@@ -178,7 +178,7 @@ def test_a_board_that_does_not_fit_is_refused_by_the_key_s_name(settings, config
 
 
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
-def test_another_protocol_or_clock_is_refused(field, value):
+def test_another_protocol_or_tick_is_rejected(field, value):
     requirements = BoardRequirements.from_config(CONFIG)
     fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
     fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=DEFAULT_LIMITS)
@@ -188,11 +188,11 @@ def test_another_protocol_or_clock_is_refused(field, value):
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
-def test_the_simulated_board_fits_every_display(name):
+def test_the_simulated_board_meets_the_requirements_of_every_display(name):
     Rig(config=DISPLAYS[name].config).connect().arm()
 
 
-def test_limits_hold_also_where_the_session_found_a_fault(rig):
+def test_limits_are_tightened_on_a_board_in_fault(rig):
     rig.core.set_input("estop", True, round(rig.clock.now_s() * 1e6))
     rig.session.close()
     rig.core.set_input("estop", False, round(rig.clock.now_s() * 1e6))
@@ -215,17 +215,17 @@ def test_arm_takes_the_board_s_two_seconds(rig):
         rig.session.arm()
 
 
-def test_what_is_executed_is_what_was_planned(rig):
+def test_the_board_executes_the_plan(rig):
     rig.arm()
-    asked = plan(500)
-    job = rig.play(asked)
+    planned = plan(500)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    done = job.build_executed(asked, 2.45, 1e-6)
+    done = job.build_executed(planned, 2.45, 1e-6)
     assert done.complete
-    assert done.pixel.tolist() == asked.pixel.tolist()
-    assert np.abs(done.start_s - asked.start_s).max() < 1e-12
-    assert np.abs(done.width_s - asked.width_s).max() < 1e-12
-    assert np.abs(done.power_w - asked.power_w).max() < 2.45 / 65535
+    assert done.pixel.tolist() == planned.pixel.tolist()
+    assert np.abs(done.start_s - planned.start_s).max() < 1e-12
+    assert np.abs(done.width_s - planned.width_s).max() < 1e-12
+    assert np.abs(done.power_w - planned.power_w).max() < 2.45 / 65535
     log = rig.pulses()
     assert [entry["on_us"] for entry in log] == done.on_tick.tolist()
     assert [entry["off_us"] - entry["on_us"] for entry in log] == done.width_ticks.tolist()
@@ -235,11 +235,11 @@ def test_what_is_executed_is_what_was_planned(rig):
 
 def test_more_points_than_the_queue_holds():
     rig = Rig(BoardSettings(queue_points=60)).connect().arm()
-    asked = plan(400)
-    job = rig.play(asked)
+    planned = plan(400)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(asked, 2.45, 1e-6).complete
-    assert rig.session.collect_link_stats()["naks"] == 0, "credits kept the host from asking for room that is not there"
+    assert job.build_executed(planned, 2.45, 1e-6).complete
+    assert rig.session.collect_link_stats()["naks"] == 0, "flow control keeps the host within the free queue space"
     assert rig.session.board.underruns == 0
 
 
@@ -247,50 +247,50 @@ def test_one_job_after_another(rig):
     rig.arm()
     for n in (1, 30, 7):
         rig.until(lambda: rig.session.is_ready)
-        asked = plan(n)
-        job = rig.play(asked)
+        planned = plan(n)
+        job = rig.play(planned)
         rig.until(lambda job=job: job.is_finished)
-        assert job.build_executed(asked, 2.45, 1e-6).complete
+        assert job.build_executed(planned, 2.45, 1e-6).complete
     assert len(rig.pulses()) == 38
 
 
-def test_lost_reports_are_asked_for_again(rig):
+def test_lost_reports_are_requested_again(rig):
     rig.arm()
     lost = []
-    rig.link.keep_back = lambda frame: frame.type == m.Executed.TYPE and len(lost) < 30 and not lost.append(frame)
-    asked = plan(200)
-    job = rig.play(asked)
+    rig.link.drop_frame = lambda frame: frame.type == m.Executed.TYPE and len(lost) < 30 and not lost.append(frame)
+    planned = plan(200)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
     assert len(lost) == 30
-    assert job.build_executed(asked, 2.45, 1e-6).complete
-    assert job.build_executed(asked, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
+    assert job.build_executed(planned, 2.45, 1e-6).complete
+    assert job.build_executed(planned, 2.45, 1e-6).on_tick.tolist() == [entry["on_us"] for entry in rig.pulses()]
     assert m.GetExecuted.TYPE in {frame.type for frame in rig.link.sent}
 
 
-def test_a_lossy_link_slows_but_does_not_change_what_is_done(rig):
+def test_a_lossy_link_does_not_change_the_execution(rig):
     rig.arm()
     rng = np.random.default_rng(1)
-    rig.link.keep_back = lambda frame: rng.random() < 0.1
-    asked = plan(300)
-    job = rig.play(asked)
+    rig.link.drop_frame = lambda frame: rng.random() < 0.1
+    planned = plan(300)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(planned, 2.45, 1e-6).complete
     assert rig.session.collect_link_stats()["retransmitted"] > 0
 
 
 # --- lease, silence, faults -----------------------------------------------------------------------------------------
 
 
-def test_the_lease_is_renewed_by_step_alone(rig):
+def test_only_step_renews_the_lease(rig):
     rig.arm()
     rig.run(3.0)
     assert rig.session.board.state == "ARMED"
-    rig.clock.sleep(0.2)  # the loop stands still, and nothing else renews
+    rig.clock.sleep(0.2)  # the loop stalls
     rig.session.step(STEP_S, renew_lease=True)
     assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
 
 
-def test_without_proof_of_the_planner_the_board_ends_within_its_lease(rig):
+def test_a_withheld_lease_ends_the_job_within_its_length(rig):
     rig.arm()
     rig.play(plan(500))
     rig.run(0.3)
@@ -301,12 +301,12 @@ def test_without_proof_of_the_planner_the_board_ends_within_its_lease(rig):
     assert fault["t_us"] - stopped_us <= 100_000
     assert not rig.core.gate
     assert rig.session.board.to_dict()["hint"] == FAULT_HINTS["LINK"]
-    lit = len(rig.pulses())
+    pulses = len(rig.pulses())
     rig.run(1.0)
-    assert len(rig.pulses()) == lit, "a lease alone brings nothing back"
+    assert len(rig.pulses()) == pulses, "a new lease does not resume the job"
 
 
-def test_silence_is_a_link_error_that_says_what_was_counted(rig):
+def test_silence_is_a_link_error_with_the_error_counts(rig):
     rig.link.cut = True
     began_s = rig.clock.now_s()
     with pytest.raises(LinkError, match=r"sent nothing for 2 s; 0 bad frames at the host"):
@@ -314,7 +314,7 @@ def test_silence_is_a_link_error_that_says_what_was_counted(rig):
     assert SILENCE_TIMEOUT_S < rig.clock.now_s() - began_s < SILENCE_TIMEOUT_S + 0.1
 
 
-def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
+def test_a_restarted_board_is_detected_and_reconnects_disarmed(rig):
     rig.arm()
     rig.core.reset(round(rig.clock.now_s() * 1e6))
     with pytest.raises(LinkError):
@@ -326,32 +326,32 @@ def test_a_board_that_restarts_is_noticed_and_comes_back_disarmed(rig):
 
 
 @pytest.mark.parametrize("kind", [m.HelloReply.TYPE, m.ClockReply.TYPE])
-def test_a_try_without_an_answer_leaves_the_clock_as_it_was(rig, kind):
-    """Heat is kept in the board's time: it would move by all the time that the board has run."""
+def test_a_failed_connect_keeps_the_clock(rig, kind):
+    """Thermal states are in board time, so a lost clock would shift them by the board's uptime."""
     rig.run(3.0)
     rig.session.disconnect()
-    rig.link.keep_back = lambda frame: frame.type == kind
+    rig.link.drop_frame = lambda frame: frame.type == kind
     with pytest.raises(LinkError):
         rig.connect()
     assert rig.session.board_s() == pytest.approx(rig.core.machine.current_tick * 1e-6, abs=0.01)
-    rig.link.keep_back = lambda frame: False
+    rig.link.drop_frame = lambda frame: False
     before_s = rig.session.board_s()
     rig.connect()
     assert rig.session.board_s() - before_s < CONNECT_TIMEOUT_S
 
 
-def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
+def test_a_fault_is_reported_with_the_pulse_that_it_truncated(rig):
     rig.arm()
-    asked = plan(100)
-    job = rig.play(asked)
+    planned = plan(100)
+    job = rig.play(planned)
     rig.until(lambda: rig.core.gate and len(rig.pulses()) > 20)
     rig.core.set_input("interlock", False, round(rig.clock.now_s() * 1e6))
     rig.until(lambda: rig.session.board.state == "FAULT")
     rig.run(0.1)
-    done = job.build_executed(asked, 2.45, 1e-6)
+    done = job.build_executed(planned, 2.45, 1e-6)
     assert len(done) == len(rig.pulses())
     assert not done.complete
-    assert done.width_s[-1] < asked.width_s[0]
+    assert done.width_s[-1] < planned.width_s[0]
     assert rig.session.board.fault == "INTERLOCK"
     with pytest.raises(NotReadyError, match="FAULT INTERLOCK"):
         rig.session.arm()
@@ -362,7 +362,7 @@ def test_a_fault_is_heard_with_the_pulse_it_cut_short(rig):
     assert get_fault_hint("INTERLOCK") == rig.session.board.to_dict()["hint"]
 
 
-def test_nothing_more_of_a_job_is_sent_after_a_fault():
+def test_no_points_are_sent_after_a_fault():
     rig = Rig(BoardSettings(queue_points=60)).connect().arm()
     rig.play(plan(400))
     rig.until(lambda: len(rig.pulses()) > 20)
@@ -373,45 +373,45 @@ def test_nothing_more_of_a_job_is_sent_after_a_fault():
     assert m.Data.TYPE not in {frame.type for frame in rig.link.sent}
 
 
-def test_every_fault_of_the_board_has_a_hint_but_those_of_its_own_electronics():
+def test_every_fault_except_those_of_the_electronics_has_a_hint():
     assert set(m.FAULTS) - set(FAULT_HINTS) == {"", "TICK", "READBACK"}
     assert "no likely cause" in get_fault_hint("TICK")
 
 
-# --- breaking off ---------------------------------------------------------------------------------------------------
+# --- aborting ---------------------------------------------------------------------------------------------------
 
 
-def test_abort_in_mid_job_then_a_new_arm_and_job(rig):
+def test_a_job_after_an_abort(rig):
     rig.arm()
     rig.play(plan(500))
     rig.run(0.3)
-    lit = len(rig.pulses())
+    pulses = len(rig.pulses())
     rig.session.abort()
     rig.session.step(STEP_S, renew_lease=True)
     assert not rig.core.gate
     assert rig.core.state == "DISARMED"
     rig.until(lambda: rig.session.is_acknowledged and rig.session.board.state == "DISARMED")
     rig.run(0.5)
-    assert len(rig.pulses()) <= lit + 1
-    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens again"
+    assert len(rig.pulses()) <= pulses + 1
+    assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj, "the new session tightens the limits again"
     rig.arm()
-    asked = plan(50)
-    job = rig.play(asked)
+    planned = plan(50)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(planned, 2.45, 1e-6).complete
 
 
-def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_limits_first(rig):
+def test_an_abort_is_confirmed_before_the_next_session_and_limits_precede_arming(rig):
     rig.arm()
     rig.play(plan(500))
     rig.run(0.3)
     hellos, rig.link.sent = [], []
 
-    def keep_back(frame):
+    def drop_frame(frame):
         hellos.extend([frame] if frame.type == m.Hello.TYPE else [])
         return frame.type == m.Hello.TYPE and len(hellos) == 1
 
-    rig.link.keep_back = keep_back
+    rig.link.drop_frame = drop_frame
     rig.session.abort()
     assert not rig.session.abort_confirmed
     rig.until(lambda: rig.session.abort_confirmed)
@@ -419,43 +419,43 @@ def test_an_abort_is_known_before_the_next_session_and_who_arms_at_once_has_its_
     assert not rig.session.is_acknowledged
     rig.arm()
     assert len(hellos) == 2
-    told = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
-    assert told == [m.Limits.TYPE, m.ArmReq.TYPE]
+    sent = [frame.type for frame in rig.link.sent if frame.type in (m.Limits.TYPE, m.ArmReq.TYPE)]
+    assert sent == [m.Limits.TYPE, m.ArmReq.TYPE]
     assert rig.core.machine.limits.spot_uj < DEFAULT_LIMITS.spot_uj
 
 
-def test_flush_in_mid_job_stays_armed_for_the_next(rig):
+def test_a_flush_keeps_the_board_armed(rig):
     rig.arm()
     cut = rig.play(plan(500))
     rig.run(0.3)
     rig.session.flush()
     rig.until(lambda: rig.session.is_ready)
     assert not cut.is_finished
-    asked = plan(50)
-    job = rig.play(asked)
+    planned = plan(50)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(planned, 2.45, 1e-6).complete
 
 
-def test_a_board_that_gave_a_hold_up_can_be_armed_again(rig):
+def test_a_board_that_ended_hold_can_be_armed_again(rig):
     rig.arm()
-    rig.link.keep_back = lambda frame: frame.type in (m.Data.TYPE, m.End.TYPE) and frame.seq >= 8
+    rig.link.drop_frame = lambda frame: frame.type in (m.Data.TYPE, m.End.TYPE) and frame.seq >= 8
     rig.play(plan(500))
     rig.until(lambda: rig.session.board.state == "DISARMED")
     assert rig.session.last_event_reason == "hold too long"
-    rig.link.keep_back = lambda frame: False
+    rig.link.drop_frame = lambda frame: False
     rig.run(0.2)
     rig.arm()
-    asked = plan(50)
-    job = rig.play(asked)
+    planned = plan(50)
+    job = rig.play(planned)
     rig.until(lambda: job.is_finished)
-    assert job.build_executed(asked, 2.45, 1e-6).complete
+    assert job.build_executed(planned, 2.45, 1e-6).complete
 
 
-def test_a_rejected_start_is_told(rig):
+def test_a_rejected_start_is_reported(rig):
     rig.arm()
     job = rig.play(plan(5))
-    job.first_index += 1  # START will name a point that is not the first queued
+    job.first_index += 1  # START names a point other than the first queued one
     rig.run(0.1)
     assert rig.session.pop_refusal() == "INDEX"
     assert rig.core.state == "ARMED"
@@ -464,7 +464,7 @@ def test_a_rejected_start_is_told(rig):
     rig.until(lambda: rig.session.is_ready)
 
 
-def test_close_says_abort_and_a_reconnect_does_not_arm(rig):
+def test_close_sends_abort_and_a_reconnect_does_not_arm(rig):
     rig.arm()
     rig.play(plan(500))
     rig.run(0.2)
@@ -481,33 +481,39 @@ def test_close_says_abort_and_a_reconnect_does_not_arm(rig):
 # --- clock ----------------------------------------------------------------------------------------------------------
 
 
-def test_clock_goes_by_the_narrowest_bracket():
+def add_exchange(sync, request_s, reply_s, board_s):
+    sync.finish_exchange(sync.start_exchange(request_s), reply_s, board_s)
+
+
+def test_the_clock_uses_the_narrowest_bracket():
     sync = ClockSync()
     assert sync.board_s(5.0) == 0.0
     assert not sync.is_synchronised
     assert sync.round_trip_s is None
-    sync.add(10.000, 10.010, 110.009)  # wide, and off by 4 ms
-    sync.add(10.020, 10.021, 110.0205)  # narrow, and right
-    sync.add(10.030, 10.050, 110.031)
+    add_exchange(sync, 10.000, 10.010, 110.009)  # wide, 4 ms off
+    add_exchange(sync, 10.020, 10.021, 110.0205)  # narrow, correct
+    add_exchange(sync, 10.030, 10.050, 110.031)
     assert sync.board_s(10.1) == pytest.approx(110.1, abs=1e-9)
     assert sync.round_trip_s == pytest.approx(0.001)
+    sync.finish_exchange(0, 10.2, 0.0)  # no request had this stamp
+    assert sync.board_s(10.1) == pytest.approx(110.1, abs=1e-9)
 
 
-def test_clock_lets_an_old_narrow_bracket_go():
+def test_an_old_narrow_bracket_is_discarded():
     sync = ClockSync()
-    sync.add(0.0, 0.001, 100.0005)
+    add_exchange(sync, 0.0, 0.001, 100.0005)
     late_s = 0.002 / DRIFT_MAX
-    sync.add(late_s, late_s + 0.002, 100.0 + late_s + 0.001 + 0.001)
+    add_exchange(sync, late_s, late_s + 0.002, 100.0 + late_s + 0.001 + 0.001)
     assert sync.board_s(late_s) == pytest.approx(100.0 + late_s + 0.001)
 
 
-def test_another_thread_may_always_ask():
-    """What REST asks while the link comes and goes is answered, whatever the loop is doing to it."""
-    rig, errors, over = Rig(), [], threading.Event()
+def test_other_threads_may_read_the_state_at_any_time():
+    """The reads of a REST request succeed while the loop connects and disconnects."""
+    rig, errors, finished = Rig(), [], threading.Event()
 
-    def ask():
+    def read():
         try:
-            while not over.is_set():
+            while not finished.is_set():
                 rig.session.collect_link_stats()
                 rig.session.board_s()
                 rig.session.board.to_dict()
@@ -516,14 +522,14 @@ def test_another_thread_may_always_ask():
 
     interval_s = sys.getswitchinterval()
     sys.setswitchinterval(1e-6)
-    asker = threading.Thread(target=ask)
-    asker.start()
+    reader = threading.Thread(target=read)
+    reader.start()
     try:
         for _ in range(300):
             rig.connect()
             rig.session.disconnect()
     finally:
-        over.set()
-        asker.join()
+        finished.set()
+        reader.join()
         sys.setswitchinterval(interval_s)
     assert not errors

@@ -12,7 +12,7 @@ PLANNED_S = np.arange(1, 101) * 0.01
 
 
 @given(st.floats(-0.1, 0.1), st.floats(-500, 500))
-def test_a_delay_and_a_drift_are_told_apart(delay_s, drift_ppm):
+def test_delay_and_drift_are_separated(delay_s, drift_ppm):
     executed_s = PLANNED_S + delay_s + drift_ppm * 1e-6 * (PLANNED_S - PLANNED_S[0])
     error = compute_timing_error(PLANNED_S, executed_s)
     assert error.pulses == 100
@@ -22,18 +22,18 @@ def test_a_delay_and_a_drift_are_told_apart(delay_s, drift_ppm):
 
 
 @given(arrays(float, 100, elements=st.floats(-1e-3, 1e-3)))
-def test_the_largest_is_the_one_farthest_from_the_plan_with_its_sign(off_s):
+def test_max_abs_is_the_signed_error_of_largest_magnitude(off_s):
     error = compute_timing_error(PLANNED_S, PLANNED_S + off_s)
     assert abs(error.max_abs_s) == pytest.approx(np.abs(off_s).max(), abs=1e-12)
     assert np.abs(off_s - error.max_abs_s).min() < 1e-12
 
 
-def test_no_pulse_has_no_error_and_one_has_no_drift():
+def test_without_pulses_no_error_and_with_one_no_drift():
     assert compute_timing_error(np.zeros(0), np.zeros(0)) is None
     assert compute_timing_error(np.array([0.1]), np.array([0.3])).drift_ppm == 0.0
 
 
-def test_totals_keep_the_worst_either_way():
+def test_totals_keep_the_errors_of_largest_magnitude():
     totals = TimingTotals()
     assert totals.worst is None
     for off_s in (1e-5, -3e-5, 2e-5):
@@ -44,7 +44,7 @@ def test_totals_keep_the_worst_either_way():
     assert worst.drift_ppm == pytest.approx(0.0, abs=1e-6)
 
 
-def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
+def test_on_the_simulated_board_only_an_underrun_delays_pulses():
     rig = Rig(BoardSettings(queue_points=64)).connect().arm()
     limited = plan(200)
     scale = rig.session.scale
@@ -58,10 +58,10 @@ def test_on_the_simulated_board_only_an_underrun_moves_a_pulse():
     assert error_of(job).max_abs_s == pytest.approx(0.0, abs=1e-6)
     job = rig.play(limited)
     rig.run(0.15)
-    rig.link.keep_back = lambda frame: frame.type == 0x10
+    rig.link.drop_frame = lambda frame: frame.type == 0x10
     rig.until(lambda: rig.session.board.state == "HOLD" or job.is_finished)
     rig.run(0.02)
-    rig.link.keep_back = lambda frame: False
+    rig.link.drop_frame = lambda frame: False
     rig.until(lambda: job.is_finished)
     assert rig.session.board.underruns == 1
     error = error_of(job)
