@@ -112,7 +112,7 @@ def run_tasks(
     from distributed import KilledWorker, as_completed
 
     run = uuid4().hex[:12]
-    futures = {client.submit(function, task, key=f"{run}-{place}"): task for place, task in enumerate(tasks)}
+    futures = {client.submit(function, task, key=f"{run}-{number}"): task for number, task in enumerate(tasks)}
     lost: list[Task] = []
     try:
         for future in as_completed(list(futures), loop=client.loop):
@@ -122,8 +122,8 @@ def run_tasks(
                 lost.append(task)
             else:
                 yield (task, future.result(), "") if error is None else (task, None, _format_error(error))
-        for place, task in enumerate(lost):
-            future = client.submit(function, task, key=f"{run}-again-{place}")
+        for number, task in enumerate(lost):
+            future = client.submit(function, task, key=f"{run}-again-{number}")
             futures[future] = task
             error = _wait_for_error(future)
             del futures[future]

@@ -67,9 +67,11 @@ def detect(
     """Score every hypothesis beside a fit, nominal or extended; extra_columns [m, k] are marginalised too."""
     data = problem.data
     sensitivity = compute_jitter_sensitivity(data, base.point, problem.epsilon, base.prediction)
-    known = compute_jacobian(problem, base.point, base.free, base.prediction)
+    fitted_columns = compute_jacobian(problem, base.point, base.free, base.prediction)
     if extra_columns is not None:
-        known = np.column_stack([known, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)])
+        fitted_columns = np.column_stack(
+            [fitted_columns, extra_columns / np.abs(extra_columns).max(axis=0, initial=1e-300)]
+        )
     trials = [(item, start) for item in hypotheses for start in _select_starts(item)]
     terms = [{**base.point.terms, item.key: start} for item, start in trials]
     effects = [
@@ -78,13 +80,13 @@ def detect(
     candidates = np.stack(effects, axis=1) if effects else np.zeros((len(data.value), 0))
     scale = np.maximum(np.abs(candidates).max(axis=0, initial=0.0), 1e-30)
     residual = (data.value - base.prediction)[:, None]
-    columns = np.column_stack([known, candidates / scale, residual])
+    columns = np.column_stack([fitted_columns, candidates / scale, residual])
     total = compute_normal_equations(data, columns, problem.noise, sensitivity.power, sensitivity.timing).total
-    width = known.shape[1]
+    width = fitted_columns.shape[1]
     total[range(len(BASE_PARAMETERS)), range(len(BASE_PARAMETERS))] += 1.0 / np.square(problem.prior.sigma)
     projected = project_out(total, list(range(width)), list(range(width, len(total))))
     independent = np.diag(projected) / np.maximum(np.diag(total)[width:], 1e-300)
-    omnibus = compute_omnibus(problem, np.column_stack([known, residual]), sensitivity)
+    omnibus = compute_omnibus(problem, np.column_stack([fitted_columns, residual]), sensitivity)
     scores, p_score = _compute_scores(trials, projected, scale, independent, seed, count_noise_degrees(data))
     residual_chi2 = float(projected[-1, -1])
     return Detection(tuple(scores), p_score, omnibus.chi2, omnibus.degrees, omnibus.p_value, residual_chi2)

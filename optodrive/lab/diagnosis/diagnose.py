@@ -72,7 +72,7 @@ def diagnose(
     seed: int = 0,
     prior: BaseParameterPrior = BROAD_PRIOR,
     epsilon: float = DEFAULT_EPSILON,
-    on_progress: ProgressCallback = lambda what: None,
+    on_progress: ProgressCallback = lambda stage: None,
 ) -> Discrepancy:
     """Diagnose a recording; raises InputError if it has no data to compare with the model."""
     began_s = perf_counter()
@@ -94,7 +94,7 @@ def diagnose(
     terms: dict[str, dict[str, float]] = {}
     for subsystem in subsystems:
         parameters |= _compute_estimates(subsystem)
-        terms |= {key: dict(own) for key, own in subsystem.final.point.terms.items()}
+        terms |= {key: dict(values) for key, values in subsystem.final.point.terms.items()}
     has_pixels = any(kind < 3 for kind in main.data.kinds)
     base = (
         dict(zip(BASE_PARAMETERS, np.exp(np.array(main.final.point.base)).tolist(), strict=True)) if has_pixels else {}
@@ -132,7 +132,7 @@ def diagnose(
 
 def _diagnose_subsystem(
     data: Dataset,
-    known: list[Hypothesis],
+    hypotheses: list[Hypothesis],
     seed: int,
     prior: BaseParameterPrior,
     epsilon: float,
@@ -146,7 +146,7 @@ def _diagnose_subsystem(
     problem, base = fit_nominal(fitted_data, prior, epsilon, min_timing_sigma_s, clock_offset_s)
     if has_replicate_excess(problem):
         # Jitter sensitivities are those of the true model; a large effect changes them, and repeats seem to differ.
-        best = find_best_candidate(problem, base, known, seed, on_progress)
+        best = find_best_candidate(problem, base, hypotheses, seed, on_progress)
         if best is not None:
             other = update_noise(problem, best.fit, min_timing_sigma_s)
             other = replace(
@@ -155,7 +155,7 @@ def _diagnose_subsystem(
             )
             if not has_replicate_excess(other):
                 problem, base = other, fit(other, base.point)
-    verdict = select_causes(problem, base, known, seed, on_progress)
+    verdict = select_causes(problem, base, hypotheses, seed, on_progress)
     gains: dict[str, float] = {}
     for candidate in verdict.candidates:
         candidate_gain = compute_held_out_gain(problem, held_out, base.point, candidate.fit.point, seed)
@@ -172,14 +172,14 @@ def _diagnose_subsystem(
         final = min((fit(all_data, point, start.free, iterations=1) for point in points), key=lambda item: item.chi2)
     if verdict.verdict == "none" and held_out_runs:
         # Only the held-out, hottest runs may show an effect: repeat the selection with all runs.
-        wider = select_causes(all_data, final, known, seed, on_progress)
+        wider = select_causes(all_data, final, hypotheses, seed, on_progress)
         if wider.verdict != "none":
             problem, base, held_out, verdict = all_data, final, data.select([]), wider
             if wider.chosen is not None:
                 final = wider.chosen.fit
     experiment = _propose_experiment(problem, verdict, on_progress)
     named = () if verdict.chosen is None else verdict.chosen.hypotheses
-    covariance = compute_covariance(all_data, final, named, known)
+    covariance = compute_covariance(all_data, final, named, hypotheses)
     return _SubsystemFit(
         data, held_out, problem, base, verdict, final, covariance, gain, _judge_candidates(verdict, gains), experiment
     )

@@ -23,9 +23,9 @@ DISCREPANCY_SIGMA = 0.2
 
 
 def compute_discrepancy_basis(
-    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], known: Sequence[Hypothesis]
+    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], all_hypotheses: Sequence[Hypothesis]
 ) -> FloatArray:
-    """Compute basis columns [m, k] for a fit with these hypotheses; known: all hypotheses."""
+    """Compute basis columns [m, k] for a fit with these hypotheses."""
     data, terms = problem.data, fitted.point.terms
     power, dose, session, heat = (np.zeros(len(data.value)) for _ in range(4))
     for block in data.blocks:
@@ -50,7 +50,7 @@ def compute_discrepancy_basis(
             effect * session,
             effect * heat,
         ]
-        for other in known:
+        for other in all_hypotheses:
             if other.key == item.key and other.label != item.label:
                 sizes = {free.names[0]: other.starts[0][free.names[0]] for free in other.free}
                 alternative = ParameterPoint(fitted.point.base, {**terms, item.key: {**terms[item.key], **sizes}})
@@ -63,10 +63,10 @@ def compute_discrepancy_basis(
 
 
 def compute_covariance(
-    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], known: Sequence[Hypothesis]
+    problem: FitProblem, fitted: ModelFit, hypotheses: Sequence[Hypothesis], all_hypotheses: Sequence[Hypothesis]
 ) -> FloatArray:
     """Compute the covariance [k, k] of fitted parameters, marginalised over a discrepancy of `DISCREPANCY_SIGMA`."""
-    basis_columns = compute_discrepancy_basis(problem, fitted, hypotheses, known)
+    basis_columns = compute_discrepancy_basis(problem, fitted, hypotheses, all_hypotheses)
     if not basis_columns.shape[1]:
         return fitted.covariance
     data, point = problem.data, fitted.point

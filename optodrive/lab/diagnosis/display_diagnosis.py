@@ -115,8 +115,8 @@ class DisplayAnswer:
         first = discrepancies[0]
         base = {name: _compute_median(item.base[name] for item in discrepancies) for name in first.base}
         terms = {
-            key: {name: _compute_median(item.terms[key][name] for item in discrepancies) for name in own}
-            for key, own in first.terms.items()
+            key: {name: _compute_median(item.terms[key][name] for item in discrepancies) for name in values}
+            for key, values in first.terms.items()
         }
         estimator = f"medians over {len(discrepancies)} of {len(self.pixels)} pixels"
         return replace(first, base=base, terms=terms), widths_m.pop(), estimator
@@ -150,8 +150,8 @@ def _build_group(verdict: str, causes: tuple[str, ...], answers: tuple[PixelAnsw
             if "." in name:
                 values.setdefault(name, []).append(item.value)
                 units[name] = item.unit
-    gains = [found.gain.reduction for found in discrepancies if found.gain is not None]
-    parameters = {name: PixelSpread.from_values(own, units[name]) for name, own in values.items()}
+    gains = [discrepancy.gain.reduction for discrepancy in discrepancies if discrepancy.gain is not None]
+    parameters = {name: PixelSpread.from_values(pixel_values, units[name]) for name, pixel_values in values.items()}
     return PixelGroup(verdict, causes, answers, parameters, PixelSpread.from_values(gains, "1") if gains else None)
 
 

@@ -81,7 +81,7 @@ def format_pixel_count(pixels: int) -> str:
 
 def format_ranges(pixels: list[int]) -> str:
     """Return sorted pixel indices as text, such as "3, 7, 12 to 15"."""
-    breaks = [at for at, (one, two) in enumerate(pairwise(pixels), start=1) if two != one + 1]
+    breaks = [at for at, (first, second) in enumerate(pairwise(pixels), start=1) if second != first + 1]
     runs = [pixels[a:b] for a, b in pairwise([0, *breaks, len(pixels)])]
     return ", ".join(
         f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(str(pixel) for pixel in run) for run in runs if run

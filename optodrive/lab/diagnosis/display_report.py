@@ -87,21 +87,23 @@ def _place_pixels(answer: DisplayAnswer, config: Config | None) -> tuple[dict[in
 
 def _draw_map(answer: DisplayAnswer, marks: dict[int, PixelMark], positions: dict[int, tuple[int, int]]) -> str:
     by_pixel = {item.pixel: item for item in answer.pixels}
-    wide, high = (CELL_PX * (1 + max(place[axis] for place in positions.values())) for axis in (0, 1))
-    drawn = []
+    wide, high = (CELL_PX * (1 + max(position[axis] for position in positions.values())) for axis in (0, 1))
+    elements = []
     for pixel, (column, row) in positions.items():
         x, y = column * CELL_PX, row * CELL_PX
         box = f"<rect x='{x + 1}' y='{y + 1}' width='{CELL_PX - 2}' height='{CELL_PX - 2}' rx='3' stroke='#999'"
         mark = marks.get(pixel)
         if mark is None:
-            drawn.append(f"<g><title>pixel {pixel}: not measured</title>{box} stroke-dasharray='2' fill='none'/></g>")
+            elements.append(
+                f"<g><title>pixel {pixel}: not measured</title>{box} stroke-dasharray='2' fill='none'/></g>"
+            )
             continue
-        drawn.append(
+        elements.append(
             f"<g><title>{escape(_build_tooltip(by_pixel[pixel], mark))}</title>{box} fill='{mark.colour}'/>"
             f"<text x='{x + CELL_PX / 2:g}' y='{y + CELL_PX / 2 + 4:g}' text-anchor='middle'>{mark.letter}</text></g>"
         )
     size = f"max-width:{max(12, 1.6 * wide / CELL_PX):g}rem"
-    return f"<svg viewBox='0 0 {wide} {high}' style='{size}' role='img'>{''.join(drawn)}</svg>"
+    return f"<svg viewBox='0 0 {wide} {high}' style='{size}' role='img'>{''.join(elements)}</svg>"
 
 
 def _build_tooltip(item: PixelAnswer, mark: PixelMark) -> str:

@@ -91,18 +91,18 @@ def has_replicate_excess(problem: FitProblem) -> bool:
 
 
 def find_best_candidate(
-    problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> RefittedCandidate | None:
     """Return the best refit of the strongest hypotheses, or None if none is promising."""
-    return next(iter(_refit(problem, base, (), detect(problem, base, known, seed).scores, on_progress)), None)
+    return next(iter(_refit(problem, base, (), detect(problem, base, hypotheses, seed).scores, on_progress)), None)
 
 
 def select_causes(
-    problem: FitProblem, base: ModelFit, known: list[Hypothesis], seed: int, on_progress: ProgressCallback
+    problem: FitProblem, base: ModelFit, hypotheses: list[Hypothesis], seed: int, on_progress: ProgressCallback
 ) -> Verdict:
     """Return the verdict on one subsystem."""
     on_progress("testing the nominal model")
-    nominal_detection = detect(problem, base, known, seed)
+    nominal_detection = detect(problem, base, hypotheses, seed)
     if has_replicate_excess(problem):
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
     if not is_rejected(nominal_detection):
@@ -112,12 +112,12 @@ def select_causes(
         return Verdict("unexplained", (), None, (), nominal_detection, None, 0.0)
     best = singles[0]
     on_progress(f"testing the residuals of {best.label}")
-    others = [item for item in known if item.key not in best.causes]
+    others = [item for item in hypotheses if item.key not in best.causes]
     residual_detection = detect(problem, best.fit, others, seed)
     single_explained = _compute_explained_fraction(residual_detection, base, best)
     if not is_rejected(residual_detection) and single_explained >= MIN_EXPLAINED:
         return _build_verdict(problem, singles, nominal_detection, residual_detection, single_explained)
-    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, known)
+    basis_columns = compute_discrepancy_basis(problem, best.fit, best.hypotheses, hypotheses)
     basis_detection = detect(problem, best.fit, others, seed, basis_columns)
     if (
         not is_rejected(basis_detection)
@@ -130,12 +130,12 @@ def select_causes(
         - basis_detection.residual_chi2
         - basis_columns.shape[1] * np.log(len(problem.data.value))
     )
-    candidates = _refit_pairs(problem, base, known, singles, residual_detection, seed, on_progress)
+    candidates = _refit_pairs(problem, base, hypotheses, singles, residual_detection, seed, on_progress)
     pairs = [item for item in candidates if _is_pair_needed(item, singles, form_gain)]
     if pairs:
         pair = pairs[0]
         on_progress(f"testing the residuals of {pair.label}")
-        others = [item for item in known if item.key not in pair.causes]
+        others = [item for item in hypotheses if item.key not in pair.causes]
         pair_detection = detect(problem, pair.fit, others, seed)
         pair_explained = _compute_explained_fraction(pair_detection, base, pair)
         # A second cause may only correct the first one's form; it is named if the residuals are insignificant.
@@ -143,12 +143,16 @@ def select_causes(
             return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
         if pair_explained >= MIN_EXPLAINED and not is_rejected(
             detect(
-                problem, pair.fit, others, seed, compute_discrepancy_basis(problem, pair.fit, pair.hypotheses, known)
+                problem,
+                pair.fit,
+                others,
+                seed,
+                compute_discrepancy_basis(problem, pair.fit, pair.hypotheses, hypotheses),
             )
         ):
             return _build_verdict(problem, pairs, nominal_detection, pair_detection, pair_explained)
     # If only one cause can occur, no other can be confused with it.
-    min_explained = MIN_EXPLAINED_OTHER_FORM if len({item.key for item in known}) > 1 else MIN_EXPLAINED
+    min_explained = MIN_EXPLAINED_OTHER_FORM if len({item.key for item in hypotheses}) > 1 else MIN_EXPLAINED
     if (
         single_explained >= MIN_EXPLAINED
         and max(single_explained, _compute_explained_fraction(basis_detection, base, best)) >= min_explained
@@ -162,10 +166,10 @@ def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
     item = score.hypothesis
     terms = {**point.terms, item.key: dict(score.start)}
     if item.is_linear and item.degrees > 1:
-        own = dict.fromkeys(score.start, 0.0)
+        values = dict.fromkeys(score.start, 0.0)
         for free, amplitude, start in zip(item.free, score.amplitude, item.starts, strict=True):
-            own[free.names[0]] = amplitude * start[free.names[0]]
-        return ParameterPoint(point.base, {**point.terms, item.key: own})
+            values[free.names[0]] = amplitude * start[free.names[0]]
+        return ParameterPoint(point.base, {**point.terms, item.key: values})
     free = item.free[0]
     scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))
     value = score.start[free.names[0]] * scale
@@ -226,7 +230,7 @@ def _select_nearest_starts(problem: FitProblem, base: ModelFit, item: Hypothesis
         residual = problem.data.value - predict(problem.data, point, problem.epsilon)
         return float(compute_normal_equations(problem.data, residual[:, None], problem.noise, zero, zero).total[0, 0])
 
-    points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: own}) for own in item.starts)
+    points = (ParameterPoint(base.point.base, {**base.point.terms, item.key: values}) for values in item.starts)
     return sorted(points, key=cost)[:MAX_STARTS]
 
 
@@ -247,7 +251,7 @@ def _compute_explained_fraction(residual_detection: Detection, base: ModelFit, b
 def _refit_pairs(
     problem: FitProblem,
     base: ModelFit,
-    known: list[Hypothesis],
+    hypotheses: list[Hypothesis],
     singles: list[RefittedCandidate],
     residual_detection: Detection,
     seed: int,
@@ -256,7 +260,7 @@ def _refit_pairs(
     """Refit second causes beside each of the best first causes; best pairs first."""
     candidates: list[RefittedCandidate] = []
     for row, first in enumerate(singles[:MAX_FIRST_CAUSES]):
-        others = [item for item in known if item.key not in first.causes]
+        others = [item for item in hypotheses if item.key not in first.causes]
         detection = residual_detection if row == 0 else detect(problem, first.fit, others, seed)
         candidates += _refit(problem, first.fit, first.hypotheses, detection.scores[:MAX_SECOND_CAUSES], on_progress)
     unique: dict[frozenset[str], RefittedCandidate] = {}

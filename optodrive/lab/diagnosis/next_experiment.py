@@ -48,14 +48,14 @@ def propose_experiment(
 
 
 def _generate_grid(data: Dataset, pixel: int) -> Iterator[tuple[str, FloatArray, float]]:
-    neighbour = next((other for other in _list_pulsed_pixels(data) if other != pixel), pixel + 1)
-    full_power_w = max(scene.full_w for scene, _ in data.experiments)
+    neighbour = next((pulsed for pulsed in _list_pulsed_pixels(data) if pulsed != pixel), pixel + 1)
+    full_power_w = max(experiment.full_w for experiment, _ in data.experiments)
     for power_w in (0.25 * full_power_w, 0.5 * full_power_w, full_power_w):
         for width_s in (0.002, 0.01, 0.05):
             for pulsed in (pixel, neighbour):
-                where = "" if pulsed == pixel else f" on neighbouring pixel {pulsed}"
+                location = "" if pulsed == pixel else f" on neighbouring pixel {pulsed}"
                 pulses = np.array([[0.02, width_s, power_w, pulsed]])
-                description = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{where}"
+                description = f"one pulse of {width_s * 1e3:g} ms at {power_w:.2f} W{location}"
                 yield description, pulses, 0.02 + width_s + 0.25
         for gap_s in (0.02, 0.06):
             starts = 0.02 + np.arange(0.0, 3.0, 0.02 + gap_s)

@@ -127,21 +127,21 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
 
     power, timing: sensitivities [m] as in `JitterSensitivity`
     """
-    found = compute_contrasts(data, residual, power, timing)
+    contrasts = compute_contrasts(data, residual, power, timing)
     coloured: dict[int, ColouredNoise] = {}
     for kind in data.kinds:
-        members = [item for item in found if item.kind == kind]
+        members = [item for item in contrasts if item.kind == kind]
         if not members:
             members = build_residual_contrasts(data, residual, power, timing, kind)
         coloured[kind] = _fit_coloured(members)
-    if not found:
+    if not contrasts:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
-    power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(found, coloured, data.kinds)
+    power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(contrasts, coloured, data.kinds)
     model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True)
     return replace(
         model,
         replicate_excess=max(
-            (_compute_replicate_excess(item, model) for item in found if item.kind in PIXEL_KINDS), default=0.0
+            (_compute_replicate_excess(item, model) for item in contrasts if item.kind in PIXEL_KINDS), default=0.0
         ),
     )
 
@@ -221,10 +221,10 @@ def _fit_jitter(
     for item in contrasts:
         pairs.setdefault(item.pair, []).append(item)
     grams = []
-    for own in pairs.values():
+    for members in pairs.values():
         size = 2 + len(kinds)
         gram, right = np.zeros((size, size)), np.zeros(size)
-        for item in own:
+        for item in members:
             whitened, _ = whiten(item.t_s, np.column_stack([item.jitter, item.value]), coloured[item.kind])
             small = whitened.T @ whitened
             indices = [0, 1, 2 + kinds.index(item.kind)]

@@ -108,10 +108,11 @@ def _compute_quadratic_form(gram: FloatArray, right: FloatArray) -> tuple[float,
     """Return rightᵀ gram⁻¹ right and the number of informative bins."""
     scale = np.sqrt(np.diag(gram))
     is_informative = scale > 1e-9 * scale.max(initial=0.0)
-    kept = np.flatnonzero(is_informative)
-    correlation = gram[np.ix_(kept, kept)] / scale[kept] / scale[kept][:, None] + RIDGE * np.eye(len(kept))
-    scaled = right[kept] / scale[kept]
-    return float(scaled @ cho_solve(cho_factor(correlation), scaled)), len(kept)
+    informative = np.flatnonzero(is_informative)
+    scale = scale[informative]
+    correlation = gram[np.ix_(informative, informative)] / scale / scale[:, None] + RIDGE * np.eye(len(informative))
+    scaled = right[informative] / scale
+    return float(scaled @ cho_solve(cho_factor(correlation), scaled)), len(informative)
 
 
 def compute_omnibus_by_group(problem: FitProblem, residual: FloatArray, sensitivity: JitterSensitivity) -> FloatArray:
@@ -156,8 +157,8 @@ def assign_bins(data: Dataset) -> IntArray:
         )
         keys = zip(order.tolist(), edge_bin.tolist(), run_bin.tolist(), strict=True)
         for at, key in enumerate(keys, start=block.part.start):
-            whole = (run.group, block.kind, block.pixel, *key)
-            label[at] = names.setdefault(whole, len(names))
+            bin_key = (run.group, block.kind, block.pixel, *key)
+            label[at] = names.setdefault(bin_key, len(names))
     return label
 
 

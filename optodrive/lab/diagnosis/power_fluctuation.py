@@ -44,8 +44,8 @@ def compute_intra_pulse_power_excess(problem: FitProblem, base: ModelFit) -> flo
             responses = _compute_slice_responses(experiments[item.block], slices, item, pixel)
             columns = np.column_stack([item.value, responses, item.jitter * sigma])
             whitened, _ = whiten(item.t_s, columns, noise.coloured[item.kind])
-            where = np.append(np.arange(count), count + np.array([0, 1, 2 + item.kind]))
-            gram[np.ix_(where, where)] += whitened.T @ whitened
+            indices = np.append(np.arange(count), count + np.array([0, 1, 2 + item.kind]))
+            gram[np.ix_(indices, indices)] += whitened.T @ whitened
         inner = gram[count:, count:] + np.eye(size)
         projected = gram[:count, :count] - gram[:count, count:] @ np.linalg.solve(inner, gram[count:, :count])
         excess += float((projected[1:, 0] ** 2).sum() - np.trace(projected[1:, 1:]))

@@ -29,7 +29,7 @@ class Contrast:
 
 def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray) -> list[Contrast]:
     """Compute Helmert contrasts between the runs of each group on their common samples."""
-    found: list[Contrast] = []
+    contrasts: list[Contrast] = []
     blocks: dict[tuple[int, int, int], int] = {
         (block.run, block.kind, block.pixel): number for number, block in enumerate(data.blocks)
     }
@@ -40,10 +40,10 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
             for number, kind, pixel in list(blocks):
                 if number != runs[later]:
                     continue
-                places = [blocks.get((run, kind, pixel)) for run in runs[: later + 1]]
-                if any(place is None for place in places):
+                block_numbers = [blocks.get((run, kind, pixel)) for run in runs[: later + 1]]
+                if any(number is None for number in block_numbers):
                     continue
-                members = [data.blocks[place] for place in places if place is not None]
+                members = [data.blocks[number] for number in block_numbers if number is not None]
                 common = _find_common_rows(members[0].t_s, [member.t_s for member in members[1:]])
                 if common is None:
                     continue
@@ -56,18 +56,18 @@ def compute_contrasts(data: Dataset, residual: FloatArray, power: FloatArray, ti
                 value = sum(w * residual[r] for w, r in zip(weights, rows, strict=True))
                 last, block = rows[-1], blocks[number, kind, pixel]
                 jitter = np.stack([power[last], timing[last], np.ones(len(last))], axis=1)
-                found.append(Contrast(pair, kind, block, members[-1].t_s[common[-1]], value, jitter))
+                contrasts.append(Contrast(pair, kind, block, members[-1].t_s[common[-1]], value, jitter))
                 used = True
             pair += used
-    return found
+    return contrasts
 
 
 def _select_settled(t_s: FloatArray, common: list[IntArray], steps_s: FloatArray) -> list[IntArray]:
     """Select rows at which the mirrors have settled: the effect of jitter on a moving mirror is no instrument noise."""
     times = t_s[common[0]]
     row = np.searchsorted(steps_s, times, side="right") - 1
-    kept = (row < 0) | (times - steps_s[np.maximum(row, 0)] > MIRROR_SETTLED_S)
-    return [rows[kept] for rows in common] if kept.sum() >= 16 else common
+    is_settled = (row < 0) | (times - steps_s[np.maximum(row, 0)] > MIRROR_SETTLED_S)
+    return [rows[is_settled] for rows in common] if is_settled.sum() >= 16 else common
 
 
 def _find_common_rows(first: FloatArray, others: list[FloatArray]) -> list[IntArray] | None:
@@ -85,10 +85,10 @@ def build_residual_contrasts(
     data: Dataset, residual: FloatArray, power: FloatArray, timing: FloatArray, kind: int
 ) -> list[Contrast]:
     """Return the residuals of one signal kind in place of contrasts, for recordings without repeats."""
-    found = []
+    contrasts = []
     for number, block in enumerate(data.blocks):
         if block.kind == kind:
             part = block.part
             jitter = np.stack([power[part], timing[part], np.ones(part.stop - part.start)], axis=1)
-            found.append(Contrast(block.run, kind, number, block.t_s, residual[part], jitter))
-    return found
+            contrasts.append(Contrast(block.run, kind, number, block.t_s, residual[part], jitter))
+    return contrasts

@@ -94,10 +94,10 @@ def _draw_scatter(signal: str, traces: tuple[ResidualTrace, ...]) -> str:
 
 
 def _draw_bars(discrepancy: Discrepancy) -> str:
-    shown = sorted(discrepancy.candidates, key=lambda item: -item.statistic)[:MAX_BARS]
-    max_log_ratio = max([np.log10(1.0 + item.statistic) for item in shown], default=1.0) or 1.0
+    strongest = sorted(discrepancy.candidates, key=lambda item: -item.statistic)[:MAX_BARS]
+    max_log_ratio = max([np.log10(1.0 + item.statistic) for item in strongest], default=1.0) or 1.0
     rows = []
-    for item in shown:
+    for item in strongest:
         width = 260 * np.log10(1.0 + item.statistic) / max_log_ratio
         css_class = "bar" if item.verdict in ("identified", "indistinguishable") else "other"
         bar = (

@@ -27,62 +27,62 @@ MODEL_PARAMETER_COUNT = 6
 """Number of parameters of the nominal pixel model, which is the minimum number of finite samples in a recording."""
 
 
-def check_format(where: str, head: Attributes) -> None:
+def check_format(place: str, head: Attributes) -> None:
     """Check the format name and the version in the root attributes."""
     for field, expected in (("format", FORMAT), ("version", VERSION)):
         if field not in head:
-            raise InputError(f"{where}: {field}", None, f"{expected!r}")
+            raise InputError(f"{place}: {field}", None, f"{expected!r}")
         if head[field] != expected:
-            raise InputError(f"{where}: {field}", head[field], f"{expected!r}, the one this release reads")
+            raise InputError(f"{place}: {field}", head[field], f"{expected!r}, the one this release reads")
 
 
-def pop_ambient_k(where: str, attributes: Attributes) -> float:
+def pop_ambient_k(place: str, attributes: Attributes) -> float:
     """Remove the ambient temperature from a run's attributes and return it, K."""
     value = attributes.pop("ambient_K", None)
     if value is None:
         near = [name for name in attributes if name.lower().startswith("ambient")]
         hint = f" (there is {format_name(near[0])!r})" if near else ""
-        raise InputError(f"{where}: ambient_K", None, f"the ambient temperature in K{hint}")
+        raise InputError(f"{place}: ambient_K", None, f"the ambient temperature in K{hint}")
     if isinstance(value, str) or not AMBIENT_MIN_K <= value <= AMBIENT_MAX_K:
         raise InputError(
-            f"{where}: ambient_K", value, f"a temperature between {AMBIENT_MIN_K:g} and {AMBIENT_MAX_K:g} K"
+            f"{place}: ambient_K", value, f"a temperature between {AMBIENT_MIN_K:g} and {AMBIENT_MAX_K:g} K"
         )
     return float(value)
 
 
-def select_signals(where: str, members: list[str]) -> list[str]:
+def select_signals(place: str, members: list[str]) -> list[str]:
     """Return the signals of a run in the format's order after checking that its members are known and complete."""
     for member in members:
         if member not in RUN_MEMBERS:
             raise InputError(
-                f"{where}/{format_name(member)}",
+                f"{place}/{format_name(member)}",
                 Unquoted("an unknown name or unit"),
                 suggest_nearest(member, list(RUN_MEMBERS)),
             )
     if PULSES not in members:
-        raise InputError(f"{where}/{PULSES}", None, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
+        raise InputError(f"{place}/{PULSES}", None, f"one row per pulse: {', '.join(TABLE_COLUMNS[PULSES])}")
     signals = [name for name in SIGNALS if name in members]
     if not signals:
-        raise InputError(where, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
+        raise InputError(place, Unquoted("a run without signals"), f"at least one of {', '.join(SIGNALS)}")
     if COMMANDS not in members and set(signals) & set(MIRROR_SIGNALS):
         raise InputError(
-            f"{where}/{COMMANDS}", None, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
+            f"{place}/{COMMANDS}", None, f"the commanded mirror angles: {', '.join(TABLE_COLUMNS[COMMANDS])}"
         )
     return signals
 
 
-def check_pulses(where: str, pulses: FloatArray) -> None:
+def check_pulses(place: str, pulses: FloatArray) -> None:
     """Check that pulses [n, 4] are finite and nonnegative, have integer pixel indices and do not overlap in time."""
-    _check_finite(where, pulses, TABLE_COLUMNS[PULSES])
+    _check_finite(place, pulses, TABLE_COLUMNS[PULSES])
     for column, name in ((1, "width_s"), (2, "power_W")):
-        _check_rows(f"{where}: {name}", pulses[:, column], pulses[:, column] >= 0, "a number of at least 0")
+        _check_rows(f"{place}: {name}", pulses[:, column], pulses[:, column] >= 0, "a number of at least 0")
     pixel = pulses[:, 3]
-    whole = (pixel >= 0) & (pixel <= PIXEL_MAX) & (pixel == np.floor(pixel))
-    _check_rows(f"{where}: pixel", pixel, whole, f"a whole number from 0 to {PIXEL_MAX}")
-    _check_no_overlap(where, pulses)
+    is_index = (pixel >= 0) & (pixel <= PIXEL_MAX) & (pixel == np.floor(pixel))
+    _check_rows(f"{place}: pixel", pixel, is_index, f"a whole number from 0 to {PIXEL_MAX}")
+    _check_no_overlap(place, pulses)
 
 
-def _check_no_overlap(where: str, pulses: FloatArray) -> None:
+def _check_no_overlap(place: str, pulses: FloatArray) -> None:
     """Check that no pulse starts before all earlier pulses have ended."""
     order = np.argsort(pulses[:, 0], kind="stable")
     start_s = pulses[order, 0]
@@ -92,86 +92,86 @@ def _check_no_overlap(where: str, pulses: FloatArray) -> None:
     if overlapping.size:
         first = int(overlapping[0])
         raise InputError(
-            f"{where}[{order[first + 1]}]: start_s",
+            f"{place}[{order[first + 1]}]: start_s",
             float(start_s[first + 1]),
             f"at least {float(end_s[first])!r}, the end of the previous pulse: the beam addresses one pixel at a time",
         )
 
 
-def check_commands(where: str, commands: FloatArray) -> None:
+def check_commands(place: str, commands: FloatArray) -> None:
     """Check that mirror commands [n, 3] are finite and that their times increase."""
-    _check_finite(where, commands, TABLE_COLUMNS[COMMANDS])
-    _check_increasing(f"{where}: t_s", commands[:, 0])
+    _check_finite(place, commands, TABLE_COLUMNS[COMMANDS])
+    _check_increasing(f"{place}: t_s", commands[:, 0])
 
 
-def check_samples(where: str, t_s: FloatArray, value: FloatArray) -> None:
+def check_samples(place: str, t_s: FloatArray, value: FloatArray) -> None:
     """Check that sample times increase and that values are finite or NaN, with at least one finite value."""
     if not t_s.size:
-        raise InputError(where, Unquoted("no samples"), "at least one")
-    _check_rows(f"{where}/t_s", t_s, np.isfinite(t_s), "a finite time in s")
-    _check_increasing(f"{where}/t_s", t_s)
-    _check_rows(f"{where}/value", value, ~np.isinf(value), "a finite value, or NaN where a sample is missing")
+        raise InputError(place, Unquoted("no samples"), "at least one")
+    _check_rows(f"{place}/t_s", t_s, np.isfinite(t_s), "a finite time in s")
+    _check_increasing(f"{place}/t_s", t_s)
+    _check_rows(f"{place}/value", value, ~np.isinf(value), "a finite value, or NaN where a sample is missing")
     if np.all(np.isnan(value)):
-        raise InputError(f"{where}/value", Unquoted(f"{value.size} times NaN"), "at least one finite value")
+        raise InputError(f"{place}/value", Unquoted(f"{value.size} times NaN"), "at least one finite value")
 
 
-def parse_pixel(where: str, signal: str, attributes: Attributes) -> int:
+def parse_pixel(place: str, signal: str, attributes: Attributes) -> int:
     """Return the index of the measured pixel; mirror signals may omit it."""
     value = attributes.get("pixel")
     if value is None and signal in MIRROR_SIGNALS:
         return 0
     if value is None or isinstance(value, str) or not (0 <= value <= PIXEL_MAX and value == int(value)):
         raise InputError(
-            f"{where}: pixel", value, f"the index of the pixel measured, a whole number from 0 to {PIXEL_MAX}"
+            f"{place}: pixel", value, f"the index of the pixel measured, a whole number from 0 to {PIXEL_MAX}"
         )
     return int(value)
 
 
-def parse_sigma(where: str, attributes: Attributes) -> float | None:
+def parse_sigma(place: str, attributes: Attributes) -> float | None:
     """Return the stated noise of the instrument, or None where it is absent or 0."""
     value = attributes.get("sigma")
     if value is None or value == 0:
         return None
     if isinstance(value, str) or not 0 < value < np.inf:
         raise InputError(
-            f"{where}: sigma", value, "the instrument's noise: a positive number in the unit of the signal"
+            f"{place}: sigma", value, "the instrument's noise: a positive number in the unit of the signal"
         )
     return float(value)
 
 
-def check_unit(where: str, signal: str, attributes: Attributes) -> None:
+def check_unit(place: str, signal: str, attributes: Attributes) -> None:
     """Check that a unit attribute, if present, agrees with the unit in the signal's name."""
     for field in ("unit", "units"):
         if attributes.get(field, UNITS[signal]) != UNITS[signal]:
             raise InputError(
-                f"{where}: {field}", attributes[field], f"'{UNITS[signal]}', as stated in the signal's name"
+                f"{place}: {field}", attributes[field], f"'{UNITS[signal]}', as stated in the signal's name"
             )
 
 
-def check_sample_count(where: str, finite: int) -> None:
+def check_sample_count(place: str, finite: int) -> None:
     """Check that there are at least as many finite samples as the nominal model has parameters."""
     if finite < MODEL_PARAMETER_COUNT:
         raise InputError(
-            where,
+            place,
             Unquoted(f"{finite} finite samples"),
             f"at least {MODEL_PARAMETER_COUNT}, the number of model parameters",
         )
 
 
-def _check_finite(where: str, table: FloatArray, columns: tuple[str, ...]) -> None:
+def _check_finite(place: str, table: FloatArray, columns: tuple[str, ...]) -> None:
     for column, name in enumerate(columns):
-        _check_rows(f"{where}: {name}", table[:, column], np.isfinite(table[:, column]), "a finite number")
+        _check_rows(f"{place}: {name}", table[:, column], np.isfinite(table[:, column]), "a finite number")
 
 
-def _check_increasing(where: str, t_s: FloatArray) -> None:
+def _check_increasing(place: str, t_s: FloatArray) -> None:
     falling = np.flatnonzero(t_s[1:] <= t_s[:-1])
     if falling.size:
         row = int(falling[0]) + 1
         expected = f"an increasing time axis: more than {float(t_s[row - 1])!r}, the previous time"
-        raise InputError(f"{where}[{row}]", float(t_s[row]), expected)
+        raise InputError(f"{place}[{row}]", float(t_s[row]), expected)
 
 
-def _check_rows(where: str, values: FloatArray, is_valid: np.ndarray, expected: str) -> None:
+def _check_rows(place: str, values: FloatArray, is_valid: np.ndarray, expected: str) -> None:
     if not np.all(is_valid):
         row = int(np.argmin(is_valid))
-        raise InputError(f"{where}[{row}]", float(values[row]), expected)
+        raise InputError(f"{place}[{row}]", float(values[row]), expected)

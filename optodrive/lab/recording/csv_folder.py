@@ -119,20 +119,20 @@ class CsvTree:
 
     def _read_csv(self, run: str, name: str, columns: tuple[str, ...], missing: bool) -> FloatArray:
         path = self._find_file(run, name)
-        where = self.format_place(run, name)
+        place = self.format_place(run, name)
         numbers = array("d")
-        with convert_errors(where, f"CSV: {','.join(columns)}"), path.open(newline="", encoding="utf-8-sig") as file:
+        with convert_errors(place, f"CSV: {','.join(columns)}"), path.open(newline="", encoding="utf-8-sig") as file:
             lines = csv.reader(file)
-            _check_header(where, next(lines, []), columns)
+            _check_header(place, next(lines, []), columns)
             for row in lines:
                 if not row:
                     continue
-                self._budget.reserve(where, len(columns))
+                self._budget.reserve(place, len(columns))
                 if len(row) == len(columns):
                     with suppress(ValueError):  # rows with other than numbers are parsed per cell
                         numbers.extend([float(cell) for cell in row])
                         continue
-                numbers.extend(_parse_row(f"{where}, line {lines.line_num}", row, columns, missing))
+                numbers.extend(_parse_row(f"{place}, line {lines.line_num}", row, columns, missing))
         return np.array(numbers, dtype=np.float64).reshape(-1, len(columns))
 
 
@@ -149,14 +149,14 @@ def _read_toml(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}, {place.rstrip(')')}", Unquoted(message), "valid TOML") from None
 
 
-def _check_header(where: str, header: list[str], columns: tuple[str, ...]) -> None:
+def _check_header(place: str, header: list[str], columns: tuple[str, ...]) -> None:
     if tuple(cell.strip() for cell in header) != columns:
-        raise InputError(f"{where}, line 1", ",".join(header), f"the header {','.join(columns)}")
+        raise InputError(f"{place}, line 1", ",".join(header), f"the header {','.join(columns)}")
 
 
-def _parse_row(where: str, row: list[str], columns: tuple[str, ...], missing: bool) -> list[float]:
+def _parse_row(place: str, row: list[str], columns: tuple[str, ...], missing: bool) -> list[float]:
     if len(row) != len(columns):
-        raise InputError(where, Unquoted(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
+        raise InputError(place, Unquoted(f"{len(row)} cells"), f"{len(columns)}: {','.join(columns)}")
     numbers = []
     for cell, column in zip(row, columns, strict=True):
         # Only a sample's value may be missing.
@@ -164,7 +164,7 @@ def _parse_row(where: str, row: list[str], columns: tuple[str, ...], missing: bo
         try:
             numbers.append(float("nan" if blank else cell))
         except ValueError:
-            raise InputError(f"{where}: {column}", cell, "a number") from None
+            raise InputError(f"{place}: {column}", cell, "a number") from None
     return numbers
 
 

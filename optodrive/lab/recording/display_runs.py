@@ -51,7 +51,7 @@ class PixelRuns:
         return Measurement(tuple(runs))
 
     def _select_signals(self, part: RecordingPart, run: Run) -> Run:
-        own = {
+        signals = {
             name: signal
             for name, signal in run.signals.items()
             if (
@@ -60,7 +60,7 @@ class PixelRuns:
                 else name not in MIRROR_SIGNALS and signal.pixel == self.pixel
             )
         }
-        return replace(run, name=f"{part.prefix}{run.name}", signals=own)
+        return replace(run, name=f"{part.prefix}{run.name}", signals=signals)
 
 
 @dataclass(frozen=True)

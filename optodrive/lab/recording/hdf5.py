@@ -82,13 +82,13 @@ class Hdf5Tree:
 
     def read_table(self, run: str, name: str) -> FloatArray:
         """Return a table of a run, [n, columns]."""
-        where, columns = self.format_place(run, name), TABLE_COLUMNS[name]
-        dataset = self._open_dataset(where, self._open_run(run), name)
-        with convert_errors(where, "readable data"):
+        place, columns = self.format_place(run, name), TABLE_COLUMNS[name]
+        dataset = self._open_dataset(place, self._open_run(run), name)
+        with convert_errors(place, "readable data"):
             if len(dataset.shape) != 2 or dataset.shape[1] != len(columns):
                 expected = f"n rows of {len(columns)} columns: {', '.join(columns)}"
-                raise InputError(where, Unquoted(f"the shape {dataset.shape}"), expected)
-            return self._read_numbers(where, dataset)
+                raise InputError(place, Unquoted(f"the shape {dataset.shape}"), expected)
+            return self._read_numbers(place, dataset)
 
     def read_samples(self, run: str, signal: str) -> tuple[FloatArray, FloatArray]:
         """Return the times and values of a signal."""
@@ -132,13 +132,13 @@ class Hdf5Tree:
             raise InputError(self.format_place(run, signal, "value"), Unquoted(f"the shape {value.shape}"), expected)
         return t_s, value
 
-    def _list_names(self, where: str, group: Any) -> list[str]:
-        with convert_errors(where, "a readable group"):
+    def _list_names(self, place: str, group: Any) -> list[str]:
+        with convert_errors(place, "a readable group"):
             return list(group)
 
-    def _read_attributes(self, where: str, group: Any) -> Attributes:
+    def _read_attributes(self, place: str, group: Any) -> Attributes:
         values: dict[str, Any] = {}
-        with convert_errors(where, "readable attributes"):
+        with convert_errors(place, "readable attributes"):
             for name in group.attrs:
                 with suppress(TypeError):  # h5py cannot represent the type
                     attribute = group.attrs.get_id(name)
@@ -146,36 +146,36 @@ class Hdf5Tree:
                         values[name] = group.attrs[name]
             return normalize_attributes(values)
 
-    def _open_member(self, where: str, group: Any, name: str, kind: Any, expected: str) -> Any:
-        with convert_errors(where, expected):
+    def _open_member(self, place: str, group: Any, name: str, kind: Any, expected: str) -> Any:
+        with convert_errors(place, expected):
             link = group.get(name, getlink=True)
             if link is None:
-                raise InputError(where, None, expected)
+                raise InputError(place, None, expected)
             # A link may lead to another file or form a cycle; a recording is one file.
             if not isinstance(link, self._h5.HardLink):
-                raise InputError(where, Unquoted("a link"), f"{expected}, stored in this file")
+                raise InputError(place, Unquoted("a link"), f"{expected}, stored in this file")
             member = group[name]
             if not isinstance(member, kind):
-                raise InputError(where, Unquoted(f"a {type(member).__name__.lower()}"), expected)
+                raise InputError(place, Unquoted(f"a {type(member).__name__.lower()}"), expected)
             return member
 
-    def _open_group(self, where: str, parent: Any, name: str) -> Any:
-        return self._open_member(where, parent, name, self._h5.Group, "a group")
+    def _open_group(self, place: str, parent: Any, name: str) -> Any:
+        return self._open_member(place, parent, name, self._h5.Group, "a group")
 
-    def _open_dataset(self, where: str, parent: Any, name: str) -> Any:
-        dataset = self._open_member(where, parent, name, self._h5.Dataset, "a dataset of numbers")
-        with convert_errors(where, "a dataset of numbers"):
+    def _open_dataset(self, place: str, parent: Any, name: str) -> Any:
+        dataset = self._open_member(place, parent, name, self._h5.Dataset, "a dataset of numbers")
+        with convert_errors(place, "a dataset of numbers"):
             if dataset.dtype.kind not in "iuf" or dataset.shape is None:
                 kind = "nothing" if dataset.shape is None else f"entries of type {dataset.dtype}"
-                raise InputError(where, Unquoted(" ".join(kind.split())), "a dataset of numbers (float64)")
+                raise InputError(place, Unquoted(" ".join(kind.split())), "a dataset of numbers (float64)")
             if dataset.is_virtual or dataset.external:
-                raise InputError(where, Unquoted("data stored in other files"), "a dataset stored in this file")
+                raise InputError(place, Unquoted("data stored in other files"), "a dataset stored in this file")
             if dataset.chunks and prod(dataset.chunks) > NUMBERS_MAX:
-                raise InputError(where, Unquoted(f"chunks of {dataset.chunks}"), f"chunks of at most {NUMBERS_MAX}")
+                raise InputError(place, Unquoted(f"chunks of {dataset.chunks}"), f"chunks of at most {NUMBERS_MAX}")
             return dataset
 
-    def _read_numbers(self, where: str, dataset: Any) -> FloatArray:
-        self._budget.reserve(where, prod(dataset.shape))
+    def _read_numbers(self, place: str, dataset: Any) -> FloatArray:
+        self._budget.reserve(place, prod(dataset.shape))
         return np.array(dataset[()], dtype=np.float64)
 
 

@@ -68,11 +68,11 @@ class RecordingIndex:
 
 
 def _build_run_index(tree: RecordingTree, name: str) -> RunIndex:
-    where = tree.format_place(name)
+    place = tree.format_place(name)
     attributes = tree.read_run_attributes(name)
-    ambient_k = checks.pop_ambient_k(where, attributes)
+    ambient_k = checks.pop_ambient_k(place, attributes)
     members = tree.list_members(name)
-    signals = {signal: _build_signal_index(tree, name, signal) for signal in checks.select_signals(where, members)}
+    signals = {signal: _build_signal_index(tree, name, signal) for signal in checks.select_signals(place, members)}
     pulses = read_pulses(tree, name)
     pulsed_pixels = tuple(int(pixel) for pixel in np.unique(pulses[:, 3]))
     return RunIndex(name, ambient_k, attributes, pulsed_pixels, len(pulses), COMMANDS in members, signals)

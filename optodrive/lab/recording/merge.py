@@ -36,13 +36,13 @@ def _read_session_runs(session: Path) -> dict[str, Run]:
 
 
 def _merge_run(run: Run, session_runs: dict[str, Run], session: Path, measured: Path, shift_s: float) -> Run:
-    where = f"{measured}: /runs/{run.name}"
+    place = f"{measured}: /runs/{run.name}"
     session_run = session_runs.get(run.name)
     if session_run is None:
-        raise InputError(where, run.name, f"a run of {session}, {suggest_nearest(run.name, list(session_runs))}")
+        raise InputError(place, run.name, f"a run of {session}, {suggest_nearest(run.name, list(session_runs))}")
     if len(run.pulses):
         expected = f"none: the pulses are taken from {session}"
-        raise InputError(f"{where}/{PULSES}", Unquoted(f"{len(run.pulses)} pulses"), expected)
+        raise InputError(f"{place}/{PULSES}", Unquoted(f"{len(run.pulses)} pulses"), expected)
     signals = {
         name: Signal(signal.pixel, np.asarray(signal.t_s + shift_s), signal.value, signal.sigma)
         for name, signal in run.signals.items()

@@ -60,8 +60,8 @@ def _compute_panel_left(column: int) -> int:
     return NAME_WIDTH + LABEL_WIDTH + column * (PANEL_WIDTH + GAP + LABEL_WIDTH)
 
 
-def _format_title(drawn: int, count: int) -> str:
-    return f"{count} runs" if drawn == count else f"{drawn} of {count} runs"
+def _format_title(plotted: int, count: int) -> str:
+    return f"{count} runs" if plotted == count else f"{plotted} of {count} runs"
 
 
 def _draw_run(draw: "ImageDraw", run: Run, columns: list[str], top: int, height: int) -> None:

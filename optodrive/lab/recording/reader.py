@@ -84,11 +84,11 @@ def read_pulses(tree: RecordingTree, run: str) -> FloatArray:
 
 
 def _read_run(tree: RecordingTree, name: str) -> Run:
-    where = tree.format_place(name)
+    place = tree.format_place(name)
     attributes = tree.read_run_attributes(name)
-    ambient_k = checks.pop_ambient_k(where, attributes)
+    ambient_k = checks.pop_ambient_k(place, attributes)
     members = tree.list_members(name)
-    signal_names = checks.select_signals(where, members)
+    signal_names = checks.select_signals(place, members)
     pulses = read_pulses(tree, name)
     commands = _read_commands(tree, name) if COMMANDS in members else None
     signals = {signal: _read_signal(tree, name, signal) for signal in signal_names}
@@ -103,10 +103,10 @@ def _read_commands(tree: RecordingTree, run: str) -> FloatArray:
 
 def read_signal_attributes(tree: RecordingTree, run: str, signal: str) -> tuple[int, float | None]:
     """Return the checked pixel and stated noise of a signal."""
-    where = tree.format_place(run, signal)
+    place = tree.format_place(run, signal)
     attributes = tree.read_signal_attributes(run, signal)
-    checks.check_unit(where, signal, attributes)
-    return checks.parse_pixel(where, signal, attributes), checks.parse_sigma(where, attributes)
+    checks.check_unit(place, signal, attributes)
+    return checks.parse_pixel(place, signal, attributes), checks.parse_sigma(place, attributes)
 
 
 def _read_signal(tree: RecordingTree, run: str, signal: str) -> Signal:

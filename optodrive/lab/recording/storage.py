@@ -82,12 +82,12 @@ class MemoryBudget:
     def __init__(self, numbers: int = NUMBERS_MAX) -> None:
         self._remaining = numbers
 
-    def reserve(self, where: str, numbers: int) -> None:
+    def reserve(self, place: str, numbers: int) -> None:
         """Count numbers that are about to be read; raises InputError if the limit is exceeded."""
         self._remaining -= numbers
         if self._remaining < 0:
             raise InputError(
-                where, f"{numbers} numbers", f"at most {NUMBERS_MAX} in total; read large recordings in parts"
+                place, f"{numbers} numbers", f"at most {NUMBERS_MAX} in total; read large recordings in parts"
             )
 
 
@@ -129,13 +129,13 @@ def format_name(name: object) -> str:
     return text if text.isprintable() and len(text) <= NAME_BYTES_MAX else abbreviate(text)
 
 
-def check_run_name(where: str, name: str) -> None:
+def check_run_name(place: str, name: str) -> None:
     """Check that both forms can store a run's name, as an HDF5 group and as a folder."""
     encoded = name.encode("utf-8", "replace")
     fits = name.isprintable() and not set(name) & {"/", "\\"} and not name.startswith(".")
     if not (fits and 0 < len(encoded) <= NAME_BYTES_MAX and name == name.strip()):
         raise InputError(
-            where, name, f"a run's name: printable, at most {NAME_BYTES_MAX} bytes, no '/', '\\' or leading '.'"
+            place, name, f"a run's name: printable, at most {NAME_BYTES_MAX} bytes, no '/', '\\' or leading '.'"
         )
 
 

@@ -50,47 +50,47 @@ def convert_recording(source: Path, target: Path) -> Measurement:
     return measurement
 
 
-def _normalize_runs(where: str, measurement: Measurement) -> tuple[Run, ...]:
+def _normalize_runs(place: str, measurement: Measurement) -> tuple[Run, ...]:
     """Check the runs and convert their numbers and text to the types that both forms store."""
     names = [run.name for run in measurement.runs]
     if not names or len(set(names)) < len(names):
-        raise InputError(f"{where}: /runs", names, "at least one run, and unique names")
+        raise InputError(f"{place}: /runs", names, "at least one run, and unique names")
     for name in names:
-        check_run_name(f"{where}: /runs", name)
-    return tuple(_normalize_run(f"{where}: /runs/{run.name}", run) for run in measurement.runs)
+        check_run_name(f"{place}: /runs", name)
+    return tuple(_normalize_run(f"{place}: /runs/{run.name}", run) for run in measurement.runs)
 
 
-def _normalize_run(where: str, run: Run) -> Run:
+def _normalize_run(place: str, run: Run) -> Run:
     for key, value in run.attributes.items():
-        _check_attribute(where, key, value)
-    _check_shape(f"{where}/{PULSES}", run.pulses, len(TABLE_COLUMNS[PULSES]))
+        _check_attribute(place, key, value)
+    _check_shape(f"{place}/{PULSES}", run.pulses, len(TABLE_COLUMNS[PULSES]))
     if run.commands is not None:
-        _check_shape(f"{where}/{COMMANDS}", run.commands, len(TABLE_COLUMNS[COMMANDS]))
+        _check_shape(f"{place}/{COMMANDS}", run.commands, len(TABLE_COLUMNS[COMMANDS]))
     for name in run.signals:
         if name not in SIGNALS:
             raise InputError(
-                f"{where}/{format_name(name)}", name, f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
+                f"{place}/{format_name(name)}", name, f"a known signal, {suggest_nearest(name, list(SIGNALS))}"
             )
     # NumPy scalars have another repr than Python's own numbers.
     attributes = normalize_attributes(run.attributes)
-    signals = {name: _normalize_signal(f"{where}/{name}", signal) for name, signal in run.signals.items()}
+    signals = {name: _normalize_signal(f"{place}/{name}", signal) for name, signal in run.signals.items()}
     return replace(run, ambient_k=float(run.ambient_k), attributes=attributes, signals=signals)
 
 
-def _normalize_signal(where: str, signal: Signal) -> Signal:
+def _normalize_signal(place: str, signal: Signal) -> Signal:
     if signal.t_s.ndim != 1 or signal.value.shape != signal.t_s.shape:
-        raise InputError(f"{where}/value", signal.value.shape, f"as many values as times, {signal.t_s.shape}")
+        raise InputError(f"{place}/value", signal.value.shape, f"as many values as times, {signal.t_s.shape}")
     return replace(signal, pixel=int(signal.pixel), sigma=None if signal.sigma is None else float(signal.sigma))
 
 
-def _check_shape(where: str, table: np.ndarray[Any, Any], columns: int) -> None:
+def _check_shape(place: str, table: np.ndarray[Any, Any], columns: int) -> None:
     if table.ndim != 2 or table.shape[1] != columns:
-        raise InputError(where, table.shape, f"n rows of {columns} columns")
+        raise InputError(place, table.shape, f"n rows of {columns} columns")
 
 
-def _check_attribute(where: str, key: str, value: object) -> None:
+def _check_attribute(place: str, key: str, value: object) -> None:
     if not key or not key.isprintable() or key in RUN_MEMBERS or key == "ambient_K":
-        raise InputError(where, key, "an attribute's name: printable, and not the name of a run's member")
+        raise InputError(place, key, "an attribute's name: printable, and not the name of a run's member")
     converted = normalize_attribute(value)
     if converted is None or (isinstance(value, str) and converted != value):
-        raise InputError(f"{where}: {key}", value, "text without NUL, or a 64-bit number")
+        raise InputError(f"{place}: {key}", value, "text without NUL, or a 64-bit number")

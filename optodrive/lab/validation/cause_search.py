@@ -156,10 +156,11 @@ class CauseSearch:
         return CauseFit(keys, tuple(fractions.tolist()), chi2, compute_aicc(chi2, len(keys), len(self.data)))
 
     def _fit_from_starts(self, keys: tuple[str, ...], start_fit: CauseFit) -> CauseFit:
-        known = dict(zip(start_fit.keys, start_fit.fractions, strict=True))
-        new_keys = [key for key in keys if key not in known]
+        start_values = dict(zip(start_fit.keys, start_fit.fractions, strict=True))
+        new_keys = [key for key in keys if key not in start_values]
         starts = [
-            np.array([known.get(key, start) for key in keys]) for start in (START_FRACTIONS if new_keys else (0.0,))
+            np.array([start_values.get(key, start) for key in keys])
+            for start in (START_FRACTIONS if new_keys else (0.0,))
         ]
         start = min(starts, key=lambda fractions: float((self._compute_residuals(keys, fractions) ** 2).sum()))
         return self._evaluate(keys, self._minimize(keys, start))
@@ -202,9 +203,9 @@ class CauseSearch:
     def _compute_jacobian(self, keys: tuple[str, ...], fractions: FloatArray, residuals: FloatArray) -> FloatArray:
         columns = []
         for number in range(len(keys)):
-            moved = fractions.copy()
-            moved[number] += FRACTION_STEP if moved[number] < 0.5 else -FRACTION_STEP
-            columns.append((self._compute_residuals(keys, moved) - residuals) / (moved[number] - fractions[number]))
+            shifted = fractions.copy()
+            shifted[number] += FRACTION_STEP if shifted[number] < 0.5 else -FRACTION_STEP
+            columns.append((self._compute_residuals(keys, shifted) - residuals) / (shifted[number] - fractions[number]))
         return np.stack(columns, axis=1)
 
 

@@ -119,7 +119,7 @@ def compute_error_factor(ratios: Sequence[float]) -> float:
 
 
 def run_study(
-    facts: Mapping[str, PaperFact], base: ParameterSet, on_progress: Callable[[str], None] = lambda what: None
+    facts: Mapping[str, PaperFact], base: ParameterSet, on_progress: Callable[[str], None] = lambda stage: None
 ) -> StudyResult:
     """Diagnose a parameter set by the paper's facts."""
     data = build_data(facts, base)
