@@ -26,7 +26,7 @@ static uint64_t hold_due_us(const struct board *b) {
     if (b->state == STATE_HOLD) {
         return b->hold_since_us + HOLD_MAX_US;
     }
-    bool waits = b->state == STATE_RUNNING && !b->has_current && b->job.exists && !enough_queued(b);
+    bool waits = b->state == STATE_RUNNING && !b->has_current_point && b->job.active && !has_enough_points(b);
     return waits ? b->job.start_us + HOLD_MAX_US : NEVER;
 }
 
@@ -34,10 +34,10 @@ static uint64_t point_due_us(const struct board *b) {
     if (b->state != STATE_RUNNING) {
         return NEVER;
     }
-    if (b->has_current) {
+    if (b->has_current_point) {
         return b->due_us;
     }
-    if (!enough_queued(b)) {
+    if (!has_enough_points(b)) {
         return NEVER;
     }
     return b->job.start_us > b->now_us ? b->job.start_us : b->now_us;
@@ -51,9 +51,9 @@ uint64_t board_next_due_us(const struct board *b) {
     return next;
 }
 
-static void do_due(struct board *b) {
+static void run_due_event(struct board *b) {
     if (lease_due_us(b) <= b->now_us) {
-        fail(b, FAULT_LINK);
+        enter_fault(b, FAULT_LINK);
     } else if (arming_due_us(b) <= b->now_us) {
         if (b->confirmed) {
             change_state(b, REASON_ARMED);
@@ -63,7 +63,7 @@ static void do_due(struct board *b) {
     } else if (hold_due_us(b) <= b->now_us) {
         disarm(b, REASON_HOLD_TOO_LONG);
     } else {
-        point_due(b);
+        advance_point(b);
     }
 }
 
@@ -71,28 +71,28 @@ static void do_due(struct board *b) {
 static void advance(struct board *b, uint64_t now_us) {
     for (uint64_t due_us; (due_us = board_next_due_us(b)) <= now_us && due_us != NEVER;) {
         b->now_us = due_us > b->now_us ? due_us : b->now_us;
-        do_due(b);
+        run_due_event(b);
     }
     b->now_us = now_us > b->now_us ? now_us : b->now_us;
 }
 
 /* --- the safety tick --- */
 
-static uint8_t unsafe(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
+static uint8_t unsafe_inputs(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
 
 /* B9: what becomes unsafe is a fault; what was unsafe at power-up keeps the board from arming. */
 static void watch_inputs(struct board *b) {
-    uint8_t inputs = b->hal.inputs(b->hal.context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
-    uint8_t became_unsafe = (uint8_t)(unsafe(inputs) & ~unsafe(b->inputs));
+    uint8_t inputs = b->hal.read_inputs(b->hal.context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
+    uint8_t became_unsafe = (uint8_t)(unsafe_inputs(inputs) & ~unsafe_inputs(b->inputs));
     b->key_turned = b->key_turned || (inputs & ~b->inputs & INPUT_KEY);
     b->inputs = inputs;
 #if MUTANT != 9
     if (became_unsafe & INPUT_INTERLOCK) {
-        fail(b, FAULT_INTERLOCK);
+        enter_fault(b, FAULT_INTERLOCK);
     } else if (became_unsafe & INPUT_KEY) {
-        fail(b, FAULT_KEY);
+        enter_fault(b, FAULT_KEY);
     } else if (became_unsafe) {
-        fail(b, FAULT_ESTOP);
+        enter_fault(b, FAULT_ESTOP);
     }
 #else
     (void)became_unsafe;
@@ -100,32 +100,32 @@ static void watch_inputs(struct board *b) {
 }
 
 /* B14. A fault of the board itself goes dark now, before what fell due meanwhile is done. */
-static void fail_at(struct board *b, enum fault fault, uint64_t now_us) {
+static void enter_fault_at(struct board *b, enum fault fault, uint64_t now_us) {
 #if MUTANT != 14
     b->now_us = now_us > b->now_us ? now_us : b->now_us;
-    fail(b, fault);
+    enter_fault(b, fault);
 #else
     (void)b, (void)fault, (void)now_us;
 #endif
 }
 
 static void watch_tick(struct board *b, uint64_t now_us) {
-    uint64_t since_us = now_us > b->ticked_us ? now_us - b->ticked_us : 0;
-    b->ticked_us += since_us;
+    uint64_t since_us = now_us > b->last_tick_us ? now_us - b->last_tick_us : 0;
+    b->last_tick_us += since_us;
     if (since_us > BOARD_TICK_US + BOARD_TICK_LATE_US) {
-        fail_at(b, FAULT_TICK, now_us);
+        enter_fault_at(b, FAULT_TICK, now_us);
     }
 }
 
 /* Looks before this tick changes the command: a gate that is just being switched is not compared. */
 static void watch_readback(struct board *b, uint64_t now_us) {
-    bool differs = b->hal.gate_readback(b->hal.context) != b->gate;
-    if (differs && !b->differs) {
-        b->differs_since_us = now_us;
+    bool differs = b->hal.read_gate(b->hal.context) != b->gate;
+    if (differs && !b->readback_differs) {
+        b->readback_differs_since_us = now_us;
     }
-    b->differs = differs;
-    if (differs && now_us > b->differs_since_us + BOARD_READBACK_US) {
-        fail_at(b, FAULT_READBACK, now_us);
+    b->readback_differs = differs;
+    if (differs && now_us > b->readback_differs_since_us + BOARD_READBACK_US) {
+        enter_fault_at(b, FAULT_READBACK, now_us);
     }
 }
 
@@ -145,7 +145,7 @@ void board_tick(struct board *b, uint64_t now_us) {
 
 /* --- the main loop --- */
 
-static void report(struct board *b) {
+static void send_reports(struct board *b) {
     uint8_t body[BODY_MAX];
     size_t length, count;
     if (b->records.reported < records_oldest(&b->records)) {
@@ -157,46 +157,46 @@ static void report(struct board *b) {
     }
 }
 
-static void refuse(struct board *b, uint8_t reason) {
+static void send_nak(struct board *b, uint8_t reason) {
     uint8_t body[NAK_SIZE];
     body[NAK_NEXT_SEQ_AT] = b->link.expected;
     body[NAK_REASON_AT] = reason;
     send_message(b, MESSAGE_NAK, body, sizeof body);
 }
 
-static void take_in_order(struct board *b, const struct frame *frame) {
+static void handle_sequenced(struct board *b, const struct frame *frame) {
     uint8_t refusal;
-    if (link_accepts(&b->link, frame->seq, &refusal)) {
-        refusal = obey_sequenced(b, frame);
+    if (link_accept(&b->link, frame->seq, &refusal)) {
+        refusal = dispatch_sequenced(b, frame);
         if (refusal != NAK_NO_ROOM) {
-            link_consumed(&b->link, refusal);
+            link_mark_consumed(&b->link, refusal);
         }
     }
-    if (refusal == REFUSED_NOTHING) {
+    if (refusal == NO_REFUSAL) {
         b->link.ack_due = true;
     } else {
-        refuse(b, refusal);
+        send_nak(b, refusal);
     }
 }
 
-static void take(struct board *b, const struct frame *frame) {
-    enum order order;
-    if (!frame_has_form(frame, &order)) {
+static void handle_frame(struct board *b, const struct frame *frame) {
+    enum frame_class class;
+    if (!frame_is_valid(frame, &class)) {
         b->link.receiver.format_errors++;
     } else if (frame->type == MESSAGE_ABORT) {
         disarm(b, REASON_ABORT);
     } else if (frame->type == MESSAGE_HELLO) {
-        obey_hello(b, frame);
-    } else if (order == ORDER_NONE || frame->session != b->link.session || b->link.session == 0) {
+        on_hello(b, frame);
+    } else if (class == FRAME_NOT_ACCEPTED || frame->session != b->link.session || b->link.session == 0) {
         b->link.seq_errors++;
-    } else if (order == ORDER_SEQUENCED) {
-        take_in_order(b, frame);
+    } else if (class == FRAME_SEQUENCED) {
+        handle_sequenced(b, frame);
     } else {
-        obey_unsequenced(b, frame);
+        handle_unsequenced(b, frame);
     }
 }
 
-static void acknowledge(struct board *b) {
+static void send_ack(struct board *b) {
     uint8_t body[ACK_SIZE];
     body[ACK_NEXT_SEQ_AT] = b->link.expected;
     put_u16(body + ACK_FREE_POINTS_AT, (uint16_t)(b->config.queue_points - b->queue.count));
@@ -205,36 +205,36 @@ static void acknowledge(struct board *b) {
     send_message(b, MESSAGE_ACK, body, sizeof body);
 }
 
-static uint32_t bad_frames(const struct board *b) {
+static uint32_t count_bad_frames(const struct board *b) {
     return b->link.receiver.crc_errors + b->link.receiver.format_errors;
 }
 
 void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now_us) {
     struct frame frame;
-    uint32_t bad = bad_frames(b);
+    uint32_t bad = count_bad_frames(b);
     b->loop_ran = true;
     advance(b, now_us);
-    report(b);
+    send_reports(b);
     for (size_t k = 0; k < n; k++) {
-        if (receiver_take(&b->link.receiver, bytes[k], &frame)) {
-            take(b, &frame);
+        if (receiver_feed(&b->link.receiver, bytes[k], &frame)) {
+            handle_frame(b, &frame);
         }
     }
-    if (bad_frames(b) != bad && b->hal.trace) {
-        struct board_trace what = {.at_us = b->now_us, .kind = TRACE_RX_ERROR, .index = bad_frames(b)};
+    if (count_bad_frames(b) != bad && b->hal.trace) {
+        struct board_trace what = {.at_us = b->now_us, .kind = TRACE_RX_ERROR, .index = count_bad_frames(b)};
         b->hal.trace(b->hal.context, &what);
     }
     if (b->link.ack_due) {
         b->link.ack_due = false;
-        acknowledge(b);
+        send_ack(b);
     }
     advance(b, now_us);
-    report(b);
+    send_reports(b);
 }
 
-void board_link_lost(struct board *b, uint64_t now_us) {
+void board_on_link_lost(struct board *b, uint64_t now_us) {
     advance(b, now_us);
-    report(b);
+    send_reports(b);
     disarm(b, REASON_LINK_LOST);
 }
 
@@ -242,16 +242,16 @@ void board_link_lost(struct board *b, uint64_t now_us) {
 
 void board_init(struct board *b, const struct board_hal *hal, const struct board_config *config,
                 enum reset_cause cause, uint64_t now_us) {
-    hal->gate(hal->context, false, 0); /* before anything else */
+    hal->set_gate(hal->context, false, 0); /* before anything else */
     memset(b, 0, sizeof *b);
     b->hal = *hal;
     b->config = *config;
     b->limits = config->limits;
-    b->now_us = b->epoch_us = b->settled_us = b->ticked_us = now_us;
+    b->now_us = b->epoch_us = b->settled_us = b->last_tick_us = now_us;
     b->reset_cause = (uint8_t)cause;
     b->x = b->y = CENTRE;
-    hal->mirrors(hal->context, b->x, b->y); /* a reset may have come upon them anywhere */
-    b->inputs = hal->inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
+    hal->move_mirrors(hal->context, b->x, b->y); /* a reset may have come upon them anywhere */
+    b->inputs = hal->read_inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
     link_begin(&b->link, 0);
     change_state(b, REASON_BOOT);
 }

@@ -47,16 +47,16 @@ struct board_trace {
 /* What a port gives. README.md says what each must guarantee. */
 struct board_hal {
     void *context;
-    void (*gate)(void *context, bool on, uint16_t duty);
-    bool (*gate_readback)(void *context);
-    void (*mirrors)(void *context, uint16_t x, uint16_t y);
-    uint8_t (*inputs)(void *context); /* INPUT_ bits */
-    void (*indicator)(void *context, bool lit);
-    void (*relay)(void *context, bool closed);
-    uint32_t (*entropy)(void *context);
-    int16_t (*temperature_dc)(void *context);
+    void (*set_gate)(void *context, bool on, uint16_t duty);
+    bool (*read_gate)(void *context);
+    void (*move_mirrors)(void *context, uint16_t x, uint16_t y);
+    uint8_t (*read_inputs)(void *context); /* INPUT_ bits */
+    void (*set_indicator)(void *context, bool lit);
+    void (*set_relay)(void *context, bool closed);
+    uint32_t (*read_entropy)(void *context);
+    int16_t (*read_temperature_dc)(void *context);
     void (*send)(void *context, const uint8_t *frame, size_t length); /* whole or not at all */
-    void (*forget)(void *context);                                    /* whole frames that have not begun to leave */
+    void (*discard_output)(void *context);                                    /* whole frames that have not begun to leave */
     void (*feed_watchdog)(void *context);
     void (*trace)(void *context, const struct board_trace *what); /* may be NULL */
 };
@@ -97,7 +97,7 @@ struct record {
 
 struct records {
     struct record ring[BOARD_RECORDS];
-    uint32_t made, reported; /* of the session */
+    uint32_t total, reported; /* of the session */
 };
 
 struct pulse {
@@ -137,7 +137,7 @@ struct job {
     uint64_t start_us;
     uint32_t number, end_index;
     uint16_t watermark;
-    bool exists, ends;
+    bool active, has_end;
 };
 
 struct board {
@@ -153,23 +153,23 @@ struct board {
     struct guards guards;
 
     struct job job;
-    struct point current;
-    uint32_t current_number;
-    bool has_current, gate;
-    uint64_t lit_us, due_us, settled_us;
+    struct point current_point;
+    uint32_t current_index;
+    bool has_current_point, gate;
+    uint64_t gate_on_us, due_us, settled_us;
     uint16_t x, y;
     uint32_t next_index, done_index;
 
     uint64_t lease_until_us, arming_since_us, hold_since_us;
     uint32_t board_nonce, host_nonce;
-    bool nonce_good, confirmed, key_turned, version_fits;
+    bool nonce_valid, confirmed, key_turned, version_supported;
 
     uint64_t underruns_us[UNDERRUNS_MAX];
-    uint32_t underruns_known, underruns_total;
-    uint64_t laser_on; /* µs × duty */
+    uint32_t underruns_count, underruns_total;
+    uint64_t laser_on_duty_us; /* µs × duty */
 
-    uint64_t ticked_us, differs_since_us;
-    bool differs, loop_ran;
+    uint64_t last_tick_us, readback_differs_since_us;
+    bool readback_differs, loop_ran;
 };
 
 /* Power-up or reset: everything forgotten, gate off, DISARMED. now_us: any 64-bit time in µs that never goes back. */
@@ -183,7 +183,7 @@ void board_tick(struct board *b, uint64_t now_us);
 void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now_us);
 
 /* BREAK, DTR dropped, cable pulled: as an ABORT. */
-void board_link_lost(struct board *b, uint64_t now_us);
+void board_on_link_lost(struct board *b, uint64_t now_us);
 
 /* When something falls due next, UINT64_MAX where nothing does: for a port that sets a timer for it. */
 uint64_t board_next_due_us(const struct board *b);

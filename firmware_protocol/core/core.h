@@ -15,7 +15,7 @@
 #define FRAME_OVERHEAD 8u                 /* header and CRC */
 #define BODY_MAX (RAW_MAX - FRAME_OVERHEAD)
 #define WIRE_MAX (RAW_MAX + 2u)           /* COBS code and delimiter */
-#define REFUSED_NOTHING 0xffu             /* in place of a NAK reason */
+#define NO_REFUSAL 0xffu             /* in place of a NAK reason */
 
 /* --- bytes --- */
 
@@ -53,17 +53,17 @@ struct frame {
     uint8_t type, seq;
 };
 
-enum order { ORDER_NONE, ORDER_HOST, ORDER_SEQUENCED };
+enum frame_class { FRAME_NOT_ACCEPTED, FRAME_UNSEQUENCED, FRAME_SEQUENCED };
 
 /* Takes one byte; true when it completes an intact frame, which lasts until the next byte. */
-bool receiver_take(struct receiver *r, uint8_t byte, struct frame *frame);
+bool receiver_feed(struct receiver *r, uint8_t byte, struct frame *frame);
 /* Whether type, length and enumerations are a message's; order: who may say it, and how. */
-bool frame_has_form(const struct frame *frame, enum order *order);
+bool frame_is_valid(const struct frame *frame, enum frame_class *class);
 /* A frame as it goes over the wire, delimiter included; the number of bytes. wire: WIRE_MAX bytes. */
 size_t frame_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
 /* Whether a sequenced frame is the one expected; refusal: what to answer where it is not. */
-bool link_accepts(struct link *link, uint8_t seq, uint8_t *refusal);
-void link_consumed(struct link *link, uint8_t refusal);
+bool link_accept(struct link *link, uint8_t seq, uint8_t *refusal);
+void link_mark_consumed(struct link *link, uint8_t refusal);
 void link_begin(struct link *link, uint16_t session);
 
 /* --- queue, records --- */
@@ -80,13 +80,13 @@ uint32_t records_oldest(const struct records *r);
 
 /* --- limits, guards --- */
 
-void limits_get(struct board_limits *limits, const uint8_t *from);
-void limits_put(const struct board_limits *limits, uint8_t *to);
-void limits_tighten(struct board_limits *limits, const struct board_limits *asked);
+void limits_decode(struct board_limits *limits, const uint8_t *from);
+void limits_encode(const struct board_limits *limits, uint8_t *to);
+void limits_tighten(struct board_limits *limits, const struct board_limits *requested);
 /* B4, B5, B8: the fault that queueing this point is, FAULT_NONE where it may be queued. */
-enum fault guards_look(const struct board_limits *limits, const struct point *point);
+enum fault guards_check_point(const struct board_limits *limits, const struct point *point);
 /* B4 to B6: the fault that lighting it now would be; where it may be lit it is counted. */
-enum fault guards_fire(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                        const struct point *point, uint64_t now_us);
 
 /* --- states and points --- */
@@ -94,22 +94,22 @@ enum fault guards_fire(struct guards *g, const struct board_limits *limits, uint
 bool is_leased(uint8_t state);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
 void trace_gate(struct board *b, bool on, bool is_point, uint32_t what);
-void set_gate(struct board *b, bool on, uint16_t duty);
+void command_gate(struct board *b, bool on, uint16_t duty);
 /* Changes to the state that the table has for this event. */
 void change_state(struct board *b, enum reason event);
 void disarm(struct board *b, enum reason reason);
-void fail(struct board *b, enum fault fault);
+void enter_fault(struct board *b, enum fault fault);
 void drop_queue(struct board *b);
 
-bool enough_queued(const struct board *b);
-void point_due(struct board *b);
-void refill(struct board *b);
-void record_point(struct board *b, uint64_t on_at_us, uint64_t on_us);
+bool has_enough_points(const struct board *b);
+void advance_point(struct board *b);
+void resume_if_refilled(struct board *b);
+void record_execution(struct board *b, uint64_t on_at_us, uint64_t on_us);
 
 /* Carries out what is not sequenced. */
-void obey_hello(struct board *b, const struct frame *frame);
-void obey_unsequenced(struct board *b, const struct frame *frame);
-/* Carries a sequenced message out; the NAK reason, or REFUSED_NOTHING. */
-uint8_t obey_sequenced(struct board *b, const struct frame *frame);
+void on_hello(struct board *b, const struct frame *frame);
+void handle_unsequenced(struct board *b, const struct frame *frame);
+/* Carries a sequenced message out; the NAK reason, or NO_REFUSAL. */
+uint8_t dispatch_sequenced(struct board *b, const struct frame *frame);
 
 #endif

@@ -3,10 +3,10 @@
 #include "core.h"
 
 #define DUTY_FULL 65535u
-#define PROBES 32u
+#define PROBES_MAX 32u
 #define GRIDS 4u
 
-enum fault guards_look(const struct board_limits *limits, const struct point *point) {
+enum fault guards_check_point(const struct board_limits *limits, const struct point *point) {
 #if MUTANT != 8
     if (point->x < limits->x_min || point->x > limits->x_max || point->y < limits->y_min || point->y > limits->y_max) {
         return FAULT_RANGE;
@@ -20,7 +20,7 @@ enum fault guards_look(const struct board_limits *limits, const struct point *po
 
 /* --- cells --- */
 
-static uint16_t cell_of(uint16_t code, uint16_t shift, uint16_t size) {
+static uint16_t cell_index(uint16_t code, uint16_t shift, uint16_t size) {
     int32_t from_centre = (int32_t)code - (int32_t)CENTRE + shift;
     int32_t cell = from_centre / size;
     if (from_centre < 0 && from_centre % size != 0) {
@@ -46,27 +46,27 @@ static uint32_t level_uj(const struct cell *cell, const struct board_limits *lim
 }
 
 /* The account of a cell. A cell that has rested and leaked empty gives its place up; NULL: no place is free. */
-static struct cell *account(struct cell *cells, uint32_t key, const struct board_limits *limits, uint64_t now_us) {
-    struct cell *free_place = NULL;
+static struct cell *find_account(struct cell *cells, uint32_t key, const struct board_limits *limits, uint64_t now_us) {
+    struct cell *free_slot = NULL;
     uint32_t hash = key * 2654435761u;
     hash ^= hash >> 15;
-    for (uint32_t k = 0; k < PROBES; k++) {
+    for (uint32_t k = 0; k < PROBES_MAX; k++) {
         struct cell *cell = &cells[(hash + k) % BOARD_CELLS];
         if (cell->used && cell->key == key) {
             return cell;
         }
         if (!cell->used) {
-            free_place = free_place ? free_place : cell;
+            free_slot = free_slot ? free_slot : cell;
             break; /* places are never emptied, so the key is nowhere behind */
         }
-        if (!free_place && on_time_us(cell, limits, now_us) == 0 && level_uj(cell, limits, now_us) == 0) {
-            free_place = cell;
+        if (!free_slot && on_time_us(cell, limits, now_us) == 0 && level_uj(cell, limits, now_us) == 0) {
+            free_slot = cell;
         }
     }
-    if (free_place) {
-        *free_place = (struct cell){.key = key, .used = true, .ended_us = now_us, .since_us = now_us};
+    if (free_slot) {
+        *free_slot = (struct cell){.key = key, .used = true, .ended_us = now_us, .since_us = now_us};
     }
-    return free_place;
+    return free_slot;
 }
 
 /* --- B5 --- */
@@ -75,24 +75,24 @@ static const struct pulse *pulse_at(const struct guards *g, uint32_t k) {
     return &g->pulses[(g->first + k) % BOARD_PULSES];
 }
 
-static uint64_t weight(const struct pulse *pulse) { return (uint64_t)pulse->on_us * pulse->duty; }
+static uint64_t duty_us(const struct pulse *pulse) { return (uint64_t)pulse->on_us * pulse->duty; }
 
-static void forget_old_pulses(struct guards *g, uint64_t now_us) {
+static void drop_old_pulses(struct guards *g, uint64_t now_us) {
     while (g->count > 0 && pulse_at(g, 0)->start_us + pulse_at(g, 0)->on_us + MEAN_WINDOW_US <= now_us) {
-        g->sum -= weight(pulse_at(g, 0));
+        g->sum -= duty_us(pulse_at(g, 0));
         g->first = (g->first + 1) % BOARD_PULSES;
         g->count--;
     }
 }
 
-/* Light of old pulses in the second that ends at end_us. gone, gone_sum: pulses that have left it whole, carried on
+/* Light of old pulses in the second that ends at end_us. gone, expired_duty_us: pulses that have left it whole, carried on
    from one call to the next. */
-static uint64_t second_before(const struct guards *g, uint64_t end_us, uint32_t *gone, uint64_t *gone_sum) {
-    while (*gone < g->count && pulse_at(g, *gone)->start_us + pulse_at(g, *gone)->on_us + MEAN_WINDOW_US <= end_us) {
-        *gone_sum += weight(pulse_at(g, (*gone)++));
+static uint64_t window_duty_us(const struct guards *g, uint64_t end_us, uint32_t *expired, uint64_t *expired_duty_us) {
+    while (*expired < g->count && pulse_at(g, *expired)->start_us + pulse_at(g, *expired)->on_us + MEAN_WINDOW_US <= end_us) {
+        *expired_duty_us += duty_us(pulse_at(g, (*expired)++));
     }
-    uint64_t left = *gone_sum;
-    for (uint32_t k = *gone; k < g->count && pulse_at(g, k)->start_us + MEAN_WINDOW_US < end_us; k++) {
+    uint64_t left = *expired_duty_us;
+    for (uint32_t k = *expired; k < g->count && pulse_at(g, k)->start_us + MEAN_WINDOW_US < end_us; k++) {
         uint64_t out_us = end_us - MEAN_WINDOW_US - pulse_at(g, k)->start_us;
         left += (out_us < pulse_at(g, k)->on_us ? out_us : pulse_at(g, k)->on_us) * pulse_at(g, k)->duty;
     }
@@ -101,21 +101,21 @@ static uint64_t second_before(const struct guards *g, uint64_t end_us, uint32_t 
 
 /* Most light that any second would hold with this pulse, µs × duty. The sum of a second grows until the pulse ends, or
    until a brighter old pulse begins to leave it: only those ends need a look. */
-static uint64_t fullest_second(const struct guards *g, const struct point *point, uint64_t now_us) {
-    uint64_t end_us = now_us + point->on_us, most = 0, gone_sum = 0;
-    uint32_t gone = 0;
+static uint64_t max_window_duty_us(const struct guards *g, const struct point *point, uint64_t now_us) {
+    uint64_t end_us = now_us + point->on_us, max_duty_us = 0, expired_duty_us = 0;
+    uint32_t expired = 0;
     for (uint32_t k = 0; k < g->count; k++) {
         uint64_t leaves_us = pulse_at(g, k)->start_us + MEAN_WINDOW_US;
         if (leaves_us >= end_us) {
             break;
         }
         if (leaves_us > now_us) {
-            uint64_t sum = second_before(g, leaves_us, &gone, &gone_sum) + (leaves_us - now_us) * point->duty;
-            most = sum > most ? sum : most;
+            uint64_t sum = window_duty_us(g, leaves_us, &expired, &expired_duty_us) + (leaves_us - now_us) * point->duty;
+            max_duty_us = sum > max_duty_us ? sum : max_duty_us;
         }
     }
-    uint64_t sum = second_before(g, end_us, &gone, &gone_sum) + (uint64_t)point->on_us * point->duty;
-    return sum > most ? sum : most;
+    uint64_t sum = window_duty_us(g, end_us, &expired, &expired_duty_us) + (uint64_t)point->on_us * point->duty;
+    return sum > max_duty_us ? sum : max_duty_us;
 }
 
 /* --- all together --- */
@@ -127,13 +127,13 @@ static uint64_t energy_uj(const struct board_limits *limits, const struct point 
 }
 
 /* The accounts of the four cells of a point; false: no place is left for one of them. */
-static bool accounts(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+static bool find_accounts(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                      const struct point *point, uint64_t now_us, struct cell *cells[GRIDS]) {
     uint16_t half = cell_codes / 2;
     for (uint32_t grid = 0; grid < GRIDS; grid++) {
-        uint32_t column = cell_of(point->x, grid & 1 ? 0 : half, cell_codes);
-        uint32_t row = cell_of(point->y, grid & 2 ? 0 : half, cell_codes);
-        cells[grid] = account(g->cells[grid], column | row << 16, limits, now_us);
+        uint32_t column = cell_index(point->x, grid & 1 ? 0 : half, cell_codes);
+        uint32_t row = cell_index(point->y, grid & 2 ? 0 : half, cell_codes);
+        cells[grid] = find_account(g->cells[grid], column | row << 16, limits, now_us);
         if (!cells[grid]) {
             return false;
         }
@@ -141,7 +141,7 @@ static bool accounts(struct guards *g, const struct board_limits *limits, uint16
     return true;
 }
 
-static enum fault refuses(const struct guards *g, const struct board_limits *limits, struct cell *const cells[GRIDS],
+static enum fault check_pulse(const struct guards *g, const struct board_limits *limits, struct cell *const cells[GRIDS],
                           const struct point *point, uint64_t now_us) {
     uint32_t on_us = 0, level = 0;
     for (uint32_t grid = 0; grid < GRIDS; grid++) {
@@ -157,20 +157,20 @@ static enum fault refuses(const struct guards *g, const struct board_limits *lim
     if (on_us + point->on_us > limits->max_on_us) {
         return FAULT_ON_TIME;
     }
-    if (MUTANT != 5 && fullest_second(g, point, now_us) > (uint64_t)MEAN_WINDOW_US * limits->mean_duty) {
+    if (MUTANT != 5 && max_window_duty_us(g, point, now_us) > (uint64_t)MEAN_WINDOW_US * limits->mean_duty) {
         return FAULT_MEAN_POWER;
     }
     return level + energy_uj(limits, point) > limits->spot_uj ? FAULT_SPOT : FAULT_NONE;
 }
 
-enum fault guards_fire(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                        const struct point *point, uint64_t now_us) {
     struct cell *cells[GRIDS];
-    forget_old_pulses(g, now_us);
-    if (!accounts(g, limits, cell_codes, point, now_us, cells)) {
+    drop_old_pulses(g, now_us);
+    if (!find_accounts(g, limits, cell_codes, point, now_us, cells)) {
         return FAULT_SPOT;
     }
-    enum fault fault = refuses(g, limits, cells, point, now_us);
+    enum fault fault = check_pulse(g, limits, cells, point, now_us);
     if (fault != FAULT_NONE || g->count == BOARD_PULSES) {
         return fault != FAULT_NONE ? fault : FAULT_MEAN_POWER;
     }

@@ -2,30 +2,30 @@
 
 #include "core.h"
 
-void limits_get(struct board_limits *limits, const uint8_t *from) {
+void limits_decode(struct board_limits *limits, const uint8_t *from) {
 #define GET(name, bits, at, way) limits->name = get_u##bits(from + at);
     LIMITS_FIELDS(GET)
 #undef GET
 }
 
-void limits_put(const struct board_limits *limits, uint8_t *to) {
+void limits_encode(const struct board_limits *limits, uint8_t *to) {
 #define PUT(name, bits, at, way) put_u##bits(to + at, limits->name);
     LIMITS_FIELDS(PUT)
 #undef PUT
 }
 
-void limits_tighten(struct board_limits *limits, const struct board_limits *asked) {
+void limits_tighten(struct board_limits *limits, const struct board_limits *requested) {
 #if MUTANT == 10
 #define LESS(name) true
 #define MORE(name) true
 #else
-#define LESS(name) (asked->name < limits->name)
-#define MORE(name) (asked->name > limits->name)
+#define LESS(name) (requested->name < limits->name)
+#define MORE(name) (requested->name > limits->name)
 #endif
 #define FIXED(name) false
 #define TIGHTEN(name, bits, at, way) \
     if (way(name)) { \
-        limits->name = asked->name; \
+        limits->name = requested->name; \
     }
     LIMITS_FIELDS(TIGHTEN)
 #undef TIGHTEN

@@ -4,18 +4,18 @@
 
 #include "core.h"
 
-struct form {
+struct layout {
     uint8_t type;
     bool from_host, sequenced;
-    uint8_t body, item, items_max;
+    uint8_t body, item, max_items;
     struct {
         uint8_t at, count;
     } names[3];
 };
 
-#define FORM(type, host, sequenced, body, item, most, at0, n0, at1, n1, at2, n2) \
+#define LAYOUT(type, host, sequenced, body, item, most, at0, n0, at1, n1, at2, n2) \
     {type, host, sequenced, body, item, most, {{at0, n0}, {at1, n1}, {at2, n2}}},
-static const struct form FORMS[] = {MESSAGE_LAYOUTS(FORM)};
+static const struct layout LAYOUTS[] = {MESSAGE_LAYOUTS(LAYOUT)};
 
 /* Decodes what stands between two zeros; false where it is no frame, which counts. */
 static bool frame_decode(struct receiver *r, struct frame *frame) {
@@ -39,7 +39,7 @@ static bool frame_decode(struct receiver *r, struct frame *frame) {
     return true;
 }
 
-bool receiver_take(struct receiver *r, uint8_t byte, struct frame *frame) {
+bool receiver_feed(struct receiver *r, uint8_t byte, struct frame *frame) {
     if (byte != 0) {
         if (r->overlong) {
             return false;
@@ -58,23 +58,23 @@ bool receiver_take(struct receiver *r, uint8_t byte, struct frame *frame) {
     return whole;
 }
 
-bool frame_has_form(const struct frame *frame, enum order *order) {
-    for (size_t k = 0; k < sizeof FORMS / sizeof FORMS[0]; k++) {
-        const struct form *form = &FORMS[k];
-        if (form->type != frame->type) {
+bool frame_is_valid(const struct frame *frame, enum frame_class *class) {
+    for (size_t k = 0; k < sizeof LAYOUTS / sizeof LAYOUTS[0]; k++) {
+        const struct layout *layout = &LAYOUTS[k];
+        if (layout->type != frame->type) {
             continue;
         }
-        size_t rest = frame->length - form->body;
-        if (frame->length < form->body || (form->item ? rest == 0 || rest % form->item != 0 : rest != 0) ||
-            rest > (size_t)form->item * form->items_max) {
+        size_t rest = frame->length - layout->body;
+        if (frame->length < layout->body || (layout->item ? rest == 0 || rest % layout->item != 0 : rest != 0) ||
+            rest > (size_t)layout->item * layout->max_items) {
             return false;
         }
         for (size_t n = 0; n < 3; n++) {
-            if (form->names[n].count && frame->body[form->names[n].at] >= form->names[n].count) {
+            if (layout->names[n].count && frame->body[layout->names[n].at] >= layout->names[n].count) {
                 return false;
             }
         }
-        *order = !form->from_host ? ORDER_NONE : form->sequenced ? ORDER_SEQUENCED : ORDER_HOST;
+        *class = !layout->from_host ? FRAME_NOT_ACCEPTED : layout->sequenced ? FRAME_SEQUENCED : FRAME_UNSEQUENCED;
         return true;
     }
     return false;
@@ -97,7 +97,7 @@ size_t frame_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, 
     return length + 1;
 }
 
-bool link_accepts(struct link *link, uint8_t seq, uint8_t *refusal) {
+bool link_accept(struct link *link, uint8_t seq, uint8_t *refusal) {
     uint8_t ahead = (uint8_t)(seq - link->expected);
     if (ahead == 0) {
         return true;
@@ -111,7 +111,7 @@ bool link_accepts(struct link *link, uint8_t seq, uint8_t *refusal) {
     return false;
 }
 
-void link_consumed(struct link *link, uint8_t refusal) {
+void link_mark_consumed(struct link *link, uint8_t refusal) {
     link->expected++;
     link->last_refusal = refusal;
 }
@@ -119,6 +119,6 @@ void link_consumed(struct link *link, uint8_t refusal) {
 void link_begin(struct link *link, uint16_t session) {
     link->session = session;
     link->expected = 0;
-    link->last_refusal = REFUSED_NOTHING;
+    link->last_refusal = NO_REFUSAL;
     link->ack_due = false;
 }

@@ -2,13 +2,13 @@
 
 #include "core.h"
 
-bool enough_queued(const struct board *b) {
-    bool all_here = b->job.ends && b->next_index >= b->job.end_index;
-    return b->job.exists && b->queue.count > 0 && (all_here || b->queue.count >= b->job.watermark);
+bool has_enough_points(const struct board *b) {
+    bool all_here = b->job.has_end && b->next_index >= b->job.end_index;
+    return b->job.active && b->queue.count > 0 && (all_here || b->queue.count >= b->job.watermark);
 }
 
 /* B7. A move that was broken off may have left the mirrors anywhere on its way: its own time counts too. */
-static uint64_t settled_us(const struct board *b, const struct point *point) {
+static uint64_t settling_end_us(const struct board *b, const struct point *point) {
     uint32_t along_x = point->x > b->x ? point->x - b->x : b->x - point->x;
     uint32_t along_y = point->y > b->y ? point->y - b->y : b->y - point->y;
     uint64_t move = along_x > along_y ? along_x : along_y;
@@ -20,14 +20,14 @@ static uint64_t settled_us(const struct board *b, const struct point *point) {
 }
 
 static void begin_point(struct board *b) {
-    b->current_number = b->next_index - b->queue.count;
-    b->current = queue_pop(&b->queue);
-    b->has_current = true;
-    b->settled_us = settled_us(b, &b->current);
-    b->x = b->current.x;
-    b->y = b->current.y;
-    b->hal.mirrors(b->hal.context, b->x, b->y);
-    b->due_us = b->now_us + b->current.dark_us;
+    b->current_index = b->next_index - b->queue.count;
+    b->current_point = queue_pop(&b->queue);
+    b->has_current_point = true;
+    b->settled_us = settling_end_us(b, &b->current_point);
+    b->x = b->current_point.x;
+    b->y = b->current_point.y;
+    b->hal.move_mirrors(b->hal.context, b->x, b->y);
+    b->due_us = b->now_us + b->current_point.dark_us;
 #if MUTANT != 7
     if (b->due_us < b->settled_us) {
         b->due_us = b->settled_us;
@@ -35,31 +35,31 @@ static void begin_point(struct board *b) {
 #endif
 }
 
-static void light(struct board *b) {
-    enum fault fault = guards_fire(&b->guards, &b->limits, b->config.cell_codes, &b->current, b->now_us);
+static void begin_pulse(struct board *b) {
+    enum fault fault = guards_admit_pulse(&b->guards, &b->limits, b->config.cell_codes, &b->current_point, b->now_us);
     if (fault != FAULT_NONE) {
-        fail(b, fault);
+        enter_fault(b, fault);
         return;
     }
-    b->lit_us = b->now_us;
-    b->due_us = b->now_us + b->current.on_us;
-    set_gate(b, true, b->current.duty);
-    trace_gate(b, true, true, b->current_number);
+    b->gate_on_us = b->now_us;
+    b->due_us = b->now_us + b->current_point.on_us;
+    command_gate(b, true, b->current_point.duty);
+    trace_gate(b, true, true, b->current_index);
 }
 
 /* Three within the window are a fault; the list never holds more. */
-static void underrun(struct board *b) {
+static void on_underrun(struct board *b) {
     b->underruns_total++;
     uint32_t kept = 0;
-    for (uint32_t k = 0; k < b->underruns_known; k++) {
+    for (uint32_t k = 0; k < b->underruns_count; k++) {
         if (b->underruns_us[k] + UNDERRUN_WINDOW_US >= b->now_us) {
             b->underruns_us[kept++] = b->underruns_us[k];
         }
     }
     b->underruns_us[kept++] = b->now_us;
-    b->underruns_known = kept;
+    b->underruns_count = kept;
     if (kept >= UNDERRUNS_MAX) {
-        fail(b, FAULT_UNDERRUN);
+        enter_fault(b, FAULT_UNDERRUN);
         return;
     }
     b->hold_since_us = b->now_us;
@@ -69,39 +69,39 @@ static void underrun(struct board *b) {
 static void finish_point(struct board *b) {
     bool lit = b->gate;
 #if MUTANT == 2
-    if (lit && b->queue.count == 0 && !(b->job.ends && b->current_number + 1 >= b->job.end_index)) {
+    if (lit && b->queue.count == 0 && !(b->job.has_end && b->current_index + 1 >= b->job.end_index)) {
         b->due_us += 1000;
         return;
     }
 #endif
     if (lit) {
-        set_gate(b, false, 0);
-        trace_gate(b, false, true, b->current_number);
+        command_gate(b, false, 0);
+        trace_gate(b, false, true, b->current_index);
     }
-    record_point(b, lit ? b->lit_us : b->now_us, lit ? b->current.on_us : 0);
-    b->has_current = false;
-    if (b->job.exists && b->job.ends && b->done_index >= b->job.end_index) {
-        b->job.exists = false;
+    record_execution(b, lit ? b->gate_on_us : b->now_us, lit ? b->current_point.on_us : 0);
+    b->has_current_point = false;
+    if (b->job.active && b->job.has_end && b->done_index >= b->job.end_index) {
+        b->job.active = false;
         change_state(b, REASON_JOB_DONE);
     } else if (b->queue.count > 0) {
         begin_point(b);
     } else {
-        underrun(b);
+        on_underrun(b);
     }
 }
 
-void point_due(struct board *b) {
-    if (!b->has_current) {
+void advance_point(struct board *b) {
+    if (!b->has_current_point) {
         begin_point(b);
-    } else if (!b->gate && b->current.on_us > 0) {
-        light(b);
+    } else if (!b->gate && b->current_point.on_us > 0) {
+        begin_pulse(b);
     } else {
         finish_point(b);
     }
 }
 
-void refill(struct board *b) {
-    if (b->state == STATE_HOLD && enough_queued(b)) {
+void resume_if_refilled(struct board *b) {
+    if (b->state == STATE_HOLD && has_enough_points(b)) {
         change_state(b, REASON_REFILLED);
     }
 }

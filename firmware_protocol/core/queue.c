@@ -17,16 +17,16 @@ struct point queue_pop(struct queue *q) {
     return point;
 }
 
-void records_clear(struct records *r) { r->made = r->reported = 0; }
+void records_clear(struct records *r) { r->total = r->reported = 0; }
 
-void records_add(struct records *r, const struct record *record) { r->ring[r->made++ % BOARD_RECORDS] = *record; }
+void records_add(struct records *r, const struct record *record) { r->ring[r->total++ % BOARD_RECORDS] = *record; }
 
-uint32_t records_oldest(const struct records *r) { return r->made > BOARD_RECORDS ? r->made - BOARD_RECORDS : 0; }
+uint32_t records_oldest(const struct records *r) { return r->total > BOARD_RECORDS ? r->total - BOARD_RECORDS : 0; }
 
 static const struct record *record_at(const struct records *r, uint32_t at) { return &r->ring[at % BOARD_RECORDS]; }
 
 uint32_t records_find(const struct records *r, uint32_t number) {
-    uint32_t low = records_oldest(r), high = r->made;
+    uint32_t low = records_oldest(r), high = r->total;
     while (low < high) {
         uint32_t middle = low + (high - low) / 2;
         if (record_at(r, middle)->number < number) {
@@ -39,13 +39,13 @@ uint32_t records_find(const struct records *r, uint32_t number) {
 }
 
 size_t records_report(const struct records *r, uint32_t at, uint8_t *body, size_t *length) {
-    if (at >= r->made) {
+    if (at >= r->total) {
         return 0;
     }
     const struct record *first = record_at(r, at);
     uint8_t *to = body + EXECUTED_SIZE;
     size_t count = 0;
-    for (; count < EXECUTED_ITEMS_MAX && at + count < r->made; count++, to += RECORD_SIZE) {
+    for (; count < EXECUTED_ITEMS_MAX && at + count < r->total; count++, to += RECORD_SIZE) {
         const struct record *record = record_at(r, at + (uint32_t)count);
         uint64_t offset = record->on_tick - first->on_tick;
         if (record->number != first->number + count || offset > UINT32_MAX) {

@@ -20,9 +20,9 @@ static void trace(struct board *b, struct board_trace what) {
     }
 }
 
-void set_gate(struct board *b, bool on, uint16_t duty) {
+void command_gate(struct board *b, bool on, uint16_t duty) {
     b->gate = on;
-    b->hal.gate(b->hal.context, on, on ? duty : 0);
+    b->hal.set_gate(b->hal.context, on, on ? duty : 0);
 }
 
 void trace_gate(struct board *b, bool on, bool is_point, uint32_t what) {
@@ -31,33 +31,33 @@ void trace_gate(struct board *b, bool on, bool is_point, uint32_t what) {
 }
 
 /* Adds the current point to the records, with what was really done. */
-void record_point(struct board *b, uint64_t on_at_us, uint64_t on_us) {
-    const struct point *point = &b->current;
-    struct record record = {.number = b->current_number, .on_tick = on_at_us - b->epoch_us};
+void record_execution(struct board *b, uint64_t on_at_us, uint64_t on_us) {
+    const struct point *point = &b->current_point;
+    struct record record = {.number = b->current_index, .on_tick = on_at_us - b->epoch_us};
     record.on_ticks = on_us > UINT16_MAX ? UINT16_MAX : (uint16_t)on_us;
     record.duty = on_us ? point->duty : 0;
     records_add(&b->records, &record);
-    b->done_index = b->current_number + 1;
-    b->laser_on += on_us * point->duty;
+    b->done_index = b->current_index + 1;
+    b->laser_on_duty_us += on_us * point->duty;
     if (on_us) {
-        trace(b, (struct board_trace){.kind = TRACE_PULSE, .index = b->current_number, .x = point->x, .y = point->y,
+        trace(b, (struct board_trace){.kind = TRACE_PULSE, .index = b->current_index, .x = point->x, .y = point->y,
                                       .duty = point->duty, .on_us = on_at_us, .off_us = on_at_us + on_us});
     }
 }
 
 /* Gate off; what a pulse that is cut short really did is recorded. */
-static void go_dark(struct board *b, enum reason reason) {
+static void close_gate(struct board *b, enum reason reason) {
     bool lit = b->gate;
     if (MUTANT != 1) {
-        set_gate(b, false, 0);
+        command_gate(b, false, 0);
     }
     if (MUTANT != 1 && lit) {
         trace_gate(b, false, false, reason);
     }
-    if (b->has_current && lit) {
-        record_point(b, b->lit_us, b->now_us - b->lit_us);
+    if (b->has_current_point && lit) {
+        record_execution(b, b->gate_on_us, b->now_us - b->gate_on_us);
     }
-    b->has_current = false;
+    b->has_current_point = false;
 }
 
 /* The state after an event; an event that the table does not have is a fault, and no caller causes one. */
@@ -74,12 +74,12 @@ static enum state next_state(uint8_t state, enum reason event) {
 void change_state(struct board *b, enum reason event) {
     enum state state = next_state(b->state, event);
     if (state != STATE_RUNNING) {
-        go_dark(b, event);
+        close_gate(b, event);
     }
     uint8_t before = b->state, body[EVENT_SIZE];
     b->state = (uint8_t)state;
-    b->hal.indicator(b->hal.context, is_leased(b->state));
-    b->hal.relay(b->hal.context, state != STATE_FAULT);
+    b->hal.set_indicator(b->hal.context, is_leased(b->state));
+    b->hal.set_relay(b->hal.context, state != STATE_FAULT);
     trace(b, (struct board_trace){.kind = TRACE_STATE, .state = b->state, .before = before, .reason = (uint8_t)event});
     body[EVENT_STATE_AT] = b->state;
     body[EVENT_FAULT_AT] = b->fault;
@@ -90,24 +90,24 @@ void change_state(struct board *b, enum reason event) {
 
 void drop_queue(struct board *b) {
     b->queue.count = 0;
-    b->job.exists = false;
+    b->job.active = false;
     b->done_index = b->next_index;
 }
 
 void disarm(struct board *b, enum reason reason) {
-    b->confirmed = b->nonce_good = false;
+    b->confirmed = b->nonce_valid = false;
     if (!(STATES_IDLE >> b->state & 1u)) {
         change_state(b, reason);
     }
     drop_queue(b);
 }
 
-void fail(struct board *b, enum fault fault) {
+void enter_fault(struct board *b, enum fault fault) {
     if (b->state != STATE_FAULT) {
         b->fault = (uint8_t)fault;
         trace(b, (struct board_trace){.kind = TRACE_FAULT, .fault = b->fault});
         change_state(b, REASON_FAULT);
     }
-    b->confirmed = b->nonce_good = false;
+    b->confirmed = b->nonce_valid = false;
     drop_queue(b);
 }

@@ -13,7 +13,20 @@ from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
 
 FIRMWARE = Path(__file__).parents[2] / "firmware_protocol"
 INPUT_BITS = {name: 1 << k for k, name in enumerate(m.INPUTS)}
-LOOKS = ("state", "fault", "gate", "lit", "indicator", "relay", "fed_us", "x", "y", "crc", "format", "fingerprint")
+SHIM_VALUES = (
+    "state",
+    "fault",
+    "gate",
+    "gate_output",
+    "indicator",
+    "relay",
+    "fed_us",
+    "x",
+    "y",
+    "crc",
+    "format",
+    "fingerprint",
+)
 TRACE_KINDS = ("gate", "state", "fault", "pulse", "rx_error")
 OUT_MAX = 1 << 20
 
@@ -94,11 +107,11 @@ def load(path):
         "shim_link_lost": ([handle], None),
         "shim_set_inputs": ([handle, u32], None),
         "shim_stick": ([handle, u32, u32], None),
-        "shim_take": ([handle, ctypes.c_char_p], size),
+        "shim_take_output": ([handle, ctypes.c_char_p], size),
         "shim_traces": ([handle, ctypes.POINTER(size)], ctypes.POINTER(Trace)),
         "shim_edges": ([handle, ctypes.POINTER(size)], ctypes.POINTER(Edge)),
         "shim_limits": ([handle, ctypes.c_char_p], None),
-        "shim_look": ([handle, u32], u64),
+        "shim_get": ([handle, u32], u64),
         "frame_encode": (
             [ctypes.c_char_p, ctypes.c_uint8, ctypes.c_uint8, ctypes.c_uint16, ctypes.c_char_p, size],
             size,
@@ -135,8 +148,8 @@ class CBoard:
     def __del__(self):
         self._library.shim_free(self._handle)
 
-    def _look(self, what):
-        return self._library.shim_look(self._handle, LOOKS.index(what))
+    def _get(self, name):
+        return self._library.shim_get(self._handle, SHIM_VALUES.index(name))
 
     def _drain(self):
         count = ctypes.c_size_t()
@@ -144,16 +157,16 @@ class CBoard:
         for k in range(count.value):
             self._sink(traces[k].entry())
 
-    state = property(lambda self: m.STATES[self._look("state")])
-    fault = property(lambda self: m.FAULTS[self._look("fault")])
-    gate = property(lambda self: bool(self._look("gate")))
-    lit = property(lambda self: bool(self._look("lit")))
-    indicator = property(lambda self: bool(self._look("indicator")))
-    relay = property(lambda self: bool(self._look("relay")))
-    fed_us = property(lambda self: self._look("fed_us"))
-    fingerprint = property(lambda self: self._look("fingerprint"))
-    bad_frames = property(lambda self: [self._look("crc"), self._look("format")])
-    mirrors = property(lambda self: (self._look("x"), self._look("y")))
+    state = property(lambda self: m.STATES[self._get("state")])
+    fault = property(lambda self: m.FAULTS[self._get("fault")])
+    gate = property(lambda self: bool(self._get("gate")))
+    gate_output = property(lambda self: bool(self._get("gate_output")))
+    indicator = property(lambda self: bool(self._get("indicator")))
+    relay = property(lambda self: bool(self._get("relay")))
+    fed_us = property(lambda self: self._get("fed_us"))
+    fingerprint = property(lambda self: self._get("fingerprint"))
+    bad_frames = property(lambda self: [self._get("crc"), self._get("format")])
+    mirrors = property(lambda self: (self._get("x"), self._get("y")))
 
     @property
     def limits(self):
@@ -162,8 +175,8 @@ class CBoard:
         return m.Limits.parse(body.raw)
 
     @property
-    def light(self):
-        """(clock, on) when the HAL was really told, every edge since power-up."""
+    def gate_edges(self):
+        """(time, on) of each edge of the HAL's gate since power-up."""
         count = ctypes.c_size_t()
         edges = self._library.shim_edges(self._handle, ctypes.byref(count))
         return [(edges[k].at_us, bool(edges[k].on)) for k in range(count.value)]
@@ -186,7 +199,7 @@ class CBoard:
         self._drain()
 
     def bytes_to_send(self):
-        length = self._library.shim_take(self._handle, self._out)
+        length = self._library.shim_take_output(self._handle, self._out)
         return ctypes.string_at(self._out, length)
 
     def set_input(self, name, value, now_us):

@@ -20,7 +20,7 @@ struct shim {
     struct board board;
     uint64_t now_us, fed_us;
     uint8_t inputs;
-    uint8_t stuck, stuck_on, lit, indicator, relay;
+    uint8_t stuck, stuck_on, gate_on, indicator, relay;
     uint16_t x, y;
     uint8_t out[OUT_MAX];
     size_t out_length;
@@ -34,30 +34,30 @@ struct shim {
     struct board_config config;
 };
 
-static void gate(void *context, bool on, uint16_t duty) {
+static void set_gate(void *context, bool on, uint16_t duty) {
     struct shim *s = context;
-    if (s->lit != on && s->edges_count < EDGES_MAX) {
+    if (s->gate_on != on && s->edges_count < EDGES_MAX) {
         s->edges[s->edges_count++] = (struct edge){s->now_us, on, duty};
     }
-    s->lit = on;
+    s->gate_on = on;
 }
-static bool gate_readback(void *context) {
+static bool read_gate(void *context) {
     struct shim *s = context;
-    return s->stuck ? s->stuck_on : s->lit;
+    return s->stuck ? s->stuck_on : s->gate_on;
 }
-static void mirrors(void *context, uint16_t x, uint16_t y) {
+static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     struct shim *s = context;
     s->x = x;
     s->y = y;
 }
-static uint8_t inputs(void *context) { return ((struct shim *)context)->inputs; }
-static void indicator(void *context, bool lit) { ((struct shim *)context)->indicator = lit; }
-static void relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
-static uint32_t entropy(void *context) {
+static uint8_t read_inputs(void *context) { return ((struct shim *)context)->inputs; }
+static void set_indicator(void *context, bool lit) { ((struct shim *)context)->indicator = lit; }
+static void set_relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
+static uint32_t read_entropy(void *context) {
     struct shim *s = context;
     return s->entropy_count ? s->entropy[s->entropy_at++ % s->entropy_count] : 1;
 }
-static int16_t temperature_dc(void *context) {
+static int16_t read_temperature_dc(void *context) {
     (void)context;
     return 250;
 }
@@ -68,7 +68,7 @@ static void send(void *context, const uint8_t *frame, size_t length) {
         s->out_length += length;
     }
 }
-static void forget(void *context) { ((struct shim *)context)->out_length = 0; }
+static void discard_output(void *context) { ((struct shim *)context)->out_length = 0; }
 static void feed_watchdog(void *context) {
     struct shim *s = context;
     s->fed_us = s->now_us;
@@ -84,9 +84,9 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
                       uint32_t key_edge) {
     struct shim *s = calloc(1, sizeof *s);
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
-    s->hal = (struct board_hal){s,     gate,    gate_readback,  mirrors, inputs, indicator,     relay,
-                                entropy, temperature_dc, send,    forget, feed_watchdog, trace};
-    limits_get(&s->config.limits, limits);
+    s->hal = (struct board_hal){s,           set_gate,     read_gate,              move_mirrors, read_inputs,    set_indicator, set_relay,
+                                read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog, trace};
+    limits_decode(&s->config.limits, limits);
     memcpy(s->config.uid, uid, sizeof s->config.uid);
     s->config.firmware = 0x00010000u;
     s->config.cell_codes = (uint16_t)cell_codes;
@@ -122,7 +122,7 @@ void shim_run(struct shim *s, uint64_t now_us) {
 }
 
 void shim_receive(struct shim *s, const uint8_t *bytes, size_t n) { board_receive(&s->board, bytes, n, s->now_us); }
-void shim_link_lost(struct shim *s) { board_link_lost(&s->board, s->now_us); }
+void shim_link_lost(struct shim *s) { board_on_link_lost(&s->board, s->now_us); }
 void shim_set_inputs(struct shim *s, uint32_t inputs) { s->inputs = (uint8_t)inputs; }
 void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
     s->stuck = (uint8_t)stuck;
@@ -130,7 +130,7 @@ void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
 }
 
 /* Copies the bytes for the host and forgets them; their number. */
-size_t shim_take(struct shim *s, uint8_t *to) {
+size_t shim_take_output(struct shim *s, uint8_t *to) {
     size_t n = s->out_length;
     memcpy(to, s->out, n);
     s->out_length = 0;
@@ -145,10 +145,10 @@ const struct edge *shim_edges(struct shim *s, size_t *count) {
     *count = s->edges_count;
     return s->edges;
 }
-void shim_limits(const struct shim *s, uint8_t *to) { limits_put(&s->board.limits, to); }
+void shim_limits(const struct shim *s, uint8_t *to) { limits_encode(&s->board.limits, to); }
 
-enum { LOOK_STATE, LOOK_FAULT, LOOK_GATE, LOOK_LIT, LOOK_INDICATOR, LOOK_RELAY, LOOK_FED, LOOK_X, LOOK_Y,
-       LOOK_CRC, LOOK_FORMAT, LOOK_FINGERPRINT };
+enum { GET_STATE, GET_FAULT, GET_GATE, GET_GATE_ON, GET_INDICATOR, GET_RELAY, GET_FED, GET_X, GET_Y,
+       GET_CRC, GET_FORMAT, GET_FINGERPRINT };
 
 /* FNV-1a of all that a board remembers but for what it counts and has not yet put together of a frame. */
 static uint64_t fingerprint(const struct shim *s) {
@@ -164,29 +164,29 @@ static uint64_t fingerprint(const struct shim *s) {
     return hash;
 }
 
-uint64_t shim_look(const struct shim *s, uint32_t what) {
+uint64_t shim_get(const struct shim *s, uint32_t what) {
     switch (what) {
-    case LOOK_STATE:
+    case GET_STATE:
         return s->board.state;
-    case LOOK_FAULT:
+    case GET_FAULT:
         return s->board.fault;
-    case LOOK_GATE:
+    case GET_GATE:
         return s->board.gate;
-    case LOOK_LIT:
-        return s->lit;
-    case LOOK_INDICATOR:
+    case GET_GATE_ON:
+        return s->gate_on;
+    case GET_INDICATOR:
         return s->indicator;
-    case LOOK_RELAY:
+    case GET_RELAY:
         return s->relay;
-    case LOOK_FED:
+    case GET_FED:
         return s->fed_us;
-    case LOOK_X:
+    case GET_X:
         return s->x;
-    case LOOK_Y:
+    case GET_Y:
         return s->y;
-    case LOOK_CRC:
+    case GET_CRC:
         return s->board.link.receiver.crc_errors;
-    case LOOK_FORMAT:
+    case GET_FORMAT:
         return s->board.link.receiver.format_errors;
     default:
         return fingerprint(s);

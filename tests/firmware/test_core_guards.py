@@ -20,7 +20,7 @@ def check_b14(make):
         b.wait(1000)
         b.core.tick(b.now_us + late_us)
         b.now_us += late_us
-        assert (b.fault, b.core.lit) == (fault, not fault)
+        assert (b.fault, b.core.gate_output) == (fault, not fault)
     assert b.pulses[-1] == (0, b.now_us - 1601, b.now_us), "the record tells how long it really was lit"
 
     for lit in (False, True):
@@ -80,20 +80,20 @@ def running(make, on_us=40_000, end=True, **limits):
     b = make(limits).ready()
     b.play(here(on_us), end=end)
     b.wait(1000)
-    assert b.core.lit
+    assert b.core.gate_output
     return b
 
 
 def dark_us(b):
-    assert not b.core.lit
-    return b.core.light[-1][0]
+    assert not b.core.gate_output
+    return b.core.gate_edges[-1][0]
 
 
 def test_an_underrun_is_dark_within_100_us(make):
     b = running(make, on_us=12_345, end=False)
     b.wait(20_000)
     assert b.state == "HOLD"
-    assert 0 <= dark_us(b) - (b.core.light[0][0] + 12_345) <= 100
+    assert 0 <= dark_us(b) - (b.core.gate_edges[0][0] + 12_345) <= 100
 
 
 @pytest.mark.parametrize(("name", "unsafe"), [("interlock", False), ("key", False), ("estop", True)])

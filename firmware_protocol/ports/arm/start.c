@@ -6,7 +6,7 @@ extern uint32_t data_begin[], data_end[], bss_begin[], bss_end[];
 extern const uint32_t data_stored[];
 extern int main(void) __attribute__((long_call)); /* it may be among what is copied, far away */
 
-__attribute__((section(".start"))) void stuck(void) {
+__attribute__((section(".start"))) void halt(void) {
     for (;;) {
     }
 }
@@ -21,5 +21,5 @@ __attribute__((section(".start"))) void reset(void) {
         *to++ = 0;
     }
     main();
-    stuck();
+    halt();
 }

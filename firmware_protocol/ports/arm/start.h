@@ -9,6 +9,6 @@ typedef void (*handler)(void);
    whole words), then runs main. Stands in section .start, which a script keeps out of what is copied. */
 void reset(void);
 /* Does nothing for ever: the watchdog's business. For vectors that should never be taken. */
-void stuck(void);
+void halt(void);
 
 #endif

@@ -1,4 +1,4 @@
-/* The board as a process on Linux: options, files, a pty with its line's pace and faults, a log, the core's HAL. */
+/* The board as a process on Linux: options, files, a pty with its line's line_rate and faults, a log, the core's HAL. */
 
 #ifndef HOST_H
 #define HOST_H
@@ -19,7 +19,7 @@ struct toml_entry {
     enum toml_kind kind;
     double number;
     long long integer;
-    bool truth;
+    bool boolean;
     char key[32], text[64], raw[64];
 };
 
@@ -82,7 +82,7 @@ void log_port(struct log *log, uint64_t at_us, bool open);
 #define OUT_MAX 262144u
 #define READ_MAX 4096u
 
-struct pace {
+struct line_rate {
     double bytes_per_s, tokens;
     uint64_t at_us;
 };
@@ -92,23 +92,23 @@ struct line {
     int master;
     bool open, was_open, mid_frame;
     uint64_t closed_since_us;
-    struct pace in, out;
+    struct line_rate in, out;
     double drop_rate, flip_rate;
     bool hung;
-    uint8_t waiting[OUT_MAX];
-    size_t waiting_count;
+    uint8_t output[OUT_MAX];
+    size_t output_count;
 };
 
 /* false, with a reason in errno, where no pty can be had. */
-bool line_make(struct line *line);
+bool line_open(struct line *line);
 void line_close(struct line *line);
 bool line_hung_up(const struct line *line);
-/* Up to READ_MAX bytes as they arrive, at the line's pace; 0 where there are none. last: all at once. */
+/* Up to READ_MAX bytes as they arrive, at the line's line_rate; 0 where there are none. last: all at once. */
 size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last);
 void line_send(struct line *line, const uint8_t *frame, size_t n);
-void line_forget(struct line *line);
+void line_discard_output(struct line *line);
 void line_write(struct line *line, uint64_t now_us);
-bool line_may_read(struct line *line, uint64_t now_us);
+bool line_can_read(struct line *line, uint64_t now_us);
 
 /* --- the port --- */
 
@@ -119,10 +119,10 @@ struct port {
     struct line line;
     struct script script;
     struct log log;
-    uint64_t started_ns, at_us, fed_us, ticks_again_us;
-    uint64_t exit_closed_us; /* UINT64_MAX: never */
+    uint64_t started_ns, at_us, watchdog_fed_us, ticks_resume_us;
+    uint64_t exit_when_closed_us; /* UINT64_MAX: never */
     uint8_t inputs;
-    bool lit, stuck, stuck_on, loop_stopped;
+    bool gate_on, readback_stuck, readback_value, loop_stopped;
 };
 
 /* Until stopped by a signal, the port being closed for long, or the log; dark then. */

@@ -1,4 +1,4 @@
-/* A pty that passes bytes as a serial line does: at its pace, and with the faults a script puts in. */
+/* A pty that passes bytes as a serial line does: at its line_rate, and with the faults a script puts in. */
 
 #define _GNU_SOURCE
 
@@ -14,7 +14,7 @@
 
 #define BURST_BYTES 64.0
 
-bool line_make(struct line *line) {
+bool line_open(struct line *line) {
     char temporary[4096];
     struct termios raw;
     snprintf(temporary, sizeof temporary, "%s.new", line->path);
@@ -46,91 +46,91 @@ bool line_hung_up(const struct line *line) {
     return poll(&look, 1, 0) > 0 && look.revents & POLLHUP;
 }
 
-/* --- pace --- */
+/* --- line_rate --- */
 
 /* A late turn may catch up on what the line would have carried meanwhile, up to a whole read. */
-static size_t allowed(struct pace *pace, uint64_t now_us) {
-    pace->tokens += (double)(now_us - pace->at_us) * 1e-6 * pace->bytes_per_s;
-    pace->tokens = pace->tokens > READ_MAX ? READ_MAX : pace->tokens;
-    pace->at_us = now_us;
-    return pace->tokens > 0 ? (size_t)pace->tokens : 0;
+static size_t available_bytes(struct line_rate *line_rate, uint64_t now_us) {
+    line_rate->tokens += (double)(now_us - line_rate->at_us) * 1e-6 * line_rate->bytes_per_s;
+    line_rate->tokens = line_rate->tokens > READ_MAX ? READ_MAX : line_rate->tokens;
+    line_rate->at_us = now_us;
+    return line_rate->tokens > 0 ? (size_t)line_rate->tokens : 0;
 }
 
 /* Nothing waits to pass: a line saves nothing up. */
-static void idle(struct pace *pace) { pace->tokens = pace->tokens > BURST_BYTES ? BURST_BYTES : pace->tokens; }
+static void cap_credit(struct line_rate *line_rate) { line_rate->tokens = line_rate->tokens > BURST_BYTES ? BURST_BYTES : line_rate->tokens; }
 
-bool line_may_read(struct line *line, uint64_t now_us) { return allowed(&line->in, now_us) > 0; }
+bool line_can_read(struct line *line, uint64_t now_us) { return available_bytes(&line->in, now_us) > 0; }
 
 /* --- faults --- */
 
-static double chance(void) { return (double)random() / ((double)RAND_MAX + 1.0); }
+static double random_unit(void) { return (double)random() / ((double)RAND_MAX + 1.0); }
 
-static size_t carry(const struct line *line, uint8_t *bytes, size_t n) {
-    size_t kept = 0;
+static size_t apply_faults(const struct line *line, uint8_t *bytes, size_t n) {
+    size_t received = 0;
     if (line->hung) {
         return 0;
     }
     for (size_t k = 0; k < n; k++) {
-        if (line->drop_rate > 0 && chance() < line->drop_rate) {
+        if (line->drop_rate > 0 && random_unit() < line->drop_rate) {
             continue;
         }
-        bytes[kept] = bytes[k];
-        if (line->flip_rate > 0 && chance() < line->flip_rate) {
-            bytes[kept] ^= (uint8_t)(1u << random() % 8);
+        bytes[received] = bytes[k];
+        if (line->flip_rate > 0 && random_unit() < line->flip_rate) {
+            bytes[received] ^= (uint8_t)(1u << random() % 8);
         }
-        kept++;
+        received++;
     }
-    return kept;
+    return received;
 }
 
 /* --- bytes --- */
 
 size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last) {
-    size_t most = last ? READ_MAX : allowed(&line->in, now_us);
-    if (most == 0) {
+    size_t max_bytes = last ? READ_MAX : available_bytes(&line->in, now_us);
+    if (max_bytes == 0) {
         return 0;
     }
-    ssize_t n = read(line->master, to, most);
+    ssize_t n = read(line->master, to, max_bytes);
     if (n <= 0) {
-        idle(&line->in);
+        cap_credit(&line->in);
         return 0; /* nothing there, or the host has just closed: the next look at the port tells */
     }
     line->in.tokens -= (double)n;
-    if ((size_t)n < most) {
-        idle(&line->in);
+    if ((size_t)n < max_bytes) {
+        cap_credit(&line->in);
     }
-    return carry(line, to, (size_t)n);
+    return apply_faults(line, to, (size_t)n);
 }
 
 void line_send(struct line *line, const uint8_t *frame, size_t n) {
-    if (line->waiting_count + n > OUT_MAX) {
+    if (line->output_count + n > OUT_MAX) {
         return; /* whole or not at all */
     }
-    memcpy(line->waiting + line->waiting_count, frame, n);
-    line->waiting_count += carry(line, line->waiting + line->waiting_count, n);
+    memcpy(line->output + line->output_count, frame, n);
+    line->output_count += apply_faults(line, line->output + line->output_count, n);
 }
 
 /* A frame that has begun to leave goes to its end. */
-void line_forget(struct line *line) {
-    const uint8_t *end = line->mid_frame ? memchr(line->waiting, 0, line->waiting_count) : NULL;
-    line->waiting_count = end ? (size_t)(end - line->waiting) + 1 : 0;
+void line_discard_output(struct line *line) {
+    const uint8_t *end = line->mid_frame ? memchr(line->output, 0, line->output_count) : NULL;
+    line->output_count = end ? (size_t)(end - line->output) + 1 : 0;
 }
 
 void line_write(struct line *line, uint64_t now_us) {
-    size_t most = allowed(&line->out, now_us);
-    most = most < line->waiting_count ? most : line->waiting_count;
-    if (line->waiting_count == 0) {
-        idle(&line->out);
+    size_t max_bytes = available_bytes(&line->out, now_us);
+    max_bytes = max_bytes < line->output_count ? max_bytes : line->output_count;
+    if (line->output_count == 0) {
+        cap_credit(&line->out);
     }
-    if (most == 0) {
+    if (max_bytes == 0) {
         return;
     }
-    ssize_t n = write(line->master, line->waiting, most);
+    ssize_t n = write(line->master, line->output, max_bytes);
     if (n <= 0) {
         return;
     }
     line->out.tokens -= (double)n;
-    line->mid_frame = line->waiting[n - 1] != 0;
-    line->waiting_count -= (size_t)n;
-    memmove(line->waiting, line->waiting + n, line->waiting_count);
+    line->mid_frame = line->output[n - 1] != 0;
+    line->output_count -= (size_t)n;
+    memmove(line->output, line->output + n, line->output_count);
 }

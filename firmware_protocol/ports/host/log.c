@@ -12,19 +12,19 @@ static const char *const STATES[STATE_COUNT] = STATE_NAMES;
 static const char *const FAULTS[FAULT_COUNT] = FAULT_NAMES;
 static const char *const REASONS[REASON_COUNT] = REASON_NAMES;
 
-static const char *json(bool truth) { return truth ? "true" : "false"; }
+static const char *json_boolean(bool value) { return value ? "true" : "false"; }
 
 __attribute__((format(printf, 4, 5))) static void write_line(struct log *log, uint64_t at_us, const char *event,
                                                              const char *format, ...) {
     char line[400];
-    va_list more;
+    va_list arguments;
     if (log->fd < 0) {
         return;
     }
     int n = snprintf(line, sizeof line, "{\"t_us\": %" PRIu64 ", \"event\": \"%s\", ", at_us, event);
-    va_start(more, format);
-    n += vsnprintf(line + n, sizeof line - (size_t)n, format, more);
-    va_end(more);
+    va_start(arguments, format);
+    n += vsnprintf(line + n, sizeof line - (size_t)n, format, arguments);
+    va_end(arguments);
     n += snprintf(line + n, sizeof line - (size_t)n, "}\n");
     ssize_t written;
     do {
@@ -44,7 +44,7 @@ static void write_gate(struct log *log, const struct board_trace *what) {
     } else {
         snprintf(reason, sizeof reason, "%s", what->reason ? REASONS[what->reason] : "reset");
     }
-    write_line(log, what->at_us, "gate", "\"on\": %s, \"reason\": \"%s\"", json(what->on), reason);
+    write_line(log, what->at_us, "gate", "\"on\": %s, \"reason\": \"%s\"", json_boolean(what->on), reason);
 }
 
 void log_trace(struct log *log, const struct board_trace *what) {
@@ -72,9 +72,9 @@ void log_trace(struct log *log, const struct board_trace *what) {
 }
 
 void log_input(struct log *log, uint64_t at_us, const char *name, bool value) {
-    write_line(log, at_us, "input", "\"input\": \"%s\", \"value\": %s", name, json(value));
+    write_line(log, at_us, "input", "\"input\": \"%s\", \"value\": %s", name, json_boolean(value));
 }
 
 void log_port(struct log *log, uint64_t at_us, bool open) {
-    write_line(log, at_us, "port", "\"open\": %s", json(open));
+    write_line(log, at_us, "port", "\"open\": %s", json_boolean(open));
 }

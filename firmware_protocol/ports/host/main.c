@@ -15,12 +15,12 @@
 #include "host.h"
 
 #define BAUD_MIN 300
-#define BITS_A_BYTE 10
+#define BITS_PER_BYTE 10
 #define CLOSED_MAX_S 1e9
 
 struct options {
     const char *pty, *log, *limits, *script;
-    double baud, exit_closed_s;
+    double baud, exit_when_closed_s;
 };
 
 static double parse_number(const char *option, const char *text, double low, double high, const char *expected) {
@@ -39,7 +39,7 @@ static struct options parse(int argc, char **argv) {
         {"baud", required_argument, NULL, 'b'},   {"exit-when-closed", required_argument, NULL, 'x'},
         {NULL, 0, NULL, 0},
     };
-    struct options options = {.baud = 1e6, .exit_closed_s = -1};
+    struct options options = {.baud = 1e6, .exit_when_closed_s = -1};
     opterr = 0;
     for (int which; (which = getopt_long(argc, argv, "", KNOWN, NULL)) != -1;) {
         switch (which) {
@@ -59,7 +59,7 @@ static struct options parse(int argc, char **argv) {
             options.baud = parse_number("--baud", optarg, BAUD_MIN, 1e9, "at least 300");
             break;
         case 'x':
-            options.exit_closed_s = parse_number("--exit-when-closed", optarg, 0, CLOSED_MAX_S, "a time in s");
+            options.exit_when_closed_s = parse_number("--exit-when-closed", optarg, 0, CLOSED_MAX_S, "a time in s");
             break;
         default:
             bad_input("options", argv[optind - 1], "--pty, --log, --limits, --script, --baud, --exit-when-closed");
@@ -106,9 +106,9 @@ int main(int argc, char **argv) {
     signal(SIGPIPE, SIG_IGN);
     signal(SIGXFSZ, SIG_IGN); /* a full disk is an error of the log's writing */
     port->line.path = options.pty;
-    port->line.in.bytes_per_s = port->line.out.bytes_per_s = options.baud / BITS_A_BYTE;
-    port->exit_closed_us = options.exit_closed_s < 0 ? UINT64_MAX : (uint64_t)(options.exit_closed_s * 1e6);
-    if (!line_make(&port->line)) {
+    port->line.in.bytes_per_s = port->line.out.bytes_per_s = options.baud / BITS_PER_BYTE;
+    port->exit_when_closed_us = options.exit_when_closed_s < 0 ? UINT64_MAX : (uint64_t)(options.exit_when_closed_s * 1e6);
+    if (!line_open(&port->line)) {
         fprintf(stderr, PROGRAM ": no pty: %s\n", strerror(errno));
         return 1;
     }

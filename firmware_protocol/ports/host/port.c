@@ -15,9 +15,9 @@
 
 #include "host.h"
 
-#define TURN_MAX_US 5000u
-#define CLOSED_TURN_US 1000u
-#define PACED_TURN_US 500u
+#define LOOP_WAIT_MAX_US 5000u
+#define CLOSED_WAIT_US 1000u
+#define PACED_WAIT_US 500u
 #define WATCHDOG_US 50000u
 #define LATE_TICK_US 1000u
 #define TIMER_SLACK_NS 1000ul
@@ -39,22 +39,22 @@ static uint64_t now_us(const struct port *port) { return (clock_ns() - port->sta
 
 /* --- the HAL --- */
 
-static void gate(void *context, bool on, uint16_t duty) {
+static void set_gate(void *context, bool on, uint16_t duty) {
     (void)duty;
-    ((struct port *)context)->lit = on;
+    ((struct port *)context)->gate_on = on;
 }
-static bool gate_readback(void *context) {
+static bool read_gate(void *context) {
     const struct port *port = context;
-    return port->stuck ? port->stuck_on : port->lit;
+    return port->readback_stuck ? port->readback_value : port->gate_on;
 }
-static void mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
-static void lamp(void *context, bool on) { (void)context, (void)on; }
-static uint8_t inputs(void *context) { return ((struct port *)context)->inputs; }
-static int16_t temperature_dc(void *context) {
+static void move_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
+static void ignore_output(void *context, bool on) { (void)context, (void)on; }
+static uint8_t read_inputs(void *context) { return ((struct port *)context)->inputs; }
+static int16_t read_temperature_dc(void *context) {
     (void)context;
     return 250;
 }
-static uint32_t entropy(void *context) {
+static uint32_t read_entropy(void *context) {
     uint32_t value = 0;
     (void)context;
     while (getrandom(&value, sizeof value, 0) != sizeof value) {
@@ -62,21 +62,21 @@ static uint32_t entropy(void *context) {
     return value;
 }
 static void send(void *context, const uint8_t *frame, size_t n) { line_send(&((struct port *)context)->line, frame, n); }
-static void forget(void *context) { line_forget(&((struct port *)context)->line); }
+static void discard_output(void *context) { line_discard_output(&((struct port *)context)->line); }
 static void feed_watchdog(void *context) {
     struct port *port = context;
-    port->fed_us = port->at_us;
+    port->watchdog_fed_us = port->at_us;
 }
 static void trace(void *context, const struct board_trace *what) { log_trace(&((struct port *)context)->log, what); }
 
 /* --- time --- */
 
 static void reset(struct port *port, enum reset_cause cause) {
-    if (port->lit) {
+    if (port->gate_on) {
         log_trace(&port->log, &(struct board_trace){.at_us = port->at_us, .kind = TRACE_GATE});
     }
     board_init(&port->board, &port->hal, &port->config, cause, port->at_us);
-    port->fed_us = port->at_us;
+    port->watchdog_fed_us = port->at_us;
     port->loop_stopped = false;
 }
 
@@ -85,19 +85,19 @@ static void tick(struct port *port) {
     if (!port->loop_stopped) {
         board_receive(&port->board, NULL, 0, port->at_us);
     }
-    if (port->at_us - port->fed_us > WATCHDOG_US) {
+    if (port->at_us - port->watchdog_fed_us > WATCHDOG_US) {
         reset(port, RESET_WATCHDOG);
     }
 }
 
 /* Makes up for all ticks up to until_us. */
-static void run_to(struct port *port, uint64_t until_us) {
+static void run_ticks_until(struct port *port, uint64_t until_us) {
     while (port->at_us < until_us) {
         uint64_t next_us = port->at_us + BOARD_TICK_US;
-        if (next_us < port->ticks_again_us) {
-            next_us = port->ticks_again_us;
+        if (next_us < port->ticks_resume_us) {
+            next_us = port->ticks_resume_us;
         }
-        if (next_us > until_us && until_us < port->ticks_again_us) {
+        if (next_us > until_us && until_us < port->ticks_resume_us) {
             return;
         }
         port->at_us = next_us < until_us ? next_us : until_us;
@@ -107,9 +107,9 @@ static void run_to(struct port *port, uint64_t until_us) {
 
 /* --- script --- */
 
-static void port_closed(struct port *port) {
+static void on_port_closed(struct port *port) {
     log_port(&port->log, port->at_us, false);
-    board_link_lost(&port->board, port->at_us);
+    board_on_link_lost(&port->board, port->at_us);
     port->line.closed_since_us = port->at_us;
     port->line.open = false;
 }
@@ -120,7 +120,7 @@ static void set_input(struct port *port, const struct step *step) {
     board_tick(&port->board, port->at_us);
 }
 
-static void take_step(struct port *port, const struct step *step) {
+static void run_step(struct port *port, const struct step *step) {
     switch (step->kind) {
     case STEP_SET:
         set_input(port, step);
@@ -136,36 +136,36 @@ static void take_step(struct port *port, const struct step *step) {
         break;
     case STEP_REPAIR:
         port->line.drop_rate = port->line.flip_rate = 0;
-        port->line.hung = port->stuck = false;
+        port->line.hung = port->readback_stuck = false;
         break;
     case STEP_RESET:
-        port->line.waiting_count = 0;
+        port->line.output_count = 0;
         reset(port, RESET_RESET);
         break;
     case STEP_CLOSE:
-        port_closed(port);
+        on_port_closed(port);
         line_close(&port->line);
-        stopped = !line_make(&port->line);
+        stopped = !line_open(&port->line);
         break;
     case STEP_STOP_LOOP:
         port->loop_stopped = true;
         break;
     case STEP_LATE_TICK:
-        port->ticks_again_us = port->at_us + LATE_TICK_US;
+        port->ticks_resume_us = port->at_us + LATE_TICK_US;
         break;
     case STEP_STICK_GATE:
-        port->stuck_on = port->lit;
-        port->stuck = true;
+        port->readback_value = port->gate_on;
+        port->readback_stuck = true;
         break;
     }
 }
 
-static void follow_script(struct port *port) {
+static void run_due_steps(struct port *port) {
     struct script *script = &port->script;
     while (script->next < script->count && script->steps[script->next].at_us <= now_us(port)) {
         const struct step *step = &script->steps[script->next++];
-        run_to(port, step->at_us);
-        take_step(port, step);
+        run_ticks_until(port, step->at_us);
+        run_step(port, step);
     }
 }
 
@@ -183,58 +183,58 @@ static void receive(struct port *port, bool last) {
 }
 
 /* What a host wrote before it closed is taken first, so that no later host finds it in the line. */
-static void watch_line(struct port *port) {
+static void update_line_state(struct port *port) {
     struct line *line = &port->line;
     bool hung_up = line_hung_up(line);
     if (line->open && hung_up) {
         receive(port, true);
-        port_closed(port);
+        on_port_closed(port);
     } else if (!line->open && !hung_up) {
         log_port(&port->log, port->at_us, true);
         line->was_open = true;
     }
     line->open = !hung_up;
-    if (line->was_open && hung_up && port->exit_closed_us != UINT64_MAX &&
-        port->at_us - line->closed_since_us > port->exit_closed_us) {
+    if (line->was_open && hung_up && port->exit_when_closed_us != UINT64_MAX &&
+        port->at_us - line->closed_since_us > port->exit_when_closed_us) {
         stopped = 1;
     }
 }
 
-static uint64_t earlier(uint64_t wait_us, uint64_t due_us, uint64_t now) {
+static uint64_t min_wait_us(uint64_t wait_us, uint64_t due_us, uint64_t now) {
     uint64_t left_us = due_us > now ? due_us - now : 0;
     return left_us < wait_us ? left_us : wait_us;
 }
 
 static void wait(struct port *port) {
     const struct script *script = &port->script;
-    uint64_t now = now_us(port), wait_us = earlier(TURN_MAX_US, board_next_due_us(&port->board), now);
+    uint64_t now = now_us(port), wait_us = min_wait_us(LOOP_WAIT_MAX_US, board_next_due_us(&port->board), now);
     struct pollfd look = {.fd = port->line.master, .events = POLLIN};
     if (script->next < script->count) {
-        wait_us = earlier(wait_us, script->steps[script->next].at_us, now);
+        wait_us = min_wait_us(wait_us, script->steps[script->next].at_us, now);
     }
     nfds_t count = 1;
     if (!port->line.open) {
         count = 0;
-        wait_us = wait_us > CLOSED_TURN_US ? wait_us : CLOSED_TURN_US;
-    } else if (!line_may_read(&port->line, now) || port->loop_stopped) {
+        wait_us = wait_us > CLOSED_WAIT_US ? wait_us : CLOSED_WAIT_US;
+    } else if (!line_can_read(&port->line, now) || port->loop_stopped) {
         count = 0;
-        wait_us = wait_us < PACED_TURN_US ? wait_us : PACED_TURN_US;
-    } else if (port->line.waiting_count > 0) {
-        wait_us = wait_us < PACED_TURN_US ? wait_us : PACED_TURN_US;
+        wait_us = wait_us < PACED_WAIT_US ? wait_us : PACED_WAIT_US;
+    } else if (port->line.output_count > 0) {
+        wait_us = wait_us < PACED_WAIT_US ? wait_us : PACED_WAIT_US;
     }
     struct timespec span = {.tv_nsec = (long)wait_us * 1000};
     ppoll(&look, count, &span, NULL);
 }
 
-static void turn(struct port *port) {
-    follow_script(port);
-    run_to(port, now_us(port));
-    bool serving = !port->loop_stopped && port->at_us >= port->ticks_again_us;
+static void run_once(struct port *port) {
+    run_due_steps(port);
+    run_ticks_until(port, now_us(port));
+    bool serving = !port->loop_stopped && port->at_us >= port->ticks_resume_us;
     if (serving) {
-        watch_line(port);
+        update_line_state(port);
     }
     if (!port->line.open) {
-        port->line.waiting_count = 0;
+        port->line.output_count = 0;
     } else if (serving) {
         receive(port, false);
         line_write(&port->line, port->at_us);
@@ -245,16 +245,16 @@ static void turn(struct port *port) {
 void port_run(struct port *port) {
     port->hal = (struct board_hal){
         .context = port,
-        .gate = gate,
-        .gate_readback = gate_readback,
-        .mirrors = mirrors,
-        .inputs = inputs,
-        .indicator = lamp,
-        .relay = lamp,
-        .entropy = entropy,
-        .temperature_dc = temperature_dc,
+        .set_gate = set_gate,
+        .read_gate = read_gate,
+        .move_mirrors = move_mirrors,
+        .read_inputs = read_inputs,
+        .set_indicator = ignore_output,
+        .set_relay = ignore_output,
+        .read_entropy = read_entropy,
+        .read_temperature_dc = read_temperature_dc,
         .send = send,
-        .forget = forget,
+        .discard_output = discard_output,
         .feed_watchdog = feed_watchdog,
         .trace = trace,
     };
@@ -265,8 +265,8 @@ void port_run(struct port *port) {
     port->started_ns = clock_ns();
     board_init(&port->board, &port->hal, &port->config, RESET_POWER_UP, 0);
     while (!stopped && !port->log.failed) {
-        turn(port);
+        run_once(port);
     }
-    board_link_lost(&port->board, port->at_us);
+    board_on_link_lost(&port->board, port->at_us);
     unlink(port->line.path);
 }

@@ -7,7 +7,7 @@
 static const char *const INPUTS[INPUT_COUNT] = INPUT_NAMES;
 static const char *const ACTIONS[] = {"",       "flip_bits", "drop_bytes", "hang",      "repair",
                                       "reset",  "close",     "stop_loop",  "late_tick", "stick_gate"};
-#define ACTIONS_LISTED \
+#define ACTION_NAMES \
     "one of flip_bits, drop_bytes, hang, repair, reset, close; of this board alone: stop_loop, late_tick, stick_gate"
 
 const char *input_name(uint8_t bit) {
@@ -19,15 +19,15 @@ const char *input_name(uint8_t bit) {
     return "";
 }
 
-static double number(const struct toml_entry *entry, const char *where, const char *expected, double most) {
+static double read_number(const struct toml_entry *entry, const char *where, const char *expected, double max) {
     bool is_number = entry && (entry->kind == TOML_INTEGER || entry->kind == TOML_FLOAT);
-    if (!is_number || entry->number < 0 || entry->number > most) {
+    if (!is_number || entry->number < 0 || entry->number > max) {
         bad_input(where, entry ? entry->raw : "nothing", expected);
     }
     return entry->number;
 }
 
-static void read_what(struct step *step, const struct toml *toml, unsigned table, const char *where) {
+static void read_action(struct step *step, const struct toml *toml, unsigned table, const char *where) {
     const struct toml_entry *set = toml_find(toml, table, "set"), *act = toml_find(toml, table, "do");
     for (size_t k = 0; set && set->kind == TOML_STRING && k < INPUT_COUNT; k++) {
         if (strcmp(set->text, INPUTS[k]) == 0) {
@@ -44,7 +44,7 @@ static void read_what(struct step *step, const struct toml *toml, unsigned table
         bad_input(where, set->raw, "set to be one of interlock, key, estop");
     }
     if (!set && step->kind == STEP_SET) {
-        bad_input(where, act ? act->raw : "neither set nor do", "do to be " ACTIONS_LISTED);
+        bad_input(where, act ? act->raw : "neither set nor do", "do to be " ACTION_NAMES);
     }
 }
 
@@ -52,7 +52,7 @@ static struct step read_step(const struct toml *toml, unsigned table, const char
     struct step step = {.rate = 0.01};
     char where[300];
     snprintf(where, sizeof where, "%s: step %u", path, table - 1);
-    read_what(&step, toml, table, where);
+    read_action(&step, toml, table, where);
     const struct toml_entry *value = toml_find(toml, table, "value"), *rate = toml_find(toml, table, "rate");
     for (size_t k = 0; k < toml->count; k++) {
         const struct toml_entry *entry = &toml->entries[k];
@@ -62,15 +62,15 @@ static struct step read_step(const struct toml *toml, unsigned table, const char
             bad_input(where, entry->key, step.kind == STEP_SET ? "at_s, set, value" : "at_s, do, rate");
         }
     }
-    double at_s = number(toml_find(toml, table, "at_s"), where, "at_s, a time from 0 in s", 1e9);
+    double at_s = read_number(toml_find(toml, table, "at_s"), where, "at_s, a time from 0 in s", 1e9);
     step.at_us = (uint64_t)(at_s * 1e6 + 0.5);
     if (rate) {
-        step.rate = number(rate, where, "a rate per byte, 0 to 1", 1.0);
+        step.rate = read_number(rate, where, "a rate per byte, 0 to 1", 1.0);
     }
     if (value && value->kind != TOML_BOOLEAN) {
         bad_input(where, value->raw, "value to be true or false");
     }
-    step.value = value && value->truth;
+    step.value = value && value->boolean;
     return step;
 }
 

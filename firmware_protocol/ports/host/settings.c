@@ -30,7 +30,7 @@ void settings_default(struct board_config *config) {
     memcpy(config->uid, "host board 1", sizeof config->uid);
 }
 
-static uint32_t whole(const char *path, const struct toml_entry *entry, long long low, long long high) {
+static uint32_t read_integer(const char *path, const struct toml_entry *entry, long long low, long long high) {
     if (entry->kind != TOML_INTEGER || entry->integer < low || entry->integer > high) {
         char where[300], expected[80];
         snprintf(where, sizeof where, "%s: %s", path, entry->key);
@@ -56,15 +56,15 @@ static void read_uid(struct board_config *config, const char *path, const struct
 static bool read_entry(struct board_config *config, const char *path, const struct toml_entry *entry) {
 #define READ(name, bits, at, way) \
     if (strcmp(entry->key, #name) == 0) { \
-        config->limits.name = (uint##bits##_t)whole(path, entry, 0, UINT##bits##_MAX); \
+        config->limits.name = (uint##bits##_t)read_integer(path, entry, 0, UINT##bits##_MAX); \
         return true; \
     }
     LIMITS_FIELDS(READ)
 #undef READ
     if (strcmp(entry->key, "cell_codes") == 0) {
-        config->cell_codes = (uint16_t)whole(path, entry, 1, UINT16_MAX);
+        config->cell_codes = (uint16_t)read_integer(path, entry, 1, UINT16_MAX);
     } else if (strcmp(entry->key, "queue_points") == 0) {
-        config->queue_points = (uint16_t)whole(path, entry, DATA_ITEMS_MAX, BOARD_QUEUE_POINTS);
+        config->queue_points = (uint16_t)read_integer(path, entry, DATA_ITEMS_MAX, BOARD_QUEUE_POINTS);
     } else if (strcmp(entry->key, "uid") == 0) {
         read_uid(config, path, entry);
     } else if (strcmp(entry->key, "key_edge") == 0) {
@@ -73,7 +73,7 @@ static bool read_entry(struct board_config *config, const char *path, const stru
             snprintf(where, sizeof where, "%s: key_edge", path);
             bad_input(where, entry->raw, "true or false");
         }
-        config->key_edge = entry->truth;
+        config->key_edge = entry->boolean;
     } else {
         return false;
     }

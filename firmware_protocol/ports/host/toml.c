@@ -20,7 +20,7 @@ static _Noreturn void bad_line(const char *path, unsigned line, const char *text
     bad_input(where, *text ? text : "the end of a line", "valid TOML: key = a number, true, false or \"a word\"");
 }
 
-static char *trimmed(char *text) {
+static char *trim(char *text) {
     while (isspace((unsigned char)*text)) {
         text++;
     }
@@ -72,7 +72,7 @@ static bool parse_value(struct toml_entry *entry, const char *text) {
     snprintf(entry->raw, sizeof entry->raw, "%.63s", text);
     if (strcmp(text, "true") == 0 || strcmp(text, "false") == 0) {
         entry->kind = TOML_BOOLEAN;
-        entry->truth = *text == 't';
+        entry->boolean = *text == 't';
         return true;
     }
     if (*text == '"') {
@@ -97,14 +97,14 @@ static bool parse_line(struct toml *toml, char *text) {
         return false;
     }
     *equals = 0;
-    char *key = trimmed(text);
+    char *key = trim(text);
     size_t n = strlen(key);
     if (n == 0 || n >= sizeof entry.key || strspn(key, "abcdefghijklmnopqrstuvwxyz_0123456789") != n ||
         toml_find(toml, toml->tables, key)) {
         return false;
     }
     memcpy(entry.key, key, n);
-    if (!parse_value(&entry, trimmed(equals + 1))) {
+    if (!parse_value(&entry, trim(equals + 1))) {
         return false;
     }
     toml->entries[toml->count++] = entry;
@@ -112,7 +112,7 @@ static bool parse_line(struct toml *toml, char *text) {
 }
 
 void toml_read(struct toml *toml, const char *path) {
-    char line[LINE_MAX_BYTES], kept[LINE_MAX_BYTES];
+    char line[LINE_MAX_BYTES], original[LINE_MAX_BYTES];
     FILE *file = fopen(path, "r");
     toml->count = toml->tables = 0;
     if (!file) {
@@ -120,10 +120,10 @@ void toml_read(struct toml *toml, const char *path) {
     }
     for (unsigned number = 1; fgets(line, sizeof line, file); number++) {
         cut_comment(line);
-        char *text = trimmed(line);
-        snprintf(kept, sizeof kept, "%s", text);
+        char *text = trim(line);
+        snprintf(original, sizeof original, "%s", text);
         if (*text && !parse_line(toml, text)) {
-            bad_line(path, number, kept);
+            bad_line(path, number, original);
         }
     }
     bool failed = ferror(file);

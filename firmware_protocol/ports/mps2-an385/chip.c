@@ -23,7 +23,7 @@
 #define TIMER0_IRQ 8u
 
 #define CLOCK_HZ 25000000u
-#define CYCLES_A_US (CLOCK_HZ / 1000000u)
+#define CYCLES_PER_US (CLOCK_HZ / 1000000u)
 #define SLEEP_MAX_US 5000u /* a chip ticks every 100 µs; an emulator that does keeps its host's processor busy */
 #define WATCHDOG_MS 3000u  /* to its interrupt, which nobody serves, and again to the reset; the late tick bites first */
 #define RING 65536u        /* a power of two */
@@ -37,7 +37,7 @@ static struct {
     volatile uint32_t in, out;
 } rings[UARTS];
 
-static void take(enum uart uart) {
+static void drain_uart(enum uart uart) {
     uint32_t at = UART_AT(uart);
     REGISTER(at + UART_CLEAR) = 2u;
     while (REGISTER(at + UART_STATE) & 2u) {
@@ -48,26 +48,26 @@ static void take(enum uart uart) {
     }
 }
 
-void uart0_came(void) { take(UART_HOST); }
-void uart1_came(void) { take(UART_WITNESS); }
-void uart2_came(void) { take(UART_BENCH); }
-void timer0_ticked(void) { REGISTER(TIMER0 + TIMER_CLEAR) = 1u; }
+void uart0_isr(void) { drain_uart(UART_HOST); }
+void uart1_isr(void) { drain_uart(UART_WITNESS); }
+void uart2_isr(void) { drain_uart(UART_BENCH); }
+void timer0_isr(void) { REGISTER(TIMER0 + TIMER_CLEAR) = 1u; }
 
 bool chip_start(void) {
-    bool by_watchdog = ran_before == RAN_BEFORE;
+    bool watchdog_reset = ran_before == RAN_BEFORE;
     ran_before = RAN_BEFORE;
-    REGISTER(FPGA_PRESCALE) = CYCLES_A_US - 1u;
+    REGISTER(FPGA_PRESCALE) = CYCLES_PER_US - 1u;
     for (uint32_t k = 0; k < UARTS; k++) {
         REGISTER(UART_AT(k) + UART_DIVIDER) = 16u;
         REGISTER(UART_AT(k) + UART_CTRL) = 1u | 2u | 8u; /* both ways; an interrupt for each byte that came */
         (void)REGISTER(UART_AT(k) + UART_DATA); /* a byte that came before its receiver was on would block it */
         REGISTER(NVIC_ENABLE) = 1u << (2u * k);
     }
-    REGISTER(TIMER0 + TIMER_RELOAD) = REGISTER(TIMER0 + TIMER_VALUE) = SLEEP_MAX_US * CYCLES_A_US;
+    REGISTER(TIMER0 + TIMER_RELOAD) = REGISTER(TIMER0 + TIMER_VALUE) = SLEEP_MAX_US * CYCLES_PER_US;
     REGISTER(TIMER0 + TIMER_CTRL) = 1u | 8u;
     REGISTER(NVIC_ENABLE) = 1u << TIMER0_IRQ;
     REGISTER(WATCHDOG + WATCHDOG_LOAD) = WATCHDOG_MS * (CLOCK_HZ / 1000u);
-    return by_watchdog;
+    return watchdog_reset;
 }
 
 void chip_feed_watchdog(void) {
@@ -87,9 +87,9 @@ void chip_sleep(uint64_t until_us) {
     uint64_t now_us = chip_now_us(), left_us = until_us > now_us ? until_us - now_us : 0;
     /* With interrupts off nothing comes between the look and the sleep, which an interrupt ends all the same. */
     __asm volatile("cpsid i" ::: "memory");
-    bool nothing_came = rings[UART_HOST].in == rings[UART_HOST].out && rings[UART_BENCH].in == rings[UART_BENCH].out;
-    if (nothing_came && left_us > 0) {
-        REGISTER(TIMER0 + TIMER_VALUE) = (uint32_t)(left_us < SLEEP_MAX_US ? left_us : SLEEP_MAX_US) * CYCLES_A_US;
+    bool is_empty = rings[UART_HOST].in == rings[UART_HOST].out && rings[UART_BENCH].in == rings[UART_BENCH].out;
+    if (is_empty && left_us > 0) {
+        REGISTER(TIMER0 + TIMER_VALUE) = (uint32_t)(left_us < SLEEP_MAX_US ? left_us : SLEEP_MAX_US) * CYCLES_PER_US;
         __asm volatile("wfi" ::: "memory");
     }
     __asm volatile("cpsie i" ::: "memory");

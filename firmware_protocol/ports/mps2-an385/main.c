@@ -11,7 +11,7 @@
 
 static struct board board;
 static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
-static bool gate_on, stuck, stuck_on, hung;
+static bool gate_on, readback_stuck, readback_value, loop_stopped;
 static uint32_t entropy_state;
 
 /* --- witness: one line of numbers each; the bench gives them names --- */
@@ -58,7 +58,7 @@ static void on_gate(void *context, bool on, uint16_t duty) {
 
 static bool on_gate_readback(void *context) {
     (void)context;
-    return stuck ? stuck_on : gate_on;
+    return readback_stuck ? readback_value : gate_on;
 }
 
 static void on_mirrors(void *context, uint16_t x, uint16_t y) { (void)context, (void)x, (void)y; }
@@ -68,7 +68,7 @@ static uint8_t on_inputs(void *context) {
     return inputs;
 }
 
-static void on_switch(void *context, bool on) { (void)context, (void)on; }
+static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 
 /* The emulated chip has no source of entropy: the bench gives a seed with the configuration. */
 static uint32_t on_entropy(void *context) {
@@ -98,16 +98,16 @@ static void on_feed_watchdog(void *context) {
 }
 
 static const struct board_hal hal = {
-    .gate = on_gate,
-    .gate_readback = on_gate_readback,
-    .mirrors = on_mirrors,
-    .inputs = on_inputs,
-    .indicator = on_switch,
-    .relay = on_switch,
-    .entropy = on_entropy,
-    .temperature_dc = on_temperature,
+    .set_gate = on_gate,
+    .read_gate = on_gate_readback,
+    .move_mirrors = on_mirrors,
+    .read_inputs = on_inputs,
+    .set_indicator = ignore_output,
+    .set_relay = ignore_output,
+    .read_entropy = on_entropy,
+    .read_temperature_dc = on_temperature,
     .send = on_send,
-    .forget = on_forget,
+    .discard_output = on_forget,
     .feed_watchdog = on_feed_watchdog,
     .trace = on_trace,
 };
@@ -116,7 +116,7 @@ static const struct board_hal hal = {
 
 static struct board_config config;
 
-static void wait_for(uint8_t *bytes, size_t n) {
+static void read_exactly(uint8_t *bytes, size_t n) {
     for (size_t have = 0; have < n;) {
         have += chip_read(UART_BENCH, bytes + have, n - have);
         if (have < n) {
@@ -129,25 +129,25 @@ static void wait_for(uint8_t *bytes, size_t n) {
    u8 key_edge, u8 inputs, then the limits as in LIMITS. */
 #define CONFIG_SIZE (4u + 4u + 12u + 2u + 2u + 1u + 1u + LIMITS_SIZE)
 
-static uint16_t u16_at(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
-static uint32_t u32_at(const uint8_t *at) { return u16_at(at) | (uint32_t)u16_at(at + 2) << 16; }
+static uint16_t get_u16(const uint8_t *at) { return (uint16_t)(at[0] | at[1] << 8); }
+static uint32_t get_u32(const uint8_t *at) { return get_u16(at) | (uint32_t)get_u16(at + 2) << 16; }
 
 static void configure(void) {
     uint8_t bytes[CONFIG_SIZE];
     chip_write(UART_WITNESS, (const uint8_t *)"\n", 1); /* ends what a reset cut short */
     write_numbers('C', NULL, 0);
-    wait_for(bytes, sizeof bytes);
-    entropy_state = u32_at(bytes);
-    config.firmware = u32_at(bytes + 4);
+    read_exactly(bytes, sizeof bytes);
+    entropy_state = get_u32(bytes);
+    config.firmware = get_u32(bytes + 4);
     memcpy(config.uid, bytes + 8, 12);
-    config.cell_codes = u16_at(bytes + 20);
-    config.queue_points = u16_at(bytes + 22);
+    config.cell_codes = get_u16(bytes + 20);
+    config.queue_points = get_u16(bytes + 22);
     config.key_edge = bytes[24] != 0;
     inputs = bytes[25];
     const uint8_t *at = bytes + 26;
-#define TAKE(name, bits, offset, way) config.limits.name = (uint##bits##_t)(bits == 16 ? u16_at(at + (offset)) : u32_at(at + (offset)));
-    LIMITS_FIELDS(TAKE)
-#undef TAKE
+#define DECODE(name, bits, offset, way) config.limits.name = (uint##bits##_t)(bits == 16 ? get_u16(at + (offset)) : get_u32(at + (offset)));
+    LIMITS_FIELDS(DECODE)
+#undef DECODE
 }
 
 static void reset(void) {
@@ -173,35 +173,35 @@ static void miss_ticks(void) {
     }
 }
 
-static void obey_bench(void) {
-    uint8_t order, value;
-    while (chip_read(UART_BENCH, &order, 1)) {
-        switch (order) {
+static void run_bench_commands(void) {
+    uint8_t command, value;
+    while (chip_read(UART_BENCH, &command, 1)) {
+        switch (command) {
         case 'I':
-            wait_for(&value, 1);
+            read_exactly(&value, 1);
             set_inputs(value, chip_now_us());
             break;
         case 'L':
-            board_link_lost(&board, chip_now_us());
+            board_on_link_lost(&board, chip_now_us());
             break;
         case 'R':
             reset();
             break;
         case 'H':
-            hung = true;
+            loop_stopped = true;
             break;
         case 'T':
             miss_ticks();
             break;
         case 'S':
-            stuck_on = gate_on;
-            stuck = true;
+            readback_value = gate_on;
+            readback_stuck = true;
             break;
         }
     }
 }
 
-static void turn_loop(void) {
+static void run_loop_once(void) {
     uint8_t bytes[256];
     size_t n = chip_read(UART_HOST, bytes, sizeof bytes);
     uint64_t until_us = board.lease_until_us, now_us = chip_now_us();
@@ -213,15 +213,15 @@ static void turn_loop(void) {
 }
 
 int main(void) {
-    bool by_watchdog = chip_start();
+    bool watchdog_reset = chip_start();
     configure();
-    board_init(&board, &hal, &config, by_watchdog ? RESET_WATCHDOG : RESET_POWER_UP, chip_now_us());
+    board_init(&board, &hal, &config, watchdog_reset ? RESET_WATCHDOG : RESET_POWER_UP, chip_now_us());
     for (;;) {
         chip_sleep(board_next_due_us(&board));
         board_tick(&board, chip_now_us());
-        obey_bench();
-        if (!hung) {
-            turn_loop();
+        run_bench_commands();
+        if (!loop_stopped) {
+            run_loop_once();
         }
     }
 }

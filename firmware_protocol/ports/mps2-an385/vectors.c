@@ -1,13 +1,13 @@
 #include "start.h"
 
 extern char stack_top[];
-void uart0_came(void), uart1_came(void), uart2_came(void), timer0_ticked(void);
+void uart0_isr(void), uart1_isr(void), uart2_isr(void), timer0_isr(void);
 
 __attribute__((section(".vectors"), used)) static const struct {
     void *stack;
     handler handlers[15 + 9];
 } vectors = {
     stack_top,
-    {reset, stuck, stuck, stuck, stuck, stuck, 0, 0, 0, 0, stuck, stuck, 0, stuck, stuck,
-     uart0_came, stuck, uart1_came, stuck, uart2_came, stuck, stuck, stuck, timer0_ticked},
+    {reset, halt, halt, halt, halt, halt, 0, 0, 0, 0, halt, halt, 0, halt, halt,
+     uart0_isr, halt, uart1_isr, halt, uart2_isr, halt, halt, halt, timer0_isr},
 };

@@ -11,7 +11,7 @@
 
 /* --- clocks --- */
 
-static void until(uint32_t address, uint32_t bits) {
+static void wait_until_set(uint32_t address, uint32_t bits) {
     while ((REGISTER(address) & bits) != bits) {
     }
 }
@@ -20,23 +20,23 @@ static void until(uint32_t address, uint32_t bits) {
 static void start_clocks(void) {
     REGISTER(XOSC_STARTUP) = 47; /* × 256 cycles: 1 ms */
     REGISTER(XOSC_CTRL) = 0xfabu << 12 | 0xaa0u;
-    until(XOSC_STATUS, BIT(31));
+    wait_until_set(XOSC_STATUS, BIT(31));
     REGISTER(CLK_REF_CTRL) = 2;
-    until(CLK_REF_SELECTED, BIT(2));
+    wait_until_set(CLK_REF_SELECTED, BIT(2));
     CLEAR(CLK_SYS_CTRL) = 1; /* off the PLL, should it run from before */
-    until(CLK_SYS_SELECTED, BIT(0));
+    wait_until_set(CLK_SYS_SELECTED, BIT(0));
     SET(RESETS) = RESET_PLL_SYS;
     CLEAR(RESETS) = RESET_PLL_SYS;
-    until(RESETS_DONE, RESET_PLL_SYS);
+    wait_until_set(RESETS_DONE, RESET_PLL_SYS);
     REGISTER(PLL_CS) = 1;
     REGISTER(PLL_FBDIV) = CLOCK_HZ / 1000000u * 12u / CRYSTAL_MHZ;
     CLEAR(PLL_PWR) = BIT(0) | BIT(5);
-    until(PLL_CS, BIT(31));
+    wait_until_set(PLL_CS, BIT(31));
     REGISTER(PLL_PRIM) = 6u << 16 | 2u << 12;
     CLEAR(PLL_PWR) = BIT(3);
     REGISTER(CLK_SYS_CTRL) = 0; /* from the PLL, when the switch below is turned */
     SET(CLK_SYS_CTRL) = 1;
-    until(CLK_SYS_SELECTED, BIT(1));
+    wait_until_set(CLK_SYS_SELECTED, BIT(1));
     REGISTER(CLK_PERI_CTRL) = CLK_ENABLE;
     REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal: slow, and good enough for a temperature */
     REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* the microsecond of timer and watchdog */
@@ -66,14 +66,14 @@ void chip_wait_us(uint32_t us) {
     }
 }
 
-void chip_alarm(uint64_t at_us) {
+void chip_set_alarm(uint64_t at_us) {
     REGISTER(TIMER_ALARM0) = (uint32_t)at_us;
     if (chip_now_us() >= at_us) {
         SET(TIMER_INTF) = 1; /* it compares for equality and would wait for more than an hour */
     }
 }
 
-void timer_came(void) {
+void timer_isr(void) {
     CLEAR(TIMER_INTF) = 1;
     REGISTER(TIMER_INTR) = 1;
     on_alarm();
@@ -96,35 +96,35 @@ void chip_release_alarm(void) {
 static struct {
     uint8_t bytes[RX_RING];
     volatile uint32_t in, out;
-    volatile bool broke;
-} came;
+    volatile bool break_received;
+} received;
 
 static struct {
     uint8_t bytes[TX_RING];
     uint32_t in, out;
     bool mid_frame;
-} leaves;
+} outgoing;
 
-static void pump(void) {
-    while (leaves.out != leaves.in && !(REGISTER(UART_FR) & BIT(5))) {
-        uint8_t byte = leaves.bytes[leaves.out++ % TX_RING];
-        leaves.mid_frame = byte != 0;
+static void fill_transmitter(void) {
+    while (outgoing.out != outgoing.in && !(REGISTER(UART_FR) & BIT(5))) {
+        uint8_t byte = outgoing.bytes[outgoing.out++ % TX_RING];
+        outgoing.mid_frame = byte != 0;
         REGISTER(UART_DR) = byte;
     }
 }
 
-void uart_came(void) {
+void uart_isr(void) {
     REGISTER(UART_ICR) = 0x7ffu;
     while (!(REGISTER(UART_FR) & BIT(4))) {
         uint32_t byte = REGISTER(UART_DR);
         if (byte & BIT(10)) {
-            came.broke = true;
-        } else if (came.in - came.out < RX_RING) {
-            came.bytes[came.in % RX_RING] = (uint8_t)byte;
-            came.in++;
+            received.break_received = true;
+        } else if (received.in - received.out < RX_RING) {
+            received.bytes[received.in % RX_RING] = (uint8_t)byte;
+            received.in++;
         }
     }
-    pump();
+    fill_transmitter();
 }
 
 static void start_uart(void) {
@@ -140,17 +140,17 @@ static void start_uart(void) {
 
 size_t chip_read(uint8_t *bytes, size_t size) {
     size_t n = 0;
-    while (n < size && came.out != came.in) {
-        bytes[n++] = came.bytes[came.out % RX_RING];
-        came.out = came.out + 1;
+    while (n < size && received.out != received.in) {
+        bytes[n++] = received.bytes[received.out % RX_RING];
+        received.out = received.out + 1;
     }
     return n;
 }
 
-bool chip_break(void) {
-    bool broke = came.broke;
-    came.broke = false;
-    return broke;
+bool chip_pop_break(void) {
+    bool break_received = received.break_received;
+    received.break_received = false;
+    return break_received;
 }
 
 static void hold_uart(void) {
@@ -165,25 +165,25 @@ static void release_uart(void) {
 
 void chip_send(const uint8_t *frame, size_t n) {
     hold_uart();
-    if (TX_RING - (leaves.in - leaves.out) >= n) {
+    if (TX_RING - (outgoing.in - outgoing.out) >= n) {
         for (size_t k = 0; k < n; k++) {
-            leaves.bytes[leaves.in++ % TX_RING] = frame[k];
+            outgoing.bytes[outgoing.in++ % TX_RING] = frame[k];
         }
     }
-    pump();
+    fill_transmitter();
     release_uart();
 }
 
-void chip_forget(void) {
+void chip_discard_output(void) {
     hold_uart();
-    uint32_t end = leaves.out;
-    if (leaves.mid_frame) {
-        while (leaves.bytes[end % TX_RING] != 0) {
+    uint32_t end = outgoing.out;
+    if (outgoing.mid_frame) {
+        while (outgoing.bytes[end % TX_RING] != 0) {
             end++;
         }
         end++;
     }
-    leaves.in = end;
+    outgoing.in = end;
     release_uart();
 }
 
@@ -200,16 +200,16 @@ void chip_feed_watchdog(void) { REGISTER(WATCHDOG_LOAD) = 2u * WATCHDOG_US; }
 
 /* --- noise, temperature --- */
 
-static uint64_t pool;
+static uint64_t entropy_pool;
 
 /* A bit of the ring oscillator's jitter, and when it was looked at. The multiplier is Knuth's for 64 bits. */
-void chip_stir(void) {
-    pool = (pool ^ (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1) * 6364136223846793005u + 1u;
+void chip_collect_entropy(void) {
+    entropy_pool = (entropy_pool ^ (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1) * 6364136223846793005u + 1u;
 }
 
 uint32_t chip_entropy(void) {
-    chip_stir();
-    uint64_t mixed = pool ^ pool >> 29;
+    chip_collect_entropy();
+    uint64_t mixed = entropy_pool ^ entropy_pool >> 29;
     mixed *= 0xd6e8feb86659fd93u;
     return (uint32_t)(mixed >> 32);
 }
@@ -222,18 +222,18 @@ int16_t chip_temperature_dc(void) {
 /* --- all together --- */
 
 void chip_start(void) {
-    static const uint32_t USED = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 | RESET_TIMER | RESET_UART0;
+    static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 | RESET_TIMER | RESET_UART0;
     CLEAR(WATCHDOG_CTRL) = BIT(30); /* should it run from before */
     start_clocks();
-    SET(RESETS) = USED; /* pins too: they let go, and pull-downs hold them */
-    CLEAR(RESETS) = USED;
-    until(RESETS_DONE, USED);
+    SET(RESETS) = USED_BLOCKS; /* pins too: they let go, and pull-downs hold them */
+    CLEAR(RESETS) = USED_BLOCKS;
+    wait_until_set(RESETS_DONE, USED_BLOCKS);
     REGISTER(TIMER_INTE) = 1;
     start_uart();
     REGISTER(ADC_CS) = 1u | BIT(1);
     REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* the temperature, again and again */
     for (uint32_t k = 0; k < NOISE_BITS; k++) {
-        chip_stir();
+        chip_collect_entropy();
         chip_wait_us(1);
     }
 }

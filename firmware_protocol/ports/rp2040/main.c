@@ -7,43 +7,43 @@
 #include "pins.h"
 #include "settings.h"
 
-#define TURN_BYTES 64u
+#define LOOP_BYTES_MAX 64u
 
 static struct board board;
-static uint64_t ticked_us;
+static uint64_t last_tick_us;
 
 /* --- the HAL --- */
 
-static void gate(void *context, bool on, uint16_t duty) {
+static void set_gate(void *context, bool on, uint16_t duty) {
     (void)context;
-    outputs_gate(on, duty);
+    outputs_set_gate(on, duty);
 }
-static bool gate_readback(void *context) {
+static bool read_gate(void *context) {
     (void)context;
     return outputs_get(PIN_READBACK);
 }
-static void mirrors(void *context, uint16_t x, uint16_t y) {
+static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     (void)context;
-    outputs_mirrors(x, y);
+    outputs_move_mirrors(x, y);
 }
-static uint8_t inputs(void *context) {
+static uint8_t read_inputs(void *context) {
     (void)context;
     return (uint8_t)((outputs_get(PIN_INTERLOCK) ? INPUT_INTERLOCK : 0) | (outputs_get(PIN_KEY) ? INPUT_KEY : 0) |
                      (outputs_get(PIN_ESTOP) ? 0 : INPUT_ESTOP));
 }
-static void indicator(void *context, bool lit) {
+static void set_indicator(void *context, bool lit) {
     (void)context;
     outputs_set(PIN_INDICATOR, lit);
 }
-static void relay(void *context, bool closed) {
+static void set_relay(void *context, bool closed) {
     (void)context;
     outputs_set(PIN_RELAY, closed);
 }
-static uint32_t entropy(void *context) {
+static uint32_t read_entropy(void *context) {
     (void)context;
     return chip_entropy();
 }
-static int16_t temperature_dc(void *context) {
+static int16_t read_temperature_dc(void *context) {
     (void)context;
     return chip_temperature_dc();
 }
@@ -51,9 +51,9 @@ static void send(void *context, const uint8_t *frame, size_t n) {
     (void)context;
     chip_send(frame, n);
 }
-static void forget(void *context) {
+static void discard_output(void *context) {
     (void)context;
-    chip_forget();
+    chip_discard_output();
 }
 static void feed_watchdog(void *context) {
     (void)context;
@@ -61,30 +61,30 @@ static void feed_watchdog(void *context) {
 }
 
 static const struct board_hal HAL = {
-    .gate = gate,
-    .gate_readback = gate_readback,
-    .mirrors = mirrors,
-    .inputs = inputs,
-    .indicator = indicator,
-    .relay = relay,
-    .entropy = entropy,
-    .temperature_dc = temperature_dc,
+    .set_gate = set_gate,
+    .read_gate = read_gate,
+    .move_mirrors = move_mirrors,
+    .read_inputs = read_inputs,
+    .set_indicator = set_indicator,
+    .set_relay = set_relay,
+    .read_entropy = read_entropy,
+    .read_temperature_dc = read_temperature_dc,
     .send = send,
-    .forget = forget,
+    .discard_output = discard_output,
     .feed_watchdog = feed_watchdog,
 };
 
 /* --- the tick --- */
 
 static void set_alarm(void) {
-    uint64_t next_us = ticked_us + BOARD_TICK_US, due_us = board_next_due_us(&board);
-    chip_alarm(due_us < next_us ? due_us : next_us);
+    uint64_t next_us = last_tick_us + BOARD_TICK_US, due_us = board_next_due_us(&board);
+    chip_set_alarm(due_us < next_us ? due_us : next_us);
 }
 
 void on_alarm(void) {
     outputs_set(PIN_TICK, true);
-    ticked_us = chip_now_us();
-    board_tick(&board, ticked_us);
+    last_tick_us = chip_now_us();
+    board_tick(&board, last_tick_us);
     set_alarm();
     outputs_set(PIN_TICK, false);
 }
@@ -92,22 +92,22 @@ void on_alarm(void) {
 /* --- the loop --- */
 
 /* A port that no program has open is told once, and what comes from it then is nobody's. */
-static bool host_left(void) {
+static bool host_disconnected(void) {
     static bool was_closed = true;
     bool closed = outputs_get(PIN_HOST_CLOSED), left = closed && !was_closed;
     was_closed = closed;
-    return chip_break() || left;
+    return chip_pop_break() || left;
 }
 
 /* The alarm is held for as long as the bytes of one turn take: a few at a time. */
-static void turn(void) {
-    uint8_t bytes[TURN_BYTES];
+static void run_loop_once(void) {
+    uint8_t bytes[LOOP_BYTES_MAX];
     size_t n = chip_read(bytes, sizeof bytes);
-    bool left = host_left();
-    chip_stir();
+    bool left = host_disconnected();
+    chip_collect_entropy();
     chip_hold_alarm();
     if (left) {
-        board_link_lost(&board, chip_now_us());
+        board_on_link_lost(&board, chip_now_us());
     }
     board_receive(&board, bytes, outputs_get(PIN_HOST_CLOSED) ? 0 : n, chip_now_us());
     set_alarm();
@@ -118,12 +118,12 @@ int main(void) {
     enum reset_cause cause = chip_reset_cause();
     chip_start();
     outputs_start();
-    ticked_us = chip_now_us();
-    board_init(&board, &HAL, &SETTINGS, cause, ticked_us);
+    last_tick_us = chip_now_us();
+    board_init(&board, &HAL, &SETTINGS, cause, last_tick_us);
     chip_start_watchdog();
     set_alarm();
     chip_release_alarm();
     for (;;) {
-        turn();
+        run_loop_once();
     }
 }

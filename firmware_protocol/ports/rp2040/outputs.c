@@ -6,7 +6,7 @@
 #include "settings.h"
 
 #define GATE_PERIOD (CLOCK_HZ / GATE_HZ)
-#define GATE_DARK (IO_PWM | IO_OUT_LOW)
+#define GATE_FORCED_LOW (IO_PWM | IO_OUT_LOW)
 
 /* --- pins --- */
 
@@ -14,13 +14,13 @@ void outputs_set(uint32_t pin, bool high) { REGISTER(high ? SIO_OUT_SET : SIO_OU
 
 bool outputs_get(uint32_t pin) { return REGISTER(SIO_IN) >> pin & 1u; }
 
-static void output(uint32_t pin, bool high) {
+static void configure_output(uint32_t pin, bool high) {
     outputs_set(pin, high);
     REGISTER(SIO_OE_SET) = BIT(pin);
     REGISTER(IO_CTRL(pin)) = IO_SIO;
 }
 
-static void input(uint32_t pin, uint32_t pull) {
+static void configure_input(uint32_t pin, uint32_t pull) {
     REGISTER(PAD(pin)) = PAD_INPUT | PAD_SCHMITT | PAD_4_MA | pull;
     REGISTER(IO_CTRL(pin)) = IO_SIO;
 }
@@ -28,8 +28,8 @@ static void input(uint32_t pin, uint32_t pull) {
 /* --- light --- */
 
 /* Dark is forced behind the PWM, at once; a slice that stands still takes its new level at once too. */
-void outputs_gate(bool on, uint16_t duty) {
-    REGISTER(IO_CTRL(PIN_GATE)) = GATE_DARK;
+void outputs_set_gate(bool on, uint16_t duty) {
+    REGISTER(IO_CTRL(PIN_GATE)) = GATE_FORCED_LOW;
     REGISTER(PWM_CSR(GATE_SLICE)) = 0;
     if (!on) {
         return;
@@ -42,7 +42,7 @@ void outputs_gate(bool on, uint16_t duty) {
 
 /* --- mirrors: a DAC8563; data are taken at the clock's falling edge --- */
 
-static void dac(uint8_t command, uint16_t value) {
+static void write_dac(uint8_t command, uint16_t value) {
     outputs_set(PIN_DAC_SYNC, false);
     REGISTER(SPI_DR) = command;
     REGISTER(SPI_DR) = value >> 8;
@@ -53,38 +53,38 @@ static void dac(uint8_t command, uint16_t value) {
 }
 
 /* The second command takes over both values. */
-void outputs_mirrors(uint16_t x, uint16_t y) {
-    dac(0x00, x);
-    dac(0x11, y);
+void outputs_move_mirrors(uint16_t x, uint16_t y) {
+    write_dac(0x00, x);
+    write_dac(0x11, y);
 }
 
 static void start_dac(void) {
-    output(PIN_DAC_SYNC, true);
+    configure_output(PIN_DAC_SYNC, true);
     REGISTER(IO_CTRL(PIN_DAC_CLOCK)) = IO_SPI;
     REGISTER(IO_CTRL(PIN_DAC_DATA)) = IO_SPI;
     REGISTER(SPI_CPSR) = 2;
     REGISTER(SPI_CR0) = 2u << 8 | BIT(7) | 7u; /* 125 MHz / 2 / 3, mode 1, 8 bits */
     REGISTER(SPI_CR1) = BIT(1);
-    dac(0x28, 1); /* as after power-up: both in the middle */
-    dac(0x38, 1); /* its own reference, 2.5 V */
-    dac(0x02, 3); /* gain 1: 0 to 2.5 V */
-    dac(0x30, 3); /* the pin LDAC is not looked at */
+    write_dac(0x28, 1); /* as after power-up: both in the middle */
+    write_dac(0x38, 1); /* its own reference, 2.5 V */
+    write_dac(0x02, 3); /* gain 1: 0 to 2.5 V */
+    write_dac(0x30, 3); /* the pin LDAC is not looked at */
 }
 
 /* --- all together --- */
 
 void outputs_start(void) {
-    REGISTER(IO_CTRL(PIN_GATE)) = GATE_DARK;
+    REGISTER(IO_CTRL(PIN_GATE)) = GATE_FORCED_LOW;
     REGISTER(PWM_TOP(GATE_SLICE)) = GATE_PERIOD - 1u;
-    output(PIN_RELAY, false);
-    output(PIN_INDICATOR, false);
-    output(PIN_TICK, false);
-    input(PIN_INTERLOCK, PAD_PULL_DOWN); /* a broken wire is low: unsafe */
-    input(PIN_KEY, PAD_PULL_DOWN);
-    input(PIN_ESTOP, PAD_PULL_DOWN);
-    input(PIN_READBACK, PAD_PULL_UP); /* a broken wire reads as light that nobody asked for */
-    input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire is a port that is closed */
-    input(PIN_HOST_RX, PAD_PULL_UP);
+    configure_output(PIN_RELAY, false);
+    configure_output(PIN_INDICATOR, false);
+    configure_output(PIN_TICK, false);
+    configure_input(PIN_INTERLOCK, PAD_PULL_DOWN); /* a broken wire is low: unsafe */
+    configure_input(PIN_KEY, PAD_PULL_DOWN);
+    configure_input(PIN_ESTOP, PAD_PULL_DOWN);
+    configure_input(PIN_READBACK, PAD_PULL_UP); /* a broken wire reads as light that nobody asked for */
+    configure_input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire is a port that is closed */
+    configure_input(PIN_HOST_RX, PAD_PULL_UP);
     REGISTER(IO_CTRL(PIN_HOST_RX)) = IO_UART;
     REGISTER(IO_CTRL(PIN_HOST_TX)) = IO_UART;
     start_dac();

@@ -8,8 +8,8 @@
 
 /* Dark, relay open, mirrors' converter ready. */
 void outputs_start(void);
-void outputs_gate(bool on, uint16_t duty);
-void outputs_mirrors(uint16_t x, uint16_t y);
+void outputs_set_gate(bool on, uint16_t duty);
+void outputs_move_mirrors(uint16_t x, uint16_t y);
 void outputs_set(uint32_t pin, bool high);
 bool outputs_get(uint32_t pin);
 

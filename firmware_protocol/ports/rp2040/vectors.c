@@ -1,14 +1,14 @@
 #include "start.h"
 
 extern char stack_top[];
-void timer_came(void), uart_came(void);
+void timer_isr(void), uart_isr(void);
 
 __attribute__((section(".vectors"), used)) static const struct {
     void *stack;
     handler handlers[15 + 26];
 } vectors = {
     stack_top,
-    {reset, stuck, stuck, 0, 0, 0, 0, 0, 0, 0, stuck, 0, 0, stuck, stuck,
-     timer_came, stuck, stuck, stuck, stuck, stuck, stuck, stuck, stuck, stuck, stuck, stuck, stuck,
-     stuck, stuck, stuck, stuck, stuck, stuck, stuck, uart_came, stuck, stuck, stuck, stuck, stuck},
+    {reset, halt, halt, 0, 0, 0, 0, 0, 0, 0, halt, 0, 0, halt, halt,
+     timer_isr, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt, halt,
+     halt, halt, halt, halt, halt, halt, halt, uart_isr, halt, halt, halt, halt, halt},
 };

@@ -45,53 +45,53 @@ static const struct board_config BOARDS_LIMITS[] = {
 
 /* --- the HAL --- */
 
-static void gate(void *context, bool on, uint16_t duty) {
+static void set_gate(void *context, bool on, uint16_t duty) {
     (void)context;
-    oracle_gate(o, on, duty);
+    oracle_on_gate(o, on, duty);
 }
-static bool gate_readback(void *context) {
+static bool read_gate(void *context) {
     (void)context;
-    bool level = driver.stuck ? driver.stuck_on : o->lit;
-    oracle_readback(o, level);
+    bool level = driver.stuck ? driver.stuck_on : o->gate_on;
+    oracle_on_readback(o, level);
     return level;
 }
-static void mirrors(void *context, uint16_t x, uint16_t y) {
+static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     (void)context;
-    oracle_mirrors(o, x, y);
+    oracle_on_mirrors(o, x, y);
 }
-static uint8_t inputs(void *context) {
+static uint8_t read_inputs(void *context) {
     (void)context;
     return o->inputs;
 }
-static void indicator(void *context, bool lit) {
+static void set_indicator(void *context, bool lit) {
     (void)context;
     o->indicator = lit;
 }
-static void relay(void *context, bool closed) {
+static void set_relay(void *context, bool closed) {
     (void)context;
     o->relay = closed;
 }
-static uint32_t entropy(void *context) {
+static uint32_t read_entropy(void *context) {
     (void)context;
     driver.entropy = driver.entropy * 1664525u + 1013904223u;
     return driver.entropy ^ driver.entropy >> 16;
 }
-static int16_t temperature_dc(void *context) {
+static int16_t read_temperature_dc(void *context) {
     (void)context;
     return 250;
 }
 static void send(void *context, const uint8_t *frame, size_t n) {
     (void)context;
-    oracle_sent(o, frame, n);
+    oracle_on_send(o, frame, n);
 }
-static void forget(void *context) { (void)context; }
+static void discard_output(void *context) { (void)context; }
 static void feed_watchdog(void *context) {
     (void)context;
-    oracle_fed(o);
+    oracle_on_feed(o);
 }
 
-static const struct board_hal HAL = {NULL,    gate,           gate_readback, mirrors, inputs,        indicator, relay,
-                                     entropy, temperature_dc, send,          forget,  feed_watchdog, NULL};
+static const struct board_hal HAL = {NULL,         set_gate,            read_gate, move_mirrors,   read_inputs,   set_indicator, set_relay,
+                                     read_entropy, read_temperature_dc, send,      discard_output, feed_watchdog, NULL};
 
 /* --- time --- */
 
@@ -99,7 +99,7 @@ static void power_up(const struct board_config *config) {
     oracle_power_up(o, config, o->now_us);
     driver.ticked_us = o->now_us;
     board_init(board, &HAL, config, RESET_POWER_UP, o->now_us);
-    oracle_look(o, board);
+    oracle_check(o, board);
 }
 
 static void tick(void) {
@@ -107,14 +107,14 @@ static void tick(void) {
     driver.ticked_us = o->now_us;
     driver.ticks++;
     board_tick(board, o->now_us);
-    oracle_look(o, board);
+    oracle_check(o, board);
     oracle_after_tick(o, since_us);
 }
 
-static void turn(const uint8_t *bytes, size_t n) {
-    o->turned = true;
+static void run_loop(const uint8_t *bytes, size_t n) {
+    o->loop_ran = true;
     board_receive(board, bytes, n, o->now_us);
-    oracle_look(o, board);
+    oracle_check(o, board);
 }
 
 /* Ticks when something is due and at least as often as a board must have them; loop: whether the main loop turns too. */
@@ -127,7 +127,7 @@ static void wait(uint64_t us, bool loop) {
         o->now_us = next_us < until_us ? next_us : until_us;
         tick();
         if (loop) {
-            turn(NULL, 0);
+            run_loop(NULL, 0);
         }
     }
 }
@@ -140,43 +140,43 @@ static void late_tick(uint64_t us) {
 
 /* --- frames --- */
 
-static void unchanged(const struct board *before) {
+static void require_unchanged(const struct board *before) {
     struct board *now = malloc(sizeof *now);
     memcpy(now, board, sizeof *now);
     now->link.receiver = before->link.receiver;
     now->link.seq_errors = before->link.seq_errors;
     now->loop_ran = before->loop_ran;
     if (memcmp(now, before, sizeof *now) || o->answered) {
-        violated("B13", "junk does more than count");
+        report_violation("B13", "junk does more than count");
     }
     free(now);
 }
 
 /* Bytes of which the oracle knows what they are: something, or nothing at all. */
-static void give(const uint8_t *wire, size_t n, bool nothing) {
+static void send_bytes(const uint8_t *wire, size_t n, bool nothing) {
     struct board *before = nothing ? malloc(sizeof *before) : NULL;
-    turn(NULL, 0);
+    run_loop(NULL, 0);
     o->answered = false;
     if (before) {
         memcpy(before, board, sizeof *before);
     }
-    turn(wire, n);
+    run_loop(wire, n);
     if (before) {
-        unchanged(before);
+        require_unchanged(before);
     }
     free(before);
 }
 
-static void say_as(uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n) {
+static void send_frame_as(uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n) {
     uint8_t wire[REFERENCE_WIRE_MAX];
     struct parsed frame = {type, seq, session, body, n};
-    size_t length = reference_write(wire, type, seq, session, body, n);
-    oracle_hears(o, &frame);
-    give(wire, length, o->changes_nothing);
+    size_t length = reference_encode(wire, type, seq, session, body, n);
+    oracle_on_frame(o, &frame);
+    send_bytes(wire, length, o->changes_nothing);
 }
 
-static void say(uint8_t type, const uint8_t *body, size_t n) {
-    say_as(type, reference_is_sequenced(type) ? o->next_seq : 0, o->session, body, n);
+static void send_frame(uint8_t type, const uint8_t *body, size_t n) {
+    send_frame_as(type, reference_is_sequenced(type) ? o->next_seq : 0, o->session, body, n);
 }
 
 static void put(uint8_t **at, uint64_t value, size_t bytes) {
@@ -188,24 +188,24 @@ static void put(uint8_t **at, uint64_t value, size_t bytes) {
 
 static void hello(uint8_t major) {
     uint8_t body[6] = {major, 0, 1, 2, 3, 4};
-    say(0x01, body, sizeof body);
+    send_frame(0x01, body, sizeof body);
 }
 
 static void lease(uint16_t ms) {
     uint8_t body[2] = {(uint8_t)ms, (uint8_t)(ms >> 8)};
-    say(0x04, body, sizeof body);
+    send_frame(0x04, body, sizeof body);
 }
 
 static void arm_request(void) {
     uint8_t body[4] = {9, 8, 7, 6};
-    say(0x14, body, sizeof body);
+    send_frame(0x14, body, sizeof body);
 }
 
 static void arm_confirm(uint32_t host_nonce, uint32_t board_nonce) {
     uint8_t body[8], *at = body;
     put(&at, host_nonce, 4);
     put(&at, board_nonce, 4);
-    say(0x15, body, sizeof body);
+    send_frame(0x15, body, sizeof body);
 }
 
 static void start(uint32_t first, uint64_t tick, uint16_t watermark) {
@@ -214,24 +214,24 @@ static void start(uint32_t first, uint64_t tick, uint16_t watermark) {
     put(&at, first, 4);
     put(&at, tick, 8);
     put(&at, watermark, 2);
-    say(0x11, body, sizeof body);
+    send_frame(0x11, body, sizeof body);
 }
 
 static void end(uint32_t index) {
     uint8_t body[8], *at = body;
     put(&at, o->job, 4);
     put(&at, index, 4);
-    say(0x12, body, sizeof body);
+    send_frame(0x12, body, sizeof body);
 }
 
 /* --- the fuzzer's bytes --- */
 
-static const uint8_t *from, *from_end;
+static const uint8_t *input, *input_end;
 
-static uint8_t byte(void) { return from < from_end ? *from++ : 0; }
-static uint16_t two(void) {
-    uint16_t low = byte();
-    return (uint16_t)(low | byte() << 8);
+static uint8_t read_u8(void) { return input < input_end ? *input++ : 0; }
+static uint16_t read_u16(void) {
+    uint16_t low = read_u8();
+    return (uint16_t)(low | read_u8() << 8);
 }
 
 static void choose_point(uint8_t *to) {
@@ -239,10 +239,10 @@ static void choose_point(uint8_t *to) {
     static const uint16_t DARK[] = {0, 100, 400, 500, 1000, 3000, 20000, 60000};
     static const uint16_t ON[] = {1000, 0, 1, 200, 5000, 20000, 30000, 50000};
     static const uint16_t DUTY[] = {20000, 0, 1000, 3000, 30000, 40000, 65534, 65535};
-    uint16_t chosen = two();
+    uint16_t chosen = read_u16();
     if (chosen >> 12 == 15) { /* any */
         for (size_t k = 0; k < 10; k++) {
-            *to++ = byte();
+            *to++ = read_u8();
         }
         return;
     }
@@ -259,12 +259,12 @@ static void data(uint32_t first, size_t count) {
     for (size_t k = 0; k < count; k++) {
         choose_point(body + 4 + 10 * k);
     }
-    say(0x10, body, 4 + 10 * count);
+    send_frame(0x10, body, 4 + 10 * count);
 }
 
 static void play(void) {
-    uint8_t how = byte();
-    uint32_t first = o->queue_count ? o->queue[o->queue_first % POINTS_SEEN].index : o->next_index;
+    uint8_t how = read_u8();
+    uint32_t first = o->queue_count ? o->queue[o->queue_first % POINTS_MAX].index : o->next_index;
     data(o->next_index, how % 4u + 1u);
     start(first, 0, how >> 4 & 3);
     if (how & 4) {
@@ -280,58 +280,58 @@ static void limits(void) {
     for (size_t k = 18; k < 32; k++) {
         body[k] = k / 2 == 10 || k / 2 == 12 ? 0xff : 0;
     }
-    uint8_t which = byte();
+    uint8_t which = read_u8();
     at += AT[which % COUNT(AT)];
     bool wide = which % COUNT(AT) == 3 || which % COUNT(AT) == 4;
     put(&at, VALUES[which >> 5], wide ? 4 : 2);
-    say(0x02, body, sizeof body);
+    send_frame(0x02, body, sizeof body);
 }
 
 /* A frame of any kind and content: often a right number and session, sometimes not. */
-static void anything(void) {
-    uint8_t body[244], how = byte(), type = byte(), n = how & 16 ? byte() : 4;
+static void send_random_frame(void) {
+    uint8_t body[244], how = read_u8(), type = read_u8(), n = how & 16 ? read_u8() : 4;
     n = n > sizeof body ? sizeof body : n;
     for (size_t k = 0; k < n; k++) {
-        body[k] = byte();
+        body[k] = read_u8();
     }
-    uint8_t seq = (uint8_t)(o->next_seq + (how & 32 ? byte() : 0));
-    say_as(type % 32 + (how & 128), seq, how & 64 ? two() : o->session, body, n);
+    uint8_t seq = (uint8_t)(o->next_seq + (how & 32 ? read_u8() : 0));
+    send_frame_as(type % 32 + (how & 128), seq, how & 64 ? read_u16() : o->session, body, n);
 }
 
 /* A frame that would do something, with a bit turned: never may anything come of it. */
-static void damaged(void) {
+static void send_damaged_frame(void) {
     static const uint8_t TYPES[] = {0x13, 0x16, 0x19, 0x01, 0x17};
-    uint8_t wire[REFERENCE_WIRE_MAX], body[6] = {1}, type = TYPES[byte() % COUNT(TYPES)], where = byte();
-    size_t n = reference_write(wire, type, o->next_seq, o->session, body, type == 0x01 ? 6 : 0);
+    uint8_t wire[REFERENCE_WIRE_MAX], body[6] = {1}, type = TYPES[read_u8() % COUNT(TYPES)], where = read_u8();
+    size_t n = reference_encode(wire, type, o->next_seq, o->session, body, type == 0x01 ? 6 : 0);
     size_t at = (where >> 3) % (n - 1);
     wire[at] ^= (uint8_t)(1u << (where & 7));
     o->pending_type = 0;
     if (wire[at]) { /* else it is two pieces, and as short */
-        give(wire, n, true);
+        send_bytes(wire, n, true);
     }
 }
 
-static void junk(void) {
-    uint8_t bytes[64], n = byte() % sizeof bytes;
+static void send_junk(void) {
+    uint8_t bytes[64], n = read_u8() % sizeof bytes;
     for (size_t k = 0; k < n; k++) {
-        bytes[k] = byte();
+        bytes[k] = read_u8();
     }
     bytes[n] = 0;
     o->pending_type = 0;
-    give(bytes, (size_t)n + 1, true);
+    send_bytes(bytes, (size_t)n + 1, true);
 }
 
 static void arm(void) {
     arm_request();
-    if (byte() & 1) {
-        arm_confirm(o->host_nonce, byte() & 1 ? o->board_nonce : byte());
+    if (read_u8() & 1) {
+        arm_confirm(o->host_nonce, read_u8() & 1 ? o->board_nonce : read_u8());
     }
 }
 
 /* As a host does that wants to. */
-static void arm_wholly(void) {
+static void arm_fully(void) {
     hello(1);
-    say(0x17, NULL, 0);
+    send_frame(0x17, NULL, 0);
     arm_request();
     arm_confirm(o->host_nonce, o->board_nonce);
     for (unsigned n = 0; n < 41; n++) {
@@ -341,7 +341,7 @@ static void arm_wholly(void) {
 }
 
 static void change_input(void) {
-    uint8_t which = byte();
+    uint8_t which = read_u8();
     oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
     tick();
     if (which & 8) { /* a short one */
@@ -350,24 +350,24 @@ static void change_input(void) {
     }
 }
 
-static void stick(void) {
-    uint8_t how = byte();
+static void stick_readback(void) {
+    uint8_t how = read_u8();
     driver.stuck = how & 1;
     driver.stuck_on = how & 2;
 }
 
 static void link_lost(void) {
-    board_link_lost(board, o->now_us);
-    oracle_look(o, board);
-    if (o->lit || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
-        violated("ABORT", "goes on after the link was lost");
+    board_on_link_lost(board, o->now_us);
+    oracle_check(o, board);
+    if (o->gate_on || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
+        report_violation("ABORT", "goes on after the link was lost");
     }
 }
 
 static void abort_frame(void) {
-    say_as(0x13, byte(), byte() & 1 ? o->session : two(), NULL, 0);
-    if (o->lit || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
-        violated("ABORT", "goes on after ABORT");
+    send_frame_as(0x13, read_u8(), read_u8() & 1 ? o->session : read_u16(), NULL, 0);
+    if (o->gate_on || (o->state != STATE_FAULT && o->state != STATE_DISARMED)) {
+        report_violation("ABORT", "goes on after ABORT");
     }
 }
 
@@ -375,7 +375,7 @@ static void step(const struct board_config *config) {
     static const uint32_t WAITS_US[] = {1000, 1, 100, 450, 5000, 20000, 60000, 110000};
     static const uint16_t LATE_US[] = {150, 300, 600, 601, 1000, 5000};
     static const uint16_t LEASES_MS[] = {65535, 100, 10, 1};
-    uint8_t what = byte();
+    uint8_t what = read_u8();
     uint8_t detail = what / 24;
     switch (what % 24) {
     case 0: case 1: case 2:
@@ -388,7 +388,7 @@ static void step(const struct board_config *config) {
         data(o->next_index + (detail == 9 ? 5 : detail == 8 ? ~0u : 0), detail % 4 + 1u);
         break;
     case 7:
-        start(o->queue_count ? o->queue[o->queue_first % POINTS_SEEN].index : o->next_index, detail & 1 ? two() : 0,
+        start(o->queue_count ? o->queue[o->queue_first % POINTS_MAX].index : o->next_index, detail & 1 ? read_u16() : 0,
               detail >> 1);
         break;
     case 8:
@@ -398,19 +398,19 @@ static void step(const struct board_config *config) {
         lease(LEASES_MS[detail % COUNT(LEASES_MS)]);
         break;
     case 10:
-        say(0x19, NULL, 0);
+        send_frame(0x19, NULL, 0);
         break;
     case 11:
         change_input();
         break;
     case 12:
-        say(detail & 1 ? 0x16 : 0x17, NULL, 0);
+        send_frame(detail & 1 ? 0x16 : 0x17, NULL, 0);
         break;
     case 13:
         if (detail < 8) {
             arm();
         } else {
-            arm_wholly();
+            arm_fully();
         }
         break;
     case 14:
@@ -420,19 +420,19 @@ static void step(const struct board_config *config) {
         limits();
         break;
     case 16:
-        anything();
+        send_random_frame();
         break;
     case 17:
-        damaged();
+        send_damaged_frame();
         break;
     case 18:
-        junk();
+        send_junk();
         break;
     case 19:
         late_tick(LATE_US[detail % COUNT(LATE_US)]);
         break;
     case 20:
-        stick();
+        stick_readback();
         break;
     case 21:
         wait(WAITS_US[detail % COUNT(WAITS_US)], false);
@@ -448,7 +448,7 @@ static void step(const struct board_config *config) {
         if (detail == 0) {
             power_up(config);
         } else if (detail & 1) {
-            say(0x18, NULL, 0);
+            send_frame(0x18, NULL, 0);
         } else {
             wait(2100000, true);
         }
@@ -482,9 +482,9 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
         if (BOARDS_LIMITS[k].key_edge) {
             turn_key(&BOARDS_LIMITS[k]);
         }
-        arm_wholly();
+        arm_fully();
         if (o->state != STATE_ARMED) {
-            violated("driver", "the board does not arm");
+            report_violation("driver", "the board does not arm");
         }
         driver.ticks = 0;
         armed_drivers[k] = driver;
@@ -493,9 +493,9 @@ int LLVMFuzzerInitialize(int *argc, char ***argv) {
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t n) {
-    from = bytes;
-    from_end = bytes + n;
-    uint8_t which = byte();
+    input = bytes;
+    input_end = bytes + n;
+    uint8_t which = read_u8();
     const struct board_config *config = &BOARDS_LIMITS[which % BOARDS];
     board = malloc(sizeof *board);
     if (which & 128) {
@@ -504,7 +504,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *bytes, size_t n) {
         driver = armed_drivers[which % BOARDS];
         memcpy(board, armed_boards[which % BOARDS], sizeof *board);
     }
-    for (unsigned k = 0; k < STEPS_MAX && from < from_end && driver.ticks < TICKS_MAX; k++) {
+    for (unsigned k = 0; k < STEPS_MAX && input < input_end && driver.ticks < TICKS_MAX; k++) {
         step(config);
     }
     wait(120000, true);

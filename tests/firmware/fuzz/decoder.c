@@ -12,7 +12,7 @@
 
 #define STREAM_MAX 4096u
 
-static void differ(const char *what) {
+static void report_difference(const char *what) {
     fprintf(stderr, "decoder: %s\n", what);
     abort();
 }
@@ -20,7 +20,7 @@ static void differ(const char *what) {
 static void compare(const struct frame *core, const struct parsed *expected) {
     if (core->type != expected->type || core->seq != expected->seq || core->session != expected->session ||
         core->length != expected->length || (core->length && memcmp(core->body, expected->body, core->length))) {
-        differ("another frame than the one that came");
+        report_difference("another frame than the one that came");
     }
     uint8_t *body = malloc(core->length);
     struct frame alone = *core;
@@ -28,9 +28,9 @@ static void compare(const struct frame *core, const struct parsed *expected) {
         memcpy(body, core->body, core->length);
     }
     alone.body = body; /* nothing is behind it */
-    enum order order;
-    if (frame_has_form(&alone, &order) != reference_has_form(expected)) {
-        differ("a form that is none, or refused one that is");
+    enum frame_class class;
+    if (frame_is_valid(&alone, &class) != reference_is_valid(expected)) {
+        report_difference("a form that is none, or refused one that is");
     }
     free(body);
 }
@@ -56,19 +56,19 @@ static void run(const uint8_t *stream, size_t n) {
         if (stream[at] == 0 && at > from) {
             unpack_alone(stream + from, at - from);
         }
-        bool whole = receiver_take(receiver, stream[at], &frame), expected = false;
+        bool whole = receiver_feed(receiver, stream[at], &frame), expected = false;
         if (stream[at] == 0) {
-            enum reading reading = at > from ? reference_read(stream + from, at - from, raw, &parsed) : READ_FRAME;
+            enum reading reading = at > from ? reference_decode(stream + from, at - from, raw, &parsed) : READ_FRAME;
             expected = at > from && reading == READ_FRAME;
             format_errors += at > from && reading == READ_FORMAT_ERROR;
             crc_errors += at > from && reading == READ_CRC_ERROR;
             from = at + 1;
             if (receiver->format_errors != format_errors || receiver->crc_errors != crc_errors) {
-                differ("counters");
+                report_difference("counters");
             }
         }
         if (whole != expected) {
-            differ(whole ? "a frame where none came" : "a frame was lost");
+            report_difference(whole ? "a frame where none came" : "a frame was lost");
         }
         if (whole) {
             compare(&frame, &parsed);
@@ -88,10 +88,10 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t n) {
         if (size) {
             memcpy(body, data + at + 4, size);
         }
-        size_t written = reference_write(wire, data[at], data[at + 1], data[at + 2], body, size);
+        size_t written = reference_encode(wire, data[at], data[at + 1], data[at + 2], body, size);
         if (frame_encode(own, data[at], data[at + 1], data[at + 2], body, size) != written ||
             memcmp(own, wire, written)) {
-            differ("a frame is encoded otherwise");
+            report_difference("a frame is encoded otherwise");
         }
         memcpy(stream + length, wire, written);
         length += written;

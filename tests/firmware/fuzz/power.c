@@ -11,14 +11,14 @@ static int cell(uint16_t code, uint16_t cell_codes, bool shifted) {
     return (int)floor(((double)code - 32768.0 + (shifted ? cell_codes / 2 : 0)) / cell_codes);
 }
 
-static bool same_cell(const struct oracle *o, const struct seen_pulse *a, const struct seen_pulse *b, unsigned grid) {
+static bool same_cell(const struct oracle *o, const struct observed_pulse *a, const struct observed_pulse *b, unsigned grid) {
     bool in_x = grid & 1, in_y = grid & 2;
     return cell(a->x, o->cell_codes, in_x) == cell(b->x, o->cell_codes, in_x) &&
            cell(a->y, o->cell_codes, in_y) == cell(b->y, o->cell_codes, in_y);
 }
 
-static const struct seen_pulse *before(const struct oracle *o, const struct seen_pulse *pulse, unsigned grid) {
-    for (const struct seen_pulse *old = pulse; old-- > o->pulses;) {
+static const struct observed_pulse *find_previous(const struct oracle *o, const struct observed_pulse *pulse, unsigned grid) {
+    for (const struct observed_pulse *old = pulse; old-- > o->pulses;) {
         if (same_cell(o, old, pulse, grid)) {
             return old;
         }
@@ -26,8 +26,8 @@ static const struct seen_pulse *before(const struct oracle *o, const struct seen
     return NULL;
 }
 
-static void account(const struct oracle *o, struct seen_pulse *pulse, unsigned grid) {
-    const struct seen_pulse *old = before(o, pulse, grid);
+static void check_cell(const struct oracle *o, struct observed_pulse *pulse, unsigned grid) {
+    const struct observed_pulse *old = find_previous(o, pulse, grid);
     double energy_uj = (double)pulse->on_us * pulse->duty / FULL * o->limits.full_power_uw * 1e-6, level_uj = 0;
     pulse->account_us[grid] = pulse->on_us;
     if (old) {
@@ -38,18 +38,18 @@ static void account(const struct oracle *o, struct seen_pulse *pulse, unsigned g
     }
     pulse->level_uj[grid] = level_uj + energy_uj;
     if (pulse->account_us[grid] > o->limits.max_on_us) {
-        violated("B4", "a cell is lit for too long");
+        report_violation("B4", "a cell is lit for too long");
     }
     if (pulse->level_uj[grid] > o->limits.spot_uj + 1e-6) {
-        violated("B6", "a cell's bucket runs over");
+        report_violation("B6", "a cell's bucket runs over");
     }
 }
 
 /* Light, µs × duty, within the second that ends at end_us; the newest pulse as long as it may get. */
-static double second_until(const struct oracle *o, double end_us) {
+static double window_duty_us(const struct oracle *o, double end_us) {
     double sum = 0;
     for (uint32_t k = 0; k < o->pulses_count; k++) {
-        const struct seen_pulse *pulse = &o->pulses[k];
+        const struct observed_pulse *pulse = &o->pulses[k];
         double from_us = (double)pulse->from_us, to_us = from_us + pulse->on_us;
         to_us = pulse->to_us ? fmin(to_us, (double)pulse->to_us) : to_us;
         sum += pulse->duty * fmax(0, fmin(to_us, end_us) - fmax(from_us, end_us - SECOND_US));
@@ -57,30 +57,30 @@ static double second_until(const struct oracle *o, double end_us) {
     return sum;
 }
 
-static void mean(const struct oracle *o, const struct seen_pulse *pulse) {
+static void check_mean_power(const struct oracle *o, const struct observed_pulse *pulse) {
     double most = SECOND_US * o->limits.mean_duty + (double)o->late_us * FULL + 0.5;
-    double begin_us = (double)pulse->from_us, end_us = begin_us + pulse->on_us, fullest = second_until(o, end_us);
+    double begin_us = (double)pulse->from_us, end_us = begin_us + pulse->on_us, max_duty_us = window_duty_us(o, end_us);
     for (uint32_t k = 0; k < o->pulses_count; k++) { /* the sum turns only where a pulse begins to leave the second */
         double leaves_us = (double)o->pulses[k].from_us + SECOND_US;
         if (leaves_us > begin_us && leaves_us < end_us) {
-            fullest = fmax(fullest, second_until(o, leaves_us));
+            max_duty_us = fmax(max_duty_us, window_duty_us(o, leaves_us));
         }
     }
-    if (fullest > most) {
-        violated("B5", "a second holds too much light");
+    if (max_duty_us > most) {
+        report_violation("B5", "a second holds too much light");
     }
 }
 
-struct seen_pulse *power_of(struct oracle *o) {
-    if (o->pulses_count == POINTS_SEEN) {
-        violated("driver", "more pulses than it may ask for");
+struct observed_pulse *check_pulse_power(struct oracle *o) {
+    if (o->pulses_count == POINTS_MAX) {
+        report_violation("driver", "more pulses than it may ask for");
     }
-    struct seen_pulse *pulse = &o->pulses[o->pulses_count++];
-    *pulse = (struct seen_pulse){.from_us = o->now_us, .index = o->current.index, .x = o->current.x, .y = o->current.y,
+    struct observed_pulse *pulse = &o->pulses[o->pulses_count++];
+    *pulse = (struct observed_pulse){.from_us = o->now_us, .index = o->current.index, .x = o->current.x, .y = o->current.y,
                                  .on_us = o->current.on_us, .duty = o->current.duty};
     for (unsigned grid = 0; grid < 4; grid++) {
-        account(o, pulse, grid);
+        check_cell(o, pulse, grid);
     }
-    mean(o, pulse);
+    check_mean_power(o, pulse);
     return pulse;
 }

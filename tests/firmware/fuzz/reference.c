@@ -2,7 +2,7 @@
 
 #include <string.h>
 
-static uint32_t crc_of(const uint8_t *bytes, size_t n) {
+static uint32_t compute_crc(const uint8_t *bytes, size_t n) {
     uint32_t crc = ~0u;
     for (size_t bit = 0; bit < 8 * n; bit++) {
         uint32_t low = (crc ^ (uint32_t)bytes[bit / 8] >> bit % 8) & 1u;
@@ -31,24 +31,24 @@ static size_t unpack(const uint8_t *bytes, size_t n, uint8_t *raw) {
     return until_code ? REFERENCE_RAW_MAX + 1 : length;
 }
 
-enum reading reference_read(const uint8_t *bytes, size_t n, uint8_t *raw, struct parsed *parsed) {
+enum reading reference_decode(const uint8_t *bytes, size_t n, uint8_t *raw, struct parsed *parsed) {
     size_t length = n > REFERENCE_WIRE_MAX - 1 ? 0 : unpack(bytes, n, raw);
     if (length < 8 || length > REFERENCE_RAW_MAX) {
         return READ_FORMAT_ERROR;
     }
-    if (crc_of(raw, length - 4) != little(raw + length - 4, 4)) {
+    if (compute_crc(raw, length - 4) != read_le(raw + length - 4, 4)) {
         return READ_CRC_ERROR;
     }
-    *parsed = (struct parsed){raw[0], raw[1], (uint16_t)little(raw + 2, 2), raw + 4, length - 8};
+    *parsed = (struct parsed){raw[0], raw[1], (uint16_t)read_le(raw + 2, 2), raw + 4, length - 8};
     return READ_FRAME;
 }
 
-size_t reference_write(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n) {
+size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n) {
     uint8_t raw[REFERENCE_RAW_MAX] = {type, seq, (uint8_t)session, (uint8_t)(session >> 8)};
     if (n) {
         memcpy(raw + 4, body, n);
     }
-    uint32_t crc = crc_of(raw, n + 4);
+    uint32_t crc = compute_crc(raw, n + 4);
     for (size_t k = 0; k < 4; k++) {
         raw[n + 4 + k] = (uint8_t)(crc >> 8 * k);
     }
@@ -105,7 +105,7 @@ static const struct {
 };
 #define MESSAGES_COUNT (sizeof MESSAGES / sizeof MESSAGES[0])
 
-bool reference_has_form(const struct parsed *parsed) {
+bool reference_is_valid(const struct parsed *parsed) {
     for (size_t k = 0; k < MESSAGES_COUNT; k++) {
         if (MESSAGES[k].type != parsed->type) {
             continue;

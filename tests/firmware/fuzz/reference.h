@@ -20,15 +20,15 @@ struct parsed {
 };
 
 /* What stands between two zeros; raw: REFERENCE_RAW_MAX bytes for its content, to which parsed->body points. */
-enum reading reference_read(const uint8_t *bytes, size_t n, uint8_t *raw, struct parsed *parsed);
+enum reading reference_decode(const uint8_t *bytes, size_t n, uint8_t *raw, struct parsed *parsed);
 /* A frame with its delimiter; wire: REFERENCE_WIRE_MAX bytes. n: at most 244. */
-size_t reference_write(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
+size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
 /* Whether type, length and enumerations are those of a message. */
-bool reference_has_form(const struct parsed *parsed);
+bool reference_is_valid(const struct parsed *parsed);
 /* Whether a message of the host goes over the wire numbered. */
 bool reference_is_sequenced(uint8_t type);
 
-static inline uint64_t little(const uint8_t *at, size_t bytes) {
+static inline uint64_t read_le(const uint8_t *at, size_t bytes) {
     uint64_t value = 0;
     while (bytes--) {
         value = value << 8 | at[bytes];

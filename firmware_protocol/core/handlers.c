@@ -11,16 +11,16 @@
 
 static bool inputs_safe(const struct board *b) { return b->inputs == (INPUT_INTERLOCK | INPUT_KEY); }
 
-static bool takes_points(const struct board *b) {
+static bool is_armed(const struct board *b) {
     return STATES_ARMED >> b->state & 1u;
 }
 
 /* --- not sequenced --- */
 
 /* Not 0 and not the last one. A source that repeats itself must not keep the board here for ever. */
-static uint16_t new_session(struct board *b) {
+static uint16_t choose_session(struct board *b) {
     for (uint32_t k = 0; k < ENTROPY_TRIES; k++) {
-        uint16_t session = (uint16_t)b->hal.entropy(b->hal.context);
+        uint16_t session = (uint16_t)b->hal.read_entropy(b->hal.context);
         if (session != 0 && session != b->link.session) {
             return session;
         }
@@ -28,15 +28,15 @@ static uint16_t new_session(struct board *b) {
     return b->link.session == UINT16_MAX ? 1 : (uint16_t)(b->link.session + 1);
 }
 
-void obey_hello(struct board *b, const struct frame *frame) {
+void on_hello(struct board *b, const struct frame *frame) {
     uint8_t body[HELLO_REPLY_SIZE];
     disarm(b, REASON_HELLO);
-    link_begin(&b->link, new_session(b));
+    link_begin(&b->link, choose_session(b));
     b->limits = b->config.limits;
     b->next_index = b->done_index = 0;
     records_clear(&b->records);
-    b->hal.forget(b->hal.context);
-    b->version_fits = frame->body[HELLO_MAJOR_AT] == PROTOCOL_MAJOR;
+    b->hal.discard_output(b->hal.context);
+    b->version_supported = frame->body[HELLO_MAJOR_AT] == PROTOCOL_MAJOR;
     body[HELLO_REPLY_MAJOR_AT] = PROTOCOL_MAJOR;
     body[HELLO_REPLY_MINOR_AT] = PROTOCOL_MINOR;
     memcpy(body + HELLO_REPLY_HOST_NONCE_AT, frame->body + HELLO_HOST_NONCE_AT, 4);
@@ -49,26 +49,26 @@ void obey_hello(struct board *b, const struct frame *frame) {
     put_u16(body + HELLO_REPLY_RX_WINDOW_AT, RX_WINDOW);
     put_u16(body + HELLO_REPLY_CELL_CODES_AT, b->config.cell_codes);
     body[HELLO_REPLY_RESET_CAUSE_AT] = b->reset_cause;
-    limits_put(&b->limits, body + HELLO_REPLY_LIMITS_AT);
+    limits_encode(&b->limits, body + HELLO_REPLY_LIMITS_AT);
     send_message(b, MESSAGE_HELLO_REPLY, body, sizeof body);
 }
 
-static void renew_lease(struct board *b, uint16_t asked_ms) {
-    uint16_t ms = asked_ms < b->limits.lease_ms ? asked_ms : b->limits.lease_ms;
+static void renew_lease(struct board *b, uint16_t requested_ms) {
+    uint16_t ms = requested_ms < b->limits.lease_ms ? requested_ms : b->limits.lease_ms;
     uint64_t until_us = b->now_us + (uint64_t)ms * MS;
     if (is_leased(b->state) && until_us > b->lease_until_us) {
         b->lease_until_us = until_us;
     }
 }
 
-static void tell_clock(struct board *b, const uint8_t *asked) {
+static void send_clock_reply(struct board *b, const uint8_t *requested) {
     uint8_t body[CLOCK_REPLY_SIZE];
-    memcpy(body + CLOCK_REPLY_HOST_T_AT, asked + CLOCK_HOST_T_AT, 4);
+    memcpy(body + CLOCK_REPLY_HOST_T_AT, requested + CLOCK_HOST_T_AT, 4);
     put_u64(body + CLOCK_REPLY_TICK_AT, b->now_us - b->epoch_us);
     send_message(b, MESSAGE_CLOCK_REPLY, body, sizeof body);
 }
 
-static void tell_status(struct board *b) {
+static void send_status(struct board *b) {
     uint8_t body[STATUS_SIZE];
     body[STATUS_STATE_AT] = b->state;
     body[STATUS_FAULT_AT] = b->fault;
@@ -80,12 +80,12 @@ static void tell_status(struct board *b) {
     put_u16(body + STATUS_FORMAT_ERRORS_AT, (uint16_t)b->link.receiver.format_errors);
     put_u16(body + STATUS_SEQ_ERRORS_AT, (uint16_t)b->link.seq_errors);
     put_u16(body + STATUS_UNDERRUNS_AT, (uint16_t)b->underruns_total);
-    put_u64(body + STATUS_LASER_ON_US_AT, b->laser_on / 65535u);
-    put_u16(body + STATUS_TEMPERATURE_DC_AT, (uint16_t)b->hal.temperature_dc(b->hal.context));
+    put_u64(body + STATUS_LASER_ON_US_AT, b->laser_on_duty_us / 65535u);
+    put_u16(body + STATUS_TEMPERATURE_DC_AT, (uint16_t)b->hal.read_temperature_dc(b->hal.context));
     send_message(b, MESSAGE_STATUS, body, sizeof body);
 }
 
-static void tell_executed(struct board *b, uint32_t first_index) {
+static void send_executed(struct board *b, uint32_t first_index) {
     uint8_t body[BODY_MAX];
     size_t length;
     if (records_report(&b->records, records_find(&b->records, first_index), body, &length) > 0) {
@@ -93,19 +93,19 @@ static void tell_executed(struct board *b, uint32_t first_index) {
     }
 }
 
-void obey_unsequenced(struct board *b, const struct frame *frame) {
+void handle_unsequenced(struct board *b, const struct frame *frame) {
     switch (frame->type) {
     case MESSAGE_LEASE:
         renew_lease(b, get_u16(frame->body + LEASE_MS_AT));
         break;
     case MESSAGE_CLOCK:
-        tell_clock(b, frame->body);
+        send_clock_reply(b, frame->body);
         break;
     case MESSAGE_GET:
-        tell_status(b);
+        send_status(b);
         break;
     case MESSAGE_GET_EXECUTED:
-        tell_executed(b, get_u32(frame->body + GET_EXECUTED_FIRST_INDEX_AT));
+        send_executed(b, get_u32(frame->body + GET_EXECUTED_FIRST_INDEX_AT));
         break;
     default:
         break;
@@ -114,14 +114,14 @@ void obey_unsequenced(struct board *b, const struct frame *frame) {
 
 /* --- sequenced --- */
 
-static uint8_t limit(struct board *b, const uint8_t *body) {
-    struct board_limits asked;
+static uint8_t on_limits(struct board *b, const uint8_t *body) {
+    struct board_limits requested;
     if (!(STATES_IDLE >> b->state & 1u)) {
         return NAK_STATE;
     }
-    limits_get(&asked, body + LIMITS_LIMITS_AT);
-    limits_tighten(&b->limits, &asked);
-    return REFUSED_NOTHING;
+    limits_decode(&requested, body + LIMITS_LIMITS_AT);
+    limits_tighten(&b->limits, &requested);
+    return NO_REFUSAL;
 }
 
 static struct point point_get(const uint8_t *at) {
@@ -134,10 +134,10 @@ static struct point point_get(const uint8_t *at) {
     };
 }
 
-static uint8_t data(struct board *b, const uint8_t *body, size_t length) {
+static uint8_t on_data(struct board *b, const uint8_t *body, size_t length) {
     uint32_t first = get_u32(body + DATA_FIRST_INDEX_AT), count = (uint32_t)((length - DATA_SIZE) / POINT_SIZE);
-    bool idle = !b->job.exists && b->queue.count == 0;
-    if (!takes_points(b)) {
+    bool idle = !b->job.active && b->queue.count == 0;
+    if (!is_armed(b)) {
         return NAK_STATE;
     }
 #if MUTANT != 12
@@ -153,9 +153,9 @@ static uint8_t data(struct board *b, const uint8_t *body, size_t length) {
     }
     for (uint32_t k = 0; k < count; k++) {
         struct point point = point_get(body + DATA_SIZE + k * POINT_SIZE);
-        enum fault fault = guards_look(&b->limits, &point);
+        enum fault fault = guards_check_point(&b->limits, &point);
         if (fault != FAULT_NONE) {
-            fail(b, fault);
+            enter_fault(b, fault);
             return NAK_STATE;
         }
     }
@@ -167,11 +167,11 @@ static uint8_t data(struct board *b, const uint8_t *body, size_t length) {
         queue_push(&b->queue, &point);
     }
     b->next_index = first + count;
-    refill(b);
-    return REFUSED_NOTHING;
+    resume_if_refilled(b);
+    return NO_REFUSAL;
 }
 
-static uint8_t start(struct board *b, const uint8_t *body) {
+static uint8_t on_start(struct board *b, const uint8_t *body) {
     uint64_t tick = get_u64(body + START_START_TICK_AT);
     if (b->state != STATE_ARMED) {
         return NAK_STATE;
@@ -179,7 +179,7 @@ static uint8_t start(struct board *b, const uint8_t *body) {
     if (get_u32(body + START_FIRST_INDEX_AT) != b->next_index - b->queue.count) {
         return NAK_INDEX;
     }
-    b->job = (struct job){.exists = true, .number = get_u32(body + START_JOB_AT), .start_us = b->now_us};
+    b->job = (struct job){.active = true, .number = get_u32(body + START_JOB_AT), .start_us = b->now_us};
     b->job.watermark = get_u16(body + START_WATERMARK_AT);
     if (tick > b->now_us - b->epoch_us) {
         /* Beyond what the clock can count is never; the hold's second must not wrap either. */
@@ -187,33 +187,33 @@ static uint8_t start(struct board *b, const uint8_t *body) {
         b->job.start_us = b->epoch_us + (tick < last ? tick : last);
     }
     change_state(b, REASON_START);
-    return REFUSED_NOTHING;
+    return NO_REFUSAL;
 }
 
-static uint8_t end(struct board *b, const uint8_t *body) {
+static uint8_t on_end(struct board *b, const uint8_t *body) {
     uint32_t end_index = get_u32(body + END_END_INDEX_AT);
-    if (!b->job.exists || b->job.number != get_u32(body + END_JOB_AT)) {
+    if (!b->job.active || b->job.number != get_u32(body + END_JOB_AT)) {
         return NAK_STATE;
     }
     if (end_index != b->next_index) {
         return NAK_INDEX;
     }
     b->job.end_index = end_index;
-    b->job.ends = true;
+    b->job.has_end = true;
     if (b->done_index >= end_index) {
-        b->job.exists = false;
+        b->job.active = false;
         change_state(b, REASON_JOB_DONE);
     }
-    refill(b);
-    return REFUSED_NOTHING;
+    resume_if_refilled(b);
+    return NO_REFUSAL;
 }
 
-static uint8_t arm(struct board *b, const uint8_t *asked) {
+static uint8_t on_arm_req(struct board *b, const uint8_t *requested) {
     uint8_t body[ARM_CHALLENGE_SIZE];
     if (b->state != STATE_DISARMED) {
         return NAK_STATE;
     }
-    if (!b->version_fits) {
+    if (!b->version_supported) {
         return NAK_VERSION;
     }
     if (!inputs_safe(b)) {
@@ -222,9 +222,9 @@ static uint8_t arm(struct board *b, const uint8_t *asked) {
     if (b->config.key_edge && !b->key_turned) {
         return NAK_KEY_EDGE;
     }
-    b->board_nonce = b->hal.entropy(b->hal.context);
-    b->nonce_good = true;
-    b->host_nonce = get_u32(asked + ARM_REQ_HOST_NONCE_AT);
+    b->board_nonce = b->hal.read_entropy(b->hal.context);
+    b->nonce_valid = true;
+    b->host_nonce = get_u32(requested + ARM_REQ_HOST_NONCE_AT);
     b->arming_since_us = b->now_us;
     b->confirmed = false;
     b->lease_until_us = b->now_us + (uint64_t)b->limits.lease_ms * MS;
@@ -232,17 +232,17 @@ static uint8_t arm(struct board *b, const uint8_t *asked) {
     put_u32(body + ARM_CHALLENGE_HOST_NONCE_AT, b->host_nonce);
     put_u32(body + ARM_CHALLENGE_BOARD_NONCE_AT, b->board_nonce);
     send_message(b, MESSAGE_ARM_CHALLENGE, body, sizeof body);
-    return REFUSED_NOTHING;
+    return NO_REFUSAL;
 }
 
 /* B11: a nonce is good for one answer, right or wrong. */
-static uint8_t confirm(struct board *b, const uint8_t *body) {
-    bool echoed = b->nonce_good && get_u32(body + ARM_CONFIRM_BOARD_NONCE_AT) == b->board_nonce &&
+static uint8_t on_arm_confirm(struct board *b, const uint8_t *body) {
+    bool echoed = b->nonce_valid && get_u32(body + ARM_CONFIRM_BOARD_NONCE_AT) == b->board_nonce &&
                   get_u32(body + ARM_CONFIRM_HOST_NONCE_AT) == b->host_nonce;
 #if MUTANT == 11
     echoed = true;
 #endif
-    b->nonce_good = false;
+    b->nonce_valid = false;
     if (b->state != STATE_ARMING || b->confirmed) {
         return NAK_STATE;
     }
@@ -252,10 +252,10 @@ static uint8_t confirm(struct board *b, const uint8_t *body) {
     }
     b->confirmed = true;
     b->key_turned = false;
-    return REFUSED_NOTHING;
+    return NO_REFUSAL;
 }
 
-static uint8_t clear_fault(struct board *b) {
+static uint8_t on_clear_fault(struct board *b) {
     if (b->state != STATE_FAULT) {
         return NAK_STATE;
     }
@@ -263,42 +263,42 @@ static uint8_t clear_fault(struct board *b) {
         return NAK_INPUT;
     }
     b->fault = FAULT_NONE;
-    b->underruns_known = 0;
+    b->underruns_count = 0;
     change_state(b, REASON_FAULT_CLEARED);
-    return REFUSED_NOTHING;
+    return NO_REFUSAL;
 }
 
-static uint8_t flush(struct board *b) {
-    if (!takes_points(b)) {
+static uint8_t on_flush(struct board *b) {
+    if (!is_armed(b)) {
         return NAK_STATE;
     }
     if (b->state != STATE_ARMED) {
         change_state(b, REASON_FLUSH);
     }
     drop_queue(b);
-    return REFUSED_NOTHING;
+    return NO_REFUSAL;
 }
 
-uint8_t obey_sequenced(struct board *b, const struct frame *frame) {
+uint8_t dispatch_sequenced(struct board *b, const struct frame *frame) {
     switch (frame->type) {
     case MESSAGE_LIMITS:
-        return limit(b, frame->body);
+        return on_limits(b, frame->body);
     case MESSAGE_DATA:
-        return data(b, frame->body, frame->length);
+        return on_data(b, frame->body, frame->length);
     case MESSAGE_START:
-        return start(b, frame->body);
+        return on_start(b, frame->body);
     case MESSAGE_END:
-        return end(b, frame->body);
+        return on_end(b, frame->body);
     case MESSAGE_ARM_REQ:
-        return arm(b, frame->body);
+        return on_arm_req(b, frame->body);
     case MESSAGE_ARM_CONFIRM:
-        return confirm(b, frame->body);
+        return on_arm_confirm(b, frame->body);
     case MESSAGE_DISARM:
         disarm(b, REASON_DISARM);
-        return REFUSED_NOTHING;
+        return NO_REFUSAL;
     case MESSAGE_CLEAR_FAULT:
-        return clear_fault(b);
+        return on_clear_fault(b);
     default:
-        return flush(b); /* the only sequenced message left */
+        return on_flush(b); /* the only sequenced message left */
     }
 }
