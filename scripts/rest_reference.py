@@ -1,22 +1,33 @@
-"""Print the REST reference, generated from the application's OpenAPI: `python scripts/rest_reference.py`."""
+"""The REST reference, generated from the application's own OpenAPI document; run as a script, it prints the page."""
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.openapi import ERROR_RESPONSES
 from optodrive.device.config import load_config
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.display_model import DisplayModel
 
-HEAD = """# REST
+HEAD = """# REST API
 
-Generated from the daemon's OpenAPI, which it answers itself at `/openapi.json`. Every route but `/v1/health` needs
-`Authorization: Bearer TOKEN`; errors are problem documents (RFC 9457) with a stable `code`. The WebSocket is in
-[streaming](../how-to/stream-frames.md), the client from Python in [client](../how-to/use-the-python-client.md).
+Generated from the daemon's OpenAPI document, which the daemon serves at `/openapi.json`. Every route except `/v1/health` needs
+`Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are problem documents (RFC 9457) with a stable
+`code`. The WebSocket is described in [streaming](../how-to/stream-frames.md), the Python client in
+[client](../how-to/use-the-python-client.md).
+"""
+PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem):
+
+| status | meaning |
+|---|---|"""
+MODELS_HEAD = """## Models
+
+The JSON bodies. A type in parentheses may be null. Members of `Problem` and `FrameResult` that do not apply are absent; all other
+models always have all members.
 """
 
 
 def build_openapi():
-    """Build the application's OpenAPI without connecting to a board."""
+    """Build the application's OpenAPI document without connecting to a board."""
     config = load_config()
     engine = Engine(DisplayModel.from_config(config), find_transport_factory(config.board)(), MonotonicClock())
     try:
@@ -26,40 +37,84 @@ def build_openapi():
 
 
 def build_rest_reference():
-    """Build the reference as Markdown, one section per route."""
-    sections = [HEAD]
-    for path, methods in build_openapi()["paths"].items():
+    """Build the page: one section per route, then one per model."""
+    document = build_openapi()
+    sections = [HEAD, PROBLEMS_HEAD, *(f"| {status} | {text} |" for status, text in list_problems()), ""]
+    for path, methods in document["paths"].items():
         for method, route in methods.items():
-            sections.append(format_section(f"{method.upper()} {path}", route))
+            sections.append(format_route(f"{method.upper()} {path}", route))
+    sections.append(MODELS_HEAD)
+    sections += [format_model(name, schema) for name, schema in sorted(document["components"]["schemas"].items())]
     return "\n".join(sections)
 
 
-def format_section(title, route):
-    """Format one route: description, parameters, body and responses."""
-    lines = [f"## {title}", "", route.get("description", ""), ""]
+def format_route(title, route):
+    """Format one route: description, role, parameters, body and responses."""
+    lines = [f"## {title}", "", route.get("description", ""), "", f"Role: {route['x-min-role'] or 'none'}.", ""]
     rows = [
-        f"| `{item['name']}` | {item['in']} | {format_type(item['schema'])} |"
-        f" {escape_cell(item.get('description', ''))} |"
+        f"| `{item['name']}` | {item['in']} | {format_parameter(item['schema'])} | "
+        f"{escape_cell(item.get('description', ''))} |"
         for item in route.get("parameters", ())
     ]
     if rows:
         lines += ["| parameter | in | type | |", "|---|---|---|---|", *rows, ""]
     if "requestBody" in route:
         lines += [f"Body: {route['requestBody'].get('description', 'JSON')}.", ""]
-    answers = [f"{status} {answer['description'].rstrip('.')}" for status, answer in sorted(route["responses"].items())]
-    return "\n".join([*lines, "Answers: " + "; ".join(answers) + ".", ""])
+    responses = sorted(route["responses"].items())
+    bodies = [f"{status} {format_content(response)}" for status, response in responses if status < "300"]
+    return "\n".join([*lines, f"Response: {'; '.join(bodies)}.", ""])
+
+
+def list_problems():
+    """List status and meaning of the problem documents, which every route may send."""
+    return [(status, response["description"]) for status, response in ERROR_RESPONSES.items()]
+
+
+def format_content(response):
+    """Format the body of a successful response: its model, or its media type."""
+    ((media_type, content),) = response["content"].items()
+    return format_type(content["schema"]) if "$ref" in content["schema"] else media_type
+
+
+def format_model(name, schema):
+    """Format one model: its description and members."""
+    lines = [f"### {name}", ""]
+    if schema.get("description"):
+        lines += [schema["description"].strip(), ""]
+    if "properties" not in schema:
+        return "\n".join([*lines, format_type(schema), ""])
+    rows = [f"| `{member}` | {format_type(item)} |" for member, item in schema["properties"].items()]
+    return "\n".join([*lines, "| member | type |", "|---|---|", *rows, ""])
+
+
+def format_parameter(schema):
+    """Format a parameter's type and default."""
+    text = ", ".join(f"`{value}`" for value in schema["enum"]) if "enum" in schema else schema.get("type", "any")
+    return escape_cell(text + (f", default {schema['default']}" if "default" in schema else ""))
 
 
 def format_type(schema):
-    """Format the type of a parameter."""
-    text = schema.get("type", "any")
-    if "enum" in schema:
-        text = ", ".join(f"`{value}`" for value in schema["enum"])
-    return escape_cell(text + (f", {schema['default']} if left out" if "default" in schema else ""))
+    """Format the type of a schema; a model is linked."""
+    if "$ref" in schema:
+        name = schema["$ref"].rpartition("/")[2]
+        return f"[{name}](#{name.lower()})"
+    if "anyOf" in schema:
+        kinds = [format_type(item) for item in schema["anyOf"] if item.get("type") != "null"]
+        text = " or ".join(kinds)
+        return f"({text})" if len(kinds) < len(schema["anyOf"]) else text
+    if "enum" in schema or "const" in schema:
+        return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
+    if schema.get("type") == "array":
+        if "prefixItems" in schema:
+            return f"[{', '.join(format_type(item) for item in schema['prefixItems'])}]"
+        return f"list of {format_type(schema['items'])}"
+    if schema.get("type") == "object" and isinstance(schema.get("additionalProperties"), dict):
+        return f"map of {format_type(schema['additionalProperties'])}"
+    return schema.get("type", "any")
 
 
 def escape_cell(text):
-    """Escape text for a cell of a table."""
+    """Escape text for a table cell."""
     return str(text).replace("|", "\\|").replace("\n", " ")
 
 

@@ -4,6 +4,7 @@ from typing import Literal
 
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.plan import PlanStatus
+from optodrive.link.protocol.states import ARMED_STATES, BoardState
 from optodrive.link.session.timing_error import TimingError
 
 
@@ -27,7 +28,7 @@ class LinkReport(JsonModel):
 class BoardReport(JsonModel):
     """The board's last reported status; `hint` explains the fault and its remedy."""
 
-    state: str
+    state: BoardState | Literal["UNKNOWN"]
     fault: str | None
     hint: str
     inputs: int
@@ -46,7 +47,7 @@ class BoardReport(JsonModel):
     @property
     def is_armed(self) -> bool:
         """Whether the board accepts plans."""
-        return self.state in ("ARMED", "RUNNING", "HOLD")
+        return self.state in ARMED_STATES
 
 
 class RecentPlan(JsonModel):
