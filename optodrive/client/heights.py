@@ -1,4 +1,4 @@
-"""Heights as callers have them, in µm, to what the daemon takes: by pixel for REST, bytes for the stream."""
+"""Conversion of heights in µm to the forms that the daemon accepts: by pixel for REST, bytes for the stream."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -13,13 +13,13 @@ from optodrive.device.config import PixelLayout
 from optodrive.planning.stimuli.streamed_frame import FRAME_NUMBER_MAX, HEADER, HEIGHT_UNIT_M, MAGIC
 
 HeightsLike = Mapping[int, float] | ArrayLike
-"""Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by place; NaN or 0 where nothing is asked."""
+"""Peak heights in µm: {pixel: height}, [p] by pixel, or [rows, columns] by position; NaN or 0: no target."""
 
 TENTHS_UM_MAX = 0xFFFF
 
 
 def convert_to_pixels(heights_um: HeightsLike, layout: PixelLayout) -> FloatArray:
-    """Heights [p] in µm, 0 where nothing is asked; InputError for shapes and heights that cannot be."""
+    """Convert heights to [p] in µm, 0 for no target; InputError for an invalid shape or height."""
     if isinstance(heights_um, Mapping):
         return _check_heights(_convert_mapping(heights_um, len(layout)))
     try:
@@ -56,12 +56,12 @@ def _check_heights(heights_um: FloatArray) -> FloatArray:
 
 
 def encode_json(heights_um: FloatArray) -> dict[str, float]:
-    """Driven pixels and their heights, as FRAMES.json has them."""
+    """Encode the pixels with a target and their heights in the form of FRAMES.json."""
     return {str(pixel): float(heights_um[pixel]) for pixel in np.flatnonzero(heights_um).tolist()}
 
 
 def encode_frame(number: int, heights_um: FloatArray) -> bytes:
-    """A stream's frame; InputError for heights that its 16 bits do not hold."""
+    """Encode a streamed frame; InputError for a height that does not fit in 16 bits."""
     tenths = np.rint(um_to_m(heights_um) / HEIGHT_UNIT_M)
     pixel = int(tenths.argmax())
     if tenths[pixel] > TENTHS_UM_MAX:

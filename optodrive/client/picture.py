@@ -1,4 +1,4 @@
-"""A display as a picture: one square a pixel, brighter the taller, with its scale."""
+"""Picture of a display: one square per pixel, brighter for larger heights, with a scale."""
 
 import io
 
@@ -11,11 +11,11 @@ WIDTH_MAX_PX, CELL_MAX_PX = 640, 24
 MARGIN_PX, FOOTER_PX = 12, 34
 BACKGROUND, TEXT_COLOUR = (24, 26, 33), (222, 226, 234)
 COLOUR_STOPS = ((52, 56, 68), (48, 92, 150), (104, 148, 150), (214, 178, 90), (255, 236, 160))
-"""From rest to the tallest; lightness rises throughout, so that it can be read without seeing hues."""
+"""From no displacement to the largest; the lightness increases throughout, so that hue is not needed to read it."""
 
 
 def interpolate_colour(fraction: float) -> tuple[int, int, int]:
-    """The colour of a share of the tallest, 0 to 1."""
+    """Return the colour of a fraction of the largest height, 0 to 1."""
     position = min(max(fraction, 0.0), 1.0) * (len(COLOUR_STOPS) - 1)
     index = min(int(position), len(COLOUR_STOPS) - 2)
     low, high = COLOUR_STOPS[index], COLOUR_STOPS[index + 1]
@@ -24,7 +24,7 @@ def interpolate_colour(fraction: float) -> tuple[int, int, int]:
 
 
 def render_png(layout: PixelLayout, heights_um: FloatArray) -> bytes:
-    """PNG of heights [p] in µm; row 0 is at the bottom, as on the display."""
+    """Render heights [p] in µm as PNG; row 0 is at the bottom, as on the display."""
     rows, columns = int(layout.row.max()) + 1, int(layout.column.max()) + 1
     cell_px = max(4, min(CELL_MAX_PX, WIDTH_MAX_PX // max(columns, rows)))
     size = max(columns * cell_px, 220) + 2 * MARGIN_PX, rows * cell_px + 2 * MARGIN_PX + FOOTER_PX

@@ -9,6 +9,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from optodrive.daemon.responses.stream import FrameResult
 from rig import TOKEN, wait_for
 
 PIXELS = 437
@@ -38,7 +39,9 @@ def until(stream, wanted):
     """Answers up to the first that has all of `wanted`."""
     answers = []
     while True:
-        answers.append(json.loads(stream.recv(timeout=20)))
+        text = stream.recv(timeout=20)
+        FrameResult.model_validate_json(text)
+        answers.append(json.loads(text))
         if wanted.items() <= answers[-1].items():
             return answers
 

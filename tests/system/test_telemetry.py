@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
+from optodrive.daemon.responses.telemetry import EVENTS
 from optodrive.device.config import load_config
 from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
@@ -41,6 +42,7 @@ class Reader:
                     if line.startswith("event: "):
                         kind = line[7:]
                     elif line.startswith("data: "):
+                        EVENTS[kind].model_validate_json(line[6:])
                         self.events.append((time.monotonic(), kind, json.loads(line[6:])))
                     if self._closing:
                         return

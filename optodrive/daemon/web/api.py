@@ -2,7 +2,7 @@
 
 import asyncio
 from concurrent.futures import Future
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request, WebSocket
 from fastapi.responses import PlainTextResponse, Response
@@ -45,6 +45,9 @@ StrictQuery = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
 FitQuery = Annotated[FitMode, Query(description="treatment of a sequence that does not fit on the beam")]
 PulsesQuery = Annotated[bool, Query(description="list every pulse")]
+DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {"model": PlanReport, "description": "A dry run: the plan is not stored"}
+}
 RateQuery = Annotated[float, Query(ge=1, le=60, description="display events per second while a pixel is warm")]
 
 
@@ -105,6 +108,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         "/v1/plans",
         status_code=201,
         response_model=PlanReport,
+        responses=DRY_RUN_RESPONSES,
         openapi_extra=build_request_body("FRAMES.json: frames and trains", SEQUENCE_SCHEMA, SEQUENCE_EXAMPLE, True),
     )
     async def submit_plan(
@@ -121,7 +125,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         future = engine.submit(
             lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
         )
-        return await build_json_response(await _await_plan(request, future), 201)
+        return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
     @app.websocket("/v1/stream")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
@@ -154,6 +158,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         "/v1/patterns/{name}",
         status_code=201,
         response_model=PlanReport,
+        responses=DRY_RUN_RESPONSES,
         openapi_extra=build_request_body("the pattern's parameters", PARAMETERS_SCHEMA, {}, False),
     )
     async def play_pattern(
@@ -171,7 +176,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
             raise InputError("body", parameters, "an object of the pattern's parameters")
         policy = resolve_policy(policy, strict)
         future = engine.submit(lambda: build_pattern(name, parameters, display.config), name, dry_run, policy, fit)
-        return await build_json_response(await _await_plan(request, future), 201)
+        return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
     extend_openapi(app)
     return app

@@ -1,7 +1,7 @@
-"""Who armed, disarmed, stopped and pushed what, and when: lines of JSON, only ever added to a file.
+"""The audit log: one line of JSON per request that is not a read, appended to a file.
 
-Written by a thread of its own, so that a slow disk holds nothing up. Arming waits for its line to be on the disk and
-is refused without it; nothing else is, least of all STOP.
+A separate thread writes it, so that a slow disk delays nothing. Only arming waits until its entry is on the disk, and
+is refused if the entry cannot be written; STOP never waits.
 """
 
 import asyncio
@@ -19,7 +19,10 @@ AuditFields = Mapping[str, object]
 
 
 class AuditLog:
-    """The file. say: gets a line when it cannot be written, and when it can again; now: wall clock, UTC."""
+    """An audit log.
+
+    report: receives a message when the file cannot be written, and when it can again; now: wall clock, UTC
+    """
 
     def __init__(
         self,
@@ -36,14 +39,14 @@ class AuditLog:
         self._is_failing = False
 
     def record(self, fields: AuditFields) -> None:
-        """Add a line soon; not where a thousand wait already."""
+        """Append an entry later; drop it if a thousand wait already."""
         if self._free_slots.acquire(blocking=False):
             self._enqueue(fields, to_disk=False)
 
     async def record_durably(self, fields: AuditFields) -> str | None:
-        """Add a line and wait until it is on the disk; what went wrong where it is not."""
+        """Append an entry and wait until it is on the disk; return the cause if that fails, else None."""
         if not self._free_slots.acquire(blocking=False):
-            return "too many lines wait to be written"
+            return "too many entries wait to be written"
         try:
             await asyncio.wait_for(asyncio.wrap_future(self._enqueue(fields, to_disk=True)), WRITE_TIMEOUT_S)
         except OSError as error:  # a TimeoutError is one
@@ -67,18 +70,18 @@ class AuditLog:
             self._is_failing = True
             raise
         if self._is_failing:
-            self._report(f"audit: {self._path} is written again")
+            self._report(f"audit: {self._path} is writable again")
         self._is_failing = self._has_partial_line = False
 
     def _append(self, text: str, to_disk: bool) -> None:
-        # Opened for each line: a file that was moved away is begun anew, and a lost disk is noticed.
+        # Opened for each entry: a file that was moved away is created anew, and a lost disk is detected.
         handle = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
         try:
             data = text.encode("ascii")
             written = os.write(handle, data)
             if written < len(data):
                 self._has_partial_line = True
-                os.write(handle, data[written:])  # says why
+                os.write(handle, data[written:])  # raises the cause
                 self._has_partial_line = False
             if to_disk:
                 os.fsync(handle)
@@ -86,10 +89,10 @@ class AuditLog:
             os.close(handle)
 
     def close(self) -> None:
-        """Write what waits, if that does not take long."""
+        """Write the waiting entries, for at most two seconds."""
         last = self._writer.submit(lambda: None)
         try:
             last.result(WRITE_TIMEOUT_S)
         except TimeoutError:
-            self._report(f"audit: {self._path} takes too long; its last lines may be missing")
+            self._report(f"audit: {self._path} is slow; its last entries may be missing")
         self._writer.shutdown(wait=False, cancel_futures=True)

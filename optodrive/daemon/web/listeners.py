@@ -1,4 +1,4 @@
-"""Where the daemon listens: a TCP port, and a Unix socket where one is configured."""
+"""The listening sockets of the daemon: a TCP port, and a Unix socket if one is configured."""
 
 import os
 import socket
@@ -11,27 +11,32 @@ SOCKET_MODE = 0o660
 
 
 def open_tcp_listener(host: str, port: int) -> socket.socket:
-    """A socket that listens on a TCP port; InputError where it is taken."""
+    """Open a socket that listens on a TCP port; InputError if the address is in use."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    # With the protocol named, asyncio turns Nagle's delay off for each caller: it costs an answer 40 ms.
+    # With an explicit protocol, asyncio disables Nagle's algorithm, which would delay each response by 40 ms.
     listener = socket.socket(family, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        listener.listen()  # from the line that tells the address on, whoever calls is heard
+        listener.listen()  # connections are accepted from the line that prints the address on
     except OSError as error:
         listener.close()
-        raise InputError("daemon.port", port, f"an address that is free on {host} ({error.strerror})") from None
+        raise InputError("daemon.port", port, f"a free port on {host} ({error.strerror})") from None
     return listener
 
 
 def open_unix_listener(path: Path) -> socket.socket:
-    """A socket that listens at a path, for its owner and group; one that a dead daemon left there is taken over."""
+    """Open a socket that listens at a path, for its owner and group; replace the socket of a dead daemon.
+
+    InputError if the path is in use or cannot hold a socket.
+    """
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         if _is_stale_socket(path):
             path.unlink()
-        previous_umask = os.umask(0o777 & ~SOCKET_MODE)  # never, not for a moment, open to others
+        previous_umask = os.umask(
+            0o777 & ~SOCKET_MODE
+        )  # the socket is never accessible to others, not even before a chmod
         try:
             listener.bind(str(path))
         finally:
@@ -40,12 +45,12 @@ def open_unix_listener(path: Path) -> socket.socket:
     except OSError as error:
         listener.close()
         reason = error.strerror or error
-        raise InputError("daemon.socket", str(path), f"a path where a socket may be made ({reason})") from None
+        raise InputError("daemon.socket", str(path), f"a path for a new socket ({reason})") from None
     return listener
 
 
 def _is_stale_socket(path: Path) -> bool:
-    """Whether a socket is there that nobody answers at."""
+    """Return whether the path holds a socket on which nobody listens."""
     try:
         if not stat.S_ISSOCK(path.stat().st_mode):
             return False

@@ -42,21 +42,16 @@ EVENT_RESPONSES: dict[int | str, dict[str, Any]] = {
         "content": {
             "text/event-stream": {
                 "schema": {
+                    "type": "object",
+                    "required": ["event", "data"],
+                    "properties": {
+                        "event": {"type": "string"},
+                        "data": {"type": "string", "contentMediaType": "application/json"},
+                    },
                     "oneOf": [
-                        {
-                            "type": "object",
-                            "required": ["event", "data"],
-                            "properties": {
-                                "event": {"type": "string", "const": event},
-                                "data": {
-                                    "type": "string",
-                                    "contentMediaType": "application/json",
-                                    "contentSchema": _refer_to(model),
-                                },
-                            },
-                        }
+                        {"properties": {"event": {"const": event}, "data": {"contentSchema": _refer_to(model)}}}
                         for event, model in EVENTS.items()
-                    ]
+                    ],
                 }
             }
         },

@@ -1,4 +1,4 @@
-"""The bodies of requests, as JSON Schema: what a body must look like before its values are looked at."""
+"""JSON Schemas of request bodies: the structure that a body needs before its values are checked."""
 
 from typing import Any
 
@@ -37,7 +37,7 @@ _FRAME_SCHEMA = _object_schema(
                 },
                 {"type": "array", "items": _HEIGHT_SCHEMA},
             ],
-            "description": "heights by pixel, or a list of all",
+            "description": "heights by pixel, or one height per pixel",
         },
     },
     {
@@ -72,7 +72,7 @@ SEQUENCE_SCHEMA: Schema = {
         {"required": ["trains"], "properties": {"trains": {"minItems": 1}}},
     ],
 }
-"""FRAMES.json."""
+"""The schema of FRAMES.json."""
 SEQUENCE_EXAMPLE: Schema = {
     "frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"0": 50}}],
     "trains": [
@@ -80,12 +80,12 @@ SEQUENCE_EXAMPLE: Schema = {
         {"pixel": 0, "start_s": 1.0, "duration_s": 0.2, "period_s": 0.04, "target_um": 100, "peak_to_peak_um": 40},
     ],
 }
-"""An example that every display can show."""
+"""An example that every shipped display can show."""
 PATTERN_NAME_EXAMPLES: Schema = {"examples": [item.name for item in describe_patterns()]}
-PARAMETERS_SCHEMA: Schema = {"type": "object", "description": "as GET /v1/patterns lists them; a file in base64"}
+PARAMETERS_SCHEMA: Schema = {"type": "object", "description": "as listed by GET /v1/patterns; a file in base64"}
 
 
 def build_request_body(description: str, schema: Schema, example: Schema, required: bool) -> Schema:
-    """A body that the route reads by itself, for FastAPI's openapi_extra."""
+    """Build the OpenAPI description of a body that the route parses itself, for FastAPI's `openapi_extra`."""
     content = {"application/json": {"schema": schema, "example": example}}
     return {"requestBody": {"description": description, "required": required, "content": content}}

@@ -1,11 +1,11 @@
-"""How often a caller may ask: a bucket each, which fills at a steady rate."""
+"""A token-bucket rate limiter with one bucket per caller."""
 
 from collections import OrderedDict
 from collections.abc import Hashable
 from dataclasses import dataclass
 
 CALLERS_MAX = 1024
-"""So many callers are remembered; whoever asked longest ago is forgotten first, and has a full bucket again."""
+"""The number of callers with a bucket; the bucket of the caller with the oldest request is dropped first."""
 
 
 @dataclass
@@ -15,7 +15,7 @@ class _Bucket:
 
 
 class RateLimiter:
-    """Requests of each caller, per_s for ever and burst at once."""
+    """Limits each caller to `per_s` requests per second on average and `burst` at once."""
 
     def __init__(self, per_s: float, burst: float) -> None:
         self._per_s = per_s
@@ -23,7 +23,7 @@ class RateLimiter:
         self._buckets: OrderedDict[Hashable, _Bucket] = OrderedDict()
 
     def acquire(self, caller: Hashable, now_s: float) -> float:
-        """Count a request: 0 where it may be answered, else how long to wait before asking again, s."""
+        """Take one token: return 0 if there is one, else the time until there is, s."""
         bucket = self._buckets.pop(caller, None) or _Bucket(self._burst, now_s)
         bucket.tokens = min(self._burst, bucket.tokens + (now_s - bucket.updated_s) * self._per_s)
         bucket.updated_s = now_s

@@ -1,4 +1,4 @@
-"""What comes in with a request, bounded: the body of a call, the pace of a stream's frames."""
+"""Limits of a request's input: the size of its body, the rate of a stream's frames."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableMapping
@@ -13,11 +13,11 @@ App = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class BodyTooLargeError(Exception):
-    """A body grew past its bound while it was read."""
+    """A body exceeds its maximum size."""
 
 
 class BoundedBody:
-    """Counts what arrives, for bodies that announce no length, and takes its digest for the audit file."""
+    """Bounds a body, also one without a content length, and computes its digest for the audit log."""
 
     def __init__(self, receive: Receive, max_bytes: int) -> None:
         self._receive = receive
@@ -26,7 +26,7 @@ class BoundedBody:
         self.size_bytes = 0
 
     async def __call__(self) -> Message:
-        """The next piece."""
+        """Return the next chunk; BodyTooLargeError if the body exceeds its maximum size."""
         message = await self._receive()
         if message["type"] == "http.request":
             chunk = message.get("body", b"")
@@ -38,14 +38,14 @@ class BoundedBody:
 
     @property
     def audit_fields(self) -> dict[str, object]:
-        """Size and SHA-256 of what was read; nothing where nothing was."""
+        """Size and SHA-256 of the body; empty if there is none."""
         return {"body_bytes": self.size_bytes, "body_sha256": self._digest.hexdigest()} if self.size_bytes else {}
 
 
 class RateLimitedFrames:
-    """Takes a stream's frames no faster than a caller may ask; what comes faster waits in the caller's own socket.
+    """Receives a stream's frames no faster than the caller's rate; frames beyond it wait in the caller's socket.
 
-    wait_s: counts a frame, says how long to wait first, s
+    acquire: counts a frame and returns the time to wait first, s
     """
 
     def __init__(self, receive: Receive, acquire: Callable[[], float]) -> None:
@@ -54,7 +54,7 @@ class RateLimitedFrames:
         self.frame_count = 0
 
     async def __call__(self) -> Message:
-        """The next frame, in its time."""
+        """Return the next message; a frame once its rate allows it."""
         message = await self._receive()
         if message["type"] == "websocket.receive":
             self.frame_count += 1
@@ -64,10 +64,10 @@ class RateLimitedFrames:
 
     @property
     def audit_fields(self) -> dict[str, object]:
-        """How many frames came."""
+        """The number of frames."""
         return {"frames": self.frame_count}
 
 
 async def receive_empty_body() -> Message:
-    """In place of a body that is not to be read."""
+    """Return an empty body in place of one that is not read."""
     return {"type": "http.request", "body": b"", "more_body": False}

@@ -1,8 +1,7 @@
-"""The page: its files, who may have them, and what a browser is told to allow (docs/how-to/operate-the-page.md).
+"""The page's files, the cookie that gives access to them, and the security headers that they are sent with.
 
-A browser cannot send a bearer header for a page, so `/` and `/page/*` take the token from a cookie too, for GET alone;
-what the page asks of the daemon carries the header as everyone's calls do. Cookies know no ports: the port is in the
-cookie's name.
+A browser cannot send a bearer header for a page, so GET requests for `/` and `/page/*` accept the token from a cookie,
+too; the page's requests to the API carry the header. A cookie is not bound to a port, so its name contains the port.
 """
 
 from http.cookies import CookieError, SimpleCookie
@@ -15,7 +14,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 LOGIN_PATHS = ("/page/login.js", "/page/login.css", "/page/colours.css")
-"""What the page that asks for the token is made of; there is no secret in it."""
+"""The files of the login page; they contain no secret."""
 SECURITY_HEADERS = {
     "Content-Security-Policy": "default-src 'self'; img-src 'self' data: blob:; object-src 'none'; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'",
@@ -31,12 +30,12 @@ MEDIA_TYPES = {".js": "text/javascript", ".css": "text/css", ".html": "text/html
 
 
 def is_page_request(method: str, path: str) -> bool:
-    """Whether a request is for a part of the page."""
+    """Return whether a request is for a file of the page."""
     return method == "GET" and (path == "/" or path.startswith("/page/"))
 
 
 def read_cookie_token(headers: dict[str, str]) -> str:
-    """The token that a browser's cookie holds, '' without one."""
+    """Return the token in a browser's cookie, '' if there is none."""
     try:
         cookies = SimpleCookie(headers.get("cookie", ""))
     except CookieError:
@@ -51,7 +50,7 @@ def _parse_port(host: str) -> str:
 
 
 def load_login_page() -> bytes:
-    """The page that asks for the token."""
+    """Return the HTML of the login page."""
     return _get_page_folder().joinpath("login.html").read_bytes()
 
 
@@ -60,7 +59,7 @@ def _get_page_folder() -> Traversable:
 
 
 def add_page_routes(app: FastAPI) -> None:
-    """Serve the page at `/`, and its files below `/page/`; all are read beforehand, so no path leads anywhere else."""
+    """Serve the page at `/` and its files below `/page/`; all are read beforehand, so that no path leads elsewhere."""
     contents = dict(_read_files(_get_page_folder(), ""))
 
     @app.get("/", include_in_schema=False)

@@ -1,6 +1,6 @@
-"""What keeps STOP prompt while many call.
+"""Measures that keep STOP's response time short under load.
 
-Requests begin in turn, and none while STOP is answered; long answers are written piece by piece.
+Requests start one at a time, none starts while STOP is being answered, and long responses are encoded in pieces.
 """
 
 import asyncio
@@ -16,16 +16,14 @@ from starlette.concurrency import run_in_threadpool
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
 
 STOP_PATH = "/v1/stop"
-
-
 HOLD_MAX_S = 0.1
-"""A STOP holds others up for so long at most: one may take seconds where the board does not answer."""
+"""The longest time that one STOP delays other requests; STOP itself takes seconds if the board does not answer."""
 
 
 class StopPriorityMiddleware:
-    """ASGI middleware: one request begins in a turn of the web server's loop, and none while STOP is answered.
+    """ASGI middleware that starts one request per iteration of the loop, and none while STOP is being answered.
 
-    Without it every request that has arrived begins before the loop looks at its sockets again, and STOP's answer
+    Without it, the loop starts all requests that have arrived before it polls its sockets again, and STOP's response
     waits behind all of them.
     """
 
@@ -37,7 +35,7 @@ class StopPriorityMiddleware:
         self._stop_done = asyncio.Event()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass the request on when it is its turn."""
+        """Forward the request when its turn comes; forward STOP at once."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
         elif scope["path"] == STOP_PATH:

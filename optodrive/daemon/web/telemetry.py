@@ -1,7 +1,7 @@
-"""What happens now, as server-sent events: state, display, pulses, budget, fault (docs/how-to/operate-the-page.md).
+"""Telemetry as server-sent events: state, display, pulses, budget, fault.
 
-Readers pull: a look is made when one of them is due, in a thread of its own, and shared by all that ask at the time. A
-reader that is slow is handed the newest when it is ready for more; nothing waits for it.
+Readers pull: when an event for one of them is due, a separate thread refreshes all events, and all readers of that time
+share the result. A slow reader receives the newest events when it is ready; nothing waits for it.
 """
 
 import asyncio
@@ -29,20 +29,20 @@ DEFAULT_RATE_HZ = 30.0
 IDLE_RATE_HZ = 20.0
 READERS_MAX = 64
 SNAPSHOT_MAX_AGE_S = 0.012
-"""A look this old still serves a reader."""
+"""Events up to this age are sent without a refresh."""
 STATE_PERIOD_S, BUDGET_PERIOD_S, COLD_DISPLAY_PERIOD_S, PULSES_PERIOD_S = 0.5, 0.25, 1.0, 0.08
 DRAIN_PERIOD_S = 1.0
 WARM_DISPLACEMENT_M, WARM_RISE_K = 5e-8, 0.1
-"""A pixel above either is warm."""
+"""A pixel above either threshold is warm."""
 ANNOUNCE_LEAD_S = 1.0
-"""Planned pulses are told so long before they are due."""
+"""Planned pulses are published this long before they start."""
 BATCHES_MAX = 300
-"""Batches of pulses kept for whoever comes late."""
+"""Batches of pulses that are kept for slow readers."""
 PULSES_MAX = 3000
 
 
 class EventStream(StreamingResponse):
-    """Server-sent events."""
+    """A response of server-sent events."""
 
     media_type = "text/event-stream"
 
@@ -58,7 +58,7 @@ class _Batch(NamedTuple):
 
 
 class Telemetry:
-    """Events for any number of readers, in the web server's thread and one of its own."""
+    """Events for up to READERS_MAX readers, in the web server's thread and one of its own."""
 
     def __init__(self, engine: Engine, clock: Clock | None = None) -> None:
         self._engine = engine
@@ -81,12 +81,12 @@ class Telemetry:
         self._is_warm = self._has_upcoming = False
 
     def close(self) -> None:
-        """End every reader soon."""
+        """End all event streams at their next event."""
         self._closed = True
 
     @asynccontextmanager
     async def lifespan(self, _app: object) -> AsyncIterator[None]:
-        """Take over what was executed also while nobody looks, as long as the server runs."""
+        """Collect executed pulses while the server runs, also without readers."""
         drain_task = asyncio.get_running_loop().create_task(self._drain_periodically())
         try:
             yield
@@ -100,12 +100,12 @@ class Telemetry:
             await asyncio.sleep(DRAIN_PERIOD_S)
 
     def require_capacity(self) -> None:
-        """NotReadyError where there are too many readers."""
+        """Raise NotReadyError if there are too many readers."""
         if self._readers >= READERS_MAX:
-            raise NotReadyError(f"{READERS_MAX} readers follow the telemetry already")
+            raise NotReadyError(f"{READERS_MAX} clients read the telemetry already")
 
     async def stream_events(self, rate_hz: float = DEFAULT_RATE_HZ) -> AsyncIterator[bytes]:
-        """Events for one reader: whatever is new each 1 / rate_hz, until it leaves."""
+        """Yield the new events for one reader every 1 / rate_hz seconds, until it disconnects."""
         sent_numbers, batch = dict[str, int](), 0
         due_s, pulses_s = self._clock.now_s(), 0.0
         self._readers += 1
@@ -129,7 +129,7 @@ class Telemetry:
             self._readers -= 1
 
     async def _refresh(self, max_age_s: float) -> None:
-        """Return when the last look is no older than age_s; readers that come at one time share it."""
+        """Return once the events are no older than max_age_s; concurrent readers share one refresh."""
         if self._refresh_task is None or (
             self._refresh_task.done() and self._clock.now_s() - self._refreshed_s > max_age_s
         ):
@@ -137,7 +137,7 @@ class Telemetry:
             self._refresh_task = loop.create_task(_wait_for(loop.run_in_executor(self._executor, self._publish_all)))
         await asyncio.shield(self._refresh_task)
 
-    # --- in the thread of its own -------------------------------------------------------------------------------
+    # --- in the telemetry thread --------------------------------------------------------------------------------
 
     def _publish_all(self) -> None:
         now_s = self._clock.now_s()
@@ -152,7 +152,7 @@ class Telemetry:
         self._refreshed_s = self._clock.now_s()
 
     def _estimate_board_s(self, now_s: float) -> float:
-        """The board's time; reckoned on while there is no link."""
+        """Estimate the board's time; it is extrapolated while there is no link."""
         if self._engine.is_linked:
             self._board_clock_reference = now_s, self._engine.board_s()
         return self._board_clock_reference[1] + now_s - self._board_clock_reference[0]
@@ -179,7 +179,7 @@ class Telemetry:
                 self._add_batch("executed", executed.record, executed.row, *columns)
 
     def _announce_planned(self, board_s: float) -> None:
-        """Tell of planned pulses that come soon."""
+        """Publish the planned pulses that start soon."""
         records = self._engine.list_upcoming()
         self._has_upcoming = bool(records)
         self._announced_rows = {record.plan_id: self._announced_rows.get(record.plan_id, 0) for record in records}

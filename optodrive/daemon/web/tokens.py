@@ -1,4 +1,4 @@
-"""The tokens a daemon asks for, one for each role: from a file, or made fresh and written where only its user reads."""
+"""The tokens of a daemon, one or more per role: read from a file, or created in a file that only its user can read."""
 
 import json
 import os
@@ -27,7 +27,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Token:
-    """A secret, who has it, what it allows."""
+    """A secret with the name of its holder and its role."""
 
     name: str
     role: Role
@@ -42,7 +42,7 @@ class Tokens:
         self._secrets = [(token.secret.encode(), token) for token in self.all]
 
     def find(self, presented: str) -> Token | None:
-        """The token that was presented, None where it is none of these; takes the same time for each of them."""
+        """Return the presented token, None if it is unknown; the time does not depend on which token matches."""
         presented_bytes = presented.encode()
         found = None
         for secret, token in self._secrets:
@@ -52,7 +52,7 @@ class Tokens:
 
     @property
     def most_privileged(self) -> Token:
-        """The token that allows most."""
+        """The token with the highest role."""
         return max(self.all, key=lambda token: ROLES.index(token.role))
 
 
@@ -69,13 +69,13 @@ class _TokensFile(Section):
 
 
 def build_tokens_path(port: int) -> Path:
-    """Where the daemon on this TCP port keeps its tokens, unless its configuration says otherwise."""
+    """Build the default path of the tokens of the daemon on a TCP port."""
     runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
     return Path(runtime) / "optodrive" / f"token-{port}"
 
 
 def read_tokens(path: Path) -> Tokens:
-    """The tokens of a file; InputError, which never shows a secret, where it cannot be read or is not in order."""
+    """Read the tokens of a file; InputError, which never contains a secret, if the file is unreadable or invalid."""
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
     try:
@@ -83,7 +83,7 @@ def read_tokens(path: Path) -> Tokens:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False)[0]
         place = ".".join(str(part) for part in first["loc"])
-        raise InputError(f"{path}: {place}", "what is not shown here", first["msg"]) from None
+        raise InputError(f"{path}: {place}", "a value that is not shown", first["msg"]) from None
     for key in ("name", "secret"):
         if len({getattr(entry, key) for entry in entries}) < len(entries):
             raise InputError(f"{path}: token", f"a {key} twice", "each once")
@@ -91,7 +91,7 @@ def read_tokens(path: Path) -> Tokens:
 
 
 def read_private_tokens(path: Path) -> Tokens:
-    """The tokens of a daemon's own file; InputError where others than its owner may read it."""
+    """Read a daemon's own tokens; InputError if others than the file's owner can read them."""
     tokens = read_tokens(path)
     mode = stat.S_IMODE(path.stat().st_mode)
     if mode & 0o077:
@@ -100,13 +100,14 @@ def read_private_tokens(path: Path) -> Tokens:
 
 
 def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
-    """A fresh token for each role, in a new file of mode 0600. armer: the armer's, if not a fresh one.
+    """Create a random token per role in a new file of mode 0600.
 
-    InputError where that is no token (its text is not shown), or the file cannot be made.
+    armer_secret: the armer's secret, random if None or empty. InputError if it is invalid (its text is not shown) or
+    the file cannot be created.
     """
     if armer_secret and not re.fullmatch(ALLOWED_PATTERN, armer_secret):
         raise InputError(
-            ENVIRONMENT_VARIABLE, "what is not shown here", "16 to 200 letters, digits or signs, no spaces"
+            ENVIRONMENT_VARIABLE, "a value that is not shown", "16 to 200 letters, digits or signs, no spaces"
         )
     tokens = Tokens(
         Token(role, role, armer_secret if armer_secret and role == "armer" else secrets.token_urlsafe(32))
@@ -122,12 +123,16 @@ def create_tokens(path: Path, armer_secret: str | None = None) -> Tokens:
         path.touch(mode=0o600, exist_ok=False)
         path.write_text("".join(lines), encoding="utf-8")
     except OSError as error:
-        raise InputError(str(path), error.strerror, "a place for the daemon's tokens") from None
+        raise InputError(str(path), error.strerror, "a writable path for the daemon's tokens") from None
     return tokens
 
 
 def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
-    """A daemon's tokens and their file. kept: a file that outlives it, made where there is none; else fresh ones."""
+    """Load a daemon's tokens; return them with the path of their file.
+
+    tokens_file: a file that persists, created if it does not exist; if empty, the daemon gets new tokens in the default
+    file.
+    """
     if tokens_file:
         path = Path(tokens_file)
         return (read_private_tokens(path) if path.exists() else create_tokens(path)), path
@@ -136,9 +141,9 @@ def load_daemon_tokens(tokens_file: str, port: int) -> tuple[Tokens, Path]:
 
 
 def read_token(port: int | None) -> str:
-    """A token for a daemon on this TCP port, the one that allows most; InputError where there is none to be read.
+    """Read the token with the highest role for a daemon on a TCP port; InputError if none is readable.
 
-    port: None for one that is reached otherwise
+    port: None for a daemon on a Unix socket
     """
     secret = os.environ.get(ENVIRONMENT_VARIABLE)
     if secret:
@@ -150,4 +155,4 @@ def read_token(port: int | None) -> str:
         if os.access(path, os.R_OK):
             return read_tokens(path).most_privileged.secret
     listed = " or ".join(str(path) for path in candidates)
-    raise InputError(ENVIRONMENT_VARIABLE, None, f"a token: set it, or {listed} to be readable")
+    raise InputError(ENVIRONMENT_VARIABLE, None, f"a token: set it, or make {listed} readable")

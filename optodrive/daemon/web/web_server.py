@@ -1,4 +1,4 @@
-"""The web server, which leaves signals and the process's end to the daemon."""
+"""The web server, with signal handling left to the daemon."""
 
 import asyncio
 import socket
@@ -9,18 +9,18 @@ import uvicorn
 
 
 class Server(uvicorn.Server):
-    """Leaves signals to `run`: uvicorn would raise them again and end the process before the board is told."""
+    """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT."""
 
     on_ready: Callable[[], None] = staticmethod(lambda: None)
     loop: asyncio.AbstractEventLoop | None = None
 
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture none."""
+        """Capture no signals."""
         yield
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to answer."""
+        """Start to accept requests."""
         await super().startup(sockets)
         self.loop = asyncio.get_running_loop()
         self.on_ready()

@@ -71,7 +71,7 @@ def test_a_disk_that_stands_still_holds_nothing_up(audit, reports, monkeypatch):
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
     for _ in range(3 * audit_module.QUEUE_MAX):
         audit.record({"event": "stop"})
-    assert "too many lines" in asyncio.run(audit.record_durably({"event": "requested"}))
+    assert "too many entries" in asyncio.run(audit.record_durably({"event": "requested"}))
     go_on.set()
 
 
