@@ -115,7 +115,7 @@ def cap_five_percent_off(guard):
 
 def wrong_constant(guard):
     def mutate(budget):
-        heat, mirrors, caps = budget.heat, budget.mirrors, budget.caps
+        heat, galvo, caps = budget.heat, budget.galvo, budget.caps
         if guard == "absorber":
             heat = heat._replace(r_k_per_w=0.8 * heat.r_k_per_w)
         elif guard == "wall":
@@ -125,8 +125,8 @@ def wrong_constant(guard):
         elif guard == "diode":
             caps = caps._replace(display_window_s=2.0 * caps.display_window_s)
         else:
-            mirrors = mirrors._replace(omega_rad_per_s=0.8 * mirrors.omega_rad_per_s)
-        return Budget(caps, heat, mirrors)
+            galvo = galvo._replace(omega_rad_per_s=0.8 * mirrors.omega_rad_per_s)
+        return Budget(caps, heat, galvo)
 
     return dict(mutate=mutate)
 
