@@ -125,7 +125,7 @@ def wrong_constant(guard):
         elif guard == "diode":
             caps = caps._replace(display_window_s=2.0 * caps.display_window_s)
         else:
-            galvo = galvo._replace(omega_rad_per_s=0.8 * mirrors.omega_rad_per_s)
+            galvo = galvo._replace(omega_rad_per_s=0.8 * galvo.omega_rad_per_s)
         return Budget(caps, heat, galvo)
 
     return dict(mutate=mutate)

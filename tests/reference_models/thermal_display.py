@@ -30,28 +30,28 @@ NO_CAPS = CapValues(
 
 
 @numba.njit(cache=False)
-def _rates(y, out, lit, power_w, numbers, beside, rim):
+def _rates(y, out, driven, power_w, numbers, neighbours, rim):
     """dy/dt of y [4, p]: absorber, gas, wall, touch surface."""
     eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
     for i in range(y.shape[1]):
         theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
         mean = ambient_k + 0.5 * (theta + wall)
         flow = (theta - wall) / (r * (mean / ambient_k) ** n)
-        drive = eps * power_w if i == lit else 0.0
+        drive = eps * power_w if i == driven else 0.0
         out[0, i] = (drive - flow) / c
         out[1, i] = (0.5 * (theta + wall) - gas) / tau_g
         out[2, i] = 0.0
         if cw > 0.0:
             leaving = wall / rw + wall * rim[i] / rf
             for k in range(4):
-                if beside[i, k] >= 0:
-                    leaving += (wall - y[2, beside[i, k]]) / rx
+                if neighbours[i, k] >= 0:
+                    leaving += (wall - y[2, neighbours[i, k]]) / rx
             out[2, i] = (flow - leaving) / cw
         out[3, i] = (fg * gas + fw * wall - touch) / lag if lag > 0.0 else 0.0
 
 
 @numba.njit(cache=False)
-def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim, lit_step, dark_step):
+def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, rim, on_step, off_step):
     """Runge–Kutta of the fourth order between events; peak [4] takes the largest of each kind ever seen."""
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     now = 0.0
@@ -59,17 +59,17 @@ def _integrate(y, peak, start, width, pixel, power, until, numbers, beside, rim,
         begin = start[row] if row < len(start) else until
         for phase in range(2):
             end = begin if phase == 0 else (begin + width[row] if row < len(start) else begin)
-            lit = pixel[row] if phase == 1 and row < len(start) else -1
+            driven = pixel[row] if phase == 1 and row < len(start) else -1
             watts = power[row] if phase == 1 and row < len(start) else 0.0
             if end <= now:
                 continue
-            steps = int(np.ceil((end - now) / (lit_step if phase == 1 else dark_step)))
+            steps = int(np.ceil((end - now) / (on_step if phase == 1 else off_step)))
             h = (end - now) / steps
             for _ in range(steps):
-                _rates(y, k1, lit, watts, numbers, beside, rim)
-                _rates(y + 0.5 * h * k1, k2, lit, watts, numbers, beside, rim)
-                _rates(y + 0.5 * h * k2, k3, lit, watts, numbers, beside, rim)
-                _rates(y + h * k3, k4, lit, watts, numbers, beside, rim)
+                _rates(y, k1, driven, watts, numbers, neighbours, rim)
+                _rates(y + 0.5 * h * k1, k2, driven, watts, numbers, neighbours, rim)
+                _rates(y + 0.5 * h * k2, k3, driven, watts, numbers, neighbours, rim)
+                _rates(y + h * k3, k4, driven, watts, numbers, neighbours, rim)
                 for kind in range(4):
                     for i in range(y.shape[1]):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
@@ -82,7 +82,7 @@ class TrueDisplay:
     """One display as it really is: `numbers` for the integrator, and the lattice."""
 
     numbers: tuple
-    beside: np.ndarray
+    neighbours: np.ndarray
     rim: np.ndarray
 
     def peaks(self, plan, dark_s=3.0):
@@ -97,7 +97,7 @@ class TrueDisplay:
             *(np.array(column) for column in columns),
             until,
             self.numbers,
-            self.beside,
+            self.neighbours,
             self.rim,
             min(1e-3, 0.5 * lag_s),
             lag_s,
@@ -124,22 +124,22 @@ def build_true_display(model, factor=None):
         touch.wall_share * f["touch_share"] if touch else 0.0,
         touch.lag_s * f["touch_lag"] if touch else 0.0,
     )
-    return TrueDisplay(numbers, np.array(model.beside), np.array(model.frame_edges))
+    return TrueDisplay(numbers, np.array(model.neighbours), np.array(model.frame_edges))
 
 
 @numba.njit(cache=False)
-def _coil(at_s, goal_rad, until_s, omega, damping, delay_s, slew, mean_s):
+def _coil(at_s, command_rad, until_s, omega, damping, delay_s, slew, mean_s):
     """Largest leaky mean of the squared acceleration of one servo, rad²/s⁴, stepped by Runge–Kutta of fourth order."""
-    angle, speed, target, mean, most, now = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    angle, speed, target, mean, maximum, now = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     still_s, longest = 14.0 / (damping * omega), 0.02 / omega
     for row in range(len(at_s)):
-        goal, end = goal_rad[row], at_s[row + 1] + delay_s if row + 1 < len(at_s) else until_s
+        command, end = command_rad[row], at_s[row + 1] + delay_s if row + 1 < len(at_s) else until_s
         begin = at_s[row] + delay_s
         mean, now = mean * np.exp(-max(0.0, begin - now) / mean_s), max(now, begin)
-        ramp_s = min(abs(goal - target) / slew, max(0.0, end - now))
+        ramp_s = min(abs(command - target) / slew, max(0.0, end - now))
         for phase in range(2):
             stop = min(end, now + (ramp_s if phase == 0 else still_s))
-            rate = slew * np.sign(goal - target) if phase == 0 else 0.0
+            rate = slew * np.sign(command - target) if phase == 0 else 0.0
             if stop <= now:
                 continue
             steps = int(np.ceil((stop - now) / longest))
@@ -157,29 +157,29 @@ def _coil(at_s, goal_rad, until_s, omega, damping, delay_s, slew, mean_s):
                 target += h * rate
                 after = omega**2 * (target - angle) - 2 * damping * omega * speed
                 mean += (0.5 * (a1**2 + after**2) - mean) * -np.expm1(-h / mean_s)
-                most = max(most, mean)
+                maximum = max(maximum, mean)
             now = stop
-            if phase == 0 and ramp_s * slew >= abs(goal - target) - 1e-12:
-                target = goal
+            if phase == 0 and ramp_s * slew >= abs(command - target) - 1e-12:
+                target = command
         if now < end:  # it has stood still for long
             angle, speed = target, 0.0
-    return most
+    return maximum
 
 
 def galvo_peak(plan, budget):
     """Largest mean-square acceleration, rad²/s⁴, of either mirror's servo.
 
-    Mirrors are sent on as soon as the last lit pulse has ended; or as late as a plan's lead before its first pulse.
+    Mirrors are sent on as soon as the last pulse has ended; or as late as a plan's lead before its first pulse.
     """
-    mirrors = budget.mirrors
-    lit = np.flatnonzero(plan.power_w > 0)
-    if not len(lit):
+    galvo = budget.galvo
+    driven = np.flatnonzero(plan.power_w > 0)
+    if not len(driven):
         return 0.0
-    ends_s = np.append(0.0, (plan.start_s + plan.width_s)[lit])
-    numbers = (mirrors.omega_rad_per_s, mirrors.damping, mirrors.delay_s, mirrors.slew_rad_per_s, mirrors.averaging_s)
-    late_s = np.maximum(ends_s[:-1], plan.start_s[lit] - mirrors.lead_s)
+    ends_s = np.append(0.0, (plan.start_s + plan.width_s)[driven])
+    numbers = (galvo.omega_rad_per_s, galvo.damping, galvo.delay_s, galvo.slew_rad_per_s, galvo.averaging_s)
+    late_s = np.maximum(ends_s[:-1], plan.start_s[driven] - galvo.lead_in_s)
     return max(
-        _coil(at_s, angle_rad[lit].copy(), ends_s[-1] + 0.1, *numbers)
+        _coil(at_s, angle_rad[driven].copy(), ends_s[-1] + 0.1, *numbers)
         for at_s in (ends_s[:-1].copy(), late_s)
         for angle_rad in (plan.x_rad, plan.y_rad)
     )
@@ -259,7 +259,7 @@ def sample_factors(rng, unsure):
 
 
 def upper_factors(unsure):
-    """What heats most in the long run."""
+    """What heats maximum in the long run."""
     high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "touch_share", "exponent")
     return {name: getattr(unsure, name) + (0.0 if name == "exponent" else 1.0) for name in high}
 
@@ -271,7 +271,7 @@ def build_sequence(rng, kind, pixels, span_s=3.0):
     """Pixels, starts and widths of a hostile sequence; whole microseconds, one beam, dark for moves."""
     home = int(rng.integers(pixels))
     ring = rng.permutation(pixels)[: int(rng.integers(2, 9))]
-    duty, width_most = rng.uniform(0.3, 1.0), rng.choice([2e-3, 15e-3, 50e-3])
+    duty, max_width = rng.uniform(0.3, 1.0), rng.choice([2e-3, 15e-3, 50e-3])
     now, rows, order = 0.001, [], 0
     while now < span_s and len(rows) < 400:
         pixel = {"hammer": home, "ring": int(ring[order % len(ring)]), "whole": order % pixels}.get(
@@ -281,7 +281,7 @@ def build_sequence(rng, kind, pixels, span_s=3.0):
             pixel = home if rng.random() < 0.8 else pixel
             if rng.random() < 0.06:
                 now += rng.choice([0.2, 1.0, 5.0])
-        width = round(rng.uniform(0.2, 1.0) * width_most * 5000) / 5000 or 2e-4
+        width = round(rng.uniform(0.2, 1.0) * max_width * 5000) / 5000 or 2e-4
         rows.append((pixel, now, width))
         rest = 5.2e-4 if rng.random() < 0.5 else max(5.2e-4, width * (1 / duty - 1))
         now = round((now + width + rest) * 1e6) * 1e-6
