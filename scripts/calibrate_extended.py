@@ -1,7 +1,7 @@
-"""The extended model on halves of the paper's facts: fitted on one, held against the other, term by term.
+"""Fit the extended model to one half of the paper's facts and compare it with the other half, term by term.
 
-The first half is what the calibrated set was fitted on, and the temperature of the same pixel; the second the same
-quantities elsewhere. So columns differ by their terms, not by what they were shown.
+The first half has the facts that the calibrated set was fitted to, and the temperature of the same pixel; the second
+half has the same quantities elsewhere. The models therefore differ by their terms, not by the fitted facts.
 """
 
 import argparse
@@ -36,13 +36,13 @@ UNIT_SCALES = {"tau_g": 1e-3, "area": 1e-6, "kappa": 1e-6, "phi": 1e-3}
 
 
 def list_free_parameters(terms):
-    """What a model has to be fitted: a quantity that a term takes over is the term's."""
+    """Return the free parameters of a model; a term replaces the nominal parameter of its quantity."""
     names = ["share" if "gas_membrane" in terms else "kappa", "tau_g", "area" if "force_area" in terms else "phi"]
     return names + (["n"] if "bridge_conductivity" in terms else [])
 
 
 def build_parameters(base, terms, values):
-    """The parameter set of a model with these values, in FREE's units."""
+    """Build the parameter set of a model from values in the units of FREE_PARAMETERS."""
 
     def build_parameter(name):
         return Parameter(value=values[name] * UNIT_SCALES.get(name, 1.0), unit=UNITS[name], source="fitted")
@@ -60,39 +60,44 @@ def build_parameters(base, terms, values):
 
 
 def fit_terms(base, terms, half):
-    """Values that meet a half's facts best, in the logarithm of model over measured."""
+    """Fit the logarithm of model over measured to one half; return the values and the fitted facts."""
     facts, names = load_paper_facts(), list_free_parameters(terms)
-    shown = [fact for fact in HALVES[half] if "n" in names or "T_peak" not in fact]
+    fitted_facts = [fact for fact in HALVES[half] if "n" in names or "T_peak" not in fact]
 
     def compute_residuals(x):
         predicted = simulate_outcomes(build_parameters(base, terms, dict(zip(names, x, strict=True))))
-        return [np.log(facts[fact].ratio(predicted[fact])) for fact in shown]
+        return [np.log(facts[fact].ratio(predicted[fact])) for fact in fitted_facts]
 
     start, low, high = (np.array([FREE_PARAMETERS[name][k] for name in names]) for k in range(3))
     best = least_squares(
         compute_residuals, start, bounds=(low, high), x_scale=start, diff_step=1e-3, xtol=1e-7, ftol=1e-9
     )
-    return dict(zip(names, best.x.tolist(), strict=True)), shown
+    return dict(zip(names, best.x.tolist(), strict=True)), fitted_facts
 
 
 def measure_gains():
-    """Model → half → values, ratios, and the error on what it was not shown."""
+    """Return values, ratios, and the error on facts outside the fit, by model and half."""
     base, facts = load_parameters("extended"), load_paper_facts()
     results = {}
     for model, terms in MODELS.items():
         for half in HALVES:
-            values, shown = fit_terms(base, terms, half)
+            values, fitted_facts = fit_terms(base, terms, half)
             predicted = simulate_outcomes(build_parameters(base, terms, values))
             ratios = {fact: facts[fact].ratio(predicted[fact]) for fact in JUDGED_FACTS}
-            unseen = [fact for fact in JUDGED_FACTS if fact not in HALVES[half] and fact != "N_50um"]
-            error = float(np.sqrt(np.mean([np.log(ratios[fact]) ** 2 for fact in unseen])))
-            results[f"{model}, {half} half"] = {"values": values, "ratios": ratios, "shown": shown, "error": error}
+            held_out = [fact for fact in JUDGED_FACTS if fact not in HALVES[half] and fact != "N_50um"]
+            error = float(np.sqrt(np.mean([np.log(ratios[fact]) ** 2 for fact in held_out])))
+            results[f"{model}, {half} half"] = {
+                "values": values,
+                "ratios": ratios,
+                "fitted_facts": fitted_facts,
+                "error": error,
+            }
             print(model, half, values, f"{100 * error:.1f} %", file=sys.stderr)
     return results
 
 
 def format_table(results):
-    """Markdown: ratios by model; bold where the fact was shown to the fit."""
+    """Format the ratios by model as Markdown; facts of the fit are bold."""
     lines = [
         "| model | fitted half | " + " | ".join(JUDGED_FACTS) + " | held-out error |",
         "| --- " * (len(JUDGED_FACTS) + 3) + "|",
@@ -100,7 +105,7 @@ def format_table(results):
     for name, row in results.items():
         model, half = name.removesuffix(" half").split(", ")
         cells = [
-            f"**{row['ratios'][fact]:.2f}**" if fact in row["shown"] else f"{row['ratios'][fact]:.2f}"
+            f"**{row['ratios'][fact]:.2f}**" if fact in row["fitted_facts"] else f"{row['ratios'][fact]:.2f}"
             for fact in JUDGED_FACTS
         ]
         lines.append(f"| {model} | {half} | " + " | ".join(cells) + f" | {100 * row['error']:.0f} % |")

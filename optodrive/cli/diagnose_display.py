@@ -55,7 +55,7 @@ def diagnose_display(
                 report_count(len(pixels))
     pixels.sort(key=lambda item: item.pixel or 0)
     if all(item.discrepancy is None for item in pixels):
-        first = f"one at least; pixel {pixels[0].pixel}: {pixels[0].error}"
+        first = f"at least one; pixel {pixels[0].pixel}: {pixels[0].error}"
         raise InputError("diagnose", Unquoted(f"no answer for any of {len(pixels)} pixels"), first)
     return DisplayAnswer(tuple(pixels), mirrors, perf_counter() - start_s)
 

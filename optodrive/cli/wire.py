@@ -158,7 +158,7 @@ def _print_verdict(verdict: dict[str, Any], result: "Replay") -> None:
         recorded, replayed = (_format_state(account.states, at) for account in (result.recorded, result.replayed))
         print(f"first difference state {at + 1}: recorded {recorded}, replayed {replayed}")
     counts = ", ".join(f"{executed[name]} {name}" for name in ("recorded", "replayed", "missing", "changed", "shifted"))
-    print(f"points executed  {counts}, by {executed['largest_shift_ticks']} ticks at most")
+    print(f"points executed  {counts}, by max {executed['largest_shift_ticks']} ticks")
 
 
 def _format_state(states: list[tuple[str, str, str]], at: int) -> str:

@@ -92,7 +92,7 @@ def test_a_plan_takes_longer_by_the_option_as_by_the_configuration(folder, capsy
     by_option = settling_s("--mirrors", f"{folder}/mirrors.toml")
     assert by_option > settling_s()
     assert by_option == settling_s("--config", str(write_config(folder)))
-    # Asked for beside a configuration that names them too, the cap is lowered once.
+    # With --mirrors and a configuration that names the same file, the cap is lowered once.
     assert by_option == settling_s("--config", str(write_config(folder)), "--mirrors", f"{folder}/mirrors.toml")
 
 
