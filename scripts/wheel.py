@@ -54,7 +54,9 @@ def try_installation(optodrive, outside):
     if optodrive.parent.parent not in package_path.parents:
         raise SystemExit(f"scripts/wheel: {package_path} was imported, which is not the wheel")
     config_names = json.loads(
-        run_python("-c", "import json; from optodrive.device.config import *; print(json.dumps(list_shipped_configs()))")
+        run_python(
+            "-c", "import json; from optodrive.device.config import *; print(json.dumps(list_shipped_configs()))"
+        )
     )
     for name in config_names:
         run_python("-m", "optodrive.cli.main", "config", "check", "--config", name)
