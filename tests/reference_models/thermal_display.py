@@ -1,4 +1,7 @@
-"""A display's heat integrated step by step, and hostile sequences: written apart from the limiter and from physics."""
+"""A numerical integrator of a display's heat and servos, and hostile sequences.
+
+It shares no code with the limiter and the physics package.
+"""
 
 from dataclasses import dataclass
 from math import inf
@@ -30,8 +33,8 @@ NO_CAPS = CapValues(
 
 
 @numba.njit(cache=False)
-def _rates(y, out, driven, power_w, numbers, neighbours, rim):
-    """dy/dt of y [4, p]: absorber, gas, wall, touch surface."""
+def _rates(y, out, driven, power_w, numbers, neighbours, frame_edges):
+    """Compute dy/dt of y [4, p]: absorber, gas, wall and touch surface."""
     eps, r, c, ambient_k, n, tau_g, rw, cw, rx, rf, fg, fw, lag = numbers
     for i in range(y.shape[1]):
         theta, gas, wall, touch = y[0, i], y[1, i], y[2, i], y[3, i]
@@ -42,7 +45,7 @@ def _rates(y, out, driven, power_w, numbers, neighbours, rim):
         out[1, i] = (0.5 * (theta + wall) - gas) / tau_g
         out[2, i] = 0.0
         if cw > 0.0:
-            leaving = wall / rw + wall * rim[i] / rf
+            leaving = wall / rw + wall * frame_edges[i] / rf
             for k in range(4):
                 if neighbours[i, k] >= 0:
                     leaving += (wall - y[2, neighbours[i, k]]) / rx
@@ -51,8 +54,8 @@ def _rates(y, out, driven, power_w, numbers, neighbours, rim):
 
 
 @numba.njit(cache=False)
-def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, rim, on_step, off_step):
-    """Runge–Kutta of the fourth order between events; peak [4] takes the largest of each kind ever seen."""
+def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, frame_edges, on_step, off_step):
+    """Integrate by the fourth-order Runge–Kutta method between events; peak [4] receives the maximum of each kind."""
     k1, k2, k3, k4 = np.empty_like(y), np.empty_like(y), np.empty_like(y), np.empty_like(y)
     now = 0.0
     for row in range(len(start) + 1):
@@ -66,10 +69,10 @@ def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, 
             steps = int(np.ceil((end - now) / (on_step if phase == 1 else off_step)))
             h = (end - now) / steps
             for _ in range(steps):
-                _rates(y, k1, driven, watts, numbers, neighbours, rim)
-                _rates(y + 0.5 * h * k1, k2, driven, watts, numbers, neighbours, rim)
-                _rates(y + 0.5 * h * k2, k3, driven, watts, numbers, neighbours, rim)
-                _rates(y + h * k3, k4, driven, watts, numbers, neighbours, rim)
+                _rates(y, k1, driven, watts, numbers, neighbours, frame_edges)
+                _rates(y + 0.5 * h * k1, k2, driven, watts, numbers, neighbours, frame_edges)
+                _rates(y + 0.5 * h * k2, k3, driven, watts, numbers, neighbours, frame_edges)
+                _rates(y + h * k3, k4, driven, watts, numbers, neighbours, frame_edges)
                 for kind in range(4):
                     for i in range(y.shape[1]):
                         y[kind, i] += h / 6 * (k1[kind, i] + 2 * k2[kind, i] + 2 * k3[kind, i] + k4[kind, i])
@@ -79,16 +82,16 @@ def _integrate(y, peak, start, width, pixel, power, until, numbers, neighbours, 
 
 @dataclass(frozen=True)
 class TrueDisplay:
-    """One display as it really is: `numbers` for the integrator, and the lattice."""
+    """The true parameters of one display: `numbers` for the integrator, and the lattice."""
 
     numbers: tuple
     neighbours: np.ndarray
-    rim: np.ndarray
+    frame_edges: np.ndarray
 
     def peaks(self, plan, dark_s=3.0):
-        """Largest absorber, gas, wall and touch rise, K, over the plan and dark_s after it."""
-        lag_s = self.numbers[5]  # the quickest node: steps beyond 2.8 of its time would not be stable
-        y, peak = np.zeros((4, len(self.rim))), np.zeros(4)
+        """Return the largest rise of absorber, gas, wall and touch surface, K, over the plan and `dark_s` after it."""
+        lag_s = self.numbers[5]  # the fastest node; steps above 2.8 of its time constants would be unstable
+        y, peak = np.zeros((4, len(self.frame_edges))), np.zeros(4)
         until = float(plan.start_s[-1] + plan.width_s[-1]) + dark_s
         columns = (plan.start_s, plan.width_s, plan.pixel, plan.power_w)
         _integrate(
@@ -98,7 +101,7 @@ class TrueDisplay:
             until,
             self.numbers,
             self.neighbours,
-            self.rim,
+            self.frame_edges,
             min(1e-3, 0.5 * lag_s),
             lag_s,
         )
@@ -106,7 +109,7 @@ class TrueDisplay:
 
 
 def build_true_display(model, factor=None):
-    """The display of a declared model, each parameter times its factor (exponent: plus)."""
+    """Build the true display from a nominal model, with each parameter times its factor (the exponent: plus)."""
     f = dict.fromkeys(Uncertainty.__dataclass_fields__, 1.0) | {"exponent": 0.0} | (factor or {})
     walls, touch = model.walls, model.touch
     numbers = (
@@ -129,7 +132,7 @@ def build_true_display(model, factor=None):
 
 @numba.njit(cache=False)
 def _coil(at_s, command_rad, until_s, omega, damping, delay_s, slew, mean_s):
-    """Largest leaky mean of the squared acceleration of one servo, rad²/s⁴, stepped by Runge–Kutta of fourth order."""
+    """Return the peak exponential mean of one servo's squared acceleration, rad²/s⁴, by fourth-order Runge–Kutta."""
     angle, speed, target, mean, maximum, now = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     still_s, longest = 14.0 / (damping * omega), 0.02 / omega
     for row in range(len(at_s)):
@@ -167,9 +170,9 @@ def _coil(at_s, command_rad, until_s, omega, damping, delay_s, slew, mean_s):
 
 
 def galvo_peak(plan, budget):
-    """Largest mean-square acceleration, rad²/s⁴, of either mirror's servo.
+    """Return the peak mean-square acceleration of both mirrors' servos, rad²/s⁴.
 
-    Mirrors are sent on as soon as the last pulse has ended; or as late as a plan's lead before its first pulse.
+    Two cases are simulated: the mirrors leave at the end of the last pulse with power, or one lead-in before a pulse.
     """
     galvo = budget.galvo
     driven = np.flatnonzero(plan.power_w > 0)
@@ -186,7 +189,7 @@ def galvo_peak(plan, budget):
 
 
 def window_peak_w(plan, window_s):
-    """Largest mean power over any window, by the energy delivered at all its corners."""
+    """Return the largest mean power over any window, from the delivered energy at all pulse edges."""
     edges_s = np.stack([plan.start_s, plan.start_s + plan.width_s], axis=1).ravel()
     energy_j = np.repeat(np.cumsum(plan.power_w * plan.width_s), 2)
     energy_j[::2] -= plan.power_w * plan.width_s
@@ -196,14 +199,14 @@ def window_peak_w(plan, window_s):
 
 
 def small_lattice(rng):
-    """A few rows and columns, perhaps with a hole."""
+    """Draw a lattice of a few rows and columns, sometimes with a missing pixel."""
     rows, columns = int(rng.integers(1, 5)), int(rng.integers(2, 5))
     missing = ((0, 0),) if rng.random() < 0.3 else ()
     return DisplaySection(rows=rows, columns=columns, pitch_m=4e-3, missing=missing, bridge_width_m=4e-4)
 
 
 def random_model(rng):
-    """A declared model, terms left out now and then, and its uncertainty."""
+    """Draw a display, a nominal model, in which terms are sometimes absent, and its uncertainty."""
     display = small_lattice(rng)
     neighbours = Neighbours.from_display(display)
     pixels = len(neighbours)
@@ -248,7 +251,7 @@ def random_model(rng):
 
 
 def sample_factors(rng, unsure):
-    """A factor for each parameter inside its half-width: anywhere, or at an end."""
+    """Draw a factor for each parameter within its half-width: anywhere, or at an end."""
     ends = rng.random() < 0.5
     factor = {}
     for name in Uncertainty.__dataclass_fields__:
@@ -268,7 +271,7 @@ KINDS = ("hammer", "ring", "whole", "bursts", "scatter")
 
 
 def build_sequence(rng, kind, pixels, span_s=3.0):
-    """Pixels, starts and widths of a hostile sequence; whole microseconds, one beam, dark for moves."""
+    """Draw pixels, starts and widths of a hostile sequence on one beam, in whole microseconds, with time for moves."""
     home = int(rng.integers(pixels))
     ring = rng.permutation(pixels)[: int(rng.integers(2, 9))]
     duty, max_width = rng.uniform(0.3, 1.0), rng.choice([2e-3, 15e-3, 50e-3])
@@ -290,7 +293,7 @@ def build_sequence(rng, kind, pixels, span_s=3.0):
 
 
 def build_plan(rows, power_w, display):
-    """A plan of (pixel, start_s, width_s) at one power or [n]."""
+    """Build a plan from rows of (pixel, start_s, width_s) at one power, or at powers [n]."""
     pixel, start, width = (np.array(column) for column in zip(*rows, strict=True))
     n = len(rows)
     side = int(np.ceil(np.sqrt(pixel.max() + 1)))
