@@ -1,6 +1,6 @@
 """The summary of a plan and its pulses, as the command line prints them and the daemon sends them."""
 
-from optodrive.core.json_model import JsonModel
+from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel, OptionalFloatColumn, TextColumn
 from optodrive.planning.feasibility.report import FeasibilityReport
 
 
@@ -117,12 +117,12 @@ class PlanSummary(JsonModel):
 class PulseColumns(JsonModel):
     """The pulses of a plan by column, in order; `target_um` is None for a pulse without a target height."""
 
-    start_s: list[float]
-    width_s: list[float]
-    power_w: list[float]
-    pixel: list[int]
-    energy_j: list[float]
-    trimmed_j: list[float]
-    reason: list[str]
-    target_um: list[float | None]
-    predicted_um: list[float]
+    start_s: FloatColumn
+    width_s: FloatColumn
+    power_w: FloatColumn
+    pixel: IntColumn
+    energy_j: FloatColumn
+    trimmed_j: FloatColumn
+    reason: TextColumn
+    target_um: OptionalFloatColumn
+    predicted_um: FloatColumn

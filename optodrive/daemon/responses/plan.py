@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from optodrive.core.json_model import JsonModel
+from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel
 from optodrive.link.session.timing_error import TimingError
 from optodrive.planning.summary_schema import PlanSummary, PulseColumns
 
@@ -29,11 +29,11 @@ class MaxTarget(JsonModel):
 class ExecutedColumns(JsonModel):
     """Executed pulses by column, in order; `simulated_um` is empty until the simulation is done."""
 
-    start_s: list[float]
-    width_s: list[float]
-    power_w: list[float]
-    pixel: list[int]
-    simulated_um: list[float]
+    start_s: FloatColumn
+    width_s: FloatColumn
+    power_w: FloatColumn
+    pixel: IntColumn
+    simulated_um: FloatColumn
 
 
 class PlanReport(JsonModel):

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 
-from optodrive.core.json_model import JsonModel
+from optodrive.core.json_model import FloatColumn, IntColumn, JsonModel, TextColumn
 from optodrive.daemon.responses.state import StateReport
 
 
@@ -30,13 +30,13 @@ class PulseBatch(JsonModel):
 
     plan: str
     name: str
-    row: list[int]
-    pixel: list[int]
-    start_s: list[float]
-    width_s: list[float]
-    power_w: list[float]
-    trimmed_j: list[float]
-    reason: list[str]
+    row: IntColumn
+    pixel: IntColumn
+    start_s: FloatColumn
+    width_s: FloatColumn
+    power_w: FloatColumn
+    trimmed_j: FloatColumn
+    reason: TextColumn
 
 
 class PulsesEvent(JsonModel):

@@ -12,15 +12,14 @@ from optodrive.device.config import DaemonSection, load_config
 from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 
-REQUEST_OBJECTS = {"PARAMETERS"}
-
 
 @pytest.fixture(scope="module")
 def document():
     engine = Engine(
         DisplayModel.from_config(load_config("display-16")), SimulatedBoard("", 1_000_000), MonotonicClock()
     )
-    return build_app(engine, AccessPolicy(Tokens(()), DaemonSection())).openapi()
+    yield build_app(engine, AccessPolicy(Tokens(()), DaemonSection())).openapi()
+    engine.close()
 
 
 def list_schemas(node):
