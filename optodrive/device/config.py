@@ -503,7 +503,7 @@ def build_input_error(error: ValidationError, where: str, model: type[BaseModel]
     if first["type"] == "missing":
         return InputError(label, None, "this key")
     if first["type"] == "value_error":
-        return InputError(label, "values that contradict", message)
+        return InputError(label, "inconsistent values", message)
     return InputError(label, first["input"], message)
 
 
