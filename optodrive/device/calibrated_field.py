@@ -1,4 +1,4 @@
-"""A calibrated field: display metres to codes and back, with how sure that is. Needs numpy and nothing else."""
+"""Calibrated scan field: display positions to converter codes and back, with their uncertainty."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -13,26 +13,28 @@ from optodrive.device.field_surface import Extent, evaluate_terms
 
 PointMap = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 BLOCK_POINTS = 8192
-"""Places worked on at a time: their numbers fit into the cache."""
+"""Points per block; the arrays of one block fit into the processor's cache."""
 MAX_ITERATIONS = 8
+"""Iterations of the search for codes."""
 CODE_TOLERANCE = 1.0
-"""Codes are looked for until the last step was shorter: the next would be a hundredth of it at most."""
+"""Step, in codes, below which the search ends; the next step would be at most a hundredth of it."""
 FOLDOVER_FACTOR = 10.0
-"""The beam lands no farther off than so many times what the last step nominally is; else it is another place."""
+"""Largest residual of a solution over the nominal length of its last step; a larger one means another branch."""
 GUESS_ORDER = 7
 GUESS_NODES = 40
+"""Degree of the polynomial for the initial guess, and its sampling nodes per axis."""
 OUTSIDE_WEIGHT = 0.01
-"""Weight of places outside the extent, where nearly nothing is looked up, for the start."""
+"""Weight of points outside the extent in the fit of the initial guess; few look-ups are there."""
 GUESS_MARGIN = 1.1
-"""The start is good for codes up to so many times the converter's range, and best up to so many times the extent."""
+"""Range of the initial guess over the converter's range, and of its fully weighted part over the extent."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibratedField:
-    """Physical geometry and smooth surface; arrays are read-only.
+    """Map from codes to display positions: physical geometry plus a smooth surface. Arrays are read-only.
 
-    surface_m: [2, TERMS] coefficients of x and y; rad_per_code, focal_length_m: of the configuration it was made for
-    sigma_grid_m: [k, k] one sigma on either axis from edge to edge of the extent, rows by y
+    surface_m: [2, TERM_COUNT] coefficients of x and y; rad_per_code, focal_length_m: of the configuration that the
+    field was calibrated with; sigma_grid_m: [k, k] standard uncertainty per axis over the extent, rows by y
     """
 
     geometry: FieldGeometry
@@ -46,13 +48,13 @@ class CalibratedField:
         freeze_arrays(self)
 
     def position_m(self, x_code: ArrayLike, y_code: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Where the beam lands for codes, whole or not, m; any shape."""
+        """Return the beam's position on the display for codes, which may be fractional, m; any shape."""
         return _apply_blockwise(self._block_position_m, x_code, y_code)
 
     def codes(self, x_m: ArrayLike, y_m: ArrayLike, extrapolate: bool = False) -> tuple[FloatArray, FloatArray]:
-        """Codes, not rounded, that lead the beam to places, m; any shape. NaN where no code of the converter does.
+        """Return the unrounded codes that send the beam to display positions, m; any shape.
 
-        beyond: also codes that a converter of a larger range would have.
+        The codes are NaN for a position outside the converter's range. extrapolate: return codes outside it as well.
         """
         x_code, y_code = _apply_blockwise(self._solve_codes, x_m, y_m)
         if extrapolate:
@@ -61,16 +63,16 @@ class CalibratedField:
         return np.where(outside, np.nan, x_code), np.where(outside, np.nan, y_code)
 
     def angles_rad(self, x_m: ArrayLike, y_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Commanded mechanical mirror angles for places, m, nominal scale; any shape, NaN likewise."""
+        """Return the commanded mechanical mirror angles, rad, for display positions, m; NaN as in `codes`."""
         x_code, y_code = self.codes(x_m, y_m)
         return (x_code - CENTRE_CODE) * self.rad_per_code, (y_code - CENTRE_CODE) * self.rad_per_code
 
     def sigma_m(self, x_code: ArrayLike, y_code: ArrayLike) -> FloatArray:
-        """One sigma of the position on either axis, m; any shape. Infinite outside the extent: nothing is claimed."""
-        shares = self.extent.normalise(np.asarray(x_code, dtype=np.float64), np.asarray(y_code, dtype=np.float64))
+        """Return the standard uncertainty of the position per axis, m, for codes; infinite outside the extent."""
+        u = self.extent.normalise(np.asarray(x_code, dtype=np.float64), np.asarray(y_code, dtype=np.float64))
         last = len(self.sigma_grid_m) - 1
-        inside = (np.abs(shares[0]) <= 1.0) & (np.abs(shares[1]) <= 1.0)
-        x_at, y_at = (np.where(inside, share + 1.0, 0.0) * 0.5 * last for share in shares)
+        inside = (np.abs(u[0]) <= 1.0) & (np.abs(u[1]) <= 1.0)
+        x_at, y_at = (np.where(inside, axis + 1.0, 0.0) * 0.5 * last for axis in u)
         column, row = (np.minimum(at.astype(np.int64), last - 1) for at in (x_at, y_at))
         x_part, y_part = x_at - column, y_at - row
         grid = self.sigma_grid_m
@@ -79,55 +81,55 @@ class CalibratedField:
         return np.asarray(np.where(inside, low * (1.0 - y_part) + high * y_part, np.inf), dtype=np.float64)
 
     def _block_position_m(self, x_code: FloatArray, y_code: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """[n] each."""
+        """Return the positions for codes of one block, [n] each."""
         scale = self.rad_per_code
         x_m, y_m = beam_position_m(self.geometry, (x_code - CENTRE_CODE) * scale, (y_code - CENTRE_CODE) * scale)
         more = evaluate_terms(self.extent, x_code, y_code) @ self.surface_m.T
         return x_m + more[:, 0], y_m + more[:, 1]
 
     def _solve_codes(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """From a polynomial's guess, moved by what the guess makes of the miss until that is nothing. [n] each.
+        """Solve for the codes of positions of one block, [n] each, by a quasi-Newton iteration.
 
-        The guess has nearly the field's slope, so each round is one of Newton's.
+        The polynomial guess serves as the inverse's slope: each step is the guess's difference over the residual.
         """
         guess = self._guess_codes(x_m, y_m)
-        found = guess
+        codes = guess
         for _ in range(MAX_ITERATIONS):
-            at_x_m, at_y_m = self._block_position_m(found[:, 0], found[:, 1])
+            at_x_m, at_y_m = self._block_position_m(codes[:, 0], codes[:, 1])
             step = guess - self._guess_codes(at_x_m, at_y_m)
-            found = found + step
+            codes = codes + step
             if not np.any(np.abs(step) > CODE_TOLERANCE):
                 break
-        # Far out the guess folds over: it says the same of another place.
-        off_m = np.hypot(at_x_m - x_m, at_y_m - y_m)
-        near_m = FOLDOVER_FACTOR * CODE_TOLERANCE * 2.0 * self.focal_length_m * self.rad_per_code
-        lost = ~(np.all(np.abs(step) <= CODE_TOLERANCE, axis=1) & (off_m <= near_m))
-        found[lost] = np.nan
-        return found[:, 0], found[:, 1]
+        # Far outside, the guess folds over, and the iteration converges to another position.
+        residual_m = np.hypot(at_x_m - x_m, at_y_m - y_m)
+        max_residual_m = FOLDOVER_FACTOR * CODE_TOLERANCE * 2.0 * self.focal_length_m * self.rad_per_code
+        failed = ~(np.all(np.abs(step) <= CODE_TOLERANCE, axis=1) & (residual_m <= max_residual_m))
+        codes[failed] = np.nan
+        return codes[:, 0], codes[:, 1]
 
     def _guess_codes(self, x_m: FloatArray, y_m: FloatArray) -> FloatArray:
-        """Codes by the polynomial, [n, 2]."""
+        """Return the initial guess of the codes, [n, 2]."""
         scale_m, coefficients = self._guess_polynomial
         guess: FloatArray = _build_monomials(x_m / scale_m, y_m / scale_m) @ coefficients
         return guess
 
     @cached_property
     def _guess_polynomial(self) -> tuple[float, FloatArray]:
-        """Scale in m and coefficients [powers, 2] of a polynomial from places to codes, over the converter's range."""
+        """Scale, m, and coefficients [powers, 2] of the polynomial from positions to codes."""
         node = np.cos(np.pi * (np.arange(GUESS_NODES) + 0.5) / GUESS_NODES) * GUESS_MARGIN * (CODE_MAX - CENTRE_CODE)
         x_code, y_code = (CENTRE_CODE + axis.ravel() for axis in np.meshgrid(node, node))
         x_m, y_m = self._block_position_m(x_code, y_code)
         scale_m = float(max(np.abs(x_m).max(), np.abs(y_m).max()))
-        wanted = np.column_stack([x_code, y_code])
+        target = np.column_stack([x_code, y_code])
         outside = np.maximum(*np.abs(self.extent.normalise(x_code, y_code))) > GUESS_MARGIN
         weight = np.where(outside, OUTSIDE_WEIGHT, 1.0)[:, None]
         powers = _build_monomials(x_m / scale_m, y_m / scale_m)
-        coefficients = np.asarray(np.linalg.lstsq(powers * weight, wanted * weight, rcond=None)[0], dtype=np.float64)
+        coefficients = np.asarray(np.linalg.lstsq(powers * weight, target * weight, rcond=None)[0], dtype=np.float64)
         return scale_m, coefficients
 
 
 def _build_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Monomials of total degree up to START_ORDER, [n, powers]."""
+    """Return the monomials of total degree up to GUESS_ORDER, [n, powers]."""
     out = np.empty((len(x), (GUESS_ORDER + 1) * (GUESS_ORDER + 2) // 2), order="F")
     out[:, 0] = 1.0
     at = 0
@@ -140,7 +142,7 @@ def _build_monomials(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _apply_blockwise(function: PointMap, first: ArrayLike, second: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Apply a function of two flat arrays to blocks of two arrays of any shape."""
+    """Apply a function of two flat arrays block by block to two arrays of any shape."""
     one, two = np.broadcast_arrays(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
     shape = one.shape
     one, two = one.ravel(), two.ravel()

@@ -1,4 +1,4 @@
-"""field.toml: a field as a file, for people to read and for the planner to load."""
+"""The file field.toml, which holds a calibrated field."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -52,39 +52,41 @@ class _FieldFile(Section):
 
 
 def strip_toml_specials(text: str) -> str:
-    """Text without what would end a string of TOML."""
+    """Return the text without characters that a basic TOML string cannot hold."""
     return "".join(letter for letter in text if letter.isprintable() and letter not in '"\\')
 
 
 def format_field(field: CalibratedField, about: dict[str, str | float | int]) -> str:
-    """TOML of format optodrive-field, version 2."""
+    """Return a field as TOML of format optodrive-field, version 2."""
     extent = field.extent
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
-    lines += ["", "[scanner] # of the configuration it was made for"]
+    lines += ["", "[scanner] # of the configuration that it was calibrated with"]
     lines += [f"rad_per_code = {field.rad_per_code!r}", f"focal_length_m = {field.focal_length_m!r}"]
-    lines += ["", "[extent] # the codes it is made for"]
+    lines += ["", "[extent] # codes for which it is calibrated"]
     lines += [f"{key} = {float(getattr(extent, key))!r}" for key in ("x_code", "y_code", "x_half", "y_half")]
     lines += ["", "[geometry]"]
     lines += [f"{key} = {value!r}" for key, value in field.geometry._asdict().items()]
     lines += ["", "[surface] # Legendre products of total degree 2 to order, each of mean square 1", f"order = {ORDER}"]
     lines += [f"{axis}_m = {row.tolist()!r}" for axis, row in zip("xy", field.surface_m, strict=True)]
-    lines += ["", "[uncertainty] # one sigma on an axis, edge to edge, rows by y", "sigma_m = ["]
+    lines += ["", "[uncertainty] # standard uncertainty per axis over the extent, rows by y", "sigma_m = ["]
     lines += [f"  [{', '.join(f'{value:.4g}' for value in row)}]," for row in field.sigma_grid_m.tolist()]
     return "\n".join([*lines, "]"]) + "\n"
 
 
 def load_field(path: Path) -> CalibratedField:
-    """Read field.toml; InputError with one line for another format or version, or what does not belong there."""
+    """Load field.toml. Raise InputError for another format or version, and for invalid content."""
     table = read_toml(path)
     check_format(path, table, FORMAT, VERSION)
     try:
         content = _FieldFile.model_validate(table)
     except ValidationError as error:
         raise build_input_error(error, str(path), _FieldFile) from None
-    missing = set(FieldGeometry._fields) ^ set(content.geometry)
-    if missing:
-        raise InputError(f"{path}: geometry", ", ".join(sorted(missing)), f"just {', '.join(FieldGeometry._fields)}")
+    differing = set(FieldGeometry._fields) ^ set(content.geometry)
+    if differing:
+        raise InputError(
+            f"{path}: geometry", ", ".join(sorted(differing)), f"exactly {', '.join(FieldGeometry._fields)}"
+        )
     grid = content.uncertainty.sigma_m
     if any(len(row) != len(grid) for row in grid):
         raise InputError(f"{path}: uncertainty.sigma_m", [len(row) for row in grid], "as many columns as rows")

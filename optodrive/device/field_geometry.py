@@ -1,6 +1,6 @@
-"""The physical part of a field: two mirrors a distance apart, an f-theta lens, a board that lies a little askew.
+"""Physical geometry of a scan field in closed form: two mirrors at a distance, an f-theta lens, a tilted display.
 
-Closed forms. A mirror at rest stands in the middle of its converter's range; the beam turns by twice its angle.
+The centre of the converter's range is the mirror's zero angle; the beam turns by twice the mechanical angle.
 """
 
 from typing import NamedTuple
@@ -13,15 +13,16 @@ from optodrive.device.config import HALF_RANGE_CODES
 CENTRE_CODE = HALF_RANGE_CODES + 1
 CODE_MAX = 2 * HALF_RANGE_CODES + 1
 DERIVATIVE_STEP = 1e-3
-"""Parameters are moved by this share of their prior's width where a derivative is taken."""
+"""Step of a parameter for its central difference, in units of its prior's standard deviation."""
 
 
 class FieldGeometry(NamedTuple):
-    """Parameters of the physical part, in the units of their names.
+    """Parameters of the geometry, in the units of their names.
 
-    gain, cross (from the other axis): of 1; cubic_per_rad2: servo, relative; apart_m: mirror x to mirror y; lens_at_m:
-    from mirror y; focal_m and bend*: r = focal θ (1 + bend3 θ² + bend5 θ⁴); shift: the board's origin; turn and tilt:
-    of the board, about the optical axis, x and y
+    gain: angle over commanded angle; cross: coupling from the other axis; cubic: relative cubic error of the angle;
+    mirror_distance: mirror x to mirror y; lens_distance: mirror y to the lens; focal_length, distortion: radius
+    r = f θ (1 + distortion3 θ² + distortion5 θ⁴); shift: origin of the display in the focal plane; turn, tilt:
+    rotation of the display about the optical axis, x and y
     """
 
     gain_x: float
@@ -45,28 +46,28 @@ class FieldGeometry(NamedTuple):
 
 
 def beam_position_m(geometry: FieldGeometry, x_rad: FloatArray, y_rad: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Where the beam lands on the board, in its own axes, m, for commanded mirror angles, rad; any shape."""
+    """Return the beam's position on the display, in its axes, m, for commanded mirror angles, rad; any shape."""
     g = geometry
-    standing_x = 2.0 * (g.gain_x * x_rad * (1.0 + g.cubic_x_per_rad2 * x_rad * x_rad) + g.cross_x * y_rad)
-    standing_y = 2.0 * (g.gain_y * y_rad * (1.0 + g.cubic_y_per_rad2 * y_rad * y_rad) + g.cross_y * x_rad)
-    standing_x += 2.0 * g.offset_x_rad
-    standing_y += 2.0 * g.offset_y_rad
-    aside_x, along_x = np.sin(standing_x), np.cos(standing_x)
-    aside_y, along = along_x * np.sin(standing_y), along_x * np.cos(standing_y)
-    # Never zero, and too little to matter: the lens stretches by f on its axis.
-    aside = np.sqrt(aside_x * aside_x + aside_y * aside_y + 1e-24)
-    bend = np.arctan2(aside, along)
-    bend2 = bend * bend
+    beam_x = 2.0 * (g.gain_x * x_rad * (1.0 + g.cubic_x_per_rad2 * x_rad * x_rad) + g.cross_x * y_rad)
+    beam_y = 2.0 * (g.gain_y * y_rad * (1.0 + g.cubic_y_per_rad2 * y_rad * y_rad) + g.cross_y * x_rad)
+    beam_x += 2.0 * g.offset_x_rad
+    beam_y += 2.0 * g.offset_y_rad
+    direction_x, cos_x = np.sin(beam_x), np.cos(beam_x)
+    direction_y, axial = cos_x * np.sin(beam_y), cos_x * np.cos(beam_y)
+    # The small constant avoids 0/0 on the optical axis, where the limit of the ratio is the focal length.
+    radial = np.sqrt(direction_x * direction_x + direction_y * direction_y + 1e-24)
+    theta = np.arctan2(radial, axial)
+    theta2 = theta * theta
     stretch = (
-        g.focal_length_m * (1.0 + bend2 * (g.distortion3_per_rad2 + bend2 * g.distortion5_per_rad4)) * bend / aside
+        g.focal_length_m * (1.0 + theta2 * (g.distortion3_per_rad2 + theta2 * g.distortion5_per_rad4)) * theta / radial
     )
-    focus_x, focus_y = stretch * aside_x, stretch * aside_y
-    # How far the beam goes sideways on a metre behind the lens, where the board does not lie in the focal plane.
+    focus_x, focus_y = stretch * direction_x, stretch * direction_y
+    # Slopes of the beam behind the lens; they matter where the display is outside the focal plane.
     slope_x = (
-        focus_x - g.lens_distance_m * aside_x / along - g.mirror_distance_m * aside_x / along_x
+        focus_x - g.lens_distance_m * direction_x / axial - g.mirror_distance_m * direction_x / cos_x
     ) / g.focal_length_m
-    slope_y = (focus_y - g.lens_distance_m * aside_y / along) / g.focal_length_m
-    (ax, ay, az), (bx, by, bz), (nx, ny, nz) = build_board_axes(g).tolist()
+    slope_y = (focus_y - g.lens_distance_m * direction_y / axial) / g.focal_length_m
+    (ax, ay, az), (bx, by, bz), (nx, ny, nz) = build_display_axes(g).tolist()
     from_x, from_y = focus_x - g.shift_x_m, focus_y - g.shift_y_m
     height = -(nx * from_x + ny * from_y) / (nz + nx * slope_x + ny * slope_y)
     from_x += height * slope_x
@@ -74,8 +75,8 @@ def beam_position_m(geometry: FieldGeometry, x_rad: FloatArray, y_rad: FloatArra
     return ax * from_x + ay * from_y + az * height, bx * from_x + by * from_y + bz * height
 
 
-def build_board_axes(geometry: FieldGeometry) -> FloatArray:
-    """The board's x, y and normal as rows, [3, 3]."""
+def build_display_axes(geometry: FieldGeometry) -> FloatArray:
+    """Return the x axis, the y axis and the normal of the display as rows, [3, 3]."""
     turn, tilt_x, tilt_y = geometry.turn_rad, geometry.tilt_x_rad, geometry.tilt_y_rad
     (c, s), (cx, sx), (cy, sy) = ((np.cos(angle), np.sin(angle)) for angle in (turn, tilt_x, tilt_y))
     about_z = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -88,7 +89,10 @@ def build_board_axes(geometry: FieldGeometry) -> FloatArray:
 def compute_parameter_derivatives(
     geometry: FieldGeometry, widths: FloatArray, x_rad: FloatArray, y_rad: FloatArray
 ) -> FloatArray:
-    """Derivatives of the landing by each parameter in units of `widths`, [2, n, parameters]; by central differences."""
+    """Return the derivatives of the position with respect to each parameter, [2, n, parameters].
+
+    widths: unit of each parameter, its prior's standard deviation
+    """
     columns = []
     for index, width in enumerate(widths.tolist()):
         high, low = (
@@ -99,5 +103,5 @@ def compute_parameter_derivatives(
     return np.stack(columns, axis=-1)
 
 
-def _perturb(geometry: FieldGeometry, index: int, by: float) -> FieldGeometry:
-    return FieldGeometry(*(value + by * (at == index) for at, value in enumerate(geometry)))
+def _perturb(geometry: FieldGeometry, index: int, step: float) -> FieldGeometry:
+    return FieldGeometry(*(value + step * (at == index) for at, value in enumerate(geometry)))

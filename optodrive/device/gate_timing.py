@@ -1,7 +1,7 @@
-"""When a mirror that a servo moves is near enough for the light, in closed form.
+"""Settling time of a mirror's servo in closed form, after which the gate may open.
 
-The servo's own target runs to the command in move / slew; from then on the error swings freely, as Re(A exp(λ t)) with
-λ = −ζω + iω√(1 − ζ²).
+The servo's internal target slews to the command in move / slew; from then on the error rings freely as Re(A exp(λ t))
+with λ = −ζω + iω√(1 − ζ²).
 """
 
 from cmath import exp as cexp
@@ -15,34 +15,37 @@ BISECTION_STEPS = 50
 
 
 def build_servo(scanner: ScannerSection) -> Servo:
-    """The servo of either mirror as configured."""
+    """Return the configured servo of both mirrors."""
     return Servo(scanner.bandwidth_hz, scanner.damping, scanner.delay_s, scanner.slew_rad_per_s)
 
 
 def pole_per_s(servo: Servo) -> complex:
-    """λ of the servo's free swing, 1/s; its damping lies below 1."""
+    """Return the pole λ of the servo's free ringing, 1/s; its damping ratio is below 1."""
     omega = 2.0 * pi * servo.frequency
     return complex(-servo.damping * omega, omega * sqrt(1.0 - servo.damping**2))
 
 
 def settling_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
-    """From a move's command until its error is within tolerance_rad for good and its ramp is over, s. All above 0."""
+    """Return the time from a move's command until its ramp is over and its error stays within tolerance_rad, s.
+
+    move_rad and tolerance_rad are positive.
+    """
     pole, ramp_s = pole_per_s(servo), move_rad / servo.slew
-    swing = -1j * servo.slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
+    amplitude = -1j * servo.slew * pole.conjugate() / (pole * pole.imag) * (1.0 - cexp(pole * ramp_s))
 
-    def beyond(at_s: float) -> bool:
-        return abs((swing * cexp(pole * at_s)).real) > tolerance_rad
+    def is_outside(at_s: float) -> bool:
+        return abs((amplitude * cexp(pole * at_s)).real) > tolerance_rad
 
-    # From one turn of the swing to the next the error only falls or only rises, so the last crossing is easily found.
-    outside_s, turn_s = 0.0, ((0.5 * pi - phase(pole * swing)) % pi) / pole.imag
-    while beyond(turn_s):
-        outside_s, turn_s = turn_s, turn_s + pi / pole.imag
-    inside_s = turn_s
-    if not beyond(outside_s):
+    # Between two extrema of the ringing the error is monotone, so bisection finds the last crossing.
+    outside_s, extremum_s = 0.0, ((0.5 * pi - phase(pole * amplitude)) % pi) / pole.imag
+    while is_outside(extremum_s):
+        outside_s, extremum_s = extremum_s, extremum_s + pi / pole.imag
+    inside_s = extremum_s
+    if not is_outside(outside_s):
         return servo.delay + ramp_s
     for _ in range(BISECTION_STEPS):
         middle_s = 0.5 * (outside_s + inside_s)
-        if beyond(middle_s):
+        if is_outside(middle_s):
             outside_s = middle_s
         else:
             inside_s = middle_s
@@ -50,16 +53,16 @@ def settling_s(servo: Servo, move_rad: float, tolerance_rad: float) -> float:
 
 
 def envelope_factor(servo: Servo) -> float:
-    """What is left of a swing that keeps within a tolerance: t later at most this × exp(−ζω t) of the tolerance.
+    """Return the factor k such that ringing within a tolerance is within k exp(−ζω t) of it a time t later.
 
-    From phase φ on, exp(−ζω t) |cos(ω_d t + φ)| reaches at most 1, and at least the larger of cos φ and of its next
-    turn, wherever in φ the larger of both is least.
+    From phase φ on, exp(−ζω t) |cos(ω_d t + φ)| is at most 1 and reaches at least the larger of cos φ and of its next
+    extremum. k is the inverse of the minimum of that larger value over φ.
     """
-    turn, decay = pi - asin(servo.damping), servo.damping / sqrt(1.0 - servo.damping**2)
+    extremum, decay = pi - asin(servo.damping), servo.damping / sqrt(1.0 - servo.damping**2)
     low, high = 0.0, 0.5 * pi
     for _ in range(BISECTION_STEPS):
         middle = 0.5 * (low + high)
-        if cos(middle) > sqrt(1.0 - servo.damping**2) * exp(-decay * (turn - middle)):
+        if cos(middle) > sqrt(1.0 - servo.damping**2) * exp(-decay * (extremum - middle)):
             low = middle
         else:
             high = middle

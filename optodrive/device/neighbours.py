@@ -1,4 +1,4 @@
-"""Who lies beside whom on the lattice of pixels."""
+"""Neighbour relations on the lattice of pixels."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from optodrive.device.config import DisplaySection, build_pixel_layout
 
 @dataclass(frozen=True, eq=False)
 class Neighbours:
-    """Pixels that share an edge. beside: [p, 4] their indices (left, right, below, above), −1 for none.
+    """Pixels that share an edge with each pixel.
 
-    frame_edges: [p] edges at the rim of the lattice, which lie against the frame. A missing place inside is neither:
-    no heat crosses there.
+    indices: [p, 4] left, right, below and above, −1 for none; frame_edges: [p] number of edges on the frame, at the rim
+    of the lattice. No heat crosses the edge to a missing place.
     """
 
     indices: IntArray
@@ -27,14 +27,14 @@ class Neighbours:
 
     @classmethod
     def from_display(cls, display: DisplaySection) -> "Neighbours":
-        """The neighbours on a display's lattice."""
+        """Return the neighbours on a display's lattice."""
         layout = build_pixel_layout(display)
         index = np.full((display.rows + 2, display.columns + 2), -1, dtype=np.int64)
         index[layout.row + 1, layout.column + 1] = np.arange(len(layout))
         row, column = layout.row + 1, layout.column + 1
-        beside = np.stack(
+        indices = np.stack(
             [index[row, column - 1], index[row, column + 1], index[row - 1, column], index[row + 1, column]], axis=1
         )
         at_rim = [layout.column == 0, layout.column == display.columns - 1]
         at_rim += [layout.row == 0, layout.row == display.rows - 1]
-        return cls(beside, np.sum(at_rim, axis=0).astype(np.int64))
+        return cls(indices, np.sum(at_rim, axis=0).astype(np.int64))

@@ -1,4 +1,4 @@
-"""pixels.toml: how high each pixel of a display stands against the model, where to aim at it, whether it lives."""
+"""Pixel map, the file pixels.toml: gain, aim offset and state of every pixel of a display."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -25,7 +25,7 @@ from optodrive.device.config import (
 FORMAT = "optodrive-pixels"
 VERSION = 1
 GAIN_MIN, GAIN_MAX = 0.2, 5.0
-"""A pixel that responds less is dead; one that responds more is nothing that one should plan with."""
+"""Range of plausible gains; a pixel with a lower gain is dead."""
 MEASURED, DEAD, NOT_MEASURED = "measured", "dead", "not measured"
 
 
@@ -70,10 +70,11 @@ NUMERIC_FIELDS = ("gain", "gain_sigma", "offset_x_m", "offset_y_m", "offset_x_si
 
 @dataclass(frozen=True, eq=False)
 class PixelMap:
-    """All [p]. gain: peak displacement over the model's; offset: where to aim, from the pixel's middle, m.
+    """Gain, aim offset and state of every pixel, all [p].
 
-    sigma: standard uncertainties, NaN where nothing was measured; state: MEASURED, DEAD or NOT_MEASURED
-    model: name of the parameter set that gains are against, "" where all are 1
+    gain: peak displacement over that of the model; offset: aim point relative to the pixel's centre, m; sigma: standard
+    uncertainties, NaN without a measurement; state: MEASURED, DEAD or NOT_MEASURED; model: name of the parameter set
+    that the gains refer to, "" if all are 1
     """
 
     gain: FloatArray
@@ -93,7 +94,7 @@ class PixelMap:
 
     @classmethod
     def uniform(cls, count: int, offset_x_m: float = 0.0, offset_y_m: float = 0.0) -> Self:
-        """Pixels of which nothing is known, all aimed at the same way off their middle."""
+        """Return a map of unmeasured pixels with one common aim offset."""
         unknown = np.full(count, np.nan)
         offsets = np.full(count, offset_x_m), np.full(count, offset_y_m)
         state = np.full(count, NOT_MEASURED)
@@ -101,28 +102,28 @@ class PixelMap:
 
     @property
     def dead(self) -> BoolArray:
-        """Which are dead, [p]."""
+        """Mask of the dead pixels, [p]."""
         return np.asarray(self.state == DEAD, dtype=np.bool_)
 
     @property
     def displacement_factor(self) -> FloatArray:
-        """Factor on the model's displacement, [p]: the gain, 0 where dead."""
+        """Factor on the model's displacement, [p]: the gain, or 0 for a dead pixel."""
         return np.where(self.dead, 0.0, self.gain)
 
 
 def remove_pixel_map(config: Config) -> Config:
-    """The configuration as if no pixel were known better than the model."""
+    """Return the configuration without a pixel map."""
     return replace_pixel_map(config, None)
 
 
 def replace_pixel_map(config: Config, path: Path | None) -> Config:
-    """The configuration with the file of another map, or none."""
+    """Return the configuration with another pixel map file, or with none."""
     display = config.display.model_copy(update={"pixel_map": None if path is None else str(path)})
     return config.model_copy(update={"display": display})
 
 
 def load_pixel_map(config: Config) -> PixelMap | None:
-    """The map that a configuration names, held against its display; None where it names none."""
+    """Load the pixel map that a configuration names and check it against the display; None if it names none."""
     if config.display.pixel_map is None:
         return None
     path = Path(config.display.pixel_map)
@@ -136,28 +137,28 @@ def load_pixel_map(config: Config) -> PixelMap | None:
 
 
 def build_aim_layout(config: Config) -> PixelLayout:
-    """Where the beam is sent for each pixel, display metres; raises as `map_of`."""
-    layout, known = build_pixel_layout(config.display), load_pixel_map(config)
-    if known is None:
+    """Return the aim points of all pixels as a layout; raises as `load_pixel_map`."""
+    layout, pixel_map = build_pixel_layout(config.display), load_pixel_map(config)
+    if pixel_map is None:
         return layout
-    return PixelLayout(layout.x_m + known.offset_x_m, layout.y_m + known.offset_y_m, layout.row, layout.column)
+    return PixelLayout(layout.x_m + pixel_map.offset_x_m, layout.y_m + pixel_map.offset_y_m, layout.row, layout.column)
 
 
 def max_aim_offset_m(config: Config) -> tuple[float, float]:
-    """The farthest that the beam may be aimed from a pixel's middle, x and y: the focus stays in the pixel's cell."""
+    """Return the largest aim offset in x and y that keeps the focus within the pixel's cell, m."""
     pitch_m, laser = config.display.pitch_m, config.laser
     return (pitch_m - laser.focus_width_m) / 2.0, (pitch_m - laser.focus_height_m) / 2.0
 
 
 def write_pixel_map(path: Path, pixel_map: PixelMap, config: Config, about: dict[str, str | float | int]) -> None:
-    """Write pixels.toml, whole or not at all. about: for people; text without quotes or backslashes."""
+    """Write pixels.toml atomically. about: informative entries; text without quotes or backslashes."""
     display = config.display
     lines = [f'format = "{FORMAT}"', f"version = {VERSION}", "", "[about]"]
     lines += [f'{key} = "{value}"' if isinstance(value, str) else f"{key} = {value!r}" for key, value in about.items()]
-    lines += ["", "[display] # the one it is a map of", f'name = "{config.name}"', f"rows = {display.rows}"]
+    lines += ["", "[display] # of the map", f'name = "{config.name}"', f"rows = {display.rows}"]
     lines += [f"columns = {display.columns}", f"pitch_m = {display.pitch_m!r}"]
     lines += [f"missing = {[list(place) for place in display.missing]}"]
-    lines += ["", "[model] # the parameter set that gains are against", f'parameters = "{pixel_map.model}"']
+    lines += ["", "[model] # the parameter set that the gains refer to", f'parameters = "{pixel_map.model}"']
     lines += ["", "[map]", "pixels = ["]
     lines += [f"  {{ {_format_entry(pixel_map, index)} }}," for index in range(len(pixel_map))]
     with atomic_write(path) as temporary:
@@ -183,34 +184,35 @@ def _read_file(path: Path, _changed_ns: int, _size: int) -> _PixelMapFile:
         raise build_input_error(error, str(path), _PixelMapFile) from None
 
 
-def _check_display(path: Path, made_for: _Display, config: Config) -> None:
-    own: DisplaySection = config.display
+def _check_display(path: Path, mapped: _Display, config: Config) -> None:
+    display: DisplaySection = config.display
     for key in ("rows", "columns", "pitch_m"):
-        given, expected = getattr(made_for, key), getattr(own, key)
+        given, expected = getattr(mapped, key), getattr(display, key)
         if abs(given - expected) > 1e-9:
-            words = f"{expected}, that of {config.name}: this is a map of {made_for.name}"
-            raise InputError(f"{path}: display.{key}", given, words)
-    if set(made_for.missing) != set(own.missing):
-        words = f"{len(own.missing)} missing places, those of {config.name}: this is a map of {made_for.name}"
-        raise InputError(f"{path}: display.missing", f"{len(made_for.missing)} places", words)
+            message = f"{expected}, the value of {config.name}: this is a map of {mapped.name}"
+            raise InputError(f"{path}: display.{key}", given, message)
+    if set(mapped.missing) != set(display.missing):
+        message = f"the {len(display.missing)} missing places of {config.name}: this is a map of {mapped.name}"
+        raise InputError(f"{path}: display.missing", f"{len(mapped.missing)} places", message)
 
 
 def _build_map(path: Path, content: _PixelMapFile, config: Config) -> PixelMap:
     pixels, count = content.map.pixels, len(build_pixel_layout(config.display))
     if [pixel.index for pixel in pixels] != list(range(count)):
         raise InputError(
-            f"{path}: map.pixels", f"{len(pixels)} entries", f"one for each pixel, 0 to {count - 1} in order"
+            f"{path}: map.pixels", f"{len(pixels)} entries", f"one entry per pixel, 0 to {count - 1} in order"
         )
     numbers = {
         name: np.array([np.nan if (value := getattr(pixel, name)) is None else value for pixel in pixels])
         for name in NUMERIC_FIELDS
     }
-    for axis, most_m in zip("xy", max_aim_offset_m(config), strict=True):
-        far = np.abs(numbers[f"offset_{axis}_m"])
-        if far.max() > most_m:
-            at, words = int(far.argmax()), f"at most {most_m:.6g} either way, the focus within the pixel's own cell"
-            raise InputError(f"{path}: pixel {at}: offset_{axis}_m", float(numbers[f"offset_{axis}_m"][at]), words)
+    for axis, max_m in zip("xy", max_aim_offset_m(config), strict=True):
+        distance_m = np.abs(numbers[f"offset_{axis}_m"])
+        if distance_m.max() > max_m:
+            at = int(distance_m.argmax())
+            message = f"at most {max_m:.6g} in either direction, so that the focus stays within the pixel's own cell"
+            raise InputError(f"{path}: pixel {at}: offset_{axis}_m", float(numbers[f"offset_{axis}_m"][at]), message)
     state = np.array([pixel.state for pixel in pixels])
     if np.all(state == DEAD):
-        raise InputError(f"{path}: map.pixels", "none but dead ones", "a pixel that lives")
+        raise InputError(f"{path}: map.pixels", "dead pixels only", "at least one live pixel")
     return PixelMap(**numbers, state=state, model=content.model.parameters)

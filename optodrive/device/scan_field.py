@@ -1,4 +1,4 @@
-"""Display metres to mirror angles: what the planner asks of a field, and the ideal one."""
+"""Scan fields: display positions to mirror angles, and the ideal field."""
 
 from dataclasses import dataclass
 from typing import Protocol
@@ -9,30 +9,30 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.device.config import Config, PixelLayout
 
 DERIVATIVE_STEP_M = 1e-4
-"""Slopes are taken over so much to either side."""
+"""Half width of the central differences for slopes of the field."""
 
 
 class ScanField(Protocol):
-    """Where to command the mirrors; an ideal field, or a calibrated one."""
+    """Map from display positions to mirror angles, ideal or calibrated."""
 
     def angles_rad(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Commanded mechanical angles of both mirrors, rad, for places on the display, m; any shape."""
+        """Return the commanded mechanical angles of both mirrors, rad, for display positions, m; any shape."""
         ...
 
 
 @dataclass(frozen=True)
 class IdealField:
-    """x = f · 2 θ: the beam turns by twice the mirror's mechanical angle, and mirrors have no distance between them."""
+    """Ideal f-theta lens, x = f · 2θ with θ the mechanical mirror angle, and mirrors without distance between them."""
 
     focal_length_m: float
 
     def angles_rad(self, x_m: FloatArray, y_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mechanical mirror angles, rad, for places on the display, m; any shape."""
+        """Return the mechanical mirror angles, rad, for display positions, m; any shape."""
         return x_m / (2.0 * self.focal_length_m), y_m / (2.0 * self.focal_length_m)
 
 
 def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatArray) -> float:
-    """The most that either mirror turns from a pixel to one beside it, also diagonally; 0 without neighbours."""
+    """Return the largest angle of either mirror between adjacent pixels, diagonals included; 0 without neighbours."""
     rows, columns = layout.row.tolist(), layout.column.tolist()
     place = {(row, column): at for at, (row, column) in enumerate(zip(rows, columns, strict=True))}
     pairs = [
@@ -48,9 +48,9 @@ def max_neighbour_step_rad(layout: PixelLayout, x_rad: FloatArray, y_rad: FloatA
 
 
 def tolerance_ratio(field: ScanField, layout: PixelLayout, config: Config) -> float:
-    """By what share of the nominal tolerance both mirrors may be off at once, anywhere, with the focus on the absorber.
+    """Return the usable fraction of the nominal angle tolerance, for both mirrors at once and on every pixel.
 
-    A beam that is turned by a little more than nominally, or askew, leaves less.
+    It is below 1 where the field's slopes exceed those of the ideal lens or couple the axes.
     """
     slopes = []
     for x_step_m, y_step_m in ((DERIVATIVE_STEP_M, 0.0), (0.0, DERIVATIVE_STEP_M)):
@@ -61,5 +61,5 @@ def tolerance_ratio(field: ScanField, layout: PixelLayout, config: Config) -> fl
         slopes.append((high - low) / (2.0 * DERIVATIVE_STEP_M))
     metres_per_rad = np.linalg.inv(np.stack(slopes, axis=-1).transpose(1, 0, 2))
     tolerance_rad = np.array(config.tolerance_rad)
-    room_m = 2.0 * config.scanner.focal_length_m * tolerance_rad
-    return float((room_m / (np.abs(metres_per_rad) @ tolerance_rad)).min())
+    tolerance_m = 2.0 * config.scanner.focal_length_m * tolerance_rad
+    return float((tolerance_m / (np.abs(metres_per_rad) @ tolerance_rad)).min())

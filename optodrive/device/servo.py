@@ -1,4 +1,4 @@
-"""A mirror that follows its command: at once, or as a servo of the second order with a delay and a slew limit."""
+"""Simulation of a mirror that follows its command as a second-order servo with a delay and a slew limit."""
 
 from dataclasses import dataclass
 from math import pi
@@ -8,13 +8,17 @@ import numpy as np
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
 
-STEPS_PER_TIME_CONSTANT = 24
-"""Steps in the servo's shortest time."""
+STEPS_PER_TIME_CONSTANT = 12
+"""Integration steps per time constant 1/ω."""
 
 
 @dataclass(frozen=True)
 class Servo:
-    """frequency: undamped, Hz; damping: of critical; delay: s; slew: rad/s at most."""
+    """Parameters of a servo.
+
+    frequency: undamped natural frequency, Hz; damping: damping ratio; delay: s; slew: largest rate of the internal
+    target, rad/s
+    """
 
     frequency: float
     damping: float
@@ -23,13 +27,16 @@ class Servo:
 
 
 def simulate_servo(at_s: FloatArray, command_rad: FloatArray, t_s: FloatArray, servo: Servo | None) -> FloatArray:
-    """Angle at t_s, rad, of a command held from each at_s until the next; before the first one: the first."""
+    """Return the angle at t_s, rad, for commands that each hold from their at_s until the next.
+
+    Before the first command the angle is that of the first one. servo: None for a mirror that follows immediately
+    """
     if servo is None:
         row = np.clip(np.searchsorted(at_s, t_s, side="right") - 1, 0, len(at_s) - 1)
         return np.asarray(command_rad[row], dtype=np.float64)
     out = np.zeros(len(t_s))
     omega = 2.0 * pi * servo.frequency
-    step_s = 1.0 / (omega * STEPS_PER_TIME_CONSTANT) * 2.0
+    step_s = 1.0 / (omega * STEPS_PER_TIME_CONSTANT)
     _integrate_servo(
         np.array(at_s) + servo.delay,
         np.array(command_rad),
@@ -54,7 +61,7 @@ def _integrate_servo(
     step_s: float,
     out: FloatArray,
 ) -> None:
-    """The servo's own target moves at the slew limit; velocity Verlet with damping, by the midpoint."""
+    """Write the angle at t_s to `out`, by a midpoint rule with a slew-limited internal target."""
     angle, speed, target = command_rad[0], 0.0, command_rad[0]
     now_s = min(at_s[0], t_s[0]) if len(t_s) else 0.0
     row = 0
@@ -62,21 +69,21 @@ def _integrate_servo(
         while now_s < t_s[index]:
             while row + 1 < len(at_s) and at_s[row + 1] <= now_s:
                 row += 1
-            wanted = command_rad[row] if at_s[row] <= now_s else command_rad[0]
-            resting = target == wanted and abs(speed) < 1e-9 and abs(angle - target) < 1e-12
+            requested = command_rad[row] if at_s[row] <= now_s else command_rad[0]
+            is_settled = target == requested and abs(speed) < 1e-9 and abs(angle - target) < 1e-12
             end_s = t_s[index]
             if row + 1 < len(at_s) and at_s[row + 1] < end_s:
                 end_s = at_s[row + 1]
             if row < len(at_s) and at_s[row] > now_s and at_s[row] < end_s:
                 end_s = at_s[row]
-            h_s = end_s - now_s if resting else min(step_s, end_s - now_s)
-            if not resting:
-                target += min(max(wanted - target, -slew * h_s), slew * h_s)
-                push = omega * omega * (target - angle) - 2.0 * damping * omega * speed
+            h_s = end_s - now_s if is_settled else min(step_s, end_s - now_s)
+            if not is_settled:
+                target += min(max(requested - target, -slew * h_s), slew * h_s)
+                acceleration = omega * omega * (target - angle) - 2.0 * damping * omega * speed
                 middle = angle + 0.5 * h_s * speed
-                faster = speed + 0.5 * h_s * push
-                push = omega * omega * (target - middle) - 2.0 * damping * omega * faster
-                angle += h_s * faster
-                speed += h_s * push
+                middle_speed = speed + 0.5 * h_s * acceleration
+                acceleration = omega * omega * (target - middle) - 2.0 * damping * omega * middle_speed
+                angle += h_s * middle_speed
+                speed += h_s * acceleration
             now_s += h_s
         out[index] = angle

@@ -70,7 +70,12 @@ def test_the_resolved_configuration_carries_what_others_rely_on():
         ("version = 4", "version = 3", "version", "scanner.codes_a_side is now half_range_codes"),
         ("damping = 0.7", "damping = 1.0", "scanner.damping", "less than or equal to 0.9"),
         ("damping = 0.7", "damping = 0.2", "scanner.damping", "greater than or equal to 0.3"),
-        ("focus_width_m = 1.0e-3", "focus_width_m = 1.8e-3", "inconsistent", "does not fit on display.absorber_width_m"),
+        (
+            "focus_width_m = 1.0e-3",
+            "focus_width_m = 1.8e-3",
+            "inconsistent",
+            "does not fit on display.absorber_width_m",
+        ),
         ("focus_height_m = 0.5e-3", "focus_height_m = 1.3e-3", "inconsistent", "laser.focus_height_m 0.0013"),
         ("aim_error_m = 1.0e-4", "aim_error_m = 5.0e-4", "inconsistent", "scanner.aim_error_m 0.0005"),
     ],

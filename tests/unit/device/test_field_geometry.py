@@ -5,7 +5,7 @@ from hidden_field import CONFIG, PRIOR
 from optodrive.device.field_geometry import (
     FieldGeometry,
     beam_position_m,
-    build_board_axes,
+    build_display_axes,
     compute_parameter_derivatives,
 )
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry, _rotation_matrix
@@ -37,7 +37,7 @@ def test_closed_forms_agree_with_rays_traced_by_other_code():
     axes = (
         _rotation_matrix(2, SAME.turn_rad) @ _rotation_matrix(0, SAME.tilt_x_rad) @ _rotation_matrix(1, SAME.tilt_y_rad)
     ).T
-    assert np.allclose(build_board_axes(SAME), axes, atol=1e-15)
+    assert np.allclose(build_display_axes(SAME), axes, atol=1e-15)
     table = {name: getattr(TRUTH, name) for name in TRUTH.__dataclass_fields__}
     traced = GroundTruthGeometry(**(table | {"display_axes": axes, "wave_m": np.zeros_like(TRUTH.wave_m)}))
     x_code, y_code = np.random.default_rng(0).uniform(2000, 63000, (2, 500))

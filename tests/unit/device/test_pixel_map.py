@@ -75,7 +75,7 @@ def test_a_changed_file_is_read_again(tmp_path):
     [
         (
             (b"rows = 4", b"rows = 5"),
-            "display.rows: got 5, expected 4, that of display-16: this is a map of display-16",
+            "display.rows: got 5, expected 4, the value of display-16: this is a map of display-16",
         ),
         ((b"missing = []", b"missing = [[0, 0]]"), "display.missing: got '1 places'"),
         ((b"pitch_m = 0.004", b"pitch_m = 0.0036"), "display.pitch_m: got 0.0036"),
@@ -83,7 +83,7 @@ def test_a_changed_file_is_read_again(tmp_path):
         ((b"version = 1", b"version = 2"), "version: got 2"),
         ((b"gain = 0.6", b"gain = -1.0"), "map.pixels.0.gain: got -1.0"),
         ((b"gain = 0.6", b"gane = 0.6"), "map.pixels.0.gane: got 'gane', expected no such key"),
-        ((b"index = 3,", b"index = 4,"), "one for each pixel, 0 to 15 in order"),
+        ((b"index = 3,", b"index = 4,"), "one entry per pixel, 0 to 15 in order"),
         ((b'parameters = "surroundings"', b'parameters = "other"'), "model.parameters: got 'other'"),
     ],
 )
@@ -107,7 +107,7 @@ def test_a_map_of_another_display_by_name(tmp_path):
 
 def test_nothing_alive_out_of_its_cell_and_no_file(tmp_path):
     path = tmp_path / "pixels.toml"
-    with pytest.raises(InputError, match="a pixel that lives"):
+    with pytest.raises(InputError, match="at least one live pixel"):
         load_pixel_map(write_and_use_map(path, replace(some_map(), state=np.full(COUNT, DEAD))))
     with pytest.raises(InputError, match=r"pixel 0: offset_y_m: got .* the pixel's own cell"):
         load_pixel_map(write_and_use_map(path, PixelMap.uniform(COUNT, 0.0, 1.1 * max_aim_offset_m(CONFIG)[1])))
