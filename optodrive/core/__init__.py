@@ -1,1 +1,1 @@
-"""Types, errors, units, clock, files and compiled kernels that every other package uses."""
+"""Types, errors, units, clock, files and compiled kernels, which every other package uses."""

@@ -1,7 +1,7 @@
-"""Host time, injected: the real monotonic clock, or one that tests and simulations move by hand.
+"""Host time, injected: the monotonic clock, or one that tests and simulations advance.
 
-Three time bases exist, and names tell them apart: `host_s` (monotonic, this module), `plan_s`
-(seconds from a plan's start) and `tick` (the board's counter).
+Names distinguish three time bases: `host_s` (monotonic, this module), `plan_s` (seconds from a plan's start) and `tick`
+(the board's counter).
 """
 
 import os
@@ -11,47 +11,47 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What the package asks of a clock."""
+    """Interface of a clock."""
 
     def now_s(self) -> float:
-        """Monotonic time, s."""
+        """Return the monotonic time, s."""
 
     def sleep(self, duration_s: float) -> None:
-        """Let `duration_s` seconds pass."""
+        """Wait for `duration_s`."""
 
 
 class MonotonicClock:
-    """The machine's monotonic clock."""
+    """The monotonic clock of the operating system."""
 
     def now_s(self) -> float:
-        """Monotonic time, s."""
+        """Return the monotonic time, s."""
         return time.monotonic()
 
     def sleep(self, duration_s: float) -> None:
-        """Block for `duration_s` seconds."""
+        """Block for `duration_s`."""
         time.sleep(duration_s)
 
 
 class ManualClock:
-    """A clock that moves only when told."""
+    """A clock that advances only through `sleep`."""
 
     def __init__(self, start_s: float = 0.0) -> None:
         self._now_s = start_s
 
     def now_s(self) -> float:
-        """Time as last set, s."""
+        """Return the current time of the clock, s."""
         return self._now_s
 
     def sleep(self, duration_s: float) -> None:
-        """Advance by `duration_s` seconds at once."""
+        """Advance by `duration_s` without waiting."""
         self._now_s += duration_s
 
 
 def request_realtime_scheduling() -> None:
-    """Ask that this thread need not wait for the processor behind others: whoever renews a lease must not be late.
+    """Request real-time scheduling for this thread, so that it renews the board's lease in time.
 
-    Threads that it starts later inherit it, so that none of them holds the interpreter while it waits itself. Where it
-    may not be asked for it stays as it is, and the lease bears less of other programs' work.
+    Threads that it starts later inherit the policy; otherwise a preempted thread could hold the interpreter lock.
+    Without the permission, scheduling stays as it is, and the lease tolerates less load by other programs.
     """
     with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))

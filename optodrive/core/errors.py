@@ -1,20 +1,20 @@
-"""Errors, by whose fault they are: the caller's input, the plan, the board, the link."""
+"""Errors by origin: the caller's input, the plan, the board, the link."""
 
 from collections.abc import Mapping
 from difflib import get_close_matches
 
 
 class OptodriveError(Exception):
-    """Base of all errors this package raises on purpose; `code` is stable and machine-readable."""
+    """Base of all errors that this package raises deliberately; `code` is stable and machine-readable."""
 
     code = "error"
     exit_status = 1
     problem: Mapping[str, object] | None = None
-    """The problem document, where a daemon answered with one."""
+    """Problem document of the daemon's answer, if there is one."""
 
 
 class InputError(OptodriveError):
-    """The caller's input is wrong: says where, which value, and what was expected, in one line."""
+    """Invalid input; the message states place, value and expectation in one line."""
 
     code = "bad_input"
     exit_status = 2
@@ -28,17 +28,18 @@ class InputError(OptodriveError):
 
 
 class RefusedError(OptodriveError):
-    """The input is well formed, but what it asks for is refused (limits, deadlines, reach)."""
+    """A well-formed request that is refused because of limits, deadlines or reach."""
 
     code = "refused"
     feasibility: Mapping[str, object] | None = None
-    """What was found of a sequence that does not fit, as `Admission.answer` gives it."""
+    """Feasibility report of a sequence that does not fit, as JSON."""
 
 
 class OverBudgetError(RefusedError):
-    """A pulse that a cap does not allow. cap: the limiter's word for it; margin_j: energy too much.
+    """A pulse that a cap does not allow.
 
-    earliest_s: how much later the whole would fit; infinite where it never does.
+    cap: the limiter's name of the cap; margin_j: excess energy of the pulse; earliest_s: delay after which the whole
+    request fits, infinite if it never does
     """
 
     code = "over_budget"
@@ -52,44 +53,44 @@ class OverBudgetError(RefusedError):
 
 
 class NotReadyError(OptodriveError):
-    """The board is not in a state in which this may be done (not armed, busy, faulted)."""
+    """The board's state does not allow the operation (not armed, busy, faulted)."""
 
     code = "not_ready"
 
 
 class LinkError(OptodriveError):
-    """The link to the board failed or was lost; the message carries the likely cause."""
+    """The link to the board failed; the message states the likely cause."""
 
     code = "link"
 
 
 class BoardFaultError(OptodriveError):
-    """The board is in FAULT; the message carries the fault's name and likely cause."""
+    """The board is in FAULT; the message states the fault and its likely cause."""
 
     code = "board_fault"
 
 
 class ProtocolError(OptodriveError):
-    """Bytes or messages that the protocol does not allow."""
+    """Bytes or messages that violate the protocol."""
 
     code = "protocol"
 
 
 class LocalProtocolError(ProtocolError):
-    """This side tried to send what the protocol does not allow now: a bug here."""
+    """This side was about to send a message that the protocol does not allow now, which is a bug."""
 
 
 class RemoteProtocolError(ProtocolError):
-    """The other side sent what the protocol does not allow."""
+    """The other side violated the protocol."""
 
 
 def abbreviate(value: object, limit: int = 60) -> str:
-    """`repr` of a value, cut to `limit` characters, so that one line stays one line."""
+    """Return `repr` of a value, cut to `limit` characters."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 def suggest_nearest(name: str, known: list[str]) -> str:
-    """A phrase that names the known word nearest to `name`, or all of them when none is near."""
+    """Return a phrase with the known name nearest to `name`, or with all known names if none is near."""
     match = get_close_matches(name, known, n=1, cutoff=0.5)
     return f"nearest is '{match[0]}'" if match else "one of " + ", ".join(known)

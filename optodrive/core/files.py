@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and TOML read with one line for what is wrong in it."""
+"""Atomic writing of files, and reading of TOML with one-line errors."""
 
 import os
 import tempfile
@@ -13,9 +13,9 @@ from optodrive.core.errors import InputError
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:
-    """Give a temporary file beside `path` that takes its place when the block ends well, and is gone when it does not.
+    """Yield a temporary file beside `path` that replaces it if the block succeeds and is removed if it fails.
 
-    InputError, naming the path, where it cannot be written.
+    Raises InputError with the path if it cannot be written.
     """
     temporary: Path | None = None
     try:
@@ -33,7 +33,7 @@ def atomic_write(path: Path) -> Iterator[Path]:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """A TOML file as a table; raises InputError where it cannot be read or parsed."""
+    """Return a TOML file as a table. Raise InputError if it cannot be read or parsed."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:

@@ -1,11 +1,11 @@
-"""Counts of values by size, as monitoring wants them."""
+"""Histogram with cumulative counts, as Prometheus defines it."""
 
 from bisect import bisect_left
 from itertools import accumulate
 
 
 class Histogram:
-    """How many values were at most each bound; one thread adds, any may read."""
+    """Counts of values up to each bound; one thread may add, any thread may read."""
 
     def __init__(self, bounds: tuple[float, ...]) -> None:
         self.bounds = bounds
@@ -18,5 +18,5 @@ class Histogram:
         self.sum += value
 
     def cumulative_counts(self) -> list[int]:
-        """Values at most each bound, and all of them at the end."""
+        """Return the number of values up to each bound, followed by the number of all values."""
         return list(accumulate(self._counts))

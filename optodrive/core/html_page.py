@@ -12,7 +12,7 @@ th { border-bottom: 1px solid #999; } td.n { text-align: right; font-variant-num
 .grid { display: grid; grid-template-columns: repeat(auto-fill, minmax(19rem, 1fr)); gap: 1rem; }
 figure { margin: 0; } figcaption { font-size: .85rem; color: #444; }
 svg { width: 100%; height: auto; background: #fafafa; border: 1px solid #ddd; }
-.nominal { stroke: #c2571a; fill: none; } .extended { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
+.nominal { stroke: #c2571a; fill: none; } .extended, .residual { stroke: #1a6fc2; fill: none; } .bar { fill: #1a6fc2; }
 .other { fill: #b5b5b5; } text { font: 11px system-ui, sans-serif; fill: #333; }
 """
 

@@ -1,4 +1,4 @@
-"""Conversions at the edges; inside, everything is SI and says its unit in its name."""
+"""Unit conversions for interfaces; internally all quantities are SI, with the unit as suffix of the name."""
 
 from typing import TypeVar
 
@@ -11,10 +11,10 @@ ZERO_CELSIUS_K = 273.15
 
 
 def um_to_m(value_um: Number) -> Number:
-    """Micrometres to metres, a number or an array."""
+    """Convert micrometres to metres, a number or an array."""
     return value_um * 1e-6
 
 
 def m_to_um(value_m: Number) -> Number:
-    """Metres to micrometres, a number or an array."""
+    """Convert metres to micrometres, a number or an array."""
     return value_m * 1e6

@@ -1,1 +1,1 @@
-"""The types that flow between packages: stimuli, plans, measurements, discrepancies."""
+"""Types that packages exchange: stimuli, plans, measurements, discrepancies."""

@@ -1,4 +1,4 @@
-"""Array aliases and read-only arrays for the shared types."""
+"""Aliases of array types, and read-only arrays for the shared types."""
 
 from dataclasses import fields
 from typing import Any

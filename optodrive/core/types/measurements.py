@@ -1,4 +1,4 @@
-"""Pixel traces and recordings of measured signals."""
+"""Pixel traces, and recordings of measured signals."""
 
 from dataclasses import dataclass, field
 

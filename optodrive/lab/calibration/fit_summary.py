@@ -56,7 +56,7 @@ def draw_residuals(fit: FieldFit) -> str:
     longest_m = max(1e-9, float(np.hypot(*fit.residual_m[is_inlier].T).max())) if is_inlier.any() else 1.0
     dx, dy = (fit.residual_m * (ARROW_FRACTION_MAX * PICTURE_SIDE / longest_m)).T
     arrows = [
-        f"<line x1='{a:.1f}' y1='{b:.1f}' x2='{a + da:.1f}' y2='{b - db:.1f}' class='after'/>"
+        f"<line x1='{a:.1f}' y1='{b:.1f}' x2='{a + da:.1f}' y2='{b - db:.1f}' class='residual'/>"
         f"<circle cx='{a:.1f}' cy='{b:.1f}' r='1.5' class='bar'/>"
         for a, b, da, db, true in zip(x, y, dx, dy, is_inlier, strict=True)
         if true
