@@ -53,8 +53,8 @@ def _build_typed_error(problem: Problem) -> OptodriveError:
             return InputError(problem.where, _PreformattedRepr(str(problem.value)), problem.expected)
         return InputError("request", problem.status, detail)
     if problem.pixel is not None and problem.cap is not None and problem.margin_j is not None:
-        earliest_s = inf if problem.fits_after_s is None else problem.fits_after_s
-        return OverBudgetError(detail, problem.pixel, problem.cap, problem.margin_j, earliest_s)
+        fits_after_s = inf if problem.fits_after_s is None else problem.fits_after_s
+        return OverBudgetError(detail, problem.pixel, problem.cap, problem.margin_j, fits_after_s)
     return ERROR_BY_CODE.get(problem.code, RefusedError)(detail)
 
 

@@ -38,17 +38,17 @@ class RefusedError(OptodriveError):
 class OverBudgetError(RefusedError):
     """A pulse that a cap does not allow.
 
-    cap: the limiter's name of the cap; margin_j: excess energy of the pulse; earliest_s: delay after which the whole
+    cap: the limiter's name of the cap; margin_j: excess energy of the pulse; fits_after_s: delay after which the whole
     request fits, infinite if it never does
     """
 
     code = "over_budget"
 
-    def __init__(self, message: str, pixel: int, cap: str, margin_j: float, earliest_s: float) -> None:
+    def __init__(self, message: str, pixel: int, cap: str, margin_j: float, fits_after_s: float) -> None:
         self.pixel = pixel
         self.cap = cap
         self.margin_j = margin_j
-        self.earliest_s = earliest_s
+        self.fits_after_s = fits_after_s
         super().__init__(message)
 
 

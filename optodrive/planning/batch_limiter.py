@@ -50,10 +50,10 @@ class BatchLimiter:
         try:
             granted, state = limit(batch, self.state, self._budget, self._policy)
         except OverBudgetError as error:
-            if self._policy != "delay" or error.earliest_s == inf:
+            if self._policy != "delay" or error.fits_after_s == inf:
                 raise
-            self.delays.append(Delay(int(batch.source[0]), error.pixel, error.cap, error.earliest_s))
-            self._scheduler.delay(ceil(error.earliest_s * 1e6))
+            self.delays.append(Delay(int(batch.source[0]), error.pixel, error.cap, error.fits_after_s))
+            self._scheduler.delay(ceil(error.fits_after_s * 1e6))
             return None
         if self._first_trimmed is None and granted.trimmed_j.any():
             self._first_trimmed = batch, granted, self.state

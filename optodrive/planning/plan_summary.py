@@ -28,7 +28,7 @@ DEAD_LISTED_MAX = 20
 TRIMMED_LISTED_MAX = 20
 PULSES_LISTED_MAX = 20_000
 """The largest number of pulses that a response lists one by one."""
-SKIP_REASON = "the heat left in the pixel reaches the target by itself"
+SKIP_REASON = "the residual heat of the pixel reaches the target without a pulse"
 
 
 def summarize_plan(planned: PlannedSequence, feasibility: FeasibilityReport | None = None) -> PlanSummary:

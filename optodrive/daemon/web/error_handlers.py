@@ -41,7 +41,7 @@ def build_error_problem(error: OptodriveError) -> Problem:
     if isinstance(error, InputError):
         extensions = {"where": error.where, "value": abbreviate(error.value), "expected": error.expected}
     if isinstance(error, OverBudgetError):
-        fits_after_s = error.earliest_s if error.earliest_s < inf else None
+        fits_after_s = error.fits_after_s if error.fits_after_s < inf else None
         extensions = {"pixel": error.pixel, "cap": error.cap, "margin_j": error.margin_j, "fits_after_s": fits_after_s}
     if isinstance(error, RefusedError) and error.feasibility is not None:
         extensions["feasibility"] = error.feasibility

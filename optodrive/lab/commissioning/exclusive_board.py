@@ -219,9 +219,9 @@ class ExclusiveBoard:
             try:
                 limited, after = limit(plan, before, self._display.budget, "refuse")
             except OverBudgetError as error:
-                if error.earliest_s == inf:
+                if error.fits_after_s == inf:
                     raise
-                self.wait(error.earliest_s)
+                self.wait(error.fits_after_s)
                 continue
             return limited, before, after, start_s
 

@@ -262,10 +262,10 @@ def _build_refusal(
     )
     fits = f"the whole fits {delay_s:.3f} s later" if delay_s < inf else "the whole does not fit at any later time"
     return OverBudgetError(
-        f"pulse {row} on pixel {pixel} at {start_s:.4f} s asks for {requested_j * 1e3:.2f} mJ, "
+        f"pulse {row} on pixel {pixel} at {start_s:.4f} s requests {requested_j * 1e3:.2f} mJ, "
         f"the {CAPS_BY_KEY[cap].message} allows {allowed_j * 1e3:.2f} mJ; {fits}",
         pixel=pixel,
         cap=cap,
         margin_j=float(requested_j - allowed_j),
-        earliest_s=delay_s,
+        fits_after_s=delay_s,
     )

@@ -165,8 +165,8 @@ def _find_min_periods(train: HeightTrain, cold_heat: ThermalState, drive: DriveR
         raise InputError(
             f"{where}.target_um",
             round(m_to_um(train.target_m), 3),
-            f"at most {m_to_um(max_m):.0f} µm, what pulses of {high * drive.period_s * 1e3:.4g} ms at "
-            f"{drive.max_power_w:g} W every {train.period_s * 1e3:.4g} ms come to",
+            f"at most {m_to_um(max_m):.0f} µm, the height of pulses of {high * drive.period_s * 1e3:.4g} ms at "
+            f"{drive.max_power_w:g} W every {train.period_s * 1e3:.4g} ms",
             code="target_unreachable",
         )
     while high - low > 1:
@@ -198,8 +198,8 @@ def _find_peak_to_peak_shape(
             raise InputError(
                 f"{where}.peak_to_peak_um",
                 round(m_to_um(target_m), 3),
-                f"{word} {m_to_um(bound_m):.4g} µm, what the {kind} pulses to {m_to_um(train.target_m):.4g} µm "
-                f"every {train.period_s * 1e3:.4g} ms come to",
+                f"{word} {m_to_um(bound_m):.4g} µm, the value of the {kind} pulses to {m_to_um(train.target_m):.4g} µm "
+                f"every {train.period_s * 1e3:.4g} ms",
                 code="bad_train",
             )
     while high - low > 1:

@@ -165,7 +165,7 @@ class TrainPulses:
         room_us = min(median_free_us, self._compute_max_width_us(train))
         if min(min_free_us, room_us) < self._drive.period_s * 1e6:
             expected = (
-                f"room for a PWM period of {self._drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of "
+                f"time for a PWM period of {self._drive.period_s * 1e3:g} ms from a pulse's start to the next pulse of "
                 f"any train, with a move of the mirrors or a gap of {self._gap_us * 1e-3:g} ms"
             )
             raise InputError(f"{where}.period_s", train.period_s, expected, code="overlapping_trains")

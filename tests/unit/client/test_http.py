@@ -48,7 +48,7 @@ def test_an_error_of_the_daemon_arrives_at_the_caller_unchanged(error):
     assert str(found) == str(error)
     assert found.code == error.code
     assert found.problem == problem.to_dict()
-    for name in ("where", "expected", "pixel", "cap", "margin_j", "earliest_s"):
+    for name in ("where", "expected", "pixel", "cap", "margin_j", "fits_after_s"):
         assert getattr(found, name, None) == getattr(error, name, None)
 
 

@@ -150,7 +150,7 @@ def test_refuse_reports_the_delay_after_which_the_plan_fits():
 def test_a_plan_that_no_delay_makes_feasible_reports_an_infinite_delay():
     with pytest.raises(OverBudgetError, match="does not fit at any later time") as caught:
         run(build_budget(absorber_k=100.0), (0, 0.0, 0.05, 2.45), policy="refuse")
-    assert caught.value.earliest_s == inf
+    assert caught.value.fits_after_s == inf
 
 
 def test_nothing_is_trimmed_within_the_caps():
