@@ -1,4 +1,4 @@
-"""A recording of many pixels by the small lab: each pixel has runs of its own and may have hidden terms."""
+"""A recording of many pixels by the small lab, with runs and optional hidden terms per pixel."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Each cap of the limiter: how close a hostile sequence comes, and mutants that exceed it."""
+"""Utilisation of each cap by hostile sequences, and mutants of the limiter that exceed it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Random frames on every display: prediction, target and cap against an independent integrator."""
+"""Prediction, target and cap of random plans on every display against an independent integrator."""
 
 import numpy as np
 import pytest

@@ -1,1 +1,1 @@
-"""Calibration: measured spots to a scan field with its uncertainty, measured heights to a pixel map."""
+"""Calibration of the scan field from measured spots and of the pixel map from measured heights."""

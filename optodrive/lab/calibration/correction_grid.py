@@ -1,4 +1,4 @@
-"""grid.cor: a field as the 65 × 65 corrections that galvo boards use, variant LMC1COR_1.0.
+"""Correction grids (grid.cor) of 65 × 65 nodes as galvo boards use them, variant LMC1COR_1.0.
 
 The format according to public readers: 22 bytes with the name in UTF-16 little-endian; 2 bytes; 63 doubles, the 44th of
 them codes per millimetre; then 65 × 65 pairs of doubles, dx and dy in codes. Here rows go by y and columns by x, both

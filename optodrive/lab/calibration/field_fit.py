@@ -1,4 +1,4 @@
-"""Fit of a field to spots: maximum a posteriori geometry and surface, outliers, and uncertainty.
+"""Maximum a posteriori fit of a field to spots, with outlier rejection and uncertainty.
 
 Every parameter is in units of its prior's sigma: the prior of z is the standard normal distribution.
 """

@@ -1,4 +1,4 @@
-"""Prior of a field: nominal parameters and their mechanical tolerances."""
+"""Prior of a field from its nominal parameters and their mechanical tolerances."""
 
 from dataclasses import dataclass
 from typing import Self

@@ -1,4 +1,4 @@
-"""Summary of a field fit: numbers, and two figures as SVG."""
+"""Summary of a field fit in numbers and in two SVG figures."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""Optimal design: the next spot to measure."""
+"""Optimal design of the next spot to measure."""
 
 import numpy as np
 

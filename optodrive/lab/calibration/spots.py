@@ -1,4 +1,4 @@
-"""Measured spots: codes of the beam and its positions on the display."""
+"""Measured spots with the codes of the beam and its positions on the display."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,1 +1,1 @@
-"""Feasibility of a sequence on one beam: report, nearest feasible variants and best-effort plans."""
+"""Feasibility of a sequence on one beam, with its report, the nearest feasible variants and best-effort plans."""

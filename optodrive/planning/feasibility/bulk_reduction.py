@@ -1,4 +1,4 @@
-"""Reduction of a long sequence in bulk: drop the excess pixels of every late frame, then restore those that fit."""
+"""Reduction of a long sequence in bulk, pass by pass over all late frames."""
 
 from collections.abc import Callable
 

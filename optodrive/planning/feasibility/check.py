@@ -1,4 +1,4 @@
-"""Feasibility check: whether a sequence fits before it is shown, and the plan of a variant that fits.
+"""Feasibility check of a sequence, and the plan of a variant that fits.
 
 A feasible sequence costs one plan.
 """

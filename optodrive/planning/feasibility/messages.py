@@ -1,4 +1,4 @@
-"""One-line messages of the feasibility report: the first violation and the nearest feasible variants."""
+"""One-line messages about the first violation and the nearest feasible variants."""
 
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.core.units import m_to_um

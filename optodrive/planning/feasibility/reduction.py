@@ -1,4 +1,4 @@
-"""Omission of pixels and trains by priority: sources of high priority stay, and of a reduced frame most pixels."""
+"""Omission of pixels and trains by priority."""
 
 from collections.abc import Iterator, Sequence
 from itertools import combinations

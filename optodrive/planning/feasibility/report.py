@@ -1,4 +1,4 @@
-"""Feasibility report: whether a sequence fits, its first violation and the nearest feasible variants."""
+"""Feasibility report with the first violation and the nearest feasible variants."""
 
 from dataclasses import asdict, dataclass
 from typing import Any, Literal

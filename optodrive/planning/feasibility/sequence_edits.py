@@ -1,4 +1,4 @@
-"""Variants of a sequence: scaled heights, stretched times, omitted pixels."""
+"""Variants of a sequence with scaled heights, stretched times or omitted pixels."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import replace

@@ -1,1 +1,1 @@
-"""Sources of tactile content: sequence files, images, text, shapes and the paper's six experiments."""
+"""Sources of tactile content such as sequence files, images, text, shapes and the paper's six experiments."""

@@ -1,4 +1,4 @@
-"""Text to uncontracted braille cells: Unified English Braille, grade 1.
+"""Encoder of text in uncontracted braille cells (Unified English Braille, grade 1).
 
 A cell is the set of its raised dots. Dots 1, 2, 3 run down the left column, 4, 5, 6 down the right one.
 """

@@ -1,4 +1,4 @@
-"""Parse tactile frames from JSON: start times in order, a height in µm for some pixels or for all."""
+"""Parser of tactile frames in JSON, in order of time and with heights in µm."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Build frames from images and animations: brightness becomes height, averaged over the area of each lattice place."""
+"""Frames from images and animations, with brightness averaged over each lattice place as height."""
 
 import struct
 import warnings

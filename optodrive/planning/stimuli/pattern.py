@@ -1,4 +1,4 @@
-"""Definition of a pattern: name, parameters with kinds and bounds, and the function that builds its sequence."""
+"""Definition of a pattern with its parameters and the function that builds its sequence."""
 
 from base64 import b64decode
 from collections.abc import Callable, Mapping

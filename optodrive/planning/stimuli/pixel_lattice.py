@@ -1,4 +1,4 @@
-"""Lattice of a display: place (row, column from the bottom left) to pixel index."""
+"""Lattice of a display, which maps a place (row, column from the bottom left) to a pixel index."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass

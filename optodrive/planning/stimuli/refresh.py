@@ -1,4 +1,4 @@
-"""Beam time of a picture, and frames that refresh it: a membrane stays raised only while pulses repeat."""
+"""Beam time of a picture, and frames that refresh it while it is held."""
 
 from math import ceil
 

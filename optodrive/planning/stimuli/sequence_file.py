@@ -1,4 +1,4 @@
-"""Read, validate and write sequences: FRAMES.json, which is also the body of a plan request."""
+"""Reader, validator and writer of FRAMES.json, which is also the body of a plan request."""
 
 from pathlib import Path
 

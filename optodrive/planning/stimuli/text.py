@@ -1,4 +1,4 @@
-"""Braille on the lattice: cells of 2 × 3 pixels, lines wrapped at words, one page after the other."""
+"""Braille text on the lattice, wrapped at words and split into pages."""
 
 from dataclasses import dataclass
 from itertools import groupby

@@ -1,1 +1,1 @@
-"""Spots by camera: pictures of a grid in the display's plane, and of the beam on that plane, to positions in metres."""
+"""Measurement of the beam's spots by camera, from pictures of a grid and of the beam in the display's plane."""

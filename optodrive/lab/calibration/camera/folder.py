@@ -1,4 +1,4 @@
-"""pictures.toml: description of the pictures in a folder, and the codes of the beam in each."""
+"""Reader of pictures.toml, which describes the pictures of a folder and the codes of the beam in each."""
 
 import csv
 import re

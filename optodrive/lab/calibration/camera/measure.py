@@ -1,4 +1,4 @@
-"""Measure a folder of pictures: spots in metres, their uncertainty and quality flags."""
+"""Measurement of a folder of pictures, with the uncertainty and quality flags of its spots."""
 
 from dataclasses import dataclass
 from pathlib import Path

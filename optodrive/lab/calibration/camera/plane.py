@@ -1,4 +1,4 @@
-"""Map from image positions to the display: a plane in perspective, seen through a lens with distortion.
+"""Map from image positions to the display, a plane in perspective seen through a lens with distortion.
 
 One view of the grid determines a rational radial distortion about a centre, followed by a homography. Several views
 first calibrate the camera with OpenCV; the residual distortion of the first view is fitted in the same way.

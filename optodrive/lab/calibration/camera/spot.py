@@ -1,4 +1,4 @@
-"""Detection of the beam's spot in a picture: selection of its blob, subpixel centre and uncertainty."""
+"""Detection of the beam's spot in a picture, with its subpixel centre and uncertainty."""
 
 from typing import Any, NamedTuple
 

@@ -1,4 +1,4 @@
-"""Response of a run: ratio of a pixel's measured heights to the model's prediction for its pulses."""
+"""Response of a run, the ratio of a pixel's measured heights to the model's prediction for its pulses."""
 
 from collections.abc import Callable
 from typing import NamedTuple

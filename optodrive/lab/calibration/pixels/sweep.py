@@ -1,4 +1,4 @@
-"""Pulses that determine every pixel's gain and offset: one pulse per pixel at each of a few aims.
+"""Pulses that determine every pixel's gain and offset, one per pixel at each of a few aims.
 
 Across an edge, part of the focus misses the absorber and falls on the wall, which the limiter does not model. Those
 pulses are weak enough to keep even black acrylic below the wall's cap.

@@ -1,4 +1,4 @@
-"""Checks of spots: valid spots pass, and the cause of invalid ones is named."""
+"""Checks of valid and invalid spots."""
 
 import numpy as np
 import pytest

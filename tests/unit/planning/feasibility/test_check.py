@@ -1,4 +1,4 @@
-"""Feasibility check: the violation, the proof, the nearest feasible variants, and the content of refusals."""
+"""Feasibility check with its violations, proofs, nearest feasible variants and refusals."""
 
 import json
 from dataclasses import replace

@@ -1,4 +1,4 @@
-"""The paper's six experiments: times, places and powers of their pulses."""
+"""Times, places and powers of the pulses in the paper's six experiments."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Images and animations as frames: fit, brightness, durations, and refusal of invalid files."""
+"""Fit, brightness, durations and refusal of images and animations."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""Pattern registry: defaults, argument conversion, refusals, and agreement with the documentation."""
+"""Defaults, argument conversion, refusals and documentation of the patterns."""
 
 import json
 from base64 import b64encode

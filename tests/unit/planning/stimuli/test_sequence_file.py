@@ -1,4 +1,4 @@
-"""Sequence files: parsing, bounds, refusals and round trips."""
+"""Parsing, bounds, refusals and round trips of sequence files."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Streamed frames: both encodings, refusals, and the order of refresh."""
+"""Encodings, refusals and refresh order of streamed frames."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""Text in braille: wrapping, pages and placement on the lattice."""
+"""Wrapping, pages and placement of braille text."""
 
 from itertools import pairwise
 

@@ -1,4 +1,4 @@
-"""Pulse trains and height trains from JSON: validation, overlaps and limits."""
+"""Validation, overlaps and limits of pulse trains and height trains from JSON."""
 
 import time
 from dataclasses import replace

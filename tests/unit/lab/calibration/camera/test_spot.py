@@ -1,4 +1,4 @@
-"""Detection of one spot in a picture: accuracy and refusals. Tuned with seeds from 1000."""
+"""Detection of one spot in a picture, tuned with seeds from 1000."""
 
 import numpy as np
 import pytest
