@@ -188,8 +188,8 @@ class NominalThermalState:
         """
         absorber_k, gas_k = np.zeros((len(t_s), len(pixels))), np.zeros((len(t_s), len(pixels)))
         for column, index in enumerate(pixels):
-            own = pulses[pulses[:, 3] == index, :3]
-            absorber_k[:, column], gas_k[:, column] = self.simulate_rises_k(index, own, t_s)
+            pixel_pulses = pulses[pulses[:, 3] == index, :3]
+            absorber_k[:, column], gas_k[:, column] = self.simulate_rises_k(index, pixel_pulses, t_s)
         each = [self.pixels.elements[index] for index in pixels]
         return PixelTrace(
             t_s=t_s,

@@ -25,7 +25,7 @@ the followers of each term come after them.
 
 POWER_W, FULL_W, SINCE_EDGE_S, DOSE, ILLUMINATED_PIXEL, AMBIENT_K, BRIDGE_FLOW_W, FAR_END_K = range(8)
 TIME_S, SESSION_TIME, IS_TARGET, MEMBRANE_DRIVE_K = range(8, 12)
-"""Entries of the context vector that kernels receive beside the states.
+"""Entries of the context vector that kernels receive besides the states.
 
 Commanded power and full power; time since the last gate edge; dose so far over the recording's largest; index of the
 illuminated pixel; ambient temperature; heat flow through the bridge and temperature rise of its far end; time in the
@@ -136,7 +136,7 @@ class Term:
         return self.kernels.membrane_drive is not None or self.kernels.displacement is not None
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
-        """Return an upper bound on the heat that the term adds, or None if there is none and the limiter refuses it."""
+        """Return an upper bound on the heat that the term adds; None without a bound, and the limiter refuses it."""
         return NO_HEAT_GAIN if self.cannot_add_heat else None
 
     def affected_pixel(self, values: TermValues) -> int | None:

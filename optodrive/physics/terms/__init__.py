@@ -40,4 +40,4 @@ def check_requirements(where: str, keys: Collection[str]) -> None:
     for key in keys:
         for required in discover_terms()[key].requires:
             if required not in keys:
-                raise InputError(f"{where}.{key}", f"without {required}", f"terms.{required} beside it")
+                raise InputError(f"{where}.{key}", f"without {required}", f"terms.{required} as well")

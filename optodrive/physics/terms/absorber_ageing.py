@@ -16,12 +16,12 @@ class AbsorberAgeing(Term):
     """P (1 − share · dose), with the dose relative to the recording's largest."""
 
     key = "absorber_ageing"
-    label = "the absorber absorbs less with the light it has had"
+    label = "the absorber ages and absorbs less"
     parameters = (TermParameter("share", "1", 0.05, -0.3, 0.3, "lost over the recording's whole dose, 1 to 20 %"),)
     kernels = Kernels(optical_power=optical_power)
     varies_between_runs = True
     is_linear = True
-    signature = "the same pulse early and late"
+    signature = "the same pulse early and late in the session"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound | None:
         """Return no gain for an absorber that loses absorption, and no bound for one that gains it."""

@@ -1,4 +1,4 @@
-"""Ambient drift: the room's temperature changes while the stated one does not."""
+"""Ambient drift: the ambient temperature differs from the stated one and changes."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
@@ -20,9 +20,9 @@ class AmbientDrift(Term):
     """offset + ramp · u + bend · (3u² − 1)/2 + rate · t, with u the session time from −1 to 1 and t the run's time."""
 
     key = "ambient_drift"
-    label = "the room's temperature is not what was stated"
+    label = "the ambient temperature differs from the stated one"
     parameters = (
-        TermParameter("offset", "K", 0.5, -10.0, 10.0, "the room against what is stated, within 5 K"),
+        TermParameter("offset", "K", 0.5, -10.0, 10.0, "ambient against stated temperature, within 5 K"),
         TermParameter("ramp", "K", 0.5, -10.0, 10.0, "over the recording, within 5 K"),
         TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording"),
         TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run"),
@@ -32,7 +32,7 @@ class AmbientDrift(Term):
     signature = "baselines before the pulse"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return the largest rise of the room above the stated temperature as a rise of everything."""
+        """Return the largest excess of the ambient over the stated temperature as a rise of everything."""
         return HeatGainBound(uniform_rise_k=abs(values["offset"]) + abs(values["ramp"]) + abs(values["bend"]))
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:

@@ -47,7 +47,7 @@ class BeamMisalignment(Term):
     )
     followers = ("missed_k",)
     kernels = Kernels(optical_power=optical_power, rates=rates, wall_rise=wall_rise)
-    signature = "several pixels beside each other"
+    signature = "a comparison of several pixels"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """Return the wall's steady rise under continuous full power as a rise of everything."""

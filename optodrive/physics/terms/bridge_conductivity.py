@@ -17,11 +17,11 @@ class BridgeConductivity(Term):
     """R = R₀ (T / T₀)ⁿ with T the mean of absorber and wall and T₀ ambient; n = 1 is k ~ 1/T (Text S2)."""
 
     key = "bridge_conductivity"
-    label = "the bridges conduct worse when hot"
+    label = "the bridges conduct less heat when hot"
     parameters = (TermParameter("exponent", "1", 0.5, 0.0, 1.3, "k_xy = 3.6e5 / T is 1 (Text S2)"),)
     kernels = Kernels(bridge_resistance=bridge_resistance)
     varies_between_runs = True
-    signature = "a ladder of powers held to the plateau"
+    signature = "plateaus at several powers"
 
 
 TERM = BridgeConductivity()

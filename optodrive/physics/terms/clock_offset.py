@@ -12,7 +12,7 @@ class ClockOffset(Term):
     key = "clock_offset"
     label = "an instrument's clock is offset"
     parameters = (
-        TermParameter("temperature", "s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms either way"),
+        TermParameter("temperature", "s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms in either direction"),
         TermParameter("displacement", "s", 1e-4, -5e-3, 5e-3, "as above"),
         TermParameter("force", "s", 1e-4, -5e-3, 5e-3, "as above"),
         TermParameter("mirrors", "s", 1e-4, -5e-3, 5e-3, "as above"),

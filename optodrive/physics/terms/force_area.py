@@ -21,7 +21,7 @@ class ForceArea(Term):
     label = "the blocked force acts on less than the whole aperture"
     parameters = (
         TermParameter("area", "m^2", 1e-6, 0.1e-6, 7.1e-6, "at most the aperture's 7.07 mm2"),
-        TermParameter("share", "1", 0.33, 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
+        TermParameter("share", "1", 0.33, 0.1, 0.5, "at most half, because heat is conducted both ways (Text S1)"),
     )
     kernels = Kernels(force=force)
     cannot_add_heat = True

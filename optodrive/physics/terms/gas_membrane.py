@@ -61,7 +61,7 @@ class GasMembrane(Term):
     key = "gas_membrane"
     label = "the gas expands under a membrane that stiffens"
     parameters = (
-        TermParameter("share", "1", 0.33, 0.1, 0.5, "half at most, conduction both ways (Text S1)"),
+        TermParameter("share", "1", 0.33, 0.1, 0.5, "at most half, because heat is conducted both ways (Text S1)"),
         TermParameter("volume", "m^3", 7.8e-9, 6.0e-9, 9.0e-9, "7.1 to 7.8 uL (Text S3, Display fabrication)"),
     )
     kernels = Kernels(displacement=displacement)

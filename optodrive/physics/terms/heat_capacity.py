@@ -24,11 +24,11 @@ class HeatCapacity(Term):
             2e-3,
             0.0,
             4e-3,
-            "c_p of graphite, 300 to 450 K: 3.9e-3; less where other matter shares the heat",
+            "c_p of graphite, 300 to 450 K: 3.9e-3; lower if other material shares the heat",
         ),
     )
     kernels = Kernels(heat_capacity=heat_capacity)
-    signature = "initial slopes at several powers, plateaus unchanged"
+    signature = "initial slopes at several powers, with unchanged plateaus"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """Return the capacity of the hottest absorber over C₀; the capacity is never below C₀."""

@@ -34,7 +34,7 @@ class LaserDroop(Term):
     followers = ("chip_1", "mount_1")
     kernels = Kernels(rates=rates, optical_power=optical_power)
     cannot_add_heat = True
-    signature = "long pulses and trains, nothing in cooling"
+    signature = "long pulses and trains, but not in cooling"
 
 
 TERM = LaserDroop()

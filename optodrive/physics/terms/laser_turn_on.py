@@ -33,7 +33,7 @@ class LaserTurnOn(Term):
     kernels = Kernels(optical_power=optical_power)
     is_fast = True
     cannot_add_heat = True
-    signature = "short pulses, the first 2 ms"
+    signature = "the first 2 ms of short pulses"
 
 
 TERM = LaserTurnOn()

@@ -1,4 +1,4 @@
-"""Lateral conduction: walls exchange heat with the walls beside them, and the frame cools the rim."""
+"""Lateral conduction: neighbouring walls exchange heat, and the frame cools the rim."""
 
 from optodrive.physics.hypothesis import TermParameter
 from optodrive.physics.term import Term
@@ -11,7 +11,7 @@ class LateralConduction(Term):
     """
 
     key = "lateral_conduction"
-    label = "walls exchange heat with the walls beside them"
+    label = "neighbouring walls exchange heat"
     requires = ("wall_heating",)
     parameters = (
         TermParameter("resistance", "K/W", 430.0, 40.0, 10_000.0, "neighbours rise by 0.002 to 0.1 of a wall's rise"),

@@ -44,7 +44,7 @@ class MembraneCreep(Term):
     followers = ("crept_soon_k", "crept_k", "crept_late_k")
     kernels = Kernels(rates=rates, membrane_drive=membrane_drive)
     cannot_add_heat = True
-    signature = "displacement lags and tails, temperature clean"
+    signature = "lags and tails of the displacement, but not in temperature"
 
 
 TERM = MembraneCreep()

@@ -19,11 +19,13 @@ class MembraneStiffening(Term):
     label = "the membrane stiffens as it rises"
     parameters = (
         TermParameter("curvature", "1/K", 2e-3, 1e-5, 5e-2, "from a plate to a stretched membrane within the stroke"),
-        TermParameter("order", "1", 1.5, 0.7, 4.0, "2 for a cubic balance where it is weak", (1.0, 2.0), is_shape=True),
+        TermParameter(
+            "order", "1", 1.5, 0.7, 4.0, "2 for a cubic balance at small displacement", (1.0, 2.0), is_shape=True
+        ),
     )
     kernels = Kernels(membrane_drive=membrane_drive)
     cannot_add_heat = True
-    signature = "peaks against power, force stays linear"
+    signature = "displacement peaks against power, with linear force"
 
 
 TERM = MembraneStiffening()

@@ -9,7 +9,7 @@ class MirrorLag(Term):
     """The servo of `optodrive.device.servo`: delay, slew limit and a second-order response."""
 
     key = "mirror_lag"
-    label = "the mirrors follow late"
+    label = "the mirrors lag behind their commands"
     parameters = (
         TermParameter(
             "frequency",

@@ -1,4 +1,4 @@
-"""Neighbour crosstalk: the wall warms with the absorbers beside it."""
+"""Neighbour crosstalk: the wall warms with the neighbouring absorbers."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
@@ -22,7 +22,7 @@ class NeighbourCrosstalk(Term):
     """lag · dn/dt = share · θ_neighbour − n, with n the rise of the bridge's far end."""
 
     key = "neighbour_crosstalk"
-    label = "pixels warm the pixels beside them"
+    label = "pixels heat their neighbours"
     parameters = (
         TermParameter("share", "1", 0.02, 0.0, 0.15, "a wall's rise over its neighbour's rise, 0.002 to 0.1"),
         TermParameter("lag", "s", 0.02, 2.5e-3, 1.0, "conduction through one cell's wall", starts=(0.003, 0.03, 0.2)),
@@ -30,14 +30,14 @@ class NeighbourCrosstalk(Term):
     followers = ("crosstalk_k",)
     kernels = Kernels(rates=rates, wall_rise=wall_rise)
     couples_neighbours = True
-    signature = "runs in which only a neighbour is lit"
+    signature = "runs in which only a neighbour is illuminated"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
-        """Return a rise of everything as if all heat of the display were beside every pixel."""
+        """Return a rise of everything as if all heat of the display were next to every pixel."""
         return HeatGainBound(uniform_rise_k=values["share"] * envelope.summed_absorbers_k)
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
-        """Return the default hypothesis if the recording has pulses beside a measured pixel."""
+        """Return the default hypothesis if the recording has pulses on neighbours of a measured pixel."""
         return super().build_hypotheses(scope) if scope.has_neighbour_pulses else []
 
 

@@ -22,13 +22,13 @@ class PowerNonlinearity(Term):
     """q (1 + curvature · (1 − q)) with q = (p − threshold) / (1 − threshold), all relative to full power."""
 
     key = "power_nonlinearity"
-    label = "the laser's power is not proportional to what is commanded"
+    label = "the laser's power is not proportional to its command"
     parameters = (
         TermParameter("threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command"),
         TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept"),
     )
     kernels = Kernels(optical_power=optical_power)
-    signature = "a ladder of powers, shapes unchanged"
+    signature = "a series of powers with unchanged pulse shapes"
 
     def bound_heat_gain(self, values: TermValues, envelope: OperatingEnvelope) -> HeatGainBound:
         """Return the curve's largest gain, which it reaches at low power; a threshold only reduces power."""

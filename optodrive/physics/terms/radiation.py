@@ -34,7 +34,7 @@ class Radiation(Term):
     kernels = Kernels(heat_loss=heat_loss)
     varies_between_runs = True
     cannot_add_heat = True
-    signature = "narrow bridges, hot, cooling that slows down"
+    signature = "hot pixels with narrow bridges, whose cooling slows down"
 
 
 TERM = Radiation()

@@ -16,7 +16,7 @@ class SensorLag(Term):
     """time · dT/dt = T_true − T, delayed as a whole by delay_share · time."""
 
     key = "sensor_lag"
-    label = "the thermometer is slow"
+    label = "the thermometer lags"
     parameters = (
         TermParameter(
             "time", "s", 5e-4, 2e-5, 5e-3, "0.05 to 3 ms, camera exposure or detector", starts=(1e-4, 5e-4, 2e-3)
@@ -27,7 +27,7 @@ class SensorLag(Term):
             0.0,
             0.0,
             1.0,
-            "a delay beside it; 0.73 for an exposure's moving mean",
+            "additional delay; 0.73 for the moving mean of an exposure",
             starts=(0.0, 0.7),
             is_shape=True,
         ),
@@ -35,7 +35,7 @@ class SensorLag(Term):
     kernels = Kernels(sensor_lag=sensor_lag)
     is_fast = True
     cannot_add_heat = True
-    signature = "edges of temperature against edges of displacement"
+    signature = "edges of temperature against those of displacement"
 
     def signal_delays(self, values: TermValues) -> SignalDelays:
         """Return the thermometer's delay."""

@@ -16,14 +16,14 @@ class SensorScale(Term):
     """gain · θ + offset in place of the rise θ above ambient."""
 
     key = "sensor_scale"
-    label = "the thermometer's scale is off"
+    label = "the thermometer's scale is wrong"
     parameters = (
         TermParameter("gain", "1", 1.03, 0.85, 1.15, "emissivity taken wrongly by 10 %"),
-        TermParameter("offset", "K", 0.0, -20.0, 20.0, "what it shows at ambient"),
+        TermParameter("offset", "K", 0.0, -20.0, 20.0, "reading at ambient"),
     )
     kernels = Kernels(sensor_reading=sensor_reading)
     cannot_add_heat = True
-    signature = "only a reference temperature"
+    signature = "a reference temperature only"
 
     def build_hypotheses(self, scope: RecordingScope) -> list[Hypothesis]:
         """Return the offset alone: a gain acts as R, C and κ together, and no data tells it from them."""

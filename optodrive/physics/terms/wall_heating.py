@@ -16,7 +16,7 @@ class WallHeating(Term):
     """C dw/dt = bridge flow − w / R; bridge and gas see the wall's rise w."""
 
     key = "wall_heating"
-    label = "the wall at the bridges' far end warms"
+    label = "the walls heat up"
     parameters = (
         TermParameter(
             "resistance",
@@ -33,7 +33,7 @@ class WallHeating(Term):
     )
     states = (WALL,)
     kernels = Kernels(rates=rates)
-    signature = "trains of seconds, then the slow tail"
+    signature = "trains of several seconds and the slow tail after them"
 
 
 TERM = WallHeating()
