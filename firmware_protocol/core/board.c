@@ -1,4 +1,4 @@
-/* Power-up, the safety tick, the main loop's turn: what happens when. */
+/* Entry points of the core: power-up, safety tick and main loop. */
 
 #include <string.h>
 
@@ -6,7 +6,7 @@
 
 #define NEVER UINT64_MAX
 
-/* --- what falls due, in this order where several do at once --- */
+/* --- due events, in this order if several are due at the same time --- */
 
 static uint64_t lease_due_us(const struct board *b) {
 #if MUTANT == 3
@@ -67,7 +67,7 @@ static void run_due_event(struct board *b) {
     }
 }
 
-/* Everything that falls due up to now_us, in order and at its exact time. */
+/* Carries out each event due up to now_us, in order and at its exact time. */
 static void advance(struct board *b, uint64_t now_us) {
     for (uint64_t due_us; (due_us = board_next_due_us(b)) <= now_us && due_us != NEVER;) {
         b->now_us = due_us > b->now_us ? due_us : b->now_us;
@@ -80,7 +80,7 @@ static void advance(struct board *b, uint64_t now_us) {
 
 static uint8_t unsafe_inputs(uint8_t inputs) { return inputs ^ (INPUT_INTERLOCK | INPUT_KEY); }
 
-/* B9: what becomes unsafe is a fault; what was unsafe at power-up keeps the board from arming. */
+/* B9: an input that becomes unsafe is a fault; one that is unsafe at power-up only prevents arming. */
 static void watch_inputs(struct board *b) {
     uint8_t inputs = b->hal.read_inputs(b->hal.context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
     uint8_t became_unsafe = (uint8_t)(unsafe_inputs(inputs) & ~unsafe_inputs(b->inputs));
@@ -99,7 +99,7 @@ static void watch_inputs(struct board *b) {
 #endif
 }
 
-/* B14. A fault of the board itself goes dark now, before what fell due meanwhile is done. */
+/* B14: a fault of the board itself turns the gate off at once, before any due event is carried out. */
 static void enter_fault_at(struct board *b, enum fault fault, uint64_t now_us) {
 #if MUTANT != 14
     b->now_us = now_us > b->now_us ? now_us : b->now_us;
@@ -117,7 +117,7 @@ static void watch_tick(struct board *b, uint64_t now_us) {
     }
 }
 
-/* Looks before this tick changes the command: a gate that is just being switched is not compared. */
+/* Runs before this tick changes the command, so that a gate in transition is not compared. */
 static void watch_readback(struct board *b, uint64_t now_us) {
     bool differs = b->hal.read_gate(b->hal.context) != b->gate;
     if (differs && !b->readback_differs) {
@@ -221,8 +221,8 @@ void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now
         }
     }
     if (count_bad_frames(b) != bad && b->hal.trace) {
-        struct board_trace what = {.at_us = b->now_us, .kind = TRACE_RX_ERROR, .index = count_bad_frames(b)};
-        b->hal.trace(b->hal.context, &what);
+        struct board_trace event = {.at_us = b->now_us, .kind = TRACE_RX_ERROR, .index = count_bad_frames(b)};
+        b->hal.trace(b->hal.context, &event);
     }
     if (b->link.ack_due) {
         b->link.ack_due = false;
@@ -250,7 +250,7 @@ void board_init(struct board *b, const struct board_hal *hal, const struct board
     b->now_us = b->epoch_us = b->settled_us = b->last_tick_us = now_us;
     b->reset_cause = (uint8_t)cause;
     b->x = b->y = CENTRE;
-    hal->move_mirrors(hal->context, b->x, b->y); /* a reset may have come upon them anywhere */
+    hal->move_mirrors(hal->context, b->x, b->y); /* their position after a reset is unknown */
     b->inputs = hal->read_inputs(hal->context) & (INPUT_INTERLOCK | INPUT_KEY | INPUT_ESTOP);
     link_begin(&b->link, 0);
     change_state(b, REASON_BOOT);

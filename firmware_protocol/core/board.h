@@ -1,5 +1,6 @@
-/* The board of PROTOCOL.md, portable: no allocation, no globals, no waiting. The caller owns one struct board and a
-   struct board_hal, calls board_tick from a timer and board_receive from the main loop. See README.md. */
+/* Portable implementation of the board in PROTOCOL.md: no allocation, no globals, no blocking. The caller owns one
+   struct board and one struct board_hal, calls board_tick from a timer and board_receive from the main loop; see
+   README.md. */
 
 #ifndef BOARD_H
 #define BOARD_H
@@ -10,7 +11,7 @@
 
 #include "messages.h"
 
-/* Sizes: define them for the compiler where memory is short. What does not fit is refused or dark, never guessed. */
+/* Sizes: define smaller ones for a chip with less memory. If a table is full, the board refuses or faults. */
 #ifndef BOARD_QUEUE_POINTS
 #define BOARD_QUEUE_POINTS 4096u /* 10 bytes each */
 #endif
@@ -24,19 +25,19 @@
 #define BOARD_CELLS 1024u /* warm cells in each of four grids, 32 bytes each, a power of two; more: fault SPOT */
 #endif
 
-#define BOARD_TICK_US 100u       /* board_tick is called at least so often */
+#define BOARD_TICK_US 100u       /* maximum period of board_tick */
 #ifndef BOARD_TICK_LATE_US
-#define BOARD_TICK_LATE_US 500u  /* later than that by more than this: fault TICK */
+#define BOARD_TICK_LATE_US 500u  /* a tick later than this is fault TICK */
 #endif
-#define BOARD_READBACK_US 100u   /* the gate differs from its command for longer: fault READBACK */
+#define BOARD_READBACK_US 100u   /* a gate that differs from its command for longer is fault READBACK */
 
-/* What happened, for a log; seen from outside the same as the edges of gate and state. */
+/* An event for a log. */
 enum board_trace_kind { TRACE_GATE, TRACE_STATE, TRACE_FAULT, TRACE_PULSE, TRACE_RX_ERROR };
 
 struct board_trace {
     uint64_t at_us;
     enum board_trace_kind kind;
-    bool on, is_point;      /* gate: its command; whether a point did it, else reason */
+    bool on, is_point;      /* gate: command, and whether a point caused it, else reason */
     uint8_t state, before;  /* state */
     uint8_t reason, fault;  /* gate and state; fault */
     uint16_t x, y, duty;    /* pulse */
@@ -44,21 +45,21 @@ struct board_trace {
     uint64_t on_us, off_us; /* pulse: times of the gate's edges */
 };
 
-/* What a port gives. README.md says what each must guarantee. */
+/* Functions of a port; README.md states what each must guarantee. */
 struct board_hal {
     void *context;
     void (*set_gate)(void *context, bool on, uint16_t duty);
     bool (*read_gate)(void *context);
     void (*move_mirrors)(void *context, uint16_t x, uint16_t y);
     uint8_t (*read_inputs)(void *context); /* INPUT_ bits */
-    void (*set_indicator)(void *context, bool lit);
+    void (*set_indicator)(void *context, bool on);
     void (*set_relay)(void *context, bool closed);
     uint32_t (*read_entropy)(void *context);
     int16_t (*read_temperature_dc)(void *context);
-    void (*send)(void *context, const uint8_t *frame, size_t length); /* whole or not at all */
-    void (*discard_output)(void *context);                                    /* whole frames that have not begun to leave */
+    void (*send)(void *context, const uint8_t *frame, size_t length); /* all of the frame or nothing */
+    void (*discard_output)(void *context); /* all frames not yet begun */
     void (*feed_watchdog)(void *context);
-    void (*trace)(void *context, const struct board_trace *what); /* may be NULL */
+    void (*trace)(void *context, const struct board_trace *event); /* may be NULL */
 };
 
 #define LIMIT_MEMBER(name, bits, at, way) uint##bits##_t name;
@@ -78,7 +79,7 @@ struct board_config {
 
 enum reset_cause { RESET_POWER_UP, RESET_RESET, RESET_BROWN_OUT, RESET_WATCHDOG };
 
-/* --- what a board remembers; for ports and tests to read, not to write --- */
+/* --- state of a board; ports and tests may read it, not write it --- */
 
 struct point {
     uint16_t x, y, dark_us, on_us, duty;
@@ -97,7 +98,7 @@ struct record {
 
 struct records {
     struct record ring[BOARD_RECORDS];
-    uint32_t total, reported; /* of the session */
+    uint32_t total, reported; /* counts of the session */
 };
 
 struct pulse {
@@ -172,20 +173,20 @@ struct board {
     bool readback_differs, loop_ran;
 };
 
-/* Power-up or reset: everything forgotten, gate off, DISARMED. now_us: any 64-bit time in µs that never goes back. */
+/* Power-up or reset: initialises all state, gate off, DISARMED. now_us: a monotonic 64-bit time in µs. */
 void board_init(struct board *b, const struct board_hal *hal, const struct board_config *config,
                 enum reset_cause cause, uint64_t now_us);
 
-/* The safety tick: does all that falls due up to now_us, then looks at inputs, readback and watchdog. */
+/* The safety tick: checks tick and readback, carries out due events, checks inputs, feeds the watchdog. */
 void board_tick(struct board *b, uint64_t now_us);
 
-/* The main loop's turn: takes n bytes that arrived by now_us, answers, reports; call it with n = 0 too. */
+/* One iteration of the main loop: processes n bytes, answers and reports; also call it with n = 0. */
 void board_receive(struct board *b, const uint8_t *bytes, size_t n, uint64_t now_us);
 
-/* BREAK, DTR dropped, cable pulled: as an ABORT. */
+/* Link lost (BREAK, DTR dropped, cable unplugged): acts as ABORT. */
 void board_on_link_lost(struct board *b, uint64_t now_us);
 
-/* When something falls due next, UINT64_MAX where nothing does: for a port that sets a timer for it. */
+/* Time of the next due event, UINT64_MAX if there is none, for a port with a programmable timer. */
 uint64_t board_next_due_us(const struct board *b);
 
 #endif

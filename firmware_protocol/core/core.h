@@ -1,12 +1,12 @@
-/* What the core's files share among themselves. */
+/* Internal declarations of the core. */
 
 #ifndef CORE_H
 #define CORE_H
 
 #include "board.h"
 
-/* make MUTANT=n breaks guard Bn at the one place that enforces it, to prove that a test notices; 101 and 102 leave out
-   what keeps the receiver within its buffer. */
+/* make MUTANT=n disables guard Bn at the one place that enforces it, to prove that the tests detect it; 101 and 102
+   remove the bounds checks of the receiver. */
 #ifndef MUTANT
 #define MUTANT 0
 #endif
@@ -15,7 +15,7 @@
 #define FRAME_OVERHEAD 8u                 /* header and CRC */
 #define BODY_MAX (RAW_MAX - FRAME_OVERHEAD)
 #define WIRE_MAX (RAW_MAX + 2u)           /* COBS code and delimiter */
-#define NO_REFUSAL 0xffu             /* in place of a NAK reason */
+#define NO_REFUSAL 0xffu                  /* instead of a NAK reason */
 
 /* --- bytes --- */
 
@@ -36,12 +36,12 @@ static inline void put_u64(uint8_t *at, uint64_t value) {
     put_u32(at + 4, (uint32_t)(value >> 32));
 }
 
-/* Not plain crc32: zlib's, in a process that has it loaded, would answer in its place. */
+/* Not named crc32, which would resolve to zlib's function in a process that has zlib loaded. */
 uint32_t frame_crc32(const uint8_t *bytes, size_t n);
 
-/* COBS of at most RAW_MAX bytes; the number of bytes written, at most n + 1, without a delimiter. */
+/* Encodes at most RAW_MAX bytes; returns the number of bytes, at most n + 1, without a delimiter. */
 size_t cobs_encode(uint8_t *encoded, const uint8_t *raw, size_t n);
-/* In place; the number of bytes, 0 where these are no COBS of at most RAW_MAX bytes. */
+/* Decodes in place; returns the number of bytes, 0 if they are not valid COBS of at most RAW_MAX bytes. */
 size_t cobs_decode(uint8_t *bytes, size_t n);
 
 /* --- link --- */
@@ -55,13 +55,13 @@ struct frame {
 
 enum frame_class { FRAME_NOT_ACCEPTED, FRAME_UNSEQUENCED, FRAME_SEQUENCED };
 
-/* Takes one byte; true when it completes an intact frame, which lasts until the next byte. */
+/* Processes one byte; returns true if it completes an intact frame, which stays valid until the next byte. */
 bool receiver_feed(struct receiver *r, uint8_t byte, struct frame *frame);
-/* Whether type, length and enumerations are a message's; order: who may say it, and how. */
+/* Returns whether type, length and enumerations are those of a message; class: whether and how it is accepted. */
 bool frame_is_valid(const struct frame *frame, enum frame_class *class);
-/* A frame as it goes over the wire, delimiter included; the number of bytes. wire: WIRE_MAX bytes. */
+/* Encodes a frame with its delimiter; returns the number of bytes. wire: buffer of WIRE_MAX bytes. */
 size_t frame_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
-/* Whether a sequenced frame is the one expected; refusal: what to answer where it is not. */
+/* Returns whether a sequenced frame is the expected one; refusal: the answer if it is not. */
 bool link_accept(struct link *link, uint8_t seq, uint8_t *refusal);
 void link_mark_consumed(struct link *link, uint8_t refusal);
 void link_begin(struct link *link, uint16_t session);
@@ -72,9 +72,9 @@ bool queue_push(struct queue *q, const struct point *point);
 struct point queue_pop(struct queue *q);
 void records_clear(struct records *r);
 void records_add(struct records *r, const struct record *record);
-/* The body of one EXECUTED from the position at on, as many as it can tell; their number, 0: nothing there. */
+/* Encodes one EXECUTED from position at on; returns the number of records, 0 if there are none. */
 size_t records_report(const struct records *r, uint32_t at, uint8_t *body, size_t *length);
-/* Position of the first record kept with this number or a later one. */
+/* Returns the position of the first record with this number or a later one. */
 uint32_t records_find(const struct records *r, uint32_t number);
 uint32_t records_oldest(const struct records *r);
 
@@ -83,9 +83,9 @@ uint32_t records_oldest(const struct records *r);
 void limits_decode(struct board_limits *limits, const uint8_t *from);
 void limits_encode(const struct board_limits *limits, uint8_t *to);
 void limits_tighten(struct board_limits *limits, const struct board_limits *requested);
-/* B4, B5, B8: the fault that queueing this point is, FAULT_NONE where it may be queued. */
+/* B4, B5, B8: returns the fault that queueing the point causes, FAULT_NONE if it is permitted. */
 enum fault guards_check_point(const struct board_limits *limits, const struct point *point);
-/* B4 to B6: the fault that lighting it now would be; where it may be lit it is counted. */
+/* B4 to B6: returns the fault that the point's pulse causes now; a permitted pulse is added to the accounts. */
 enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                        const struct point *point, uint64_t now_us);
 
@@ -93,9 +93,9 @@ enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limit
 
 bool is_leased(uint8_t state);
 void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n);
-void trace_gate(struct board *b, bool on, bool is_point, uint32_t what);
+void trace_gate(struct board *b, bool on, bool is_point, uint32_t index_or_reason);
 void command_gate(struct board *b, bool on, uint16_t duty);
-/* Changes to the state that the table has for this event. */
+/* Changes to the state that the event leads to. */
 void change_state(struct board *b, enum reason event);
 void disarm(struct board *b, enum reason reason);
 void enter_fault(struct board *b, enum fault fault);
@@ -106,10 +106,10 @@ void advance_point(struct board *b);
 void resume_if_refilled(struct board *b);
 void record_execution(struct board *b, uint64_t on_at_us, uint64_t on_us);
 
-/* Carries out what is not sequenced. */
+/* Carries out a message that is not sequenced. */
 void on_hello(struct board *b, const struct frame *frame);
 void handle_unsequenced(struct board *b, const struct frame *frame);
-/* Carries a sequenced message out; the NAK reason, or NO_REFUSAL. */
+/* Carries out a sequenced message; returns the NAK reason, or NO_REFUSAL. */
 uint8_t dispatch_sequenced(struct board *b, const struct frame *frame);
 
 #endif

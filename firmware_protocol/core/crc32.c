@@ -1,4 +1,4 @@
-/* CRC-32 as zlib computes it, four bits at a time: a table of 64 bytes instead of one of 1,024. */
+/* CRC-32 of zlib, four bits at a time: a table of 64 bytes instead of 1,024. */
 
 #include "core.h"
 

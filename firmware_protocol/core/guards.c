@@ -1,4 +1,4 @@
-/* B4 to B6 and B8: what is looked at when a point is queued, and again before it is lit. Whole numbers only. */
+/* Guards B4 to B6 and B8: checks of a point when queued, and of its pulse before the gate opens. Integers only. */
 
 #include "core.h"
 
@@ -26,16 +26,16 @@ static uint16_t cell_index(uint16_t code, uint16_t shift, uint16_t size) {
     if (from_centre < 0 && from_centre % size != 0) {
         cell--;
     }
-    return (uint16_t)cell; /* cells of one grid are fewer than 65,537 in a row, and those at the ends differ */
+    return (uint16_t)cell; /* a grid has at most 65,536 cells per axis, so the indices stay distinct */
 }
 
-/* B4: light that the cell had without a rest. */
+/* B4: gate-on time of the cell since its last rest. */
 static uint32_t on_time_us(const struct cell *cell, const struct board_limits *limits, uint64_t now_us) {
     bool rested = now_us >= cell->ended_us && now_us - cell->ended_us >= limits->rest_us;
     return rested ? 0 : cell->on_us;
 }
 
-/* B6: level of the bucket; seconds and rest apart, so that no age overflows. */
+/* B6: level of the bucket. Whole seconds and remainder are computed separately to avoid an overflow. */
 static uint32_t level_uj(const struct cell *cell, const struct board_limits *limits, uint64_t now_us) {
     uint64_t age_us = now_us - cell->since_us, leak = limits->spot_leak_uw;
     if (age_us / 1000000u > UINT32_MAX) {
@@ -45,7 +45,7 @@ static uint32_t level_uj(const struct cell *cell, const struct board_limits *lim
     return leaked >= cell->level_uj ? 0 : (uint32_t)(cell->level_uj - leaked);
 }
 
-/* The account of a cell. A cell that has rested and leaked empty gives its place up; NULL: no place is free. */
+/* Returns the account of a cell. A rested cell with an empty bucket is replaced; NULL if no slot is free. */
 static struct cell *find_account(struct cell *cells, uint32_t key, const struct board_limits *limits, uint64_t now_us) {
     struct cell *free_slot = NULL;
     uint32_t hash = key * 2654435761u;
@@ -57,7 +57,7 @@ static struct cell *find_account(struct cell *cells, uint32_t key, const struct 
         }
         if (!cell->used) {
             free_slot = free_slot ? free_slot : cell;
-            break; /* places are never emptied, so the key is nowhere behind */
+            break; /* slots are never emptied, so the key is in none of the following ones */
         }
         if (!free_slot && on_time_us(cell, limits, now_us) == 0 && level_uj(cell, limits, now_us) == 0) {
             free_slot = cell;
@@ -85,22 +85,23 @@ static void drop_old_pulses(struct guards *g, uint64_t now_us) {
     }
 }
 
-/* Light of old pulses in the second that ends at end_us. gone, expired_duty_us: pulses that have left it whole, carried on
-   from one call to the next. */
+/* Sum of on time × duty of older pulses in the second that ends at end_us. expired, expired_duty_us: pulses that lie
+   entirely before it, kept from one call to the next. */
 static uint64_t window_duty_us(const struct guards *g, uint64_t end_us, uint32_t *expired, uint64_t *expired_duty_us) {
-    while (*expired < g->count && pulse_at(g, *expired)->start_us + pulse_at(g, *expired)->on_us + MEAN_WINDOW_US <= end_us) {
+    while (*expired < g->count &&
+           pulse_at(g, *expired)->start_us + pulse_at(g, *expired)->on_us + MEAN_WINDOW_US <= end_us) {
         *expired_duty_us += duty_us(pulse_at(g, (*expired)++));
     }
-    uint64_t left = *expired_duty_us;
+    uint64_t outside = *expired_duty_us;
     for (uint32_t k = *expired; k < g->count && pulse_at(g, k)->start_us + MEAN_WINDOW_US < end_us; k++) {
         uint64_t out_us = end_us - MEAN_WINDOW_US - pulse_at(g, k)->start_us;
-        left += (out_us < pulse_at(g, k)->on_us ? out_us : pulse_at(g, k)->on_us) * pulse_at(g, k)->duty;
+        outside += (out_us < pulse_at(g, k)->on_us ? out_us : pulse_at(g, k)->on_us) * pulse_at(g, k)->duty;
     }
-    return g->sum - left;
+    return g->sum - outside;
 }
 
-/* Most light that any second would hold with this pulse, µs × duty. The sum of a second grows until the pulse ends, or
-   until a brighter old pulse begins to leave it: only those ends need a look. */
+/* Maximum sum of on time × duty over any second that contains this pulse, µs × duty. The sum peaks where the pulse
+   ends or where an older pulse begins to leave the window, so only those windows are evaluated. */
 static uint64_t max_window_duty_us(const struct guards *g, const struct point *point, uint64_t now_us) {
     uint64_t end_us = now_us + point->on_us, max_duty_us = 0, expired_duty_us = 0;
     uint32_t expired = 0;
@@ -118,15 +119,15 @@ static uint64_t max_window_duty_us(const struct guards *g, const struct point *p
     return sum > max_duty_us ? sum : max_duty_us;
 }
 
-/* --- all together --- */
+/* --- admission of a pulse --- */
 
-/* Energy, µJ, rounded up; the product of the three largest values just fits 64 bits. */
+/* Energy, µJ, rounded up; the product of the three maximum values fits 64 bits. */
 static uint64_t energy_uj(const struct board_limits *limits, const struct point *point) {
     uint64_t product = (uint64_t)point->on_us * point->duty * limits->full_power_uw, full = DUTY_FULL * 1000000ull;
     return product / full + (product % full != 0);
 }
 
-/* The accounts of the four cells of a point; false: no place is left for one of them. */
+/* Finds the accounts of the four cells of a point; returns false if a grid has no free slot. */
 static bool find_accounts(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                      const struct point *point, uint64_t now_us, struct cell *cells[GRIDS]) {
     uint16_t half = cell_codes / 2;

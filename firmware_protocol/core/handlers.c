@@ -1,4 +1,4 @@
-/* What the messages ask for, and when it is refused. Each refusal is looked at in the order of PROTOCOL.md. */
+/* Message handlers. Each checks its refusals in the order of PROTOCOL.md. */
 
 #include <string.h>
 
@@ -15,9 +15,9 @@ static bool is_armed(const struct board *b) {
     return STATES_ARMED >> b->state & 1u;
 }
 
-/* --- not sequenced --- */
+/* --- unsequenced messages --- */
 
-/* Not 0 and not the last one. A source that repeats itself must not keep the board here for ever. */
+/* Neither 0 nor the last session. The number of tries is bounded in case the entropy source repeats itself. */
 static uint16_t choose_session(struct board *b) {
     for (uint32_t k = 0; k < ENTROPY_TRIES; k++) {
         uint16_t session = (uint16_t)b->hal.read_entropy(b->hal.context);
@@ -112,7 +112,7 @@ void handle_unsequenced(struct board *b, const struct frame *frame) {
     }
 }
 
-/* --- sequenced --- */
+/* --- sequenced messages --- */
 
 static uint8_t on_limits(struct board *b, const uint8_t *body) {
     struct board_limits requested;
@@ -182,7 +182,7 @@ static uint8_t on_start(struct board *b, const uint8_t *body) {
     b->job = (struct job){.active = true, .number = get_u32(body + START_JOB_AT), .start_us = b->now_us};
     b->job.watermark = get_u16(body + START_WATERMARK_AT);
     if (tick > b->now_us - b->epoch_us) {
-        /* Beyond what the clock can count is never; the hold's second must not wrap either. */
+        /* A start beyond the clock's range never comes; the limit keeps start + HOLD_MAX_US from wrapping. */
         uint64_t last = UINT64_MAX - HOLD_MAX_US - 1 - b->epoch_us;
         b->job.start_us = b->epoch_us + (tick < last ? tick : last);
     }
@@ -235,7 +235,7 @@ static uint8_t on_arm_req(struct board *b, const uint8_t *requested) {
     return NO_REFUSAL;
 }
 
-/* B11: a nonce is good for one answer, right or wrong. */
+/* B11: a nonce is valid for one confirmation, right or wrong. */
 static uint8_t on_arm_confirm(struct board *b, const uint8_t *body) {
     bool echoed = b->nonce_valid && get_u32(body + ARM_CONFIRM_BOARD_NONCE_AT) == b->board_nonce &&
                   get_u32(body + ARM_CONFIRM_HOST_NONCE_AT) == b->host_nonce;

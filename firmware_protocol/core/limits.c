@@ -1,4 +1,4 @@
-/* Limits on the wire, and B10: they only tighten. */
+/* Encoding of limits, and guard B10: limits only tighten. */
 
 #include "core.h"
 

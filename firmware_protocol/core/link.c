@@ -1,4 +1,4 @@
-/* Bytes to frames, frames to bytes, and the receiving end of go-back-N. */
+/* Framing, message validation, and the receiving end of go-back-N. */
 
 #include <string.h>
 
@@ -17,7 +17,7 @@ struct layout {
     {type, host, sequenced, body, item, most, {{at0, n0}, {at1, n1}, {at2, n2}}},
 static const struct layout LAYOUTS[] = {MESSAGE_LAYOUTS(LAYOUT)};
 
-/* Decodes what stands between two zeros; false where it is no frame, which counts. */
+/* Decodes the bytes between two zeros; returns false and counts an error if they are not a frame. */
 static bool frame_decode(struct receiver *r, struct frame *frame) {
     size_t n = cobs_decode(r->bytes, r->length);
     if (n < FRAME_OVERHEAD) {

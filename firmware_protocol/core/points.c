@@ -1,4 +1,4 @@
-/* Points one after the other: move, dark time, light; the ends of jobs, underruns and holds. */
+/* Execution of points: move, gate-off time, pulse; end of job, underrun and hold. */
 
 #include "core.h"
 
@@ -7,7 +7,7 @@ bool has_enough_points(const struct board *b) {
     return b->job.active && b->queue.count > 0 && (all_here || b->queue.count >= b->job.watermark);
 }
 
-/* B7. A move that was broken off may have left the mirrors anywhere on its way: its own time counts too. */
+/* B7: an interrupted move may have left the mirrors anywhere on its path, so its own settling time counts too. */
 static uint64_t settling_end_us(const struct board *b, const struct point *point) {
     uint32_t along_x = point->x > b->x ? point->x - b->x : b->x - point->x;
     uint32_t along_y = point->y > b->y ? point->y - b->y : b->y - point->y;
@@ -47,7 +47,7 @@ static void begin_pulse(struct board *b) {
     trace_gate(b, true, true, b->current_index);
 }
 
-/* Three within the window are a fault; the list never holds more. */
+/* UNDERRUNS_MAX within the window are a fault, so the list never holds more. */
 static void on_underrun(struct board *b) {
     b->underruns_total++;
     uint32_t kept = 0;
@@ -67,18 +67,18 @@ static void on_underrun(struct board *b) {
 }
 
 static void finish_point(struct board *b) {
-    bool lit = b->gate;
+    bool gate_was_on = b->gate;
 #if MUTANT == 2
-    if (lit && b->queue.count == 0 && !(b->job.has_end && b->current_index + 1 >= b->job.end_index)) {
+    if (gate_was_on && b->queue.count == 0 && !(b->job.has_end && b->current_index + 1 >= b->job.end_index)) {
         b->due_us += 1000;
         return;
     }
 #endif
-    if (lit) {
+    if (gate_was_on) {
         command_gate(b, false, 0);
         trace_gate(b, false, true, b->current_index);
     }
-    record_execution(b, lit ? b->gate_on_us : b->now_us, lit ? b->current_point.on_us : 0);
+    record_execution(b, gate_was_on ? b->gate_on_us : b->now_us, gate_was_on ? b->current_point.on_us : 0);
     b->has_current_point = false;
     if (b->job.active && b->job.has_end && b->done_index >= b->job.end_index) {
         b->job.active = false;

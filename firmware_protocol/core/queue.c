@@ -1,4 +1,4 @@
-/* Points to do, and records of points done. */
+/* Queue of points, and ring of execution records. */
 
 #include "core.h"
 

@@ -1,4 +1,4 @@
-/* The states, and what each change of them turns off, drops, tells. */
+/* State changes and their effects: gate, outputs, queue, log and EVENT. */
 
 #include "core.h"
 
@@ -13,10 +13,10 @@ void send_message(struct board *b, uint8_t type, const uint8_t *body, size_t n) 
     }
 }
 
-static void trace(struct board *b, struct board_trace what) {
+static void trace(struct board *b, struct board_trace event) {
     if (b->hal.trace) {
-        what.at_us = b->now_us;
-        b->hal.trace(b->hal.context, &what);
+        event.at_us = b->now_us;
+        b->hal.trace(b->hal.context, &event);
     }
 }
 
@@ -25,12 +25,13 @@ void command_gate(struct board *b, bool on, uint16_t duty) {
     b->hal.set_gate(b->hal.context, on, on ? duty : 0);
 }
 
-void trace_gate(struct board *b, bool on, bool is_point, uint32_t what) {
+void trace_gate(struct board *b, bool on, bool is_point, uint32_t index_or_reason) {
     trace(b, (struct board_trace){.kind = TRACE_GATE, .on = on, .is_point = is_point,
-                                  .index = is_point ? what : 0, .reason = is_point ? 0 : (uint8_t)what});
+                                  .index = is_point ? index_or_reason : 0,
+                                  .reason = is_point ? 0 : (uint8_t)index_or_reason});
 }
 
-/* Adds the current point to the records, with what was really done. */
+/* Records the execution of the current point. */
 void record_execution(struct board *b, uint64_t on_at_us, uint64_t on_us) {
     const struct point *point = &b->current_point;
     struct record record = {.number = b->current_index, .on_tick = on_at_us - b->epoch_us};
@@ -45,22 +46,22 @@ void record_execution(struct board *b, uint64_t on_at_us, uint64_t on_us) {
     }
 }
 
-/* Gate off; what a pulse that is cut short really did is recorded. */
+/* Turns the gate off and records what an interrupted pulse emitted. */
 static void close_gate(struct board *b, enum reason reason) {
-    bool lit = b->gate;
+    bool gate_was_on = b->gate;
     if (MUTANT != 1) {
         command_gate(b, false, 0);
     }
-    if (MUTANT != 1 && lit) {
+    if (MUTANT != 1 && gate_was_on) {
         trace_gate(b, false, false, reason);
     }
-    if (b->has_current_point && lit) {
+    if (b->has_current_point && gate_was_on) {
         record_execution(b, b->gate_on_us, b->now_us - b->gate_on_us);
     }
     b->has_current_point = false;
 }
 
-/* The state after an event; an event that the table does not have is a fault, and no caller causes one. */
+/* Returns the state after an event; FAULT if the table has no such transition, which no caller causes. */
 static enum state next_state(uint8_t state, enum reason event) {
 #define TRANSITION(from, reason, to) \
     if (state == (from) && event == (reason)) { \

@@ -1,4 +1,4 @@
-/* A board on the bench: the core with a HAL of arrays and a clock that is moved by hand. */
+/* Test shim of the core: a HAL of arrays and a clock under the test's control. */
 
 #include <stdlib.h>
 #include <string.h>
@@ -11,7 +11,7 @@
 #define ENTROPY_MAX 256u
 
 struct edge {
-    uint64_t at_us; /* the clock when the core called, not what it logs */
+    uint64_t at_us; /* time of the core's call, not the time that it logs */
     uint32_t on;
     uint32_t duty;
 };
@@ -51,7 +51,7 @@ static void move_mirrors(void *context, uint16_t x, uint16_t y) {
     s->y = y;
 }
 static uint8_t read_inputs(void *context) { return ((struct shim *)context)->inputs; }
-static void set_indicator(void *context, bool lit) { ((struct shim *)context)->indicator = lit; }
+static void set_indicator(void *context, bool on) { ((struct shim *)context)->indicator = on; }
 static void set_relay(void *context, bool closed) { ((struct shim *)context)->relay = closed; }
 static uint32_t read_entropy(void *context) {
     struct shim *s = context;
@@ -73,10 +73,10 @@ static void feed_watchdog(void *context) {
     struct shim *s = context;
     s->fed_us = s->now_us;
 }
-static void trace(void *context, const struct board_trace *what) {
+static void trace(void *context, const struct board_trace *event) {
     struct shim *s = context;
     if (s->traces_count < TRACES_MAX) {
-        s->traces[s->traces_count++] = *what;
+        s->traces[s->traces_count++] = *event;
     }
 }
 
@@ -113,7 +113,7 @@ void shim_tick(struct shim *s, uint64_t now_us) {
     board_tick(&s->board, now_us);
 }
 
-/* Ticks on time up to now_us. */
+/* Runs punctual ticks up to now_us. */
 void shim_run(struct shim *s, uint64_t now_us) {
     while (s->now_us + BOARD_TICK_US < now_us) {
         shim_tick(s, s->now_us + BOARD_TICK_US);
@@ -129,7 +129,7 @@ void shim_stick(struct shim *s, uint32_t stuck, uint32_t on) {
     s->stuck_on = (uint8_t)on;
 }
 
-/* Copies the bytes for the host and forgets them; their number. */
+/* Copies and clears the bytes for the host; returns their number. */
 size_t shim_take_output(struct shim *s, uint8_t *to) {
     size_t n = s->out_length;
     memcpy(to, s->out, n);
@@ -150,7 +150,7 @@ void shim_limits(const struct shim *s, uint8_t *to) { limits_encode(&s->board.li
 enum { GET_STATE, GET_FAULT, GET_GATE, GET_GATE_ON, GET_INDICATOR, GET_RELAY, GET_FED, GET_X, GET_Y,
        GET_CRC, GET_FORMAT, GET_FINGERPRINT };
 
-/* FNV-1a of all that a board remembers but for what it counts and has not yet put together of a frame. */
+/* FNV-1a hash of a board's state without error counters and partly received frames. */
 static uint64_t fingerprint(const struct shim *s) {
     struct board *b = malloc(sizeof *b);
     memcpy(b, &s->board, sizeof *b);

@@ -4,7 +4,7 @@
 
 extern uint32_t data_begin[], data_end[], bss_begin[], bss_end[];
 extern const uint32_t data_stored[];
-extern int main(void) __attribute__((long_call)); /* it may be among what is copied, far away */
+extern int main(void) __attribute__((long_call)); /* it may be in the copied section, out of branch range */
 
 __attribute__((section(".start"))) void halt(void) {
     for (;;) {
@@ -12,7 +12,7 @@ __attribute__((section(".start"))) void halt(void) {
 }
 
 __attribute__((section(".start"))) void reset(void) {
-    /* volatile: else the compiler calls memcpy, which may not be there before it is copied. */
+    /* volatile prevents a call of memcpy, which may itself be in the section to copy. */
     const volatile uint32_t *from = data_stored;
     for (volatile uint32_t *to = data_begin; to < data_end;) {
         *to++ = *from++;

@@ -1,14 +1,14 @@
-/* What Cortex-M ports share: the way from reset to main. */
+/* Startup code of the Cortex-M ports. */
 
 #ifndef START_H
 #define START_H
 
 typedef void (*handler)(void);
 
-/* Copies and clears memory as the linker script says (data_stored, data_begin, data_end, bss_begin, bss_end, all at
-   whole words), then runs main. Stands in section .start, which a script keeps out of what is copied. */
+/* Initialises memory by the symbols of the linker script (data_stored, data_begin, data_end, bss_begin, bss_end, all
+   word-aligned), then runs main. Located in section .start, which the script does not copy. */
 void reset(void);
-/* Does nothing for ever: the watchdog's business. For vectors that should never be taken. */
+/* Loops until the watchdog resets the chip; handler of all unexpected exceptions. */
 void halt(void);
 
 #endif

@@ -1,4 +1,4 @@
-/* The board as a process on Linux: options, files, a pty with its line's line_rate and faults, a log, the core's HAL. */
+/* The board as a Linux process: options, files, a pty with rate and faults of a serial line, a log, the core's HAL. */
 
 #ifndef HOST_H
 #define HOST_H
@@ -10,12 +10,12 @@
 #define PROGRAM "board"
 #define STEPS_MAX 1000u
 
-/* --- files: TOML as far as these two need it --- */
+/* --- files: the subset of TOML that limits and scripts use --- */
 
 enum toml_kind { TOML_INTEGER, TOML_FLOAT, TOML_BOOLEAN, TOML_STRING };
 
 struct toml_entry {
-    unsigned table; /* 0: the top; n: the n-th [[step]] */
+    unsigned table; /* 0: top level; n: the n-th [[step]] */
     enum toml_kind kind;
     double number;
     long long integer;
@@ -29,7 +29,7 @@ struct toml {
     unsigned tables;
 };
 
-/* One line on stderr: where, what was there, what was expected; ends with status 2. */
+/* Prints one line on stderr (place, value, expected) and exits with status 2. */
 _Noreturn void bad_input(const char *where, const char *value, const char *expected);
 void toml_read(struct toml *toml, const char *path);
 const struct toml_entry *toml_find(const struct toml *toml, unsigned table, const char *key);
@@ -45,9 +45,9 @@ enum step_kind {
     STEP_REPAIR,
     STEP_RESET,
     STEP_CLOSE,
-    STEP_STOP_LOOP,  /* the main loop turns no more, until the watchdog bites */
-    STEP_LATE_TICK,  /* the safety tick stays away for a millisecond */
-    STEP_STICK_GATE, /* the gate's readback stays as it is, until repair */
+    STEP_STOP_LOOP,  /* stops the main loop until the watchdog resets */
+    STEP_LATE_TICK,  /* delays the safety tick by a millisecond */
+    STEP_STICK_GATE, /* freezes the gate's readback until repair */
 };
 
 struct step {
@@ -70,10 +70,10 @@ const char *input_name(uint8_t bit);
 
 struct log {
     int fd;             /* -1: none */
-    const char *failed; /* why it can no longer be written */
+    const char *failed; /* error of the last write, NULL if none */
 };
 
-void log_trace(struct log *log, const struct board_trace *what);
+void log_trace(struct log *log, const struct board_trace *event);
 void log_input(struct log *log, uint64_t at_us, const char *name, bool value);
 void log_port(struct log *log, uint64_t at_us, bool open);
 
@@ -99,11 +99,11 @@ struct line {
     size_t output_count;
 };
 
-/* false, with a reason in errno, where no pty can be had. */
+/* Returns false and sets errno if no pty is available. */
 bool line_open(struct line *line);
 void line_close(struct line *line);
 bool line_hung_up(const struct line *line);
-/* Up to READ_MAX bytes as they arrive, at the line's line_rate; 0 where there are none. last: all at once. */
+/* Reads up to READ_MAX bytes at the line's rate; 0 if there are none. last: without rate limit. */
 size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last);
 void line_send(struct line *line, const uint8_t *frame, size_t n);
 void line_discard_output(struct line *line);
@@ -125,7 +125,7 @@ struct port {
     bool gate_on, readback_stuck, readback_value, loop_stopped;
 };
 
-/* Until stopped by a signal, the port being closed for long, or the log; dark then. */
+/* Runs until a signal, a long close of the port, or a log error; then disarms. */
 void port_run(struct port *port);
 
 #endif

@@ -1,4 +1,4 @@
-/* A pty that passes bytes as a serial line does: at its line_rate, and with the faults a script puts in. */
+/* A pty that transmits like a serial line: at a limited rate, and with the faults of a script. */
 
 #define _GNU_SOURCE
 
@@ -32,7 +32,7 @@ bool line_open(struct line *line) {
     tcsetattr(slave, TCSANOW, &raw);
     unlink(temporary);
     bool linked = symlink(name, temporary) == 0 && rename(temporary, line->path) == 0;
-    close(slave); /* from here on a hang-up means that no host has the port open */
+    close(slave); /* from now on a hang-up means that no host has the port open */
     return linked;
 }
 
@@ -46,9 +46,9 @@ bool line_hung_up(const struct line *line) {
     return poll(&look, 1, 0) > 0 && look.revents & POLLHUP;
 }
 
-/* --- line_rate --- */
+/* --- rate --- */
 
-/* A late turn may catch up on what the line would have carried meanwhile, up to a whole read. */
+/* A late iteration may catch up with what the line would have carried, up to one whole read. */
 static size_t available_bytes(struct line_rate *line_rate, uint64_t now_us) {
     line_rate->tokens += (double)(now_us - line_rate->at_us) * 1e-6 * line_rate->bytes_per_s;
     line_rate->tokens = line_rate->tokens > READ_MAX ? READ_MAX : line_rate->tokens;
@@ -56,7 +56,7 @@ static size_t available_bytes(struct line_rate *line_rate, uint64_t now_us) {
     return line_rate->tokens > 0 ? (size_t)line_rate->tokens : 0;
 }
 
-/* Nothing waits to pass: a line saves nothing up. */
+/* An idle line does not accumulate credit beyond a burst. */
 static void cap_credit(struct line_rate *line_rate) { line_rate->tokens = line_rate->tokens > BURST_BYTES ? BURST_BYTES : line_rate->tokens; }
 
 bool line_can_read(struct line *line, uint64_t now_us) { return available_bytes(&line->in, now_us) > 0; }
@@ -93,7 +93,7 @@ size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last) {
     ssize_t n = read(line->master, to, max_bytes);
     if (n <= 0) {
         cap_credit(&line->in);
-        return 0; /* nothing there, or the host has just closed: the next look at the port tells */
+        return 0; /* empty, or the host has just closed the port, which the next poll reports */
     }
     line->in.tokens -= (double)n;
     if ((size_t)n < max_bytes) {
@@ -104,13 +104,13 @@ size_t line_read(struct line *line, uint8_t *to, uint64_t now_us, bool last) {
 
 void line_send(struct line *line, const uint8_t *frame, size_t n) {
     if (line->output_count + n > OUT_MAX) {
-        return; /* whole or not at all */
+        return; /* all of the frame or nothing */
     }
     memcpy(line->output + line->output_count, frame, n);
     line->output_count += apply_faults(line, line->output + line->output_count, n);
 }
 
-/* A frame that has begun to leave goes to its end. */
+/* A partly sent frame is completed. */
 void line_discard_output(struct line *line) {
     const uint8_t *end = line->mid_frame ? memchr(line->output, 0, line->output_count) : NULL;
     line->output_count = end ? (size_t)(end - line->output) + 1 : 0;

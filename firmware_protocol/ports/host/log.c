@@ -1,4 +1,4 @@
-/* The log: a line of JSON for each event, written at once, so that it is there whatever ends the process. */
+/* The log: one line of JSON per event, written immediately so that it survives any end of the process. */
 
 #include <errno.h>
 #include <inttypes.h>
@@ -37,36 +37,36 @@ __attribute__((format(printf, 4, 5))) static void write_line(struct log *log, ui
     }
 }
 
-static void write_gate(struct log *log, const struct board_trace *what) {
+static void write_gate(struct log *log, const struct board_trace *event) {
     char reason[40];
-    if (what->is_point) {
-        snprintf(reason, sizeof reason, "point %" PRIu32 "%s", what->index, what->on ? "" : " done");
+    if (event->is_point) {
+        snprintf(reason, sizeof reason, "point %" PRIu32 "%s", event->index, event->on ? "" : " done");
     } else {
-        snprintf(reason, sizeof reason, "%s", what->reason ? REASONS[what->reason] : "reset");
+        snprintf(reason, sizeof reason, "%s", event->reason ? REASONS[event->reason] : "reset");
     }
-    write_line(log, what->at_us, "gate", "\"on\": %s, \"reason\": \"%s\"", json_boolean(what->on), reason);
+    write_line(log, event->at_us, "gate", "\"on\": %s, \"reason\": \"%s\"", json_boolean(event->on), reason);
 }
 
-void log_trace(struct log *log, const struct board_trace *what) {
-    switch (what->kind) {
+void log_trace(struct log *log, const struct board_trace *event) {
+    switch (event->kind) {
     case TRACE_GATE:
-        write_gate(log, what);
+        write_gate(log, event);
         break;
     case TRACE_STATE:
-        write_line(log, what->at_us, "state", "\"state\": \"%s\", \"before\": \"%s\", \"reason\": \"%s\"",
-                   STATES[what->state], STATES[what->before], REASONS[what->reason]);
+        write_line(log, event->at_us, "state", "\"state\": \"%s\", \"before\": \"%s\", \"reason\": \"%s\"",
+                   STATES[event->state], STATES[event->before], REASONS[event->reason]);
         break;
     case TRACE_FAULT:
-        write_line(log, what->at_us, "fault", "\"fault\": \"%s\"", FAULTS[what->fault]);
+        write_line(log, event->at_us, "fault", "\"fault\": \"%s\"", FAULTS[event->fault]);
         break;
     case TRACE_PULSE:
-        write_line(log, what->at_us, "pulse",
+        write_line(log, event->at_us, "pulse",
                    "\"index\": %" PRIu32 ", \"x\": %u, \"y\": %u, \"duty\": %u, \"on_us\": %" PRIu64
                    ", \"off_us\": %" PRIu64,
-                   what->index, what->x, what->y, what->duty, what->on_us, what->off_us);
+                   event->index, event->x, event->y, event->duty, event->on_us, event->off_us);
         break;
     case TRACE_RX_ERROR:
-        write_line(log, what->at_us, "rx_error", "\"bad_frames\": %" PRIu32, what->index);
+        write_line(log, event->at_us, "rx_error", "\"bad_frames\": %" PRIu32, event->index);
         break;
     }
 }

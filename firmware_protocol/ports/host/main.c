@@ -104,7 +104,7 @@ int main(int argc, char **argv) {
         return 2;
     }
     signal(SIGPIPE, SIG_IGN);
-    signal(SIGXFSZ, SIG_IGN); /* a full disk is an error of the log's writing */
+    signal(SIGXFSZ, SIG_IGN); /* a full disk is reported as a write error of the log */
     port->line.path = options.pty;
     port->line.in.bytes_per_s = port->line.out.bytes_per_s = options.baud / BITS_PER_BYTE;
     port->exit_when_closed_us = options.exit_when_closed_s < 0 ? UINT64_MAX : (uint64_t)(options.exit_when_closed_s * 1e6);
@@ -113,10 +113,10 @@ int main(int argc, char **argv) {
         return 1;
     }
     struct sched_param first = {.sched_priority = 1};
-    (void)sched_setscheduler(0, SCHED_RR, &first); /* a chip waits for no other program; so does this, where it may */
+    (void)sched_setscheduler(0, SCHED_RR, &first); /* real-time priority, if permitted: a chip does not wait for other programs */
     port_run(port);
     if (port->log.failed) {
-        fprintf(stderr, PROGRAM ": the log cannot be written (%s); without its witness the board ends dark\n",
+        fprintf(stderr, PROGRAM ": the log cannot be written (%s); the board stops with the gate off\n",
                 port->log.failed);
         return 1;
     }

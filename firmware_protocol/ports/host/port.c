@@ -1,8 +1,7 @@
-/* The core between a pty and the machine's clock.
+/* The core between a pty and the system clock.
 
-   No ordinary Linux gives a process every 100 µs. So ticks are made up for: a turn does all ticks that have passed
-   since the last one, each with its own time, before it looks at the port. The core sees a board whose ticks come on
-   time; only a script makes one late. */
+   Linux does not schedule a process every 100 µs. Each iteration therefore runs all ticks since the last one, each with
+   its nominal time, before it reads the port. The core sees punctual ticks; only a script makes one late. */
 
 #define _GNU_SOURCE
 
@@ -67,7 +66,7 @@ static void feed_watchdog(void *context) {
     struct port *port = context;
     port->watchdog_fed_us = port->at_us;
 }
-static void trace(void *context, const struct board_trace *what) { log_trace(&((struct port *)context)->log, what); }
+static void trace(void *context, const struct board_trace *event) { log_trace(&((struct port *)context)->log, event); }
 
 /* --- time --- */
 
@@ -90,7 +89,7 @@ static void tick(struct port *port) {
     }
 }
 
-/* Makes up for all ticks up to until_us. */
+/* Runs all ticks up to until_us. */
 static void run_ticks_until(struct port *port, uint64_t until_us) {
     while (port->at_us < until_us) {
         uint64_t next_us = port->at_us + BOARD_TICK_US;
@@ -169,7 +168,7 @@ static void run_due_steps(struct port *port) {
     }
 }
 
-/* --- a turn --- */
+/* --- one iteration --- */
 
 static void receive(struct port *port, bool last) {
     uint8_t bytes[READ_MAX];
@@ -182,7 +181,7 @@ static void receive(struct port *port, bool last) {
     }
 }
 
-/* What a host wrote before it closed is taken first, so that no later host finds it in the line. */
+/* Bytes that a host wrote before it closed are processed first, so that they do not affect a later host. */
 static void update_line_state(struct port *port) {
     struct line *line = &port->line;
     bool hung_up = line_hung_up(line);

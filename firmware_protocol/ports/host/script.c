@@ -1,4 +1,4 @@
-/* What happens to the board and its line, and when. */
+/* Scripts: timed steps of inputs and faults. */
 
 #include <string.h>
 

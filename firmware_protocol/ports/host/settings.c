@@ -1,4 +1,4 @@
-/* What this board is: its own limits and identity, the same as the simulated board's unless --limits says otherwise. */
+/* Settings of the board: limits and identity, by default as those of the simulated board. */
 
 #include <stdlib.h>
 #include <string.h>

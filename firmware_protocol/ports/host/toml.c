@@ -1,4 +1,4 @@
-/* As much TOML as --limits and --script need: key = number, truth or plain string, [[step]], comments. */
+/* The subset of TOML of --limits and --script: key = number, boolean or plain string, [[step]], comments. */
 
 #include <ctype.h>
 #include <errno.h>

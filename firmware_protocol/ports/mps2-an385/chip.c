@@ -24,12 +24,12 @@
 
 #define CLOCK_HZ 25000000u
 #define CYCLES_PER_US (CLOCK_HZ / 1000000u)
-#define SLEEP_MAX_US 5000u /* a chip ticks every 100 µs; an emulator that does keeps its host's processor busy */
-#define WATCHDOG_MS 3000u  /* to its interrupt, which nobody serves, and again to the reset; the late tick bites first */
+#define SLEEP_MAX_US 5000u /* longer than a chip's tick of 100 µs, to keep the load of the emulator low */
+#define WATCHDOG_MS 3000u  /* to its interrupt, which is not handled, and again to the reset; fault TICK comes first */
 #define RING 65536u        /* a power of two */
 #define RAN_BEFORE 0x52414e21u
 
-/* Not cleared at reset: whether the program ran since power-up, which only a watchdog interrupts here. */
+/* Not cleared at reset: marks that the program ran since power-up, so the reset came from the watchdog. */
 __attribute__((section(".noinit"))) static volatile uint32_t ran_before;
 
 static struct {
@@ -59,8 +59,8 @@ bool chip_start(void) {
     REGISTER(FPGA_PRESCALE) = CYCLES_PER_US - 1u;
     for (uint32_t k = 0; k < UARTS; k++) {
         REGISTER(UART_AT(k) + UART_DIVIDER) = 16u;
-        REGISTER(UART_AT(k) + UART_CTRL) = 1u | 2u | 8u; /* both ways; an interrupt for each byte that came */
-        (void)REGISTER(UART_AT(k) + UART_DATA); /* a byte that came before its receiver was on would block it */
+        REGISTER(UART_AT(k) + UART_CTRL) = 1u | 2u | 8u; /* both directions; an interrupt per received byte */
+        (void)REGISTER(UART_AT(k) + UART_DATA); /* a byte received before the receiver was enabled would block it */
         REGISTER(NVIC_ENABLE) = 1u << (2u * k);
     }
     REGISTER(TIMER0 + TIMER_RELOAD) = REGISTER(TIMER0 + TIMER_VALUE) = SLEEP_MAX_US * CYCLES_PER_US;
@@ -71,13 +71,13 @@ bool chip_start(void) {
 }
 
 void chip_feed_watchdog(void) {
-    REGISTER(WATCHDOG + WATCHDOG_CTRL) = 1u | 2u; /* awake from the first meal on: before, the bench may take its time */
+    REGISTER(WATCHDOG + WATCHDOG_CTRL) = 1u | 2u; /* enabled by the first feed, since the bench may be slow before it */
     REGISTER(WATCHDOG + WATCHDOG_CLEAR) = 1u;
 }
 
 uint64_t chip_now_us(void) {
     static uint32_t last, wraps;
-    uint32_t now = REGISTER(FPGA_COUNTER); /* never from counted ticks: they may be joined */
+    uint32_t now = REGISTER(FPGA_COUNTER); /* not counted from ticks, which may be merged */
     wraps += now < last;
     last = now;
     return (uint64_t)wraps << 32 | now;
@@ -85,7 +85,7 @@ uint64_t chip_now_us(void) {
 
 void chip_sleep(uint64_t until_us) {
     uint64_t now_us = chip_now_us(), left_us = until_us > now_us ? until_us - now_us : 0;
-    /* With interrupts off nothing comes between the look and the sleep, which an interrupt ends all the same. */
+    /* Interrupts are masked between the check and the sleep; a pending interrupt still ends the sleep. */
     __asm volatile("cpsid i" ::: "memory");
     bool is_empty = rings[UART_HOST].in == rings[UART_HOST].out && rings[UART_BENCH].in == rings[UART_BENCH].out;
     if (is_empty && left_us > 0) {

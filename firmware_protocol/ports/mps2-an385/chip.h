@@ -1,4 +1,4 @@
-/* What this port needs of the AN385's peripherals (Arm DAI 0385, CMSDK APB components). */
+/* Peripherals of the AN385 that this port uses (Arm DAI 0385, CMSDK APB components). */
 
 #ifndef CHIP_H
 #define CHIP_H
@@ -9,14 +9,14 @@
 
 enum uart { UART_HOST, UART_WITNESS, UART_BENCH, UARTS };
 
-/* Clocks, UARTs, the timer, the watchdog; true where it was the watchdog that reset the chip. */
+/* Initialises clocks, UARTs, timer and watchdog; returns whether the watchdog reset the chip. */
 bool chip_start(void);
-/* µs since power-up; may be asked as often as one likes, but at least once an hour. */
+/* Returns µs since power-up; must be called at least once per hour to detect wraps. */
 uint64_t chip_now_us(void);
-/* Waits in sleep for a byte or until a time, a few milliseconds at most. */
+/* Sleeps until a byte arrives or until a time, a few milliseconds at most. */
 void chip_sleep(uint64_t until_us);
 void chip_feed_watchdog(void);
-/* Bytes that came; at most size of them. */
+/* Reads up to size received bytes. */
 size_t chip_read(enum uart uart, uint8_t *bytes, size_t size);
 void chip_write(enum uart uart, const uint8_t *bytes, size_t n);
 

@@ -1,8 +1,8 @@
-/* The board's core on a Cortex-M3: UART 0 is the host, UART 1 a witness that writes down what happens, UART 2 the bench.
+/* The board's core on a Cortex-M3: UART 0 is the host, UART 1 the log, UART 2 the bench.
 
-   The bench stands for the world outside: it says what the board is before it starts (the configuration, whenever the
-   witness asks with C), and later what inputs read (I, one byte), that the link was lost (L), a reset (R), and what
-   fails: the main loop hangs (H), no tick comes for too long (T), the gate's readback sticks (S). */
+   The bench simulates the environment. It sends the configuration whenever the log requests it with C, then commands:
+   input levels (I, one byte), link lost (L), reset (R), and faults: the main loop stops (H), the tick is late (T), the
+   gate's readback freezes (S). */
 
 #include <string.h>
 
@@ -14,7 +14,7 @@ static uint8_t inputs = INPUT_INTERLOCK | INPUT_KEY;
 static bool gate_on, readback_stuck, readback_value, loop_stopped;
 static uint32_t entropy_state;
 
-/* --- witness: one line of numbers each; the bench gives them names --- */
+/* --- log: one line of numbers per event, decoded by the bench --- */
 
 static void write_numbers(char kind, const uint64_t *numbers, size_t n) {
     uint8_t line[256], digits[20];
@@ -32,16 +32,16 @@ static void write_numbers(char kind, const uint64_t *numbers, size_t n) {
             line[length++] = digits[--count];
         }
     }
-    line[length++] = '.'; /* without it a reset cut the line short */
+    line[length++] = '.'; /* marks a line that no reset has truncated */
     line[length++] = '\n';
     chip_write(UART_WITNESS, line, length);
 }
 
-static void on_trace(void *context, const struct board_trace *what) {
+static void on_trace(void *context, const struct board_trace *event) {
     (void)context;
-    uint64_t numbers[] = {what->at_us, (uint64_t)what->kind, what->on,    what->is_point, what->state,
-                          what->before, what->reason,        what->fault, what->x,        what->y,
-                          what->duty,   what->index,         what->on_us, what->off_us};
+    uint64_t numbers[] = {event->at_us, (uint64_t)event->kind, event->on,    event->is_point, event->state,
+                          event->before, event->reason,        event->fault, event->x,        event->y,
+                          event->duty,   event->index,         event->on_us, event->off_us};
     write_numbers('T', numbers, sizeof numbers / sizeof numbers[0]);
 }
 
@@ -50,7 +50,7 @@ static void on_trace(void *context, const struct board_trace *what) {
 static void on_gate(void *context, bool on, uint16_t duty) {
     (void)context;
     if (on != gate_on) {
-        uint64_t numbers[] = {chip_now_us(), on, duty}; /* when the pin really changed */
+        uint64_t numbers[] = {chip_now_us(), on, duty}; /* actual time of the pin's change */
         write_numbers('G', numbers, 3);
     }
     gate_on = on;
@@ -70,7 +70,7 @@ static uint8_t on_inputs(void *context) {
 
 static void ignore_output(void *context, bool on) { (void)context, (void)on; }
 
-/* The emulated chip has no source of entropy: the bench gives a seed with the configuration. */
+/* The emulated chip has no entropy source; the configuration contains a seed. */
 static uint32_t on_entropy(void *context) {
     (void)context;
     entropy_state += 0x9e3779b9u;
@@ -90,7 +90,7 @@ static void on_send(void *context, const uint8_t *frame, size_t length) {
     chip_write(UART_HOST, frame, length);
 }
 
-static void on_forget(void *context) { (void)context; /* frames leave at once, nothing waits */ }
+static void on_forget(void *context) { (void)context; /* frames are sent immediately */ }
 
 static void on_feed_watchdog(void *context) {
     (void)context;
@@ -134,7 +134,7 @@ static uint32_t get_u32(const uint8_t *at) { return get_u16(at) | (uint32_t)get_
 
 static void configure(void) {
     uint8_t bytes[CONFIG_SIZE];
-    chip_write(UART_WITNESS, (const uint8_t *)"\n", 1); /* ends what a reset cut short */
+    chip_write(UART_WITNESS, (const uint8_t *)"\n", 1); /* ends a line that a reset truncated */
     write_numbers('C', NULL, 0);
     read_exactly(bytes, sizeof bytes);
     entropy_state = get_u32(bytes);
@@ -158,7 +158,7 @@ static void reset(void) {
     board_init(&board, &hal, &config, RESET_RESET, now_us);
 }
 
-/* With a tick at the same time: an emulator that is kept from its host's processor has no next one within a millisecond. */
+/* Runs a tick at the same time, since the emulator's next one may come later than a millisecond. */
 static void set_inputs(uint8_t value, uint64_t now_us) {
     uint64_t numbers[] = {now_us, value};
     write_numbers('I', numbers, 2);
@@ -208,7 +208,7 @@ static void run_loop_once(void) {
     board_receive(&board, bytes, n, now_us);
     if (board.lease_until_us != until_us) {
         uint64_t numbers[] = {now_us, board.lease_until_us};
-        write_numbers('P', numbers, 2); /* the permit to emit */
+        write_numbers('P', numbers, 2); /* end of the lease */
     }
 }
 

@@ -16,14 +16,14 @@ static void wait_until_set(uint32_t address, uint32_t bits) {
     }
 }
 
-/* The crystal for reference and time, 12 MHz × 125 / 6 / 2 from the PLL for all else. */
+/* Reference and timer from the crystal; all other clocks from the PLL, 12 MHz × 125 / 6 / 2. */
 static void start_clocks(void) {
     REGISTER(XOSC_STARTUP) = 47; /* × 256 cycles: 1 ms */
     REGISTER(XOSC_CTRL) = 0xfabu << 12 | 0xaa0u;
     wait_until_set(XOSC_STATUS, BIT(31));
     REGISTER(CLK_REF_CTRL) = 2;
     wait_until_set(CLK_REF_SELECTED, BIT(2));
-    CLEAR(CLK_SYS_CTRL) = 1; /* off the PLL, should it run from before */
+    CLEAR(CLK_SYS_CTRL) = 1; /* leave the PLL, which may still run */
     wait_until_set(CLK_SYS_SELECTED, BIT(0));
     SET(RESETS) = RESET_PLL_SYS;
     CLEAR(RESETS) = RESET_PLL_SYS;
@@ -34,19 +34,19 @@ static void start_clocks(void) {
     wait_until_set(PLL_CS, BIT(31));
     REGISTER(PLL_PRIM) = 6u << 16 | 2u << 12;
     CLEAR(PLL_PWR) = BIT(3);
-    REGISTER(CLK_SYS_CTRL) = 0; /* from the PLL, when the switch below is turned */
+    REGISTER(CLK_SYS_CTRL) = 0; /* PLL as source, selected by the next line */
     SET(CLK_SYS_CTRL) = 1;
     wait_until_set(CLK_SYS_SELECTED, BIT(1));
     REGISTER(CLK_PERI_CTRL) = CLK_ENABLE;
-    REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal: slow, and good enough for a temperature */
-    REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* the microsecond of timer and watchdog */
+    REGISTER(CLK_ADC_CTRL) = CLK_ENABLE | 3u << 5; /* the crystal, fast enough for a temperature */
+    REGISTER(WATCHDOG_TICK) = CRYSTAL_MHZ | BIT(9); /* 1 µs tick of timer and watchdog */
 }
 
 enum reset_cause chip_reset_cause(void) {
     if (REGISTER(WATCHDOG_REASON) & 1u) {
         return RESET_WATCHDOG;
     }
-    return REGISTER(CHIP_RESET) & BIT(16) ? RESET_RESET : RESET_POWER_UP; /* the chip tells no brown-out apart */
+    return REGISTER(CHIP_RESET) & BIT(16) ? RESET_RESET : RESET_POWER_UP; /* the chip does not report a brown-out */
 }
 
 /* --- time --- */
@@ -69,7 +69,7 @@ void chip_wait_us(uint32_t us) {
 void chip_set_alarm(uint64_t at_us) {
     REGISTER(TIMER_ALARM0) = (uint32_t)at_us;
     if (chip_now_us() >= at_us) {
-        SET(TIMER_INTF) = 1; /* it compares for equality and would wait for more than an hour */
+        SET(TIMER_INTF) = 1; /* the alarm compares for equality and would otherwise wait for more than an hour */
     }
 }
 
@@ -91,7 +91,7 @@ void chip_release_alarm(void) {
     REGISTER(NVIC_ENABLE) = TIMER_IRQ;
 }
 
-/* --- bytes: both interrupts have the same priority, so neither comes upon the other --- */
+/* --- bytes: both interrupts have the same priority, so neither preempts the other --- */
 
 static struct {
     uint8_t bytes[RX_RING];
@@ -133,7 +133,7 @@ static void start_uart(void) {
     REGISTER(UART_FBRD) = divisor & 63u;
     REGISTER(UART_LCR_H) = 3u << 5 | BIT(4);
     REGISTER(UART_CR) = BIT(0) | BIT(8) | BIT(9);
-    REGISTER(UART_IFLS) = 1u << 3 | 1u; /* at a quarter, both ways */
+    REGISTER(UART_IFLS) = 1u << 3 | 1u; /* at a quarter, both directions */
     REGISTER(UART_IMSC) = BIT(4) | BIT(5) | BIT(6) | BIT(9);
     REGISTER(NVIC_ENABLE) = UART_IRQ;
 }
@@ -190,19 +190,19 @@ void chip_discard_output(void) {
 /* --- watchdog --- */
 
 void chip_start_watchdog(void) {
-    REGISTER(PSM_WDSEL) = 0x1fffcu; /* everything but the oscillators, so every pin lets go */
+    REGISTER(PSM_WDSEL) = 0x1fffcu; /* resets everything but the oscillators, so all pins become inputs */
     chip_feed_watchdog();
     REGISTER(WATCHDOG_CTRL) = BIT(30);
 }
 
-/* The chip counts two for each microsecond (its erratum E1). */
+/* The chip counts down twice per microsecond (erratum E1). */
 void chip_feed_watchdog(void) { REGISTER(WATCHDOG_LOAD) = 2u * WATCHDOG_US; }
 
-/* --- noise, temperature --- */
+/* --- entropy, temperature --- */
 
 static uint64_t entropy_pool;
 
-/* A bit of the ring oscillator's jitter, and when it was looked at. The multiplier is Knuth's for 64 bits. */
+/* Adds one bit of the ring oscillator's jitter and its sampling time. The multiplier is Knuth's 64-bit constant. */
 void chip_collect_entropy(void) {
     entropy_pool = (entropy_pool ^ (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1) * 6364136223846793005u + 1u;
 }
@@ -216,22 +216,22 @@ uint32_t chip_entropy(void) {
 
 int16_t chip_temperature_dc(void) {
     int32_t uv = (int32_t)((uint64_t)(REGISTER(ADC_RESULT) & 0xfffu) * 3300000u / 4096u);
-    return (int16_t)(270 - (uv - 706000) * 10 / 1721); /* 0.706 V at 27 °C, 1.721 mV less for each more */
+    return (int16_t)(270 - (uv - 706000) * 10 / 1721); /* 0.706 V at 27 °C, −1.721 mV per °C */
 }
 
-/* --- all together --- */
+/* --- startup --- */
 
 void chip_start(void) {
     static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 | RESET_TIMER | RESET_UART0;
-    CLEAR(WATCHDOG_CTRL) = BIT(30); /* should it run from before */
+    CLEAR(WATCHDOG_CTRL) = BIT(30); /* it may still run */
     start_clocks();
-    SET(RESETS) = USED_BLOCKS; /* pins too: they let go, and pull-downs hold them */
+    SET(RESETS) = USED_BLOCKS; /* including the pins, which pull-downs then hold */
     CLEAR(RESETS) = USED_BLOCKS;
     wait_until_set(RESETS_DONE, USED_BLOCKS);
     REGISTER(TIMER_INTE) = 1;
     start_uart();
     REGISTER(ADC_CS) = 1u | BIT(1);
-    REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* the temperature, again and again */
+    REGISTER(ADC_CS) = 1u | BIT(1) | BIT(3) | 4u << 12; /* temperature, free-running */
     for (uint32_t k = 0; k < NOISE_BITS; k++) {
         chip_collect_entropy();
         chip_wait_us(1);

@@ -1,5 +1,5 @@
-/* The board's core on a Raspberry Pi Pico: the safety tick from the timer's interrupt, everything else from the loop.
-   docs/how-to/wire-a-board.md has the circuit. Compiled, and never yet run on hardware. */
+/* The board's core on a Raspberry Pi Pico: the safety tick runs in the timer interrupt, the rest in the main loop.
+   docs/how-to/wire-a-board.md shows the circuit. Compiled, but not yet run on hardware. */
 
 #include "board.h"
 #include "chip.h"
@@ -31,9 +31,9 @@ static uint8_t read_inputs(void *context) {
     return (uint8_t)((outputs_get(PIN_INTERLOCK) ? INPUT_INTERLOCK : 0) | (outputs_get(PIN_KEY) ? INPUT_KEY : 0) |
                      (outputs_get(PIN_ESTOP) ? 0 : INPUT_ESTOP));
 }
-static void set_indicator(void *context, bool lit) {
+static void set_indicator(void *context, bool on) {
     (void)context;
-    outputs_set(PIN_INDICATOR, lit);
+    outputs_set(PIN_INDICATOR, on);
 }
 static void set_relay(void *context, bool closed) {
     (void)context;
@@ -91,7 +91,7 @@ void on_alarm(void) {
 
 /* --- the loop --- */
 
-/* A port that no program has open is told once, and what comes from it then is nobody's. */
+/* Reports the close of the port once; bytes from a closed port are ignored. */
 static bool host_disconnected(void) {
     static bool was_closed = true;
     bool closed = outputs_get(PIN_HOST_CLOSED), left = closed && !was_closed;
@@ -99,7 +99,7 @@ static bool host_disconnected(void) {
     return chip_pop_break() || left;
 }
 
-/* The alarm is held for as long as the bytes of one turn take: a few at a time. */
+/* The alarm is held while the few bytes of one iteration are processed. */
 static void run_loop_once(void) {
     uint8_t bytes[LOOP_BYTES_MAX];
     size_t n = chip_read(bytes, sizeof bytes);

@@ -25,9 +25,9 @@ static void configure_input(uint32_t pin, uint32_t pull) {
     REGISTER(IO_CTRL(pin)) = IO_SIO;
 }
 
-/* --- light --- */
+/* --- gate --- */
 
-/* Dark is forced behind the PWM, at once; a slice that stands still takes its new level at once too. */
+/* Off is forced at the pin, behind the PWM. A stopped PWM slice applies its new level immediately. */
 void outputs_set_gate(bool on, uint16_t duty) {
     REGISTER(IO_CTRL(PIN_GATE)) = GATE_FORCED_LOW;
     REGISTER(PWM_CSR(GATE_SLICE)) = 0;
@@ -40,7 +40,7 @@ void outputs_set_gate(bool on, uint16_t duty) {
     REGISTER(IO_CTRL(PIN_GATE)) = IO_PWM;
 }
 
-/* --- mirrors: a DAC8563; data are taken at the clock's falling edge --- */
+/* --- mirrors: a DAC8563, which samples data at the clock's falling edge --- */
 
 static void write_dac(uint8_t command, uint16_t value) {
     outputs_set(PIN_DAC_SYNC, false);
@@ -52,7 +52,7 @@ static void write_dac(uint8_t command, uint16_t value) {
     outputs_set(PIN_DAC_SYNC, true);
 }
 
-/* The second command takes over both values. */
+/* The second command updates both outputs. */
 void outputs_move_mirrors(uint16_t x, uint16_t y) {
     write_dac(0x00, x);
     write_dac(0x11, y);
@@ -65,13 +65,13 @@ static void start_dac(void) {
     REGISTER(SPI_CPSR) = 2;
     REGISTER(SPI_CR0) = 2u << 8 | BIT(7) | 7u; /* 125 MHz / 2 / 3, mode 1, 8 bits */
     REGISTER(SPI_CR1) = BIT(1);
-    write_dac(0x28, 1); /* as after power-up: both in the middle */
-    write_dac(0x38, 1); /* its own reference, 2.5 V */
+    write_dac(0x28, 1); /* software reset: both outputs at mid-scale */
+    write_dac(0x38, 1); /* internal reference, 2.5 V */
     write_dac(0x02, 3); /* gain 1: 0 to 2.5 V */
-    write_dac(0x30, 3); /* the pin LDAC is not looked at */
+    write_dac(0x30, 3); /* ignore the pin LDAC */
 }
 
-/* --- all together --- */
+/* --- startup --- */
 
 void outputs_start(void) {
     REGISTER(IO_CTRL(PIN_GATE)) = GATE_FORCED_LOW;
@@ -82,8 +82,8 @@ void outputs_start(void) {
     configure_input(PIN_INTERLOCK, PAD_PULL_DOWN); /* a broken wire is low: unsafe */
     configure_input(PIN_KEY, PAD_PULL_DOWN);
     configure_input(PIN_ESTOP, PAD_PULL_DOWN);
-    configure_input(PIN_READBACK, PAD_PULL_UP); /* a broken wire reads as light that nobody asked for */
-    configure_input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire is a port that is closed */
+    configure_input(PIN_READBACK, PAD_PULL_UP); /* a broken wire reads as gate on */
+    configure_input(PIN_HOST_CLOSED, PAD_PULL_UP); /* a broken wire reads as a closed port */
     configure_input(PIN_HOST_RX, PAD_PULL_UP);
     REGISTER(IO_CTRL(PIN_HOST_RX)) = IO_UART;
     REGISTER(IO_CTRL(PIN_HOST_TX)) = IO_UART;

@@ -1,4 +1,4 @@
-/* Light and mirrors. */
+/* Gate, relay, indicator and mirrors. */
 
 #ifndef OUTPUTS_H
 #define OUTPUTS_H
@@ -6,7 +6,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Dark, relay open, mirrors' converter ready. */
+/* Initialises the outputs: gate off, relay open, DAC ready. */
 void outputs_start(void);
 void outputs_set_gate(bool on, uint16_t duty);
 void outputs_move_mirrors(uint16_t x, uint16_t y);

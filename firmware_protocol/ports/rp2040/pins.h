@@ -1,4 +1,4 @@
-/* Which pin of the Pico does what; docs/how-to/wire-a-board.md has the circuit around them. Numbers are GPIOs. */
+/* Pin assignment of the Pico, GPIO numbers; docs/how-to/wire-a-board.md shows the circuit. */
 
 #ifndef PINS_H
 #define PINS_H
@@ -11,12 +11,12 @@
 #define PIN_INTERLOCK 10u  /* high while the interlock is closed */
 #define PIN_INDICATOR 11u
 #define PIN_RELAY 12u
-#define PIN_READBACK 13u   /* high while light may come from the driver's input */
+#define PIN_READBACK 13u   /* high while the driver's input permits emission */
 #define PIN_GATE 14u       /* PWM slice 7, channel A */
 #define GATE_SLICE 7u
 #define PIN_DAC_SYNC 17u
 #define PIN_DAC_CLOCK 18u
 #define PIN_DAC_DATA 19u
-#define PIN_TICK 22u       /* high while the tick runs: for a scope */
+#define PIN_TICK 22u       /* high while the tick runs, for an oscilloscope */
 
 #endif

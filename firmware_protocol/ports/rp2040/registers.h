@@ -1,4 +1,4 @@
-/* Registers of the RP2040 (data sheet: Raspberry Pi, "RP2040 Datasheet"), as far as this port uses them. */
+/* Registers of the RP2040 (data sheet: Raspberry Pi, "RP2040 Datasheet"), used by this port. */
 
 #ifndef REGISTERS_H
 #define REGISTERS_H
@@ -6,7 +6,7 @@
 #include <stdint.h>
 
 #define REGISTER(address) (*(volatile uint32_t *)(address))
-/* Every peripheral's register stands three times more: what is written there is toggled, set, cleared. */
+/* Aliases of each peripheral register toggle, set or clear the written bits. */
 #define SET(address) REGISTER((address) + 0x2000u)
 #define CLEAR(address) REGISTER((address) + 0x3000u)
 #define BIT(n) (1u << (n))
@@ -50,7 +50,7 @@
 #define PLL_FBDIV (PLL_SYS + 0x8u)
 #define PLL_PRIM (PLL_SYS + 0xcu)
 
-/* --- watchdog, reset's cause --- */
+/* --- watchdog, reset cause --- */
 #define PSM_WDSEL 0x40010008u
 #define WATCHDOG_CTRL 0x40058000u
 #define WATCHDOG_LOAD 0x40058004u
@@ -64,7 +64,7 @@
 #define IO_UART 2u
 #define IO_PWM 4u
 #define IO_SIO 5u
-#define IO_OUT_LOW (2u << 8) /* whatever the peripheral says */
+#define IO_OUT_LOW (2u << 8) /* independent of the peripheral */
 #define PAD(pin) (0x4001c004u + 4u * (pin))
 #define PAD_SCHMITT BIT(1)
 #define PAD_PULL_DOWN BIT(2)
@@ -94,7 +94,7 @@
 #define SPI_SR (SPI + 0x0cu)
 #define SPI_CPSR (SPI + 0x10u)
 
-/* --- PWM, timer, temperature, noise --- */
+/* --- PWM, timer, temperature, entropy --- */
 #define PWM_CSR(slice) (0x40050000u + 0x14u * (slice))
 #define PWM_CTR(slice) (0x40050008u + 0x14u * (slice))
 #define PWM_CC(slice) (0x4005000cu + 0x14u * (slice))

@@ -1,4 +1,4 @@
-/* What this board is: its own limits, which no host can loosen. Edit for the laser and mirrors that it drives. */
+/* Settings of this board: its limits, which no host can loosen. Edit them for its laser and mirrors. */
 
 #ifndef SETTINGS_H
 #define SETTINGS_H
@@ -6,7 +6,7 @@
 #include "board.h"
 
 #define HOST_BAUD 1000000u
-#define GATE_HZ 50000u /* of the PWM behind the duty: what the laser's driver still follows */
+#define GATE_HZ 50000u /* PWM frequency of the duty, within the bandwidth of the laser driver */
 #define FIRMWARE 0x00010000u
 #ifndef BOARD_UID
 #define BOARD_UID {'r', 'p', '2', '0', '4', '0', '-', '0', '0', '0', '0', '1'}

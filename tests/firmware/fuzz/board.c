@@ -1,8 +1,8 @@
-/* Fuzz target: a whole board under a host, inputs and a clock that do anything, watched by the oracle.
+/* Fuzz target: a whole board with arbitrary host, inputs and clock, checked by the oracle.
 
-   The fuzzer's bytes are steps: frames that are framed, numbered and addressed as they should be, mostly, so that they
-   get beyond the link; waits; inputs; damage. The first byte chooses the board, and whether it is armed already: that
-   it is by a real exchange, once for each board, remembered and put back. */
+   The fuzzer's bytes are steps: frames, mostly with valid framing, sequence number and session so that they pass the
+   link; waits; input changes; damage. The first byte selects the board and whether it is already armed: each board is
+   armed once by a real exchange, and its state is saved and restored. */
 
 #include <stdlib.h>
 #include <string.h>
@@ -10,7 +10,7 @@
 #include "oracle.h"
 
 #define STEPS_MAX 100u
-#define TICKS_MAX 6000u /* of one run */
+#define TICKS_MAX 6000u /* per run */
 #define SLOW_TICK_US 500u
 #define BOARDS (sizeof BOARDS_LIMITS / sizeof BOARDS_LIMITS[0])
 #define COUNT(list) (sizeof(list) / sizeof *(list))
@@ -63,9 +63,9 @@ static uint8_t read_inputs(void *context) {
     (void)context;
     return o->inputs;
 }
-static void set_indicator(void *context, bool lit) {
+static void set_indicator(void *context, bool on) {
     (void)context;
-    o->indicator = lit;
+    o->indicator = on;
 }
 static void set_relay(void *context, bool closed) {
     (void)context;
@@ -117,7 +117,7 @@ static void run_loop(const uint8_t *bytes, size_t n) {
     oracle_check(o, board);
 }
 
-/* Ticks when something is due and at least as often as a board must have them; loop: whether the main loop turns too. */
+/* Runs ticks at due events and at least at the required rate; loop: whether the main loop runs too. */
 static void wait(uint64_t us, bool loop) {
     uint64_t until_us = o->now_us + us;
     while (o->now_us < until_us && driver.ticks < TICKS_MAX) {
@@ -152,7 +152,7 @@ static void require_unchanged(const struct board *before) {
     free(now);
 }
 
-/* Bytes of which the oracle knows what they are: something, or nothing at all. */
+/* Passes bytes; nothing: whether the oracle expects no effect. */
 static void send_bytes(const uint8_t *wire, size_t n, bool nothing) {
     struct board *before = nothing ? malloc(sizeof *before) : NULL;
     run_loop(NULL, 0);
@@ -276,7 +276,7 @@ static void limits(void) {
     uint8_t body[34], *at = body;
     static const uint16_t AT[] = {0, 2, 4, 6, 10, 18, 20, 22, 24, 26, 28, 30, 32};
     static const uint16_t VALUES[] = {100, 1000, 5000, 20000, 32000, 33000, 40000, 65535};
-    memset(body, 0xff, sizeof body); /* as loose as can be */
+    memset(body, 0xff, sizeof body); /* loosest values */
     for (size_t k = 18; k < 32; k++) {
         body[k] = k / 2 == 10 || k / 2 == 12 ? 0xff : 0;
     }
@@ -287,7 +287,7 @@ static void limits(void) {
     send_frame(0x02, body, sizeof body);
 }
 
-/* A frame of any kind and content: often a right number and session, sometimes not. */
+/* Sends a frame of any type and content, often with a valid sequence number and session. */
 static void send_random_frame(void) {
     uint8_t body[244], how = read_u8(), type = read_u8(), n = how & 16 ? read_u8() : 4;
     n = n > sizeof body ? sizeof body : n;
@@ -298,7 +298,7 @@ static void send_random_frame(void) {
     send_frame_as(type % 32 + (how & 128), seq, how & 64 ? read_u16() : o->session, body, n);
 }
 
-/* A frame that would do something, with a bit turned: never may anything come of it. */
+/* Sends an effective frame with one flipped bit, which must have no effect. */
 static void send_damaged_frame(void) {
     static const uint8_t TYPES[] = {0x13, 0x16, 0x19, 0x01, 0x17};
     uint8_t wire[REFERENCE_WIRE_MAX], body[6] = {1}, type = TYPES[read_u8() % COUNT(TYPES)], where = read_u8();
@@ -306,7 +306,7 @@ static void send_damaged_frame(void) {
     size_t at = (where >> 3) % (n - 1);
     wire[at] ^= (uint8_t)(1u << (where & 7));
     o->pending_type = 0;
-    if (wire[at]) { /* else it is two pieces, and as short */
+    if (wire[at]) { /* else the frame is split in two */
         send_bytes(wire, n, true);
     }
 }
@@ -328,7 +328,7 @@ static void arm(void) {
     }
 }
 
-/* As a host does that wants to. */
+/* Arms as a correct host does. */
 static void arm_fully(void) {
     hello(1);
     send_frame(0x17, NULL, 0);
@@ -344,7 +344,7 @@ static void change_input(void) {
     uint8_t which = read_u8();
     oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
     tick();
-    if (which & 8) { /* a short one */
+    if (which & 8) { /* a short change */
         oracle_inputs_change(o, o->inputs ^ (uint8_t)(1u << which % 3));
         tick();
     }
@@ -456,7 +456,7 @@ static void step(const struct board_config *config) {
     }
 }
 
-/* --- boards that are armed --- */
+/* --- armed boards --- */
 
 static void begin(const struct board_config *config) {
     memset(&driver, 0, sizeof driver);
@@ -466,7 +466,7 @@ static void begin(const struct board_config *config) {
     power_up(config);
 }
 
-/* Off at power-up, then on: no fault. */
+/* Key off at power-up, then on, which is no fault. */
 static void turn_key(const struct board_config *config) {
     oracle_inputs_change(o, INPUT_INTERLOCK);
     power_up(config);

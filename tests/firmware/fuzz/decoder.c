@@ -1,7 +1,7 @@
-/* Fuzz target: the core's receiver against the reference, on bytes as they come.
+/* Fuzz target: the core's receiver against the reference decoder, byte by byte.
 
-   The first byte says how many of the pieces that follow are made into intact frames: otherwise no fuzzer would ever
-   meet the right CRC. The core's own buffers are on the heap, each as large as it must be and no larger. */
+   The first byte is the number of following pieces that become intact frames, since a fuzzer does not find a valid
+   CRC. The core's own buffers are on the heap, each as large as it must be and no larger. */
 
 #include <stdio.h>
 #include <stdlib.h>
@@ -27,7 +27,7 @@ static void compare(const struct frame *core, const struct parsed *expected) {
     if (core->length) {
         memcpy(body, core->body, core->length);
     }
-    alone.body = body; /* nothing is behind it */
+    alone.body = body; /* allocated exactly, so that an overrun is detected */
     enum frame_class class;
     if (frame_is_valid(&alone, &class) != reference_is_valid(expected)) {
         report_difference("a form that is none, or refused one that is");
@@ -35,7 +35,7 @@ static void compare(const struct frame *core, const struct parsed *expected) {
     free(body);
 }
 
-/* The piece alone, with nothing before or behind it that belongs to anyone. */
+/* Decodes the piece in a buffer of its exact size. */
 static void unpack_alone(const uint8_t *piece, size_t n) {
     if (n <= RAW_MAX + 1) {
         uint8_t *alone = malloc(n);
@@ -45,7 +45,7 @@ static void unpack_alone(const uint8_t *piece, size_t n) {
     }
 }
 
-/* The stream as a receiver must see it, piece by piece, and the core on the same bytes one by one. */
+/* Compares the reference, piece by piece, with the core, byte by byte. */
 static void run(const uint8_t *stream, size_t n) {
     struct receiver *receiver = calloc(1, sizeof *receiver);
     uint32_t format_errors = 0, crc_errors = 0;

@@ -55,7 +55,7 @@ void oracle_power_up(struct oracle *o, const struct board_config *config, uint64
                            .key_edge = config->key_edge, .now_us = now_us, .state = STATE_DISARMED,
                            .state_since_us = now_us, .inputs = o->inputs, .observed_inputs = o->inputs,
                            .unsafe_since_us = o->unsafe_since_us, .powering_up = true};
-    /* The world goes on: mirrors stand where they stood, and a pulse was as long as it was. */
+    /* A reset does not change the physical state: mirror position and gate. */
     fresh.x = o->x;
     fresh.y = o->y;
     fresh.gate_on = o->gate_on;
@@ -72,11 +72,11 @@ void oracle_inputs_change(struct oracle *o, uint8_t inputs) {
     o->inputs = inputs;
 }
 
-/* --- what the host says --- */
+/* --- messages from the host --- */
 
 static void on_sequenced_frame(struct oracle *o, const struct parsed *frame) {
     if (frame->seq != o->next_seq) {
-        return; /* a repetition, or one too early: must not be carried out */
+        return; /* a duplicate or a gap must not be carried out */
     }
     o->pending_type = frame->type;
     if (frame->type == 0x10) {
@@ -111,7 +111,7 @@ void oracle_on_frame(struct oracle *o, const struct parsed *frame) {
     }
 }
 
-/* --- what the board says --- */
+/* --- messages from the board --- */
 
 static void on_points_accepted(struct oracle *o) {
     uint32_t first = o->pending[0].index;
@@ -163,7 +163,7 @@ static void on_answer(struct oracle *o, bool carried_out, uint8_t next_seq) {
         on_accepted(o);
     }
     if (o->pending_type == 0x15) {
-        o->challenged = false; /* good for one answer */
+        o->challenged = false; /* valid for one confirmation */
     }
     o->pending_type = 0;
     o->next_seq = next_seq;
@@ -189,7 +189,7 @@ static const struct observed_pulse *pulse_of(const struct oracle *o, uint32_t in
     return NULL;
 }
 
-/* A report tells what was seen at the gate. */
+/* A report must match the observed gate edges. */
 static void check_report(const struct oracle *o, const struct parsed *frame) {
     for (size_t at = 12, k = 0; at < frame->length; at += 8, k++) {
         uint16_t on_ticks = u16(frame->body + at + 4), duty = u16(frame->body + at + 6);
@@ -220,7 +220,7 @@ void oracle_on_send(struct oracle *o, const uint8_t *bytes, size_t n) {
     case 0x91:
         on_answer(o, false, frame.body[0]);
         break;
-    case 0x92: /* HOLD may be left and come to again within one call */
+    case 0x92: /* HOLD may be left and entered again within one call */
         o->state_since_us = frame.body[0] == STATE_HOLD ? o->now_us : o->state_since_us;
         break;
     case 0x94:
@@ -236,7 +236,7 @@ void oracle_on_send(struct oracle *o, const uint8_t *bytes, size_t n) {
     }
 }
 
-/* --- light and mirrors --- */
+/* --- gate and mirrors --- */
 
 static uint64_t slack_us(const struct oracle *o) { return o->late_us; }
 
@@ -272,7 +272,7 @@ void oracle_on_mirrors(struct oracle *o, uint16_t x, uint16_t y) {
     o->x = x;
     o->y = y;
     if (o->powering_up) {
-        return; /* two seconds of arming are longer than any way back to rest */
+        return; /* the arming time exceeds any return to centre */
     }
     require(o->queue_count > 0, "B12", "mirrors move without a point");
     o->current = o->queue[o->queue_first % POINTS_MAX];
@@ -288,7 +288,7 @@ void oracle_on_mirrors(struct oracle *o, uint16_t x, uint16_t y) {
     }
 }
 
-/* --- the board's own watch --- */
+/* --- self-checks of the board --- */
 
 void oracle_on_readback(struct oracle *o, bool level) {
     if (level != o->gate_on && !o->differs) {

@@ -1,6 +1,6 @@
-/* What must hold of a board whatever is said and done to it: PROTOCOL.md's guards, stated once more over what goes into
-   the core and what comes out of it. It keeps its own lists and shares no code with the core but the struct's
-   declaration; where the page allows more than one answer, it takes the core's from its frames. */
+/* Test oracle: PROTOCOL.md's guards as conditions on the inputs and outputs of the core. It keeps its own state and
+   shares only the struct declarations with the core. Where PROTOCOL.md permits several answers, it follows the one in
+   the core's frames. */
 
 #ifndef ORACLE_H
 #define ORACLE_H
@@ -9,7 +9,7 @@
 #include "reference.h"
 
 #define POINTS_MAX 512u
-#define TICK_MAX_US 100u /* the driver's longest step, but for ticks that it makes late */
+#define TICK_MAX_US 100u /* longest time step of the driver, except for late ticks */
 
 struct observed_pulse {
     uint64_t from_us, to_us;
@@ -24,10 +24,10 @@ struct observed_point {
 };
 
 struct oracle {
-    struct board_limits own, limits; /* the board's, and those in force */
+    struct board_limits own, limits; /* the board's own limits, and the limits in force */
     uint16_t cell_codes;
     bool key_edge;
-    uint64_t now_us, late_us; /* late_us: ticks came so much too late, all in all */
+    uint64_t now_us, late_us; /* late_us: total lateness of all ticks */
 
     /* link */
     uint16_t session;
@@ -66,10 +66,10 @@ _Noreturn void report_violation(const char *guard, const char *what);
 /* --- before and after the driver calls the core --- */
 
 void oracle_power_up(struct oracle *o, const struct board_config *config, uint64_t now_us);
-/* The driver is about to pass an intact frame; says in changes_nothing whether it must not matter. */
+/* Call before an intact frame is passed; sets changes_nothing if the frame must have no effect. */
 void oracle_on_frame(struct oracle *o, const struct parsed *frame);
 void oracle_inputs_change(struct oracle *o, uint8_t inputs);
-/* After each call: what may be seen at that time. */
+/* Call after each call of the core: checks the visible state. */
 void oracle_check(struct oracle *o, const struct board *b);
 void oracle_after_tick(struct oracle *o, uint64_t since_us);
 
@@ -81,7 +81,7 @@ void oracle_on_readback(struct oracle *o, bool level);
 void oracle_on_feed(struct oracle *o);
 void oracle_on_send(struct oracle *o, const uint8_t *frame, size_t n);
 
-/* B4 to B6 of a pulse that begins now; keeps it in the list. */
+/* Checks B4 to B6 for a pulse that begins now, and adds it to the list. */
 struct observed_pulse *check_pulse_power(struct oracle *o);
 
 #endif

@@ -1,4 +1,4 @@
-/* B4 to B6 once more: over a list of all pulses, with fractions, without tables. */
+/* Independent checks of B4 to B6, in floating point over the list of all pulses. */
 
 #include <math.h>
 
@@ -45,7 +45,7 @@ static void check_cell(const struct oracle *o, struct observed_pulse *pulse, uns
     }
 }
 
-/* Light, µs × duty, within the second that ends at end_us; the newest pulse as long as it may get. */
+/* On time × duty within the second that ends at end_us, µs; the newest pulse counts with its full width. */
 static double window_duty_us(const struct oracle *o, double end_us) {
     double sum = 0;
     for (uint32_t k = 0; k < o->pulses_count; k++) {
@@ -60,7 +60,7 @@ static double window_duty_us(const struct oracle *o, double end_us) {
 static void check_mean_power(const struct oracle *o, const struct observed_pulse *pulse) {
     double most = SECOND_US * o->limits.mean_duty + (double)o->late_us * FULL + 0.5;
     double begin_us = (double)pulse->from_us, end_us = begin_us + pulse->on_us, max_duty_us = window_duty_us(o, end_us);
-    for (uint32_t k = 0; k < o->pulses_count; k++) { /* the sum turns only where a pulse begins to leave the second */
+    for (uint32_t k = 0; k < o->pulses_count; k++) { /* the sum peaks only where a pulse begins to leave the second */
         double leaves_us = (double)o->pulses[k].from_us + SECOND_US;
         if (leaves_us > begin_us && leaves_us < end_us) {
             max_duty_us = fmax(max_duty_us, window_duty_us(o, leaves_us));

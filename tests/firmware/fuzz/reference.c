@@ -11,7 +11,7 @@ static uint32_t compute_crc(const uint8_t *bytes, size_t n) {
     return ~crc;
 }
 
-/* The length of what the COBS bytes stand for, or more than REFERENCE_RAW_MAX where they are none. */
+/* Decodes COBS; returns the length, or more than REFERENCE_RAW_MAX if the bytes are invalid. */
 static size_t unpack(const uint8_t *bytes, size_t n, uint8_t *raw) {
     size_t length = 0, until_code = 0;
     for (size_t k = 0; k < n; k++) {
@@ -53,7 +53,7 @@ size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t sessi
         raw[n + 4 + k] = (uint8_t)(crc >> 8 * k);
     }
     size_t left = n + 8, to = 0;
-    for (const uint8_t *from = raw;;) { /* from zero to zero */
+    for (const uint8_t *from = raw;;) { /* one run between zeros per iteration */
         size_t run = 0;
         while (run < left && from[run]) {
             run++;
@@ -71,7 +71,7 @@ size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t sessi
     return to;
 }
 
-/* From the page's table: bytes of the body, bytes of each of 1 to `most` items that follow, numbers that need a name. */
+/* From PROTOCOL.md: bytes of the body, bytes per item of 1 to `most` items, enumerated fields. */
 static const struct {
     uint8_t type, size, item, most;
     bool sequenced;

@@ -1,4 +1,4 @@
-/* Framing once more, written from PROTOCOL.md and not from the core: what the fuzz targets judge the core by. */
+/* Reference implementation of framing, written from PROTOCOL.md and independent of the core. */
 
 #ifndef REFERENCE_H
 #define REFERENCE_H
@@ -19,13 +19,13 @@ struct parsed {
     size_t length;
 };
 
-/* What stands between two zeros; raw: REFERENCE_RAW_MAX bytes for its content, to which parsed->body points. */
+/* Decodes the bytes between two zeros. raw: buffer of REFERENCE_RAW_MAX bytes, to which parsed->body points. */
 enum reading reference_decode(const uint8_t *bytes, size_t n, uint8_t *raw, struct parsed *parsed);
-/* A frame with its delimiter; wire: REFERENCE_WIRE_MAX bytes. n: at most 244. */
+/* Encodes a frame with its delimiter. wire: buffer of REFERENCE_WIRE_MAX bytes; n: at most 244. */
 size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t session, const uint8_t *body, size_t n);
-/* Whether type, length and enumerations are those of a message. */
+/* Returns whether type, length and enumerations are those of a message. */
 bool reference_is_valid(const struct parsed *parsed);
-/* Whether a message of the host goes over the wire numbered. */
+/* Returns whether a host's message is sequenced. */
 bool reference_is_sequenced(uint8_t type);
 
 static inline uint64_t read_le(const uint8_t *at, size_t bytes) {
