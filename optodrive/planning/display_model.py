@@ -16,7 +16,7 @@ from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import ThermalState, build_cold_state
 from optodrive.planning.budget_setup import build_budget
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.limiter import cold_state
+from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.scheduler.scan_head import ScanHead
 
 
@@ -69,4 +69,4 @@ class DisplayModel:
 
     def build_cold_state(self) -> tuple[ThermalState, BudgetState]:
         """Return the thermal state and the budget state of a display at ambient temperature."""
-        return self.build_cold_heat(), cold_state(len(self.pixels))
+        return self.build_cold_heat(), build_cold_budget_state(len(self.pixels))

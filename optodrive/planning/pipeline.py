@@ -16,7 +16,7 @@ from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain,
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.batch_limiter import BatchLimiter
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import cold_state, concatenate
+from optodrive.planning.limiter.limiter import build_cold_budget_state, concatenate
 from optodrive.planning.limiter.usage import compute_usage
 from optodrive.planning.planned_sequence import (
     TIME_TOLERANCE_S,
@@ -59,7 +59,7 @@ def warm_up(display: DisplayModel) -> None:
         display.build_cold_heat().simulate_traces(np.zeros((0, 4)), [0], np.zeros(2))
     # The telemetry reads heat and budget while a plan runs.
     display.build_cold_heat().state_at(0.0)
-    compute_usage(cold_state(len(display.pixels)), display.budget, 0.0)
+    compute_usage(build_cold_budget_state(len(display.pixels)), display.budget, 0.0)
 
 
 def plan_sequence(

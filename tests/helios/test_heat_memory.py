@@ -9,7 +9,7 @@ from helios.bench import build_display, build_train
 from optodrive.core.errors import InputError
 from optodrive.core.types.plans import BudgetState
 from optodrive.link.helios.heat_memory import ZERO_OFFSET_S, HeatMemory
-from optodrive.planning.limiter.limiter import cold_state
+from optodrive.planning.limiter.limiter import build_cold_budget_state
 from optodrive.planning.pipeline import plan_sequence
 
 DAY_S = 1.7e9
@@ -34,14 +34,14 @@ def test_the_file_lies_in_the_state_folder(memory, tmp_path):
 
 
 def test_without_a_play_the_state_is_cold(memory):
-    fresh = cold_state(16)
+    fresh = build_cold_budget_state(16)
     assert memory.load(DAY_S, fresh) is fresh
 
 
 def test_a_loaded_budget_counts_time_from_now(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S)
-    back = memory.load(DAY_S + 100.0, cold_state(16))
+    back = memory.load(DAY_S + 100.0, build_cold_budget_state(16))
     for item in fields(BudgetState):
         before, after = np.asarray(getattr(budget, item.name)), np.asarray(getattr(back, item.name))
         moved = (
@@ -56,7 +56,7 @@ def test_an_immediate_second_play_may_emit_less_than_a_cold_one(memory):
     sequence = build_train(width_s=0.04, gap_s=0.004, duration_s=1.0, power_w=2.0)
     energies = []
     for later_s in (budget.at_s, 3600.0):
-        recalled = memory.load(DAY_S + later_s, cold_state(16))
+        recalled = memory.load(DAY_S + later_s, build_cold_budget_state(16))
         energies.append(plan_sequence(display, sequence, display.build_cold_state()[0], recalled).plan.energy_j.sum())
     from_cold = plan_sequence(display, sequence, *display.build_cold_state()).plan.energy_j.sum()
     assert energies[0] < 0.9 * from_cold
@@ -66,23 +66,25 @@ def test_an_immediate_second_play_may_emit_less_than_a_cold_one(memory):
 def test_a_killed_play_may_still_emit(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S + ZERO_OFFSET_S)
-    assert memory.load(DAY_S + 0.1, cold_state(16)).at_s == pytest.approx(budget.at_s + ZERO_OFFSET_S - 0.1, abs=1e-6)
+    assert memory.load(DAY_S + 0.1, build_cold_budget_state(16)).at_s == pytest.approx(
+        budget.at_s + ZERO_OFFSET_S - 0.1, abs=1e-6
+    )
 
 
 def test_an_unusable_file_is_rejected_by_name(memory):
     _, budget = after_a_play()
     memory.save(budget, DAY_S)
     with pytest.raises(InputError, match=r"Helios-12-3\.npz: pixels: got 16, expected 437"):
-        memory.load(DAY_S, cold_state(437))
+        memory.load(DAY_S, build_cold_budget_state(437))
     with pytest.raises(InputError, match="the time of day: got"):
-        memory.load(DAY_S - 5.0, cold_state(16))
+        memory.load(DAY_S - 5.0, build_cold_budget_state(16))
     with memory.path.open("wb") as file:
         np.savez(file, format="optodrive-helios-memory", version=0)
     with pytest.raises(InputError, match="expected optodrive-helios-memory 1"):
-        memory.load(DAY_S, cold_state(16))
+        memory.load(DAY_S, build_cold_budget_state(16))
     memory.path.write_bytes(memory.path.read_bytes()[:100])
     with pytest.raises(InputError, match="a file that can be read; remove it once the display has cooled"):
-        memory.load(DAY_S, cold_state(16))
+        memory.load(DAY_S, build_cold_budget_state(16))
     memory.path.unlink()
     memory.path.mkdir()
     with pytest.raises(InputError, match="a file that can be written"):

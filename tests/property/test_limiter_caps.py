@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
 from optodrive.planning.limiter.budget import Budget, GalvoModel
-from optodrive.planning.limiter.limiter import cold_state, commit_until, limit, shift_state
+from optodrive.planning.limiter.limiter import build_cold_budget_state, commit_until, limit, shift_state
 from optodrive.planning.limiter.worst_case import build_heat_bound
 from reference_models.thermal_display import (
     KINDS,
@@ -59,7 +59,7 @@ def build_budget(model, unsure, caps, mirrors):
 
 def limit_in_batches(rng, plan, budget, pixels):
     """Limit the plan batch by batch; some batches are cancelled half-way, and their executed pulses are committed."""
-    state, committed, at = cold_state(pixels), [], 0
+    state, committed, at = build_cold_budget_state(pixels), [], 0
     while at < len(plan):
         until = at + int(rng.integers(1, 120))
         rows = slice(at, until)

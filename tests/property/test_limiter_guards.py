@@ -9,7 +9,7 @@ from optodrive.device.neighbours import Neighbours
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.budget_setup import build_nominal_model
 from optodrive.planning.limiter.budget import Budget
-from optodrive.planning.limiter.limiter import cold_state, limit
+from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 from optodrive.planning.limiter.worst_case import Uncertainty, build_heat_bound
 from reference_models.thermal_display import (
     NO_CAPS,
@@ -67,7 +67,7 @@ def cap_fraction(guard, factor=None, mutate=keep_budget, carry=keep_state):
     pixels = len(model.epsilon)
     offset_s = rows[-1][1] + rows[-1][2] + pause_s
     again = [(pixel, start_s + offset_s, width_s) for pixel, start_s, width_s in rows]
-    state, limited = cold_state(pixels), []
+    state, limited = build_cold_budget_state(pixels), []
     for part in (rows, again):
         batch, after = limit(build_plan(part, 2.45, display.config.display), state, mutate(budget))
         limited.append(batch)
@@ -132,7 +132,7 @@ def wrong_constant(guard):
 
 
 def forgotten_over_a_pause(guard):
-    return dict(carry=lambda state, before, at_s, pixels: cold_state(pixels, at_s))
+    return dict(carry=lambda state, before, at_s, pixels: build_cold_budget_state(pixels, at_s))
 
 
 def unacknowledged_not_counted(guard):

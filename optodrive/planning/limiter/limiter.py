@@ -66,7 +66,7 @@ MAX_WAIT_S = 3600.0
 WAIT_RESOLUTION_S = 1e-3
 
 
-def cold_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
+def build_cold_budget_state(pixel_count: int, at_s: float = 0.0) -> BudgetState:
     """Return the budget state of a cold display with its mirrors at their centre."""
 
     def zero() -> FloatArray:

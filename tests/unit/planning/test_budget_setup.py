@@ -13,7 +13,7 @@ from optodrive.physics.term import HeatGainBound
 from optodrive.physics.terms import discover_terms
 from optodrive.planning import budget_setup
 from optodrive.planning.budget_setup import BOUNDED_TERMS, build_budget, compute_heat_gain_bound
-from optodrive.planning.limiter.limiter import cold_state, limit
+from optodrive.planning.limiter.limiter import build_cold_budget_state, limit
 
 DISPLAY = DISPLAYS["display-16"]
 CONFIG = DISPLAY.config
@@ -82,7 +82,7 @@ def build_hostile_plan(power_w, seed):
 
 def compute_peak_fraction(key, budget, plan):
     """Return the peak of the absorber over its cap, simulated with that term alone."""
-    limited, _ = limit(plan, cold_state(len(DISPLAY.pixels)), budget)
+    limited, _ = limit(plan, build_cold_budget_state(len(DISPLAY.pixels)), budget)
     pulses = np.column_stack([limited.start_s, limited.width_s, limited.power_w, limited.pixel])
     t_s = np.arange(0.0, float(plan.start_s[-1]) + 0.3, 1e-4)
     ambient_k = CONFIG.ambient_c + ZERO_CELSIUS_K

@@ -12,7 +12,14 @@ from optodrive.core.types.plans import PulsePlan
 from optodrive.planning.limiter.budget import Budget, GalvoModel
 from optodrive.planning.limiter.caps import CAPS
 from optodrive.planning.limiter.energy_windows import PulseHistory, WindowChains, append, max_window_power_w
-from optodrive.planning.limiter.limiter import cold_state, commit_until, compute_wait_s, limit, shift_state, verify
+from optodrive.planning.limiter.limiter import (
+    build_cold_budget_state,
+    commit_until,
+    compute_wait_s,
+    limit,
+    shift_state,
+    verify,
+)
 from optodrive.planning.limiter.worst_case import (
     NominalThermalModel,
     NominalTouch,
@@ -76,7 +83,7 @@ def pulses(*rows):
 
 
 def run(budget, *rows, policy="trim"):
-    return limit(pulses(*rows), cold_state(3), budget, policy)[0]
+    return limit(pulses(*rows), build_cold_budget_state(3), budget, policy)[0]
 
 
 CASES = {
@@ -136,7 +143,7 @@ def test_refuse_names_pixel_and_cap(cause):
 
 def test_refuse_reports_the_delay_after_which_the_plan_fits():
     budget = build_budget(touch_k=2.0)
-    _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), cold_state(3), budget)
+    _, warm = limit(pulses((1, 0.0, 0.05, 2.45)), build_cold_budget_state(3), budget)
     again = pulses((1, 0.1, 0.05, 2.45))
     later_s = compute_wait_s(again, warm, budget)
     assert 0.01 < later_s < 10.0
@@ -188,7 +195,7 @@ def test_state_carries_over_plans_and_pauses():
     budget = build_budget(absorber_k=200.0, display_mean_w=0.5)
     rows = [(k % 3, 0.06 * k + (0.3 if k > 5 else 0.0), 0.05, 2.45) for k in range(12)]
     whole = run(budget, *rows)
-    state, power = cold_state(3), []
+    state, power = build_cold_budget_state(3), []
     for row in rows:
         piece, state = limit(pulses(row), state, budget)
         power += piece.power_w.tolist()
@@ -197,14 +204,14 @@ def test_state_carries_over_plans_and_pauses():
 
 def test_a_shifted_state_gives_the_same_limits():
     budget = build_budget(absorber_k=150.0, pixel_mean_w=0.6)
-    _, state = limit(pulses((0, 0.0, 0.05, 2.45)), cold_state(3), budget)
+    _, state = limit(pulses((0, 0.0, 0.05, 2.45)), build_cold_budget_state(3), budget)
     here, _ = limit(pulses((0, 0.07, 0.05, 2.45)), state, budget)
     there, _ = limit(pulses((0, 5.07, 0.05, 2.45)), shift_state(state, 5.0), budget)
     assert there.power_w == pytest.approx(here.power_w)
 
 
 def test_a_plan_must_not_start_before_the_budgets_time():
-    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), cold_state(3), WITHOUT_CAPS)
+    _, state = limit(pulses((0, 1.0, 0.05, 1.0)), build_cold_budget_state(3), WITHOUT_CAPS)
     with pytest.raises(RefusedError, match="before the budget's time"):
         limit(pulses((1, 0.5, 0.05, 1.0)), state, WITHOUT_CAPS)
 
@@ -217,22 +224,28 @@ def build_timed_pulses(plan, power_w):
 def test_verification_passes_limited_pulses_and_rejects_others():
     budget = build_budget(absorber_k=150.0)
     plan = run(budget, (0, 0.0, 0.05, 2.45), (1, 0.06, 0.05, 2.45))
-    verify(plan, np.arange(2), build_timed_pulses(plan, plan.power_w), cold_state(3), budget)
+    verify(plan, np.arange(2), build_timed_pulses(plan, plan.power_w), build_cold_budget_state(3), budget)
     with pytest.raises(LocalProtocolError, match="encoded pulse 1 on pixel 1 passes a cap"):
-        verify(plan, np.arange(2), build_timed_pulses(plan, plan.power_w * [1.0, 1.001]), cold_state(3), budget)
+        verify(
+            plan,
+            np.arange(2),
+            build_timed_pulses(plan, plan.power_w * [1.0, 1.001]),
+            build_cold_budget_state(3),
+            budget,
+        )
 
 
 def test_only_executed_pulses_count():
     budget = build_budget(touch_k=5.0)
-    plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), cold_state(3), budget)
-    first_only = commit_until(plan, 0.1, cold_state(3), budget)
+    plan, after = limit(pulses((0, 0.0, 0.05, 2.45), (1, 0.1, 0.05, 2.45)), build_cold_budget_state(3), budget)
+    first_only = commit_until(plan, 0.1, build_cold_budget_state(3), budget)
     assert first_only.touch_k[0].max() > 0.5
     assert first_only.touch_k[1].max() == 0.0
     assert after.touch_k[1].max() > 0.5
 
 
 def test_the_state_does_not_grow_with_the_number_of_pulses():
-    budget, state = build_budget(pixel_mean_w=1.3, touch_k=20.0), cold_state(3)
+    budget, state = build_budget(pixel_mean_w=1.3, touch_k=20.0), build_cold_budget_state(3)
     sizes = []
     for k in range(30):
         train = pulses(*[(n % 3, 100.0 * k + 0.01 * n, 0.005, 2.45) for n in range(1000)])

@@ -7,7 +7,7 @@ import pytest
 
 from optodrive.device.config import load_config
 from optodrive.planning.display_model import DisplayModel
-from optodrive.planning.limiter.limiter import cold_state, commit_executed, shift_state
+from optodrive.planning.limiter.limiter import build_cold_budget_state, commit_executed, shift_state
 from optodrive.planning.limiter.usage import compute_usage
 
 DISPLAY = DisplayModel.from_config(load_config("display-16"))
@@ -23,7 +23,7 @@ def build_train_state(pixel=5, count=20, start_s=0.1, width_s=0.02, gap_s=0.02, 
         x_rad=np.zeros(count),
         y_rad=np.zeros(count),
     )
-    state = commit_executed(np.full(count, pixel), pulses, cold_state(len(DISPLAY.pixels)), BUDGET)
+    state = commit_executed(np.full(count, pixel), pulses, build_cold_budget_state(len(DISPLAY.pixels)), BUDGET)
     return state, float(start[-1] + width_s)
 
 
@@ -32,7 +32,7 @@ def of(state, at_s):
 
 
 def test_a_cold_display_uses_nothing():
-    assert all(item.used == 0.0 for item in compute_usage(cold_state(len(DISPLAY.pixels)), BUDGET, 100.0))
+    assert all(item.used == 0.0 for item in compute_usage(build_cold_budget_state(len(DISPLAY.pixels)), BUDGET, 100.0))
 
 
 def test_mean_powers_are_the_energy_within_their_windows():

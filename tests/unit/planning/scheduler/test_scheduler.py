@@ -3,6 +3,7 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.scheduler.scheduler import GalvoPause, Scheduler
 
 
 def frame(display, heights_um, show_at=0.0, duration=1.0, name="f"):
@@ -93,3 +94,71 @@ def test_a_given_visiting_order_is_kept(display):
     sequence = FrameSequence((frame(display, dict.fromkeys((3, 4, 5), 50)),))
     result = plan_sequence(display, sequence, *display.build_cold_state(), visiting_orders={0: np.array([4, 3, 5])})
     assert result.plan.pixel.tolist() == [4, 3, 5]
+
+
+def cold(display):
+    return display.build_cold_heat()
+
+
+def start(display, *frames):
+    return Scheduler(display.scan_head, FrameSequence(frames), display.build_cold_heat)
+
+
+def test_a_delayed_batch_and_everything_after_it_start_later(display):
+    scheduler, heat = (
+        start(display, frame(display, {3: 50, 4: 50}, 0.0, 0.1), frame(display, {9: 50}, 0.1)),
+        cold(display),
+    )
+    first = scheduler.next_batch(heat)
+    scheduler.delay(20_000)
+    delayed = scheduler.next_batch(heat)
+    scheduler.accept()
+    second = scheduler.next_batch(heat)
+    assert delayed.start_s == pytest.approx(first.start_s + 0.02)
+    assert second.start_s[0] == pytest.approx(scheduler.lead_in_us * 1e-6 + 0.1 + 0.02)
+
+
+def test_a_pause_splits_a_batch_after_its_first_pulses(display):
+    scheduler, heat = start(display, frame(display, {3: 50, 4: 50, 5: 50})), cold(display)
+    whole = scheduler.next_batch(heat)
+    scheduler.pause(GalvoPause(2, 100_000))
+    first = scheduler.next_batch(heat)
+    scheduler.accept()
+    last = scheduler.next_batch(heat)
+    assert [len(batch) for batch in (whole, first, last)] == [3, 2, 1]
+    assert first.start_s == pytest.approx(whole.start_s[:2])
+    assert last.start_s[0] == pytest.approx(whole.start_s[2] + 0.1)
+    scheduler.pause(GalvoPause(0, 50_000))
+    assert scheduler.next_batch(heat).start_s[0] == pytest.approx(last.start_s[0] + 0.05)
+
+
+def test_a_withdrawn_batch_leaves_no_trace(display):
+    frames = frame(display, {7: 300}, 0.0, 0.04, "a"), frame(display, {7: 20, 8: 20}, 0.04, 0.04, "b")
+    scheduler, heat = start(display, *frames), cold(display)
+    for _ in scheduler.run(heat, refuse_once(scheduler)):
+        pass
+    assert [(item.source, item.pixel) for item in scheduler.skipped] == [(1, 7)]
+
+
+def refuse_once(scheduler):
+    """Return a callback that delays every batch once by 1 µs."""
+    seen = []
+
+    def grant(batch):
+        if len(seen) % 2 == 0:
+            scheduler.delay(1)
+        seen.append(batch)
+        return batch if len(seen) % 2 == 0 else None
+
+    return grant
+
+
+def test_an_answer_needs_a_proposed_batch(display):
+    scheduler, heat = start(display, frame(display, {3: 50})), cold(display)
+    with pytest.raises(RuntimeError, match="no batch is proposed"):
+        scheduler.accept()
+    scheduler.next_batch(heat)
+    scheduler.accept()
+    assert scheduler.next_batch(heat) is None
+    with pytest.raises(RuntimeError, match="no batch is proposed"):
+        scheduler.delay(1)
