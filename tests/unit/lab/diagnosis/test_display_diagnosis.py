@@ -79,20 +79,20 @@ def answers_by_pixel(recording):
 
 
 @pytest.mark.slow
-def test_every_pixel_has_its_answer_though_workers_were_killed(answers_by_pixel):
+def test_every_pixel_has_an_answer_although_workers_were_killed(answers_by_pixel):
     assert sorted(answers_by_pixel) == [*HIDDEN, BAD, KILLER]
     for pixel, terms in HIDDEN.items():
         answer, error = answers_by_pixel[pixel]
         assert not error
-        assert answer.found.causes == tuple(terms)
+        assert answer.discrepancy.causes == tuple(terms)
 
 
 def test_answers_are_those_of_one_process(answers_by_pixel, recording):
     for task in tasks_of(DisplayRuns.open([recording]))[:2]:
-        alone, there = diagnose_pixel(task).discrepancy, answers_by_pixel[task.pixel][0].discrepancy
-        assert alone.parameters == there.parameters
-        assert alone.candidates == there.candidates
-        assert alone.gain == there.gain
+        local, remote = diagnose_pixel(task).discrepancy, answers_by_pixel[task.pixel][0].discrepancy
+        assert local.parameters == remote.parameters
+        assert local.candidates == remote.candidates
+        assert local.gain == remote.gain
 
 
 def test_bad_data_are_that_pixels_error_alone(answers_by_pixel):
@@ -102,13 +102,13 @@ def test_bad_data_are_that_pixels_error_alone(answers_by_pixel):
     assert "\n" not in answer.error
 
 
-def test_a_pixel_that_kills_its_workers_is_told_and_takes_no_other_with_it(answers_by_pixel):
+def test_a_pixel_that_kills_its_workers_is_reported_and_affects_no_other(answers_by_pixel):
     answer, error = answers_by_pixel[KILLER]
     assert answer is None
     assert "worker died" in error
 
 
-def test_what_is_told_of_a_display(answers_by_pixel):
+def test_narrative_and_answer_of_a_display(answers_by_pixel):
     pixels = tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD])
     found = DisplayAnswer(pixels, None, 1.0)
     lines = build_display_narrative(found)
@@ -125,7 +125,7 @@ def test_what_is_told_of_a_display(answers_by_pixel):
     assert document["pixels"]["31"]["verdict"] is None
 
 
-def test_the_map_lies_as_the_display_does_and_needs_nothing_beside_itself(answers_by_pixel):
+def test_the_map_follows_the_layout_and_is_self_contained(answers_by_pixel):
     found = DisplayAnswer(tuple(answers_by_pixel[pixel][0] for pixel in [*HIDDEN, BAD]), None, 1.0)
     html = build_display_report(found, "display.h5", load_config("display-437"))
     assert html.count("<title>pixel ") == 437
