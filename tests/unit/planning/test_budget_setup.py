@@ -131,9 +131,9 @@ def test_a_larger_heat_capacity_when_hot_slows_the_cooling_of_the_bound():
 
 def test_a_uniform_rise_is_subtracted_from_every_cap_with_its_effect_on_walls_and_touch_surfaces():
     parameters = with_term("ambient_drift", **LARGE["ambient_drift"])
-    warming = compute_heat_gain_bound(parameters, DISPLAY.pixels, CONFIG)
-    assert 4.5 < warming.uniform_rise_k < 4.7
+    heat_gain = compute_heat_gain_bound(parameters, DISPLAY.pixels, CONFIG)
+    assert 4.5 < heat_gain.uniform_rise_k < 4.7
     plain = build_budget(CONFIG, load_parameters("surroundings"), DISPLAY.pixels).caps
     caps = build_budget(CONFIG, parameters, DISPLAY.pixels).caps
     for name in ("absorber_k", "wall_k", "touch_k"):
-        assert getattr(plain, name) - getattr(caps, name) == pytest.approx(warming.uniform_rise_k, rel=0.01)
+        assert getattr(plain, name) - getattr(caps, name) == pytest.approx(heat_gain.uniform_rise_k, rel=0.01)

@@ -197,8 +197,8 @@ def test_state_carries_over_plans_and_pauses():
     whole = run(budget, *rows)
     state, power = build_cold_budget_state(3), []
     for row in rows:
-        piece, state = limit(pulses(row), state, budget)
-        power += piece.power_w.tolist()
+        batch, state = limit(pulses(row), state, budget)
+        power += batch.power_w.tolist()
     assert power == pytest.approx(whole.power_w.tolist(), rel=1e-12, abs=1e-12)
 
 
@@ -277,18 +277,18 @@ def search_max_power_w(window_s, cap_j, rows, start, width):
 def test_the_energy_window_agrees_with_an_exhaustive_search():
     rng = np.random.default_rng(5)
     for _ in range(15):
-        fired_pulses = PulseHistory(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
+        history = PulseHistory(*np.zeros((3, 12)), np.zeros(12, dtype=np.int64), np.zeros(1, dtype=np.int64))
         chain = WindowChains(np.full(1, -1), np.full(1, -1), np.zeros(1), np.full(12, -1), np.zeros(12))
         time, rows = 0.0, []
         for row in range(12):
             time += rng.uniform(0.0, 0.1)
             width, power = rng.uniform(0.001, 0.05), rng.uniform(0.0, 4.0)
-            exact = max_window_power_w(chain, 0, fired_pulses, time, width, 0.5, 1.0)
+            exact = max_window_power_w(chain, 0, history, time, width, 0.5, 1.0)
             tried = search_max_power_w(0.5, 0.5, rows, time, width)
             assert exact <= tried * (1 + 1e-9) + 1e-9
             assert exact == pytest.approx(tried, rel=2e-2, abs=2e-2)
             power = max(0.0, min(power, exact))
-            fired_pulses.start_s[row], fired_pulses.width_s[row], fired_pulses.power_w[row] = time, width, power
-            append(chain, 0, fired_pulses, row)
+            history.start_s[row], history.width_s[row], history.power_w[row] = time, width, power
+            append(chain, 0, history, row)
             rows.append((time, width, power))
             time += width

@@ -128,8 +128,8 @@ def test_the_last_round_compensates_for_trimmed_sub_pulses():
     for row in range(len(plan)):
         if row in last:
             periods, duty = heat.solve_pulse(int(plan.pixel[row]), plan.start_s[row], 100e-6, DISPLAY.scan_head.drive)
-            asked_j = periods * 2e-4 * duty * DISPLAY.scan_head.drive.max_power_w
-            assert plan.energy_j[row] + plan.trimmed_j[row] == pytest.approx(asked_j, rel=1e-6)
+            requested_j = periods * 2e-4 * duty * DISPLAY.scan_head.drive.max_power_w
+            assert plan.energy_j[row] + plan.trimmed_j[row] == pytest.approx(requested_j, rel=1e-6)
         heat.apply_pulse(int(plan.pixel[row]), plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 

@@ -145,8 +145,8 @@ def test_the_next_pulse_compensates_for_a_trimmed_one():
     drive = limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
     for row in range(len(plan)):
         periods, duty = heat.solve_pulse(17, plan.start_s[row], 200e-6, drive)
-        asked_j = plan.energy_j[row] + plan.trimmed_j[row]
-        assert asked_j == pytest.approx(periods * drive.period_s * duty * drive.max_power_w, rel=1e-6)
+        requested_j = plan.energy_j[row] + plan.trimmed_j[row]
+        assert requested_j == pytest.approx(periods * drive.period_s * duty * drive.max_power_w, rel=1e-6)
         heat.apply_pulse(17, plan.start_s[row], plan.width_s[row], plan.power_w[row])
 
 
@@ -214,17 +214,17 @@ def test_starts_too_close_for_a_move_are_refused():
 
 
 def test_many_cycles_converge_to_the_steady_state():
-    at_rest, drive = DISPLAY.build_cold_heat(), limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
+    cold_heat, drive = DISPLAY.build_cold_heat(), limit_pulse_width(DISPLAY.scan_head.drive, 39_500)
     train = HeightTrain(17, 0.0, 1.0, 0.04, 250e-6, 100e-6)
-    shape = build_pulse_recipe(train, at_rest, drive, "t")
+    shape = build_pulse_recipe(train, cold_heat, drive, "t")
     assert shape.target_m == 250e-6
-    found = solve_steady_state(train, at_rest, drive, shape.min_periods)
+    found = solve_steady_state(train, cold_heat, drive, shape.min_periods)
     assert found.peak_m == pytest.approx(250e-6, rel=1e-3)
     assert found.peak_to_peak_m == pytest.approx(100e-6, rel=0.02)
-    wider = solve_steady_state(train, at_rest, drive, shape.min_periods + 20)
+    wider = solve_steady_state(train, cold_heat, drive, shape.min_periods + 20)
     assert wider.peak_to_peak_m < found.peak_to_peak_m
-    assert compute_steady_state(train, at_rest, drive, 10, 0.5).peak_m == pytest.approx(
-        0.5 * compute_steady_state(train, at_rest, drive, 10, 1.0).peak_m
+    assert compute_steady_state(train, cold_heat, drive, 10, 0.5).peak_m == pytest.approx(
+        0.5 * compute_steady_state(train, cold_heat, drive, 10, 1.0).peak_m
     )
 
 

@@ -25,8 +25,8 @@ def test_every_move_has_its_settling_time(any_display):
     result = plan_frames(any_display, frame(any_display, dict.fromkeys(range(len(any_display.layout)), 40), duration=9))
     plan = result.plan
     moves = any_display.scan_head.settling
-    lit_us = np.rint(plan.width_s[:-1] * 1e6)
-    steps = zip(np.diff(plan.x_rad), np.diff(plan.y_rad), lit_us, strict=True)
+    dwell_us = np.rint(plan.width_s[:-1] * 1e6)
+    steps = zip(np.diff(plan.x_rad), np.diff(plan.y_rad), dwell_us, strict=True)
     needed = [moves.settling_us(*step) * 1e-6 for step in steps]
     assert np.all(gaps(plan) >= np.array(needed) - 1e-9)
     assert len(plan) == len(any_display.layout)
