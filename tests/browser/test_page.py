@@ -277,7 +277,7 @@ def test_the_library_offers_every_pattern_with_its_parameters(visit, daemon):
     page.locator("#pattern").select_option("text")
     page.get_by_role("button", name="Preview").click()
     expect(page.locator("#result .bad")).to_contain_text("text")
-    page.get_by_label("text (needed)").fill("hello")
+    page.get_by_label("text (required)").fill("hello")
     preview(page)
 
 

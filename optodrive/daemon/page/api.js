@@ -1,13 +1,13 @@
-// Calls to the daemon. The token lies in this daemon's own cookie; calls carry it as a bearer header.
+// Requests to the daemon. The token is in a cookie named after the daemon's port; requests send it as a bearer header.
 
 const COOKIE = `optodrive-${location.port || "80"}=`;
 
 export function token() {
-  const own = document.cookie.split("; ").find((item) => item.startsWith(COOKIE));
-  return own ? own.slice(COOKIE.length) : "";
+  const cookie = document.cookie.split("; ").find((item) => item.startsWith(COOKIE));
+  return cookie ? cookie.slice(COOKIE.length) : "";
 }
 
-// What the daemon refused, with its problem document; status 0 where nothing answered.
+// An error response with its problem document; status 0 if the daemon does not answer.
 export class Problem extends Error {
   constructor(status, problem) {
     super(problem.detail || problem.title || `the daemon answered ${status}`);
@@ -26,18 +26,18 @@ export function request(method, path, { body, signal } = {}) {
 }
 
 export async function call(method, path, options = {}) {
-  let answer;
+  let response;
   try {
-    answer = await request(method, path, options);
+    response = await request(method, path, options);
   } catch (error) {
     if (error.name === "AbortError") {
       throw error;
     }
     throw new Problem(0, { detail: "The daemon does not answer." });
   }
-  const body = await answer.json().catch(() => ({}));
-  if (!answer.ok) {
-    throw new Problem(answer.status, body);
+  const body = await response.json().catch(() => ({}));
+  if (!response.ok) {
+    throw new Problem(response.status, body);
   }
   return body;
 }

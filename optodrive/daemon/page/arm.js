@@ -1,77 +1,76 @@
-// Arming, deliberately: one control asks, another confirms within five seconds. Never by itself.
+// Arming in two steps: one button requests it, another confirms it within five seconds. The page never arms by itself.
 
 import { call } from "./api.js";
-import { ARMED_STATES, BoardState } from "./board_states.js";
 
 const CONFIRM_S = 5;
 
-export class Arm {
-  constructor(find, say, failed) {
+export class ArmControl {
+  constructor(find, announce, onError) {
     this.button = find("arm");
-    this.box = find("confirm");
-    this.left = find("confirm-left");
-    this.line = find("arming");
-    this.idle = this.line.textContent;
-    this.say = say;
-    this.failed = failed;
+    this.confirmation = find("confirm");
+    this.countdown = find("confirm-left");
+    this.status = find("arming");
+    this.idleText = this.status.textContent;
+    this.announce = announce;
+    this.onError = onError;
     this.state = "";
-    this.button.addEventListener("click", () => this.#ask());
+    this.button.addEventListener("click", () => this.#requestConfirmation());
     find("confirm-arm").addEventListener("click", () => this.#confirm());
     find("disarm").addEventListener("click", () => this.disarm());
   }
 
-  // The board's state, '' where it is not known.
+  // Show the board's state; '' if it is unknown.
   show(state) {
     if (state !== this.state) {
       this.state = state;
-      this.button.disabled = state !== BoardState.DISARMED;
-      this.line.textContent =
-        state === BoardState.ARMING
-          ? "The indicator is lit; the laser can emit when its two seconds are over."
-          : ARMED_STATES.includes(state)
+      this.button.disabled = state !== "DISARMED";
+      this.status.textContent =
+        state === "ARMING"
+          ? "The indicator is on; the laser can emit after two seconds."
+          : ["ARMED", "RUNNING", "HOLD"].includes(state)
             ? "ARMED: the laser emits when a plan plays."
-            : this.idle;
-      if (state !== BoardState.DISARMED) {
-        this.#close();
+            : this.idleText;
+      if (state !== "DISARMED") {
+        this.#closeConfirmation();
       }
     }
   }
 
   async disarm() {
-    this.#close();
-    await call("POST", "/v1/disarm").catch(this.failed);
+    this.#closeConfirmation();
+    await call("POST", "/v1/disarm").catch(this.onError);
   }
 
-  #ask() {
-    this.until = performance.now() + CONFIRM_S * 1000;
-    this.box.hidden = false;
-    this.say("To arm the laser, press the button Confirm within five seconds.");
+  #requestConfirmation() {
+    this.deadline = performance.now() + CONFIRM_S * 1000;
+    this.confirmation.hidden = false;
+    this.announce("To arm the laser, press the button Confirm within five seconds.");
     clearInterval(this.timer);
-    this.timer = setInterval(() => this.#count(), 100);
-    this.#count();
+    this.timer = setInterval(() => this.#updateCountdown(), 100);
+    this.#updateCountdown();
   }
 
-  #count() {
-    const left = (this.until - performance.now()) / 1000;
-    this.left.value = Math.max(0, left);
-    if (left <= 0) {
-      this.#close();
-      this.say("Not armed.");
+  #updateCountdown() {
+    const remainingS = (this.deadline - performance.now()) / 1000;
+    this.countdown.value = Math.max(0, remainingS);
+    if (remainingS <= 0) {
+      this.#closeConfirmation();
+      this.announce("Not armed.");
     }
   }
 
-  #close() {
+  #closeConfirmation() {
     clearInterval(this.timer);
-    this.box.hidden = true;
+    this.confirmation.hidden = true;
   }
 
   async #confirm() {
-    if (this.box.hidden || performance.now() > this.until) {
+    if (this.confirmation.hidden || performance.now() > this.deadline) {
       return;
     }
-    this.#close();
+    this.#closeConfirmation();
     this.button.disabled = true;
-    await call("POST", "/v1/arm").catch(this.failed);
-    this.button.disabled = this.state !== BoardState.DISARMED;
+    await call("POST", "/v1/arm").catch(this.onError);
+    this.button.disabled = this.state !== "DISARMED";
   }
 }

@@ -1,9 +1,9 @@
-// The display: every pixel a square, what is drawn and the beam's path over it. One picture of the lattice is scaled up.
+// The display: one square per pixel, the drawing, and the path of the beam. A picture of the grid is scaled up.
 
-import { table, themed } from "./colours.js";
+import { buildColourMap, readThemeColour } from "./colours.js";
 
 const SIZE = 680;
-const STEPS = [10, 20, 50, 100, 200, 500, 1000];
+const SCALE_STEPS = [10, 20, 50, 100, 200, 500, 1000];
 const SHRINK_MS = 3000;
 const GAP = 0.12;
 
@@ -11,15 +11,14 @@ export class DisplayView {
   constructor(canvas, grid) {
     this.canvas = canvas;
     this.grid = grid;
-    this.show = "height";
-    this.cursor = grid.middle();
+    this.quantity = "height";
+    this.cursor = grid.centre();
     this.drawn = new Float32Array(grid.pixels);
-    this.beam = [];
-    this.live = false;
+    this.beamPath = [];
     this.values = { height: new Float32Array(grid.pixels), absorber: new Float32Array(grid.pixels), preview: new Float32Array(grid.pixels) };
     this.ambient = 20;
-    this.top = { height: 10, absorber: 10, preview: 10 };
-    this.small = new Map();
+    this.scaleRange = { height: 10, absorber: 10, preview: 10 };
+    this.lastFilled = new Map();
     this.frames = 0;
     this.cell = SIZE / Math.max(grid.rows, grid.columns);
     canvas.width = Math.round(this.cell * grid.columns);
@@ -30,54 +29,58 @@ export class DisplayView {
     this.picture = new ImageData(grid.columns, grid.rows);
     this.mask = new OffscreenCanvas(canvas.width, canvas.height);
     this.marks = new OffscreenCanvas(canvas.width, canvas.height);
-    this.setColours("viridis");
-    this.asked = false;
-    this.rescaled = () => {};
+    this.setColourMap("viridis");
+    this.paintRequested = false;
+    this.onScaleChange = () => {};
   }
 
-  setColours(name) {
-    this.colours = table(name);
-    this.themed();
+  setColourMap(name) {
+    this.colours = buildColourMap(name);
+    this.applyTheme();
   }
 
-  // Colours of the theme, and all that depends on them.
-  themed() {
-    this.ink = themed("ink");
-    this.mark = themed("mark");
-    this.#paintMask(themed("well"));
+  // Read the colours of the theme and repaint everything that depends on them.
+  applyTheme() {
+    this.ink = readThemeColour("ink");
+    this.mark = readThemeColour("mark");
+    this.#paintMask(readThemeColour("well"));
     this.redrawMarks();
   }
 
-  // What came from the daemon; values in µm and °C.
-  take(height, absorber) {
+  // Set heights in µm and absorber temperatures in °C.
+  setValues(height, absorber) {
     this.values.height = height;
     this.values.absorber = absorber;
-    this.ask();
+    this.requestPaint();
   }
 
-  ask() {
-    if (!this.asked) {
-      this.asked = true;
+  requestPaint() {
+    if (!this.paintRequested) {
+      this.paintRequested = true;
       requestAnimationFrame(() => this.paint());
     }
   }
 
-  get low() {
-    return this.show === "absorber" ? this.ambient : 0;
+  get scaleMin() {
+    return this.quantity === "absorber" ? this.ambient : 0;
+  }
+
+  get scaleMax() {
+    return this.scaleMin + this.scaleRange[this.quantity];
   }
 
   paint() {
-    this.asked = false;
+    this.paintRequested = false;
     const { grid, context, picture, colours } = this;
-    const values = this.values[this.show];
-    const top = this.#scale(values);
+    const values = this.values[this.quantity];
+    const range = this.#updateScale(values);
     const bytes = picture.data;
     for (let pixel = 0; pixel < grid.pixels; pixel++) {
-      const place = grid.place[pixel];
-      const row = grid.rows - 1 - Math.floor(place / grid.columns);
-      const share = Math.min(255, Math.max(0, Math.round(((values[pixel] - this.low) / top) * 255)));
-      const at = 4 * (row * grid.columns + (place % grid.columns));
-      bytes.set(colours.subarray(4 * share, 4 * share + 4), at);
+      const position = grid.positions[pixel];
+      const row = grid.rows - 1 - Math.floor(position / grid.columns);
+      const level = Math.min(255, Math.max(0, Math.round(((values[pixel] - this.scaleMin) / range) * 255)));
+      const offset = 4 * (row * grid.columns + (position % grid.columns));
+      bytes.set(colours.subarray(4 * level, 4 * level + 4), offset);
     }
     this.lattice.getContext("2d").putImageData(picture, 0, 0);
     context.imageSmoothingEnabled = false;
@@ -89,31 +92,31 @@ export class DisplayView {
     this.canvas.dataset.frames = this.frames;
   }
 
-  // The top of the scale: a round number above all, which goes down only after a while.
-  #scale(values) {
-    let most = 0;
+  // Return the range of the scale: a round number above all values, which decreases only after a delay.
+  #updateScale(values) {
+    let max = 0;
     for (const value of values) {
-      most = Math.max(most, value - this.low);
+      max = Math.max(max, value - this.scaleMin);
     }
-    const before = this.top[this.show];
-    const wanted = STEPS.find((step) => step >= most) ?? STEPS.at(-1);
+    const previous = this.scaleRange[this.quantity];
+    const needed = SCALE_STEPS.find((step) => step >= max) ?? SCALE_STEPS.at(-1);
     const now = performance.now();
-    if (wanted >= before) {
-      this.small.set(this.show, now);
+    if (needed >= previous) {
+      this.lastFilled.set(this.quantity, now);
     }
-    if (wanted > before || now - (this.small.get(this.show) ?? now) > SHRINK_MS) {
-      this.top[this.show] = wanted;
-      this.rescaled();
+    if (needed > previous || now - (this.lastFilled.get(this.quantity) ?? now) > SHRINK_MS) {
+      this.scaleRange[this.quantity] = needed;
+      this.onScaleChange();
     }
-    return this.top[this.show];
+    return this.scaleRange[this.quantity];
   }
 
   #corner(pixel) {
     return [this.grid.column(pixel) * this.cell, (this.grid.rows - 1 - this.grid.row(pixel)) * this.cell];
   }
 
-  #middle(pixel) {
-    return this.#corner(pixel).map((at) => at + this.cell / 2);
+  #centre(pixel) {
+    return this.#corner(pixel).map((coordinate) => coordinate + this.cell / 2);
   }
 
   #paintMask(colour) {
@@ -140,27 +143,27 @@ export class DisplayView {
         context.strokeRect(x + line / 2, y + line / 2, this.cell - line, this.cell - line);
       }
     }
-    this.ask();
+    this.requestPaint();
   }
 
   #paintBeam() {
-    const { context } = this;
-    if (this.beam.length < 1) {
+    const { context, beamPath } = this;
+    if (beamPath.length < 1) {
       return;
     }
-    // White on the darker part of every map, and edged for the lighter.
+    // White, which contrasts with the darker part of every map, with an edge for the lighter part.
     context.strokeStyle = context.fillStyle = "white";
-    for (let k = 1; k < this.beam.length; k++) {
-      context.globalAlpha = 0.1 + (0.7 * k) / this.beam.length;
-      context.lineWidth = 1 + (2 * k) / this.beam.length;
+    for (let k = 1; k < beamPath.length; k++) {
+      context.globalAlpha = 0.1 + (0.7 * k) / beamPath.length;
+      context.lineWidth = 1 + (2 * k) / beamPath.length;
       context.beginPath();
-      context.moveTo(...this.#middle(this.beam[k - 1]));
-      context.lineTo(...this.#middle(this.beam[k]));
+      context.moveTo(...this.#centre(beamPath[k - 1]));
+      context.lineTo(...this.#centre(beamPath[k]));
       context.stroke();
     }
     context.globalAlpha = 1;
     context.beginPath();
-    context.arc(...this.#middle(this.beam.at(-1)), this.cell * 0.26, 0, 7);
+    context.arc(...this.#centre(beamPath.at(-1)), this.cell * 0.26, 0, 7);
     context.fill();
     context.strokeStyle = "black";
     context.stroke();
@@ -176,8 +179,8 @@ export class DisplayView {
     context.setLineDash([]);
   }
 
-  // The pixel under a pointer, -1 where there is none.
-  under(event) {
+  // Return the pixel under a pointer, -1 if there is none.
+  pixelAt(event) {
     const box = this.canvas.getBoundingClientRect();
     const column = Math.floor(((event.clientX - box.left) / box.width) * this.grid.columns);
     const row = this.grid.rows - 1 - Math.floor(((event.clientY - box.top) / box.height) * this.grid.rows);

@@ -1,10 +1,10 @@
-// Drawing on the grid by mouse, touch and keys; a picture laid over it.
+// Drawing on the grid by mouse, touch and keys, or from a picture.
 
 const ARROWS = { ArrowUp: [1, 0], ArrowDown: [-1, 0], ArrowLeft: [0, -1], ArrowRight: [0, 1] };
-const FINE = 16;
-const DARK_BELOW = 0.02;
+const SAMPLES = 16;
+const BRIGHTNESS_MIN = 0.02;
 
-// The mean of RGBA bytes, 0 to 1; what is transparent is dark, inverted or not.
+// Return the mean brightness of RGBA bytes, 0 to 1; transparent samples are dark, inverted or not.
 function brightness(bytes, invert) {
   let sum = 0;
   for (let at = 0; at < bytes.length; at += 4) {
@@ -15,7 +15,7 @@ function brightness(bytes, invert) {
 }
 
 export class Drawing extends EventTarget {
-  // heights: µm by pixel, written to; editing: whether strokes draw or only pick
+  // heights: target per pixel in µm; editing: whether strokes draw or only select
   constructor(view) {
     super();
     this.view = view;
@@ -23,13 +23,13 @@ export class Drawing extends EventTarget {
     this.editing = true;
     this.tool = "raise";
     this.height = 100;
-    this.last = -1;
+    this.lastPixel = -1;
     const { canvas } = view;
-    canvas.addEventListener("pointerdown", (event) => this.#down(event));
-    canvas.addEventListener("pointermove", (event) => this.#stroke(event));
-    canvas.addEventListener("pointerup", () => (this.last = -1));
-    canvas.addEventListener("pointercancel", () => (this.last = -1));
-    canvas.addEventListener("keydown", (event) => this.#key(event));
+    canvas.addEventListener("pointerdown", (event) => this.#onPointerDown(event));
+    canvas.addEventListener("pointermove", (event) => this.#onPointerMove(event));
+    canvas.addEventListener("pointerup", () => (this.lastPixel = -1));
+    canvas.addEventListener("pointercancel", () => (this.lastPixel = -1));
+    canvas.addEventListener("keydown", (event) => this.#onKeyDown(event));
   }
 
   get count() {
@@ -39,94 +39,94 @@ export class Drawing extends EventTarget {
   set(pixel, height) {
     if (this.heights[pixel] !== height) {
       this.heights[pixel] = height;
-      this.#changed();
+      this.#notifyChange();
     }
   }
 
   clear() {
     this.heights.fill(0);
-    this.#changed();
+    this.#notifyChange();
   }
 
-  // All that is drawn gets another height, pictures keep their shades.
+  // Scale the drawing so that its largest height is the given one; a picture keeps its shades.
   rescale(height) {
-    const most = this.heights.reduce((a, b) => Math.max(a, b), 0);
-    if (most > 0 && height > 0) {
-      this.heights.forEach((old, pixel) => (this.heights[pixel] = (old / most) * height));
-      this.#changed();
+    const max = this.heights.reduce((a, b) => Math.max(a, b), 0);
+    if (max > 0 && height > 0) {
+      this.heights.forEach((old, pixel) => (this.heights[pixel] = (old / max) * height));
+      this.#notifyChange();
     }
     this.height = height;
   }
 
-  // A picture fitted whole into the grid, each pixel as bright as what it covers on the average.
-  async lay(file, invert) {
+  // Fit a picture into the grid; each pixel gets the mean brightness of the area that it covers.
+  async placePicture(file, invert) {
     const { grid } = this.view;
     const image = await createImageBitmap(file);
-    const canvas = new OffscreenCanvas(grid.columns * FINE, grid.rows * FINE);
+    const canvas = new OffscreenCanvas(grid.columns * SAMPLES, grid.rows * SAMPLES);
     const context = canvas.getContext("2d", { willReadFrequently: true });
     context.imageSmoothingQuality = "high";
     const scale = Math.min(canvas.width / image.width, canvas.height / image.height);
     const [width, height] = [image.width * scale, image.height * scale];
     context.drawImage(image, (canvas.width - width) / 2, (canvas.height - height) / 2, width, height);
     for (let pixel = 0; pixel < grid.pixels; pixel++) {
-      const [x, y] = [grid.column(pixel) * FINE, (grid.rows - 1 - grid.row(pixel)) * FINE];
-      const bright = brightness(context.getImageData(x, y, FINE, FINE).data, invert);
-      this.heights[pixel] = bright > DARK_BELOW ? Math.round(bright * this.height * 10) / 10 : 0;
+      const [x, y] = [grid.column(pixel) * SAMPLES, (grid.rows - 1 - grid.row(pixel)) * SAMPLES];
+      const mean = brightness(context.getImageData(x, y, SAMPLES, SAMPLES).data, invert);
+      this.heights[pixel] = mean > BRIGHTNESS_MIN ? Math.round(mean * this.height * 10) / 10 : 0;
     }
-    this.#changed();
+    this.#notifyChange();
   }
 
-  pick(pixel) {
+  select(pixel) {
     this.view.cursor = pixel;
-    this.view.ask();
-    this.dispatchEvent(new CustomEvent("picked", { detail: pixel }));
+    this.view.requestPaint();
+    this.dispatchEvent(new CustomEvent("selected", { detail: pixel }));
   }
 
-  #changed() {
+  #notifyChange() {
     this.view.redrawMarks();
     this.dispatchEvent(new Event("changed"));
   }
 
   #apply(pixel) {
-    this.pick(pixel);
+    this.select(pixel);
     if (this.editing) {
       this.set(pixel, this.tool === "raise" ? this.height : 0);
     }
   }
 
-  #down(event) {
-    const pixel = this.view.under(event);
+  #onPointerDown(event) {
+    const pixel = this.view.pixelAt(event);
     if (event.button === 0 && pixel >= 0) {
       this.view.canvas.setPointerCapture(event.pointerId);
-      this.last = pixel;
+      this.lastPixel = pixel;
       this.#apply(pixel);
     }
   }
 
-  #stroke(event) {
-    if (this.last < 0) {
+  #onPointerMove(event) {
+    if (this.lastPixel < 0) {
       return;
     }
     for (const point of event.getCoalescedEvents?.() ?? [event]) {
-      const pixel = this.view.under(point);
-      if (pixel >= 0 && pixel !== this.last) {
-        this.last = pixel;
+      const pixel = this.view.pixelAt(point);
+      if (pixel >= 0 && pixel !== this.lastPixel) {
+        this.lastPixel = pixel;
         this.#apply(pixel);
       }
     }
   }
 
-  #key(event) {
+  #onKeyDown(event) {
     const step = ARROWS[event.key];
     if (step) {
       event.preventDefault();
-      this.pick(this.view.grid.from(this.view.cursor, ...step));
+      this.select(this.view.grid.findNeighbour(this.view.cursor, ...step));
     } else if (event.key === " " || event.key === "Enter") {
       event.preventDefault();
       const pixel = this.view.cursor;
       if (this.editing) {
         this.set(pixel, this.heights[pixel] > 0 ? 0 : this.height);
-        this.pick(pixel);
+        this.select(pixel);
       }
     }
   }

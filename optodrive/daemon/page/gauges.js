@@ -1,21 +1,21 @@
-// Budgets as gauges: how much of each cap is used, by the limiter's own bound on what was executed.
+// Gauges of the used fraction of each cap, by the limiter's bound on the executed pulses.
 
-import { CAPS } from "./plans.js";
+import { labelCap } from "./caps.js";
 
 export class Gauges {
-  constructor(box) {
-    this.box = box;
-    this.each = new Map();
+  constructor(container) {
+    this.container = container;
+    this.gauges = new Map();
   }
 
   show(caps) {
     for (const cap of caps) {
-      const gauge = this.each.get(cap.cap) ?? this.#make(cap);
-      const at = cap.pixel !== null && cap.fraction > 0.5 ? `, pixel ${cap.pixel}` : "";
-      const [thousand, k] = cap.limit >= 1e4 ? [1000, "k"] : [1, ""];
-      const limit = cap.limit / thousand;
+      const gauge = this.gauges.get(cap.cap) ?? this.#create(cap);
+      const place = cap.pixel !== null && cap.fraction > 0.5 ? `, pixel ${cap.pixel}` : "";
+      const [divisor, prefix] = cap.limit >= 1e4 ? [1000, "k"] : [1, ""];
+      const limit = cap.limit / divisor;
       const digits = Math.max(0, 2 - Math.floor(Math.log10(limit)));
-      const text = `${(cap.value / thousand).toFixed(digits)} of ${limit.toFixed(digits)} ${k}${cap.unit}${at}`;
+      const text = `${(cap.value / divisor).toFixed(digits)} of ${limit.toFixed(digits)} ${prefix}${cap.unit}${place}`;
       gauge.text.textContent = text;
       gauge.bar.style.setProperty("--fraction", Math.min(1, Math.max(0, cap.fraction)));
       gauge.item.dataset.kind = cap.fraction > 0.95 ? "bad" : cap.fraction > 0.8 ? "warn" : "";
@@ -24,18 +24,18 @@ export class Gauges {
     }
   }
 
-  #make(cap) {
+  #create(cap) {
     const item = Object.assign(document.createElement("div"), { className: "gauge" });
-    const name = Object.assign(document.createElement("b"), { textContent: CAPS[cap.cap] ?? cap.cap });
+    const name = Object.assign(document.createElement("b"), { textContent: labelCap(cap.cap) });
     const text = document.createElement("span");
     const bar = document.createElement("i");
     for (const [key, value] of Object.entries({ role: "meter", "aria-valuemin": 0, "aria-valuemax": 100, "aria-label": name.textContent })) {
       bar.setAttribute(key, value);
     }
     item.append(name, text, bar);
-    this.box.append(item);
+    this.container.append(item);
     const gauge = { item, text, bar };
-    this.each.set(cap.cap, gauge);
+    this.gauges.set(cap.cap, gauge);
     return gauge;
   }
 }

@@ -1,35 +1,35 @@
-// Takes the token from the address or the form, keeps it in a cookie of this daemon's own, and asks again.
+// Login: takes the token from the address or the form, stores it in a cookie named after the port, and loads the page.
 
 const name = `optodrive-${location.port || "80"}`;
 
-const TRIES = 20;
-const NEXT_TRY_MS = 50;
+const ATTEMPTS = 20;
+const RETRY_MS = 50;
 
-// What is wrong, "" where the page loads anew with the token.
-async function tryToken(token) {
-  // Only what a cookie and a header can hold; a token made here has nothing else.
-  const fits = /^[\w.~+/=-]+$/.test(token);
+// Return an error message; "" if the page reloads with the token.
+async function signIn(token) {
+  // Cookies and headers allow only these characters; generated tokens contain no others.
+  const isValid = /^[\w.~+/=-]+$/.test(token);
   const headers = { Authorization: `Bearer ${token}` };
-  if (!fits || (await fetch("/v1/state", { headers, cache: "no-store" })).status === 401) {
+  if (!isValid || (await fetch("/v1/state", { headers, cache: "no-store" })).status === 401) {
     return "This is not the token of the daemon that runs here now.";
   }
   document.cookie = `${name}=${token}; Path=/; SameSite=Strict`;
-  // A busy browser may ask again before it has put the cookie away.
-  for (let tried = 0; tried < TRIES; tried += 1) {
+  // A busy browser may send a request before it has stored the cookie.
+  for (let attempt = 0; attempt < ATTEMPTS; attempt += 1) {
     if ((await fetch("/", { cache: "no-store" })).ok) {
       location.reload();
       return "";
     }
-    await new Promise((resolve) => setTimeout(resolve, NEXT_TRY_MS));
+    await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
   }
-  return "This browser keeps no cookie for this page: allow one, it holds the token.";
+  return "This browser keeps no cookie for this page: allow cookies, since one holds the token.";
 }
 
 async function submit(token) {
-  const wrong = document.getElementById("wrong");
-  wrong.textContent = "";
-  wrong.textContent = await tryToken(token).catch(() => "The daemon does not answer; try again.");
-  if (wrong.textContent) {
+  const message = document.getElementById("wrong");
+  message.textContent = "";
+  message.textContent = await signIn(token).catch(() => "The daemon does not answer; try again.");
+  if (message.textContent) {
     document.getElementById("token").select();
   }
 }
@@ -39,14 +39,14 @@ document.getElementById("form").addEventListener("submit", (event) => {
   submit(document.getElementById("token").value.trim());
 });
 
-function takeFromAddress() {
-  const given = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (given) {
+function submitTokenOfAddress() {
+  const token = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (token) {
     history.replaceState(null, "", location.pathname);
-    submit(given);
+    submit(token);
   }
 }
 
-// An address that differs in its hash alone loads nothing anew.
-addEventListener("hashchange", takeFromAddress);
-takeFromAddress();
+// An address that differs only in its hash does not reload the page.
+addEventListener("hashchange", submitTokenOfAddress);
+submitTokenOfAddress();

@@ -1,64 +1,67 @@
-// The library: every pattern the daemon knows, with a field for each of its parameters.
+// Pattern library: every pattern of the daemon, with a field per parameter.
 
-export class Library extends EventTarget {
-  constructor(find, patterns, picked) {
+export class PatternLibrary extends EventTarget {
+  constructor(find, patterns, getSelectedPixel) {
     super();
     this.patterns = new Map(patterns.map((pattern) => [pattern.name, pattern]));
     this.select = find("pattern");
     this.notes = find("pattern-notes");
-    this.fields = find("parameters");
-    this.picked = picked;
+    this.container = find("parameters");
+    this.getSelectedPixel = getSelectedPixel;
     for (const name of this.patterns.keys()) {
       this.select.append(new Option(name));
     }
-    this.select.addEventListener("change", () => this.#choose());
-    this.fields.addEventListener("input", () => this.dispatchEvent(new Event("changed")));
-    this.#choose();
+    this.select.addEventListener("change", () => this.#showFields());
+    this.container.addEventListener("input", () => this.dispatchEvent(new Event("changed")));
+    this.#showFields();
   }
 
   get name() {
     return this.select.value;
   }
 
-  #choose() {
+  #showFields() {
     const pattern = this.patterns.get(this.name);
     this.notes.textContent = `${pattern.summary}. ${pattern.notes}`;
-    this.inputs = new Map(pattern.parameters.map((parameter) => [parameter, input(parameter)]));
-    this.fields.replaceChildren(...[...this.inputs].map(([parameter, field]) => this.#labelled(parameter, field)));
+    this.fields = new Map(pattern.parameters.map((parameter) => [parameter, createField(parameter)]));
+    this.container.replaceChildren(...[...this.fields].map(([parameter, field]) => this.#createLabel(parameter, field)));
     this.dispatchEvent(new Event("changed"));
   }
 
-  #labelled(parameter, field) {
+  #createLabel(parameter, field) {
     const label = document.createElement("label");
     const unit = parameter.unit ? `, ${parameter.unit}` : "";
-    const words = parameter.name.replace(/_(um|mm|s|hz)$/, "").replaceAll("_", " ");
-    label.append(`${words}${unit}${parameter.required ? " (needed)" : ""}`, field);
+    const text = parameter.name.replace(/_(um|mm|s|hz)$/, "").replaceAll("_", " ");
+    label.append(`${text}${unit}${parameter.required ? " (required)" : ""}`, field);
     label.title = parameter.description;
     if (parameter.kind === "pixel") {
-      field.addEventListener("focus", () => (field.placeholder = `${parameter.default ?? "middle"}; picked: ${this.picked()}`));
+      field.addEventListener("focus", () => {
+        field.placeholder = `${parameter.default ?? "middle"}; selected: ${this.getSelectedPixel()}`;
+      });
     }
     return label;
   }
 
-  // What is filled in, as the daemon takes it.
-  async values() {
-    const given = {};
-    for (const [parameter, field] of this.inputs) {
+  // Return the parameters that are filled in, in the form of the request.
+  async readValues() {
+    const values = {};
+    for (const [parameter, field] of this.fields) {
       if (parameter.kind === "flag") {
-        given[parameter.name] = field.checked;
+        values[parameter.name] = field.checked;
       } else if (parameter.kind === "file") {
         if (field.files[0]) {
-          given[parameter.name] = await base64(field.files[0]);
+          values[parameter.name] = await encodeBase64(field.files[0]);
         }
       } else if (field.value !== "") {
-        given[parameter.name] = ["number", "integer", "pixel"].includes(parameter.kind) ? Number(field.value) : field.value;
+        const isNumber = ["number", "integer", "pixel"].includes(parameter.kind);
+        values[parameter.name] = isNumber ? Number(field.value) : field.value;
       }
     }
-    return given;
+    return values;
   }
 }
 
-function input(parameter) {
+function createField(parameter) {
   if (parameter.kind === "choice") {
     const select = document.createElement("select");
     select.append(...parameter.choices.map((choice) => new Option(choice, choice, false, choice === parameter.default)));
@@ -80,7 +83,7 @@ function input(parameter) {
   return field;
 }
 
-async function base64(file) {
+async function encodeBase64(file) {
   const bytes = new Uint8Array(await file.arrayBuffer());
   let text = "";
   for (let at = 0; at < bytes.length; at += 0x8000) {

@@ -1,22 +1,14 @@
-// Preview and play: what is asked for is planned without light first, and only what was previewed can be played.
+// Preview and play: a stimulus is planned without light first, and only a previewed stimulus can be played.
 
 import { call } from "./api.js";
+import { labelCap } from "./caps.js";
 
 const POLL_MS = 400;
 const FRAMES_MAX = 500;
-const ENDED = ["done", "superseded", "failed", "cancelled"];
+const FINAL_STATUSES = ["done", "superseded", "failed", "cancelled"];
 
-// Labels by cap, from the configuration.
-export const CAPS = {};
-
-export function setCaps(caps) {
-  for (const [key, { label }] of Object.entries(caps)) {
-    CAPS[key] = label;
-  }
-}
-
-// Frames of a drawing, once or so often a second.
-export function framesOf(heights, rateHz, seconds) {
+// Build the frames of a drawing: one, or several at a rate.
+export function buildFrames(heights, rateHz, seconds) {
   const target_um = {};
   heights.forEach((height, pixel) => {
     if (height > 0) {
@@ -29,58 +21,58 @@ export function framesOf(heights, rateHz, seconds) {
   return { frames };
 }
 
-export class Plans extends EventTarget {
-  // request(): path without ?, and body, of what is asked for now
-  constructor(find, request, say) {
+export class PlanControl extends EventTarget {
+  // buildRequest(): returns path and body of the present stimulus
+  constructor(find, buildRequest, announce) {
     super();
-    this.request = request;
-    this.say = say;
-    this.preview = find("preview");
-    this.play = find("play");
+    this.buildRequest = buildRequest;
+    this.announce = announce;
+    this.previewButton = find("preview");
+    this.playButton = find("play");
     this.policy = find("policy");
     this.result = find("result");
-    this.ready = null;
+    this.previewed = null;
     this.abort = null;
-    this.preview.addEventListener("click", () => this.#preview());
-    this.play.addEventListener("click", () => this.#play());
-    this.policy.addEventListener("change", () => this.changed());
+    this.previewButton.addEventListener("click", () => this.#preview());
+    this.playButton.addEventListener("click", () => this.#play());
+    this.policy.addEventListener("change", () => this.invalidate());
   }
 
-  // What was previewed is no longer what is asked for.
-  changed() {
-    this.ready = null;
-    this.play.disabled = true;
+  // Discard the preview: the stimulus has changed.
+  invalidate() {
+    this.previewed = null;
+    this.playButton.disabled = true;
     this.dispatchEvent(new CustomEvent("previewed", { detail: null }));
   }
 
-  // Give up connections that wait for an answer.
+  // Abort a preview that waits for its response.
   cancel() {
     this.abort?.abort();
   }
 
   async #preview() {
-    this.changed();
+    this.invalidate();
     this.followed = null;
     this.abort = new AbortController();
-    this.#tell(["soft", "Planning …"]);
-    this.preview.disabled = true;
+    this.#showLines(["soft", "Planning …"]);
+    this.previewButton.disabled = true;
     try {
-      const ready = { ...(await this.request()), policy: this.policy.value };
-      const query = `?dry_run=true&policy=${ready.policy}`;
-      const answer = await call("POST", ready.path + query, { body: ready.body, signal: this.abort.signal });
-      this.ready = ready;
-      this.play.disabled = false;
-      this.#show(answer);
-      this.dispatchEvent(new CustomEvent("previewed", { detail: answer.pulses }));
+      const stimulus = { ...(await this.buildRequest()), policy: this.policy.value };
+      const query = `?dry_run=true&policy=${stimulus.policy}`;
+      const plan = await call("POST", stimulus.path + query, { body: stimulus.body, signal: this.abort.signal });
+      this.previewed = stimulus;
+      this.playButton.disabled = false;
+      this.#showSummary(plan);
+      this.dispatchEvent(new CustomEvent("previewed", { detail: plan.pulses }));
     } catch (error) {
-      this.#failed(error);
+      this.#showError(error);
     } finally {
-      this.preview.disabled = false;
+      this.previewButton.disabled = false;
     }
   }
 
-  #show(answer) {
-    const { summary } = answer;
+  #showSummary(plan) {
+    const { summary } = plan;
     const lines = [];
     const fits = summary.feasibility?.fits ?? summary.trimmed.pulses === 0;
     const message = summary.feasibility?.message ?? (fits ? "all of it fits" : "not all of it fits");
@@ -88,61 +80,61 @@ export class Plans extends EventTarget {
     lines.push(["", `${summary.pulses} pulses in ${summary.duration_s.toFixed(2)} s, ${(summary.energy_j * 1e3).toFixed(0)} mJ of light.`]);
     lines.push(["", `Highest predicted: ${summary.predicted_max_um.toFixed(1)} µm of ${summary.target_max_um.toFixed(1)} µm requested.`]);
     if (summary.trimmed.pulses) {
-      const caps = Object.entries(summary.trimmed.by_reason).map(([cap, count]) => `${count} for ${CAPS[cap] ?? cap}`);
+      const caps = Object.entries(summary.trimmed.by_reason).map(([cap, count]) => `${count} by ${labelCap(cap)}`);
       lines.push(["warn", `Trimmed: ${summary.trimmed.pulses} pulses (${caps.join(", ")}), ${(summary.trimmed.energy_j * 1e3).toFixed(1)} mJ.`]);
     }
     for (const delay of summary.delays.slice(0, 3)) {
-      lines.push(["warn", `${delay.source} comes ${delay.wait_s.toFixed(2)} s later for ${CAPS[delay.cap] ?? delay.cap}.`]);
+      lines.push(["warn", `${delay.source} is delayed by ${delay.wait_s.toFixed(2)} s: ${labelCap(delay.cap)}.`]);
     }
     if (summary.skipped.length) {
-      lines.push(["", `${summary.skipped.length} pixels need no pulse: the heat left in them is enough.`]);
+      lines.push(["", `${summary.skipped.length} pixels need no pulse: their residual heat is sufficient.`]);
     }
-    this.#tell(...lines);
+    this.#showLines(...lines);
   }
 
   async #play() {
-    const ready = this.ready;
-    this.play.disabled = true; // a second press would play it twice
+    const stimulus = this.previewed;
+    this.playButton.disabled = true; // a second click would play it twice
     try {
-      const answer = await call("POST", `${ready.path}?policy=${ready.policy}`, { body: ready.body });
-      this.say(`Playing ${answer.plan}`);
-      await this.#follow(answer);
+      const plan = await call("POST", `${stimulus.path}?policy=${stimulus.policy}`, { body: stimulus.body });
+      this.announce(`Playing ${plan.plan}`);
+      await this.#follow(plan);
     } catch (error) {
-      this.#failed(error);
+      this.#showError(error);
     }
-    this.play.disabled = this.ready === null;
+    this.playButton.disabled = this.previewed === null;
   }
 
-  async #follow(answer) {
+  async #follow(plan) {
     const bar = document.createElement("progress");
-    bar.max = Math.max(1, answer.planned);
+    bar.max = Math.max(1, plan.planned);
     bar.setAttribute("aria-label", "Pulses executed");
-    this.followed = answer.plan;
-    while (!ENDED.includes(answer.status)) {
-      this.#tell(["", `${answer.plan}: ${answer.executed} of ${answer.planned} pulses executed`]);
-      bar.value = answer.executed;
+    this.followed = plan.plan;
+    while (!FINAL_STATUSES.includes(plan.status)) {
+      this.#showLines(["", `${plan.plan}: ${plan.executed} of ${plan.planned} pulses executed`]);
+      bar.value = plan.executed;
       this.result.append(bar);
       await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-      answer = await call("GET", `/v1/plans/${answer.plan}?pulses=false`);
-      if (this.followed !== answer.plan) {
+      plan = await call("GET", `/v1/plans/${plan.plan}?pulses=false`);
+      if (this.followed !== plan.plan) {
         return;
       }
     }
-    const height = answer.simulated_max_um === null ? "" : `; highest ${answer.simulated_max_um.toFixed(1)} µm by what was executed`;
-    const why = answer.error ? `: ${answer.error}` : "";
-    this.#tell([answer.status === "done" ? "good" : "warn", `${answer.plan} ${answer.status}${why}`], ["", `${answer.executed} of ${answer.planned} pulses executed${height}.`]);
+    const height = plan.simulated_max_um === null ? "" : `; highest ${plan.simulated_max_um.toFixed(1)} µm, simulated from the executed pulses`;
+    const cause = plan.error ? `: ${plan.error}` : "";
+    this.#showLines([plan.status === "done" ? "good" : "warn", `${plan.plan} ${plan.status}${cause}`], ["", `${plan.executed} of ${plan.planned} pulses executed${height}.`]);
   }
 
-  #failed(error) {
+  #showError(error) {
     if (error.name === "AbortError") {
-      this.#tell(["soft", "Given up."]);
+      this.#showLines(["soft", "Cancelled."]);
       return;
     }
     const where = error.problem?.where ? `${error.problem.where}: ` : "";
-    this.#tell(["bad", error.message.startsWith(where) ? error.message : where + error.message]);
+    this.#showLines(["bad", error.message.startsWith(where) ? error.message : where + error.message]);
   }
 
-  #tell(...lines) {
+  #showLines(...lines) {
     this.result.replaceChildren(
       ...lines.map(([kind, text]) => Object.assign(document.createElement("p"), { className: kind, textContent: text })),
     );

@@ -1,98 +1,92 @@
-// The board and the link in words: what state they are in, and what to do where they are not well.
+// State of the board and the link, and what to do about a fault.
 
-import { BoardState, LEASED_STATES } from "./board_states.js";
-
-const WORDS = { [BoardState.HOLD]: "HOLD, waiting for points" };
+const STATE_KINDS = { DISARMED: "none", ARMING: "warn", ARMED: "warn", RUNNING: "warn", HOLD: "warn", FAULT: "bad", BOOT: "none" };
+const STATE_LABELS = { HOLD: "HOLD, waiting for points" };
 
 export class Status {
-  constructor(find, say, acknowledge) {
-    this.board = find("board");
-    this.link = find("link");
-    this.trouble = find("trouble");
-    this.figures = find("figures");
-    this.say = say;
+  constructor(find, announce, acknowledge) {
+    this.boardPill = find("board");
+    this.linkPill = find("link");
+    this.alert = find("trouble");
+    this.stats = find("figures");
+    this.announce = announce;
     this.acknowledge = acknowledge;
-    this.last = "";
-    this.told = "";
+    this.announcedState = "";
+    this.alertText = "";
   }
 
   showState(state) {
     const { board, link, totals } = state;
-    const up = link.state === "up";
-    pill(this.board, up ? `board: ${WORDS[board.state] ?? board.state}` : "board: no link", up ? kindOf(board.state) : "bad");
-    const now = up ? board.state : "no link to the board";
-    if (this.last && now !== this.last && ![BoardState.RUNNING, BoardState.HOLD].includes(now)) {
-      this.say(`Board: ${now}`);
+    const linked = link.state === "up";
+    const label = linked ? `board: ${STATE_LABELS[board.state] ?? board.state}` : "board: no link";
+    setPill(this.boardPill, label, linked ? STATE_KINDS[board.state] ?? "none" : "bad");
+    const current = linked ? board.state : "no link to the board";
+    if (this.announcedState && current !== this.announcedState && !["RUNNING", "HOLD"].includes(current)) {
+      this.announce(`Board: ${current}`);
     }
-    this.last = now;
+    this.announcedState = current;
+    const waiting = `${state.queue.waiting} waiting`;
     const rows = {
       Port: link.port,
       "Round trip": link.round_trip_ms === null ? "–" : `${link.round_trip_ms.toFixed(1)} ms`,
-      "Sent again": link.retransmitted,
+      Retransmitted: link.retransmitted,
       Underruns: board.underruns,
       "Laser on": `${board.laser_on_s.toFixed(2)} s`,
       "Pulses executed": totals.executed,
-      Queue: state.queue.running ? `${state.queue.running} runs, ${state.queue.waiting} wait` : `${state.queue.waiting} wait`,
+      Queue: state.queue.running ? `${state.queue.running} running, ${waiting}` : waiting,
       Temperature: board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
     };
-    this.figures.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [element("dt", name), element("dd", value)]));
+    this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));
   }
 
   showFault(fault) {
-    this.fault = fault;
-    const lines = [];
+    const items = [];
     if (fault.link === "down") {
-      lines.push(element("span", `No link to the board: ${fault.link_error ?? "it is lost"}. It is tried again by itself; the board stays disarmed.`));
+      const cause = fault.link_error ?? "it is lost";
+      items.push(createElement("span", `No link to the board: ${cause}. The daemon reconnects automatically; the board stays disarmed.`));
     } else if (fault.fault) {
-      lines.push(element("strong", `Fault: ${fault.fault}`), element("span", `${fault.hint}.`));
-      const button = element("button", "Acknowledge");
+      items.push(createElement("strong", `Fault: ${fault.fault}`), createElement("span", `${fault.hint}.`));
+      const button = createElement("button", "Acknowledge");
       button.type = "button";
       button.id = "acknowledge";
       button.addEventListener("click", this.acknowledge);
-      lines.push(button);
+      items.push(button);
     }
-    this.#tell(lines);
+    this.#showAlert(items);
   }
 
-  connection(live) {
-    pill(this.link, live ? "live" : "no daemon, trying again", live ? "good" : "bad");
+  showConnection(live) {
+    setPill(this.linkPill, live ? "live" : "no daemon, trying again", live ? "good" : "bad");
     if (!live) {
-      pill(this.board, "board: not known", "bad");
-      this.last = "";
-      this.#tell([element("span", "The daemon does not answer; what is shown is not live. It is tried again by itself, and never armed by that.")]);
+      setPill(this.boardPill, "board: unknown", "bad");
+      this.announcedState = "";
+      this.#showAlert([createElement("span", "The daemon does not answer; the display is not live. The page reconnects automatically and never arms.")]);
     }
   }
 
-  stranger() {
-    pill(this.link, "another token", "bad");
-    const again = Object.assign(element("a", "Enter the new one"), { href: "/" });
-    this.#tell([element("span", "The daemon has another token since it was started anew."), again]);
+  showTokenChange() {
+    setPill(this.linkPill, "another token", "bad");
+    const login = Object.assign(createElement("a", "Enter the new one"), { href: "/" });
+    this.#showAlert([createElement("span", "The daemon was restarted and has another token."), login]);
   }
 
-  #tell(lines) {
-    const words = lines.map((line) => line.textContent).join();
-    if (words !== this.told) {
-      this.told = words;
-      this.trouble.replaceChildren(...lines);
-      this.trouble.hidden = lines.length === 0;
+  #showAlert(items) {
+    const text = items.map((item) => item.textContent).join();
+    if (text !== this.alertText) {
+      this.alertText = text;
+      this.alert.replaceChildren(...items);
+      this.alert.hidden = items.length === 0;
     }
   }
 }
 
-function kindOf(state) {
-  if (state === BoardState.FAULT) {
-    return "bad";
-  }
-  return LEASED_STATES.includes(state) ? "warn" : "none";
-}
-
-function pill(item, text, kind) {
+function setPill(item, text, kind) {
   if (item.textContent !== text) {
     item.textContent = text;
   }
   item.dataset.kind = kind;
 }
 
-function element(name, text) {
+function createElement(name, text) {
   return Object.assign(document.createElement(name), { textContent: text });
 }

@@ -1,64 +1,61 @@
-// STOP: sent at once and again until the daemon has answered, whatever else on this page works or does not.
+// STOP: sent at once and repeated until the daemon answers; it depends on no other part of the page.
 
 import { request } from "./api.js";
 
-const TRY_MS = 1200;
-const AGAIN_MS = 300;
+const TIMEOUT_MS = 1200;
+const RETRY_MS = 300;
 
-export class Stop {
-  // beforeRetry: frees connections that may be in the way; after: the board's answer is in
-  constructor(button, line, beforeRetry, after) {
-    this.line = line;
+export class StopControl {
+  // beforeRetry: closes connections that may block the request; onAnswered: the daemon has answered
+  constructor(button, status, beforeRetry, onAnswered) {
+    this.status = status;
     this.beforeRetry = beforeRetry;
-    this.after = after;
+    this.onAnswered = onAnswered;
     this.running = false;
-    button.addEventListener("click", () => this.press());
-    // Seen before anything on the page can take the key for itself.
-    window.addEventListener("keydown", (event) => event.key === "Escape" && this.press(), { capture: true });
+    button.addEventListener("click", () => this.stop());
+    // Captured before any other handler of the page.
+    window.addEventListener("keydown", (event) => event.key === "Escape" && this.stop(), { capture: true });
   }
 
-  async press() {
+  async stop() {
     if (this.running) {
       return;
     }
     this.running = true;
-    this.#say("STOP sent …");
-    for (let tries = 1; ; tries++) {
-      if (await this.#try(tries)) {
-        break;
-      }
-      this.#say(`STOP is not answered yet, sent ${tries} times and again. In doubt use the emergency stop or the key.`);
+    this.#show("STOP sent …");
+    for (let attempts = 1; !(await this.#attempt()); attempts++) {
+      this.#show(`STOP is not answered yet after ${attempts} attempts; it is sent again. In doubt use the emergency stop or the key.`);
       this.beforeRetry();
-      await new Promise((resolve) => setTimeout(resolve, AGAIN_MS));
+      await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
     this.running = false;
-    this.after();
+    this.onAnswered();
   }
 
-  // Whether the daemon has said what became of it.
-  async #try() {
+  // Send STOP once; return whether the daemon has answered.
+  async #attempt() {
     try {
-      const answer = await request("POST", "/v1/stop", { signal: AbortSignal.timeout(TRY_MS) });
-      if (answer.ok) {
-        this.#say("");
+      const response = await request("POST", "/v1/stop", { signal: AbortSignal.timeout(TIMEOUT_MS) });
+      if (response.ok) {
+        this.#show("");
         return true;
       }
-      if (answer.status === 401) {
-        this.#say("STOP was refused: the daemon has another token since it was started anew. A daemon that starts is never armed.");
+      if (response.status === 401) {
+        this.#show("STOP was refused: the daemon was restarted and has another token. A restarted daemon is never armed.");
         return true;
       }
-      if (answer.status === 503) {
-        this.#say("The daemon has no link to the board. Without it the board ends dark by itself; in doubt use the emergency stop.");
+      if (response.status === 503) {
+        this.#show("The daemon has no link to the board. Without a link the board switches the gate off; in doubt use the emergency stop.");
         return true;
       }
     } catch {
-      // Not answered: again.
+      // Not answered: retry.
     }
     return false;
   }
 
-  #say(text) {
-    this.line.hidden = !text;
-    this.line.textContent = text;
+  #show(text) {
+    this.status.hidden = !text;
+    this.status.textContent = text;
   }
 }

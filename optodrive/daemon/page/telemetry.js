@@ -1,9 +1,9 @@
-// The telemetry: server-sent events by fetch, for EventSource cannot send a header; taken up again whenever it ends.
+// Telemetry: server-sent events read by fetch, because EventSource cannot send a header; it reconnects after every end.
 
 import { request } from "./api.js";
 
 const RETRY_MS = 500;
-const SILENT_MS = 3000;
+const SILENCE_MS = 3000;
 
 export class Telemetry extends EventTarget {
   #abort = null;
@@ -13,15 +13,15 @@ export class Telemetry extends EventTarget {
     super();
     this.rateHz = rateHz;
     this.live = false;
-    // Browsers give all windows on one daemon six connections together: a hidden one must not hold any that STOP needs.
+    // Browsers allow six connections per daemon for all windows: a hidden window must not hold one that STOP needs.
     document.addEventListener("visibilitychange", () => this.pause(document.hidden));
   }
 
   async run() {
     for (;;) {
       if (!this.#paused) {
-        await this.#follow().catch(() => {});
-        this.#down();
+        await this.#readEvents().catch(() => {});
+        this.#setDown();
       }
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
@@ -34,29 +34,29 @@ export class Telemetry extends EventTarget {
     }
   }
 
-  async #follow() {
+  async #readEvents() {
     this.#abort = new AbortController();
-    let timer = setTimeout(() => this.#abort.abort(), SILENT_MS);
+    let timer = setTimeout(() => this.#abort.abort(), SILENCE_MS);
     try {
-      const answer = await request("GET", `/v1/telemetry?rate_hz=${this.rateHz}`, { signal: this.#abort.signal });
-      if (answer.status === 401) {
-        this.dispatchEvent(new Event("stranger"));
+      const response = await request("GET", `/v1/telemetry?rate_hz=${this.rateHz}`, { signal: this.#abort.signal });
+      if (response.status === 401) {
+        this.dispatchEvent(new Event("unauthorized"));
       }
-      if (!answer.ok) {
+      if (!response.ok) {
         return;
       }
       let rest = "";
-      const reader = answer.body.pipeThrough(new TextDecoderStream()).getReader();
+      const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
       for (;;) {
         const { value, done } = await reader.read();
         if (done) {
           return;
         }
         clearTimeout(timer);
-        timer = setTimeout(() => this.#abort.abort(), SILENT_MS);
-        const parts = (rest + value).split("\n\n");
-        rest = parts.pop();
-        this.#take(parts);
+        timer = setTimeout(() => this.#abort.abort(), SILENCE_MS);
+        const texts = (rest + value).split("\n\n");
+        rest = texts.pop();
+        this.#dispatch(texts);
       }
     } finally {
       clearTimeout(timer);
@@ -64,18 +64,18 @@ export class Telemetry extends EventTarget {
     }
   }
 
-  #take(parts) {
+  #dispatch(texts) {
     if (!this.live) {
       this.live = true;
       this.dispatchEvent(new Event("up"));
     }
-    for (const part of parts) {
-      const [first, second] = part.split("\n");
-      this.dispatchEvent(new CustomEvent(first.slice(7), { detail: JSON.parse(second.slice(6)) }));
+    for (const text of texts) {
+      const [event, data] = text.split("\n");
+      this.dispatchEvent(new CustomEvent(event.slice("event: ".length), { detail: JSON.parse(data.slice("data: ".length)) }));
     }
   }
 
-  #down() {
+  #setDown() {
     if (this.live) {
       this.live = false;
       this.dispatchEvent(new Event("down"));

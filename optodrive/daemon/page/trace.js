@@ -1,59 +1,64 @@
-// Height and temperature of the picked pixel over the last ten seconds.
+// Height and temperature of the selected pixel over the last ten seconds.
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
-import { themed } from "./colours.js";
+import { readThemeColour } from "./colours.js";
 
-const BACK_S = 10;
+const HISTORY_S = 10;
 const HEIGHT = 170;
 
 export class Trace {
-  constructor(box) {
-    this.box = box;
-    this.forget();
-    this.themed();
-    new ResizeObserver(() => this.plot.setSize({ width: Math.max(100, box.clientWidth), height: HEIGHT })).observe(box);
+  constructor(container) {
+    this.container = container;
+    this.clear();
+    this.applyTheme();
+    const fit = () => this.plot.setSize({ width: Math.max(100, container.clientWidth), height: HEIGHT });
+    new ResizeObserver(fit).observe(container);
   }
 
-  forget() {
+  clear() {
     this.t = [];
     this.height = [];
     this.absorber = [];
   }
 
-  themed() {
+  applyTheme() {
     this.plot?.destroy();
-    const [ink, line] = [themed("soft"), themed("line")];
+    const [ink, line, accent, bad] = ["soft", "line", "accent", "bad"].map(readThemeColour);
     const axis = { stroke: ink, grid: { stroke: line, width: 1 }, ticks: { stroke: line, width: 1 }, font: "11px system-ui" };
     const options = {
-      width: Math.max(100, this.box.clientWidth),
+      width: Math.max(100, this.container.clientWidth),
       height: HEIGHT,
       legend: { show: false },
       cursor: { show: false },
-      scales: { x: { time: false, range: [-BACK_S, 0] }, um: { range: (u, low, high) => [0, Math.max(10, high * 1.1)] }, c: { range: (u, low, high) => [Math.min(20, low), Math.max(40, high * 1.05)] } },
+      scales: {
+        x: { time: false, range: [-HISTORY_S, 0] },
+        um: { range: (u, low, high) => [0, Math.max(10, high * 1.1)] },
+        c: { range: (u, low, high) => [Math.min(20, low), Math.max(40, high * 1.05)] },
+      },
       axes: [
         { ...axis, values: (u, ticks) => ticks.map((tick) => `${tick} s`) },
-        { ...axis, scale: "um", size: 58, stroke: themed("accent"), values: (u, ticks) => ticks.map((tick) => `${tick} µm`) },
-        { ...axis, scale: "c", side: 1, size: 58, stroke: themed("bad"), grid: { show: false }, values: (u, ticks) => ticks.map((tick) => `${tick} °C`) },
+        { ...axis, scale: "um", size: 58, stroke: accent, values: (u, ticks) => ticks.map((tick) => `${tick} µm`) },
+        { ...axis, scale: "c", side: 1, size: 58, stroke: bad, grid: { show: false }, values: (u, ticks) => ticks.map((tick) => `${tick} °C`) },
       ],
       series: [
         {},
-        { scale: "um", stroke: themed("accent"), width: 2, points: { show: false } },
-        { scale: "c", stroke: themed("bad"), width: 1.5, dash: [4, 3], points: { show: false } },
+        { scale: "um", stroke: accent, width: 2, points: { show: false } },
+        { scale: "c", stroke: bad, width: 1.5, dash: [4, 3], points: { show: false } },
       ],
     };
-    this.plot = new uPlot(options, [[], [], []], this.box);
+    this.plot = new uPlot(options, [[], [], []], this.container);
   }
 
-  add(boardS, heightUm, celsius) {
+  add(boardS, heightUm, absorberC) {
     if (this.t.length && boardS < this.t.at(-1)) {
-      this.forget();
+      this.clear();
     }
     this.t.push(boardS);
     this.height.push(heightUm);
-    this.absorber.push(celsius);
-    const from = this.t.findIndex((s) => s > boardS - BACK_S);
+    this.absorber.push(absorberC);
+    const first = this.t.findIndex((s) => s > boardS - HISTORY_S);
     for (const column of [this.t, this.height, this.absorber]) {
-      column.splice(0, from);
+      column.splice(0, first);
     }
   }
 

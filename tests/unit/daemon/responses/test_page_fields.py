@@ -34,17 +34,17 @@ VARIABLES = {
     "grid.js": {"config": EffectiveConfig, "display": EffectiveConfig.model_fields["display"].annotation},
     "main.js": {"config": EffectiveConfig, "pulses": PulseColumns},
     "patterns.js": {"pattern": PatternDescription, "parameter": PatternParameter},
-    "plans.js": {"answer": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
-    "status.js": {"state": StateReport, "board": StateReport.model_fields["board"].annotation},
+    "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
+    "status.js": {"fault": FaultEvent, "state": StateReport, "board": StateReport.model_fields["board"].annotation},
     "timeline.js": {"batch": PulseBatch},
 }
 """The models that the page's variables hold, by module."""
 EVENT_DETAILS = {"state": StateReport, "fault": FaultEvent, "budget": BudgetEvent, "display": DisplayEvent}
 DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
-    ("plans.js", r"const \{([^}]*)\} = answer;"): PlanReport,
+    ("plans.js", r"const \{([^}]*)\} = plan;"): PlanReport,
     ("status.js", r"const \{([^}]*)\} = state;"): StateReport,
-    ("timeline.js", r"take\(\{([^}]*)\}\)"): PulsesEvent,
+    ("timeline.js", r"addPulses\(\{([^}]*)\}\)"): PulsesEvent,
 }
 OTHER_VARIABLES = {
     "status.js": {"link": "link", "totals": "totals"},
