@@ -25,10 +25,10 @@ EXCLUDED_FACTS = {"tau_g": ("N_50um",)}
 """Facts that contradict those of SCATTER at every width of Table S3; their own width is not stated."""
 
 CLAIMS = """\
-kappa, tau_g and phi from one fact each; epsilon, R and C the paper's own. A displacement fixes the product of
-kappa and the gas's half of the absorber rise, not each of the two. Holds for single pulses of 8 to 50 ms and trains
-up to 200 Hz, not for the blocked force at every width; phi is known to 15 %, tau_g to a quarter.
-tau_g takes its ripple to be at full power, which the paper does not say: a tenth less there would make it 2.6 ms.
+kappa, tau_g and phi are each fitted to one fact; epsilon, R and C are the paper's. A displacement determines only the
+product of kappa and the gas's half of the absorber's rise. Valid for single pulses of 8 to 50 ms and trains up to
+200 Hz, but not for the blocked force at every width; phi is known to 15 %, tau_g to a quarter. The fit of tau_g assumes
+that the ripple was measured at full power, which the paper does not state: at a tenth less, tau_g would be 2.6 ms.
 """
 
 
