@@ -1,15 +1,15 @@
-"""A whole display whose cells warm each other through their walls: exact, pulse by pulse.
+"""Exact thermal state of a display whose walls are coupled, for comparison with the package's models.
 
     C dθ_i/dt   = ε P_i − (θ_i − w_i)/R                                        θ absorber rise, K
     C_w dw_i/dt = (θ_i − w_i)/R − w_i/R_w − Σ_j (w_i − w_j)/R_x − f_i w_i/R_f  w wall rise, K
     τ_g dγ_i/dt = (θ_i + w_i)/2 − γ_i                                          γ gas rise, K
     z_i = κ γ_i                                                                z displacement, m
 
-j are the pixels beside i, f_i its edges against the frame; resistances and sources in `surroundings.toml`.
+j are the neighbours of i, f_i its edges on the frame; resistances and sources are in `surroundings.toml`.
 
-Every cell is the same, so the equations fall apart into the modes of the lattice: the eigenvectors of the walls'
-conductances. A mode is a cell by itself, with two rates of its own and the gas's, and between two events each of its
-three amplitudes decays by its own exponential. A pulse adds to all modes, in the measure of its pixel in each.
+All cells are equal, so the equations decouple in the modes of the lattice, the eigenvectors of the walls' conductances.
+Each mode has three amplitudes, which decay exponentially between two events: two coupled motions of absorber and wall,
+and the gas. A pulse adds to every mode in proportion to its pixel's share.
 """
 
 from math import exp, expm1, factorial
@@ -25,17 +25,17 @@ from optodrive.physics.parameters import ParameterSet
 from optodrive.physics.pixel import GAS_FRACTION, Pixel, cooling_peak, gas_peak
 
 MIN_RATE_SEPARATION = 1e-8
-"""A mode whose rate meets the gas's is moved off by this share, or its gas would need a form of its own.
+"""Smallest relative distance of a mode's rate from the gas's; closer rates are moved apart.
 
-Rises are then wrong by about as little: less by the rate, and no more by the digits that near rates lose.
+The closed form of the gas is singular for equal rates; the error of the rises is of this order.
 """
 COEFFICIENTS = tuple(1.0 / factorial(n + 1) for n in range(13, -1, -1))
 SERIES_REACH = 0.5
-"""The series of these coefficients leaves out less than 1e-16 up to here."""
+"""Largest argument at which the series with these coefficients has an error below 1e-16."""
 
 
 class WallParameters(NamedTuple):
-    """What surrounds each cell: wall to ambient, the wall's heat capacity, wall to wall beside it, wall to frame."""
+    """Surroundings of each cell: wall to ambient, heat capacity of the wall, wall to wall, wall to frame."""
 
     r_k_per_w: float
     c_j_per_k: float
@@ -44,7 +44,7 @@ class WallParameters(NamedTuple):
 
     @classmethod
     def from_parameters(cls, parameters: ParameterSet) -> "WallParameters":
-        """The terms wall_heating and, where there is one, lateral_conduction of a parameter set."""
+        """Return the values of wall_heating and, if present, lateral_conduction of a parameter set."""
         wall, side = parameters.terms["wall_heating"], parameters.terms.get("lateral_conduction")
         return cls(
             wall["resistance"].value,
@@ -55,10 +55,10 @@ class WallParameters(NamedTuple):
 
 
 class WallPeaks(NamedTuple):
-    """What each pulse [n] does to its pixel.
+    """Peaks that each pulse [n] causes on its pixel.
 
-    displacement_m: the largest from its start to the pixel's next pulse; absorber_k: the larger rise of its two ends;
-    wall_k: the wall's rise at its end.
+    displacement_m: peak from its start to the pixel's next pulse; absorber_k: larger rise at its two ends; wall_k: rise
+    of the wall at its end
     """
 
     displacement_m: FloatArray
@@ -67,7 +67,7 @@ class WallPeaks(NamedTuple):
 
 
 class ModalAmplitudes(NamedTuple):
-    """Amplitudes [p], a mode each: the absorber's rise in the mode's two motions, and the gas's own, K."""
+    """Amplitudes of the modes [p]: absorber rise in the two motions of each mode, and the gas's own part, K."""
 
     first_k: FloatArray
     second_k: FloatArray
@@ -75,10 +75,11 @@ class ModalAmplitudes(NamedTuple):
 
 
 class Modes(NamedTuple):
-    """The display's modes. first, second: the two motions of a mode, the first mostly absorber, the second mostly wall.
+    """Modes of the display; the first motion of a mode is mostly absorber, the second mostly wall.
 
-    share: [p, p] of pixel in mode. Of each motion, all [p]: its rate; what wall and gas rise with a kelvin of the
-    absorber; what the absorber rises by a joule of light. gas_k_per_j: [p] the same for the gas's own amplitude.
+    share: [p, p] component of each pixel in each mode. For each motion, all [p]: its rate; rise of wall and gas per
+    kelvin of the absorber; rise of the absorber per joule of light. gas_k_per_j: [p] rise of the gas's own amplitude
+    per joule of light
     """
 
     pixel: Pixel
@@ -98,7 +99,7 @@ class Modes(NamedTuple):
 
     @classmethod
     def diagonalise(cls, pixel: Pixel, walls: WallParameters, neighbours: Neighbours) -> "Modes":
-        """Diagonalise a display of equal cells; takes a second or so for 1,511, once for any number of simulations."""
+        """Diagonalise a display of equal cells, which takes about a second for 1,511 of them."""
         wall_w_per_k, share = np.linalg.eigh(build_conductances_w_per_k(walls, neighbours))
         first_per_s, second_per_s, tangent = _solve_motions(pixel, walls, wall_w_per_k)
         wall_per_absorber = np.sqrt(pixel.c_j_per_k / walls.c_j_per_k)
@@ -126,7 +127,7 @@ class Modes(NamedTuple):
 
 
 def build_conductances_w_per_k(walls: WallParameters, neighbours: Neighbours) -> FloatArray:
-    """[p, p] heat that leaves the wall of a row for each kelvin of the wall of a column."""
+    """Return the conductance matrix [p, p]: heat flow out of the wall of a row per kelvin of the wall of a column."""
     pixel, side = np.nonzero(neighbours.indices >= 0)
     matrix = np.zeros((len(neighbours), len(neighbours)))
     matrix[pixel, neighbours.indices[pixel, side]] = -1.0 / walls.side_k_per_w
@@ -137,7 +138,7 @@ def build_conductances_w_per_k(walls: WallParameters, neighbours: Neighbours) ->
 def _solve_motions(
     pixel: Pixel, walls: WallParameters, wall_w_per_k: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Each mode's two rates, [p] 1/s, and the tangent between its motions and absorber and wall by themselves, [p].
+    """Return the two rates of each mode, [p] 1/s, and the tangent of the rotation that decouples them, [p].
 
     In √C θ and √C_w w the two equations are symmetric, and one Jacobi rotation makes them independent.
     """
@@ -147,7 +148,7 @@ def _solve_motions(
     halves = (absorber_per_s - wall_per_s) / (2.0 * between_per_s)
     tangent = np.copysign(1.0, halves) / (np.abs(halves) + np.hypot(1.0, halves))
     rates_per_s = np.stack([absorber_per_s + tangent * between_per_s, wall_per_s - tangent * between_per_s])
-    # The smaller from the product of both, which has lost no digits.
+    # The product of both rates gives the smaller one without cancellation.
     larger_per_s = rates_per_s.max(axis=0)
     smaller_per_s = absorber_per_s * wall_w_per_k / walls.c_j_per_k / larger_per_s
     rates_per_s = _separate_rates(np.where(rates_per_s < larger_per_s, smaller_per_s, rates_per_s), 1.0 / pixel.tau_g_s)
@@ -160,7 +161,7 @@ def _separate_rates(rate_per_s: FloatArray, gas_per_s: float) -> FloatArray:
 
 
 class CoupledDisplay:
-    """The heat of a display of equal cells with walls, from rest; mutable. All pixels share one time."""
+    """Mutable thermal state of a display of equal cells with coupled walls; all pixels share one time."""
 
     def __init__(self, modes: Modes, at_s: float = 0.0) -> None:
         self._modes = modes
@@ -168,9 +169,9 @@ class CoupledDisplay:
         self._now = _zero_amplitudes(len(modes.share))
 
     def apply_pulses(self, pixel: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray) -> WallPeaks:
-        """Light pixels one after the other; all [n], in order of time, power the mean incident one.
+        """Apply pulses in order of time, all [n], power_w the mean incident power; return their peaks.
 
-        ValueError for a pulse that starts before the last event; those before it have been.
+        Raises ValueError for a pulse that starts before the last event; the pulses before it remain applied.
         """
         columns = build_kernel_columns(len(self._modes.share), pixel, start_s, width_s, power_w)
         peaks = WallPeaks(*np.zeros((3, len(pixel))))
@@ -180,12 +181,12 @@ class CoupledDisplay:
         return peaks
 
     def rises_k(self, at_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Rises of absorber, wall and gas, K, each [p], left dark until at_s; ValueError for a time before the last."""
-        dark_s = at_s - float(self._at_s[0])
-        if dark_s < -TIME_ROUNDING_S:
+        """Return the rises of absorber, wall and gas, K, each [p], with the gate off until at_s."""
+        off_s = at_s - float(self._at_s[0])
+        if off_s < -TIME_ROUNDING_S:
             raise ValueError(f"the display was advanced to {self._at_s[0]} s, {at_s} s lies before it")
         modes, then = self._modes, _zero_amplitudes(len(self._modes.share))
-        _advance(modes, self._now, then, 0, 0.0, max(0.0, dark_s))
+        _advance(modes, self._now, then, 0, 0.0, max(0.0, off_s))
         wall_k = modes.first_wall * then.first_k + modes.second_wall * then.second_k
         gas_k = modes.first_gas * then.first_k + modes.second_gas * then.second_k + then.gas_k
         absorber_k = then.first_k + then.second_k
@@ -209,44 +210,44 @@ def _apply_pulses(
     peak_k: FloatArray,
     wall_k: FloatArray,
 ) -> int:
-    """Heat by the pulses [n], fill in what they do [n]; the number of pulses that did not come too early.
+    """Apply the pulses [n] and fill in their peaks [n]; return the number of pulses before one out of order.
 
-    When the gas turns is told by the pixel with its wall held, what it is then by all modes: at a turn, a small error
-    of time is a far smaller one of height. For walls a thousand times as slow as the pixel, as the laminate's, the peak
-    lies less than 1e-6 of itself too low; for walls as quick as the gas, less than 1e-3. Light on other pixels before
-    the turn is left out of it: it comes through two walls.
+    The time of the gas peak assumes a constant wall, the value at that time uses all modes: near a peak, a small error
+    of time causes a much smaller one of height. For walls a thousand times slower than the pixel, as in the laminate,
+    the peak is less than 1e-6 of itself too low; for walls as fast as the gas, less than 1e-3. Light on other pixels
+    before the peak is neglected, because its heat passes two walls.
     """
     one = modes.pixel
     spare = ModalAmplitudes(np.empty_like(now.gas_k), np.empty_like(now.gas_k), np.empty_like(now.gas_k))
     next_s = _next_on_pixel(len(now.gas_k), pixel, start_s)
     for row in range(len(pixel)):
-        i, lit_w, lit_s = pixel[row], power_w[row], width_s[row]
+        i, on_w, on_s = pixel[row], power_w[row], width_s[row]
         if start_s[row] - at_s[0] < -TIME_ROUNDING_S:
             return row
         _advance(modes, now, now, i, 0.0, max(0.0, start_s[row] - at_s[0]))
-        before_k, held_k, least_k = _read_rises(modes, now, i)
-        turn_s = gas_peak(one, before_k - held_k, least_k - held_k, lit_w, lit_s)[1]
-        most_k = least_k
-        if 0.0 < turn_s < lit_s:
-            _advance(modes, now, spare, i, lit_w, turn_s)
-            most_k = max(most_k, _read_rises(modes, spare, i)[2])
-        _advance(modes, now, now, i, lit_w, lit_s)
-        at_s[0] = start_s[row] + lit_s
-        after_k, held_k, end_k = _read_rises(modes, now, i)
-        turn_s = cooling_peak(one, after_k - held_k, end_k - held_k, max(0.0, next_s[row] - at_s[0]))[1]
-        most_k = max(most_k, end_k)
+        before_k, wall_rise_k, start_k = _read_rises(modes, now, i)
+        turn_s = gas_peak(one, before_k - wall_rise_k, start_k - wall_rise_k, on_w, on_s)[1]
+        peak_gas_k = start_k
+        if 0.0 < turn_s < on_s:
+            _advance(modes, now, spare, i, on_w, turn_s)
+            peak_gas_k = max(peak_gas_k, _read_rises(modes, spare, i)[2])
+        _advance(modes, now, now, i, on_w, on_s)
+        at_s[0] = start_s[row] + on_s
+        after_k, wall_rise_k, end_k = _read_rises(modes, now, i)
+        turn_s = cooling_peak(one, after_k - wall_rise_k, end_k - wall_rise_k, max(0.0, next_s[row] - at_s[0]))[1]
+        peak_gas_k = max(peak_gas_k, end_k)
         if turn_s > 0.0:
             _advance(modes, now, spare, i, 0.0, turn_s)
-            most_k = max(most_k, _read_rises(modes, spare, i)[2])
-        peak_m[row] = one.kappa_m_per_k * most_k
+            peak_gas_k = max(peak_gas_k, _read_rises(modes, spare, i)[2])
+        peak_m[row] = one.kappa_m_per_k * peak_gas_k
         peak_k[row] = max(before_k, after_k)
-        wall_k[row] = held_k
+        wall_k[row] = wall_rise_k
     return len(pixel)
 
 
 @vector_kernel
 def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatArray:
-    """[n] when the pixel of each pulse is lit again; infinite for its last."""
+    """Return the start of the next pulse on the pixel of each pulse, [n]; infinite for its last one."""
     coming_s = np.full(pixels, np.inf)
     next_s = np.empty(len(pixel))
     for row in range(len(pixel) - 1, -1, -1):
@@ -259,7 +260,7 @@ def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatAr
 def _advance(
     modes: Modes, before: ModalAmplitudes, after: ModalAmplitudes, pixel: int, power_w: float, time_s: float
 ) -> None:
-    """Amplitudes after time_s at constant power on one pixel; before and after may be the same."""
+    """Advance the amplitudes by time_s at constant power on one pixel; before and after may be the same."""
     share = modes.share[pixel]
     light_j = power_w * time_s
     mean, left = _decay(modes.first_per_s, modes.first_max_per_s, time_s)
@@ -282,20 +283,20 @@ def _advance_motion(
     k_per_j: FloatArray,
     mean: FloatArray,
 ) -> None:
-    """One motion of all modes. A loop apart: with more arrays the compiler does not see that it may take several k."""
+    """Advance one motion of all modes; the compiler vectorises this loop only with few arrays."""
     for k in range(len(share)):
         after_k[k] = before_k[k] * left[k] + light_j * share[k] * k_per_j[k] * mean[k]
 
 
 @vector_kernel
-def _decay(rate_per_s: FloatArray, most_per_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
-    """Of e^(−rate t): the mean over the time, and what is left at its end, each [p].
+def _decay(rate_per_s: FloatArray, max_per_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
+    """Return the mean of e^(−rate t) over the time and its value at the end, each [p].
 
-    By the series of (1 − e^(−x))/x for a part of the time, doubled as often as needed: it has no branches, so the
-    processor takes several modes at once, and it is exact for a pause without end.
+    The series of (1 − e^(−x))/x covers a fraction of the time, which is doubled as often as necessary: it has no
+    branches, so that the loop vectorises, and it is exact for arbitrarily long pauses.
     """
     doublings, part_s = 0, time_s
-    while most_per_s * part_s > SERIES_REACH:
+    while max_per_s * part_s > SERIES_REACH:
         doublings, part_s = doublings + 1, 0.5 * part_s
     mean, left = np.empty_like(rate_per_s), np.empty_like(rate_per_s)
     for k in range(len(rate_per_s)):
@@ -311,7 +312,7 @@ def _decay(rate_per_s: FloatArray, most_per_s: float, time_s: float) -> tuple[Fl
 
 @vector_kernel
 def _series(x: float) -> float:
-    """(1 − e^(−x))/x = Σ (−x)^n/(n+1)!."""
+    """Return (1 − e^(−x))/x = Σ (−x)^n/(n+1)!."""
     total = 0.0
     for coefficient in COEFFICIENTS:
         total = coefficient - x * total
@@ -320,7 +321,7 @@ def _series(x: float) -> float:
 
 @vector_kernel
 def _read_rises(modes: Modes, heat: ModalAmplitudes, pixel: int) -> tuple[float, float, float]:
-    """Rises of absorber, wall and gas of one pixel, K."""
+    """Return the rises of absorber, wall and gas of one pixel, K."""
     absorber_k, wall_k, gas_k = 0.0, 0.0, 0.0
     share = modes.share[pixel]
     for k in range(len(share)):

@@ -1,11 +1,11 @@
-"""A pixel's two equations, integrated by solve_ivp: written apart from the package's physics."""
+"""The two equations of the nominal pixel, integrated by solve_ivp, independent of the package."""
 
 import numpy as np
 from scipy.integrate import solve_ivp
 
 
 def height_um(pixel, pulses, t_s):
-    """Displacement at t_s [m] under pulses [n, 3] (start, width, power) in order, from rest; from edge to edge."""
+    """Return the displacement at t_s [m], µm, under pulses [n, 3] (start, width, power) in order, from cold."""
     edges_s = [0.0, *np.concatenate([pulses[:, :1], pulses[:, :1] + pulses[:, 1:2]], axis=1).ravel(), t_s[-1] + 1e-3]
     power_w = [0.0, *np.column_stack([pulses[:, 2], np.zeros(len(pulses))]).ravel()]
     state, height = np.zeros(2), np.zeros(len(t_s))

@@ -262,7 +262,7 @@ def sample_factors(rng, unsure):
 
 
 def upper_factors(unsure):
-    """What heats maximum in the long run."""
+    """Return the parameter factors with the highest steady temperatures."""
     high = ("absorbed_power", "bridge_resistance", "wall_resistance", "side_resistance", "touch_share", "exponent")
     return {name: getattr(unsure, name) + (0.0 if name == "exponent" else 1.0) for name in high}
 

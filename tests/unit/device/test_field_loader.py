@@ -1,4 +1,4 @@
-"""Planning with a calibrated field of a hidden geometry."""
+"""Planning with the calibrated field of a hidden geometry."""
 
 import numpy as np
 import pytest
@@ -17,14 +17,14 @@ from optodrive.planning.pipeline import plan_sequence
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory):
-    """Seed to truth and configuration."""
+def calibrated(tmp_path_factory):
+    """Ground truth and configuration by seed."""
     folder = tmp_path_factory.mktemp("fields")
     return {seed: calibrate_hidden_field(folder / f"field-{seed}.toml", seed) for seed in (0, 1, 2)}
 
 
-def landed_m(truth, config):
-    """Where the light of a full frame really falls, by the very bytes; and the pixel of each pulse."""
+def compute_landing_m(truth, config):
+    """Return the true positions of a full frame's light, from the bytes on the wire, and the pixel of each pulse."""
     display, scale = DisplayModel.from_config(config), BoardRequirements.from_config(config).scale
     full = FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(len(LAYOUT), 10e-6)),))
     plan = plan_sequence(display, full, *display.build_cold_state()).plan
@@ -35,17 +35,17 @@ def landed_m(truth, config):
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_every_planned_pulse_lands_within_30_um_of_its_pixel_and_uncorrected_ones_miss(made, seed):
-    truth, config = made[seed]
+def test_every_planned_pulse_lands_within_30_um_of_its_pixel_and_uncorrected_ones_miss(calibrated, seed):
+    truth, config = calibrated[seed]
     for aimed, misses in ((CONFIG, True), (config, False)):
-        at_m, pixel = landed_m(truth, aimed)
-        off_m = np.hypot(at_m[0] - LAYOUT.x_m[pixel], at_m[1] - LAYOUT.y_m[pixel])
+        at_m, pixel = compute_landing_m(truth, aimed)
+        error_m = np.hypot(at_m[0] - LAYOUT.x_m[pixel], at_m[1] - LAYOUT.y_m[pixel])
         assert set(pixel.tolist()) == set(range(len(LAYOUT)))
-        assert (off_m.max() > 0.5e-3) if misses else (off_m.max() <= 30e-6)
+        assert (error_m.max() > 0.5e-3) if misses else (error_m.max() <= 30e-6)
 
 
-def test_planner_limiter_and_board_see_the_same(made):
-    _, config = made[0]
+def test_planner_limiter_and_board_see_the_same(calibrated):
+    _, config = calibrated[0]
     display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
     assert build_galvo_model(config).lead_in_s == display.scan_head.settling.lead_in_us * 1e-6
     x_code, y_code = (
@@ -56,8 +56,8 @@ def test_planner_limiter_and_board_see_the_same(made):
     assert limits.y_max - 65 <= y_code.max() <= limits.y_max
 
 
-def test_the_board_s_own_time_of_a_move_never_passes_the_plan_s(made):
-    for _, config in made.values():
+def test_the_board_s_own_time_of_a_move_never_passes_the_plan_s(calibrated):
+    for _, config in calibrated.values():
         display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
         moves, limits = display.scan_head.settling, requirements.build_limits()
         angles_rad = display.scan_head.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)

@@ -19,7 +19,7 @@ servos = st.builds(
 @settings(max_examples=150)
 @given(servo=servos, move_rad=st.floats(2e-3, 0.3), share=st.floats(0.01, 0.45))
 def test_settled_is_when_the_stepped_servo_last_comes_inside(servo, move_rad, share):
-    """The servo as the diagnosis steps it, which is good to some 2e-4 of a step."""
+    """The diagnosis integrates the servo with an error of about 2e-4 of a step."""
     tolerance_rad = share * min(move_rad, 0.02)
     done_s = settling_s(servo, move_rad, tolerance_rad)
     t_s = np.linspace(0.0, done_s + 8 / (servo.damping * 2 * np.pi * servo.frequency), 20_001)
@@ -42,8 +42,8 @@ def test_the_servo_of_the_shipped_scanners_settles_as_its_class():
     assert settling_s(SERVO, step_rad, 0.02 * step_rad) - 3e-5 == pytest.approx(0.55e-3, abs=2e-5)
 
 
-def still_to_come(pole, phases):
-    """[phases] largest |exp(λ t)| from a phase on, sampled."""
+def peak_from_phase(pole, phases):
+    """Return the sampled maximum of |Re exp(λ t)| from each phase on, [phases]."""
     t_s = np.linspace(0.0, 3 * np.pi / pole.imag, 3001)
     return np.abs((np.exp(1j * phases[:, None] + pole * t_s)).real).max(axis=1)
 
@@ -53,10 +53,10 @@ def still_to_come(pole, phases):
 )
 def test_what_outlasts_a_tolerance_is_bounded_over_all_phases_and_tightly(damping):
     servo = Servo(1000.0, damping, 0.0, 100.0)
-    pole, phases, most = pole_per_s(servo), np.linspace(0, np.pi, 721), 0.0
-    now = still_to_come(pole, phases)
+    pole, phases, max_ratio = pole_per_s(servo), np.linspace(0, np.pi, 721), 0.0
+    now = peak_from_phase(pole, phases)
     for later_s in np.linspace(0.0, np.pi / pole.imag, 91):
-        later = still_to_come(pole, phases + pole.imag * later_s)  # the decay itself is left out
-        most = max(most, (later / now).max())
-    assert most <= envelope_factor(servo) * (1 + 1e-6)
-    assert most >= 0.99 * envelope_factor(servo)
+        later = peak_from_phase(pole, phases + pole.imag * later_s)  # without the decay itself
+        max_ratio = max(max_ratio, (later / now).max())
+    assert max_ratio <= envelope_factor(servo) * (1 + 1e-6)
+    assert max_ratio >= 0.99 * envelope_factor(servo)

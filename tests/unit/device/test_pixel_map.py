@@ -1,4 +1,4 @@
-"""pixels.toml, and what planner, limiter and board make of it."""
+"""Pixel maps: the file, and its effect on planner, limiter and board."""
 
 from dataclasses import replace
 
@@ -41,8 +41,8 @@ def some_map(offset_m=1e-4):
     return PixelMap(gain, np.full(COUNT, 0.01), x_m, y_m, unknown, np.full(COUNT, 1e-6), state, "surroundings")
 
 
-def write_and_use_map(path, known=None, config=CONFIG):
-    write_pixel_map(path, some_map() if known is None else known, config, {"source": "a test"})
+def write_and_use_map(path, pixel_map=None, config=CONFIG):
+    write_pixel_map(path, some_map() if pixel_map is None else pixel_map, config, {"source": "a test"})
     return replace_pixel_map(CONFIG, path)
 
 
@@ -51,15 +51,15 @@ def display(tmp_path_factory):
     return DisplayModel.from_config(write_and_use_map(tmp_path_factory.mktemp("map") / "pixels.toml"))
 
 
-def everywhere(target_m, count=COUNT):
+def frame_of_all(target_m, count=COUNT):
     return FrameSequence((TactileFrame("all", 0.0, 1.0, np.full(count, target_m)),))
 
 
 def test_there_and_back(tmp_path):
-    known, again = some_map(), load_pixel_map(write_and_use_map(tmp_path / "pixels.toml"))
+    pixel_map, again = some_map(), load_pixel_map(write_and_use_map(tmp_path / "pixels.toml"))
     for name in NUMERIC_FIELDS:
-        assert getattr(again, name) == pytest.approx(getattr(known, name), rel=1e-5, nan_ok=True)
-    assert again.state.tolist() == known.state.tolist()
+        assert getattr(again, name) == pytest.approx(getattr(pixel_map, name), rel=1e-5, nan_ok=True)
+    assert again.state.tolist() == pixel_map.state.tolist()
     assert again.displacement_factor[DEAD_PIXEL] == 0.0
 
 
@@ -71,7 +71,7 @@ def test_a_changed_file_is_read_again(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (
             (b"rows = 4", b"rows = 5"),
@@ -87,14 +87,14 @@ def test_a_changed_file_is_read_again(tmp_path):
         ((b'parameters = "surroundings"', b'parameters = "other"'), "model.parameters: got 'other'"),
     ],
 )
-def test_a_map_that_is_not_of_this_display_is_refused(tmp_path, change, says):
+def test_a_map_that_is_not_of_this_display_is_refused(tmp_path, change, message):
     path = tmp_path / "pixels.toml"
     config = write_and_use_map(path)
     assert change[0] in path.read_bytes()
     path.write_bytes(path.read_bytes().replace(*change))
     with pytest.raises(InputError) as caught:
         DisplayModel.from_config(config)
-    assert says in str(caught.value)
+    assert message in str(caught.value)
     assert str(path) in str(caught.value)
 
 
@@ -116,8 +116,8 @@ def test_nothing_alive_out_of_its_cell_and_no_file(tmp_path):
 
 
 def test_heights_are_kept_and_heat_is_never_scaled(display):
-    plan = plan_sequence(display, everywhere(60e-6), *display.build_cold_state())
-    nominal = plan_sequence(PLAIN, everywhere(60e-6), *PLAIN.build_cold_state())
+    plan = plan_sequence(display, frame_of_all(60e-6), *display.build_cold_state())
+    nominal = plan_sequence(PLAIN, frame_of_all(60e-6), *PLAIN.build_cold_state())
     assert plan.predicted_m == pytest.approx(np.full(COUNT - 1, 60e-6), rel=1e-3)
     energy_j, nominal_j = (
         dict(zip(each.plan.pixel.tolist(), each.plan.energy_j, strict=True)) for each in (plan, nominal)
@@ -134,9 +134,9 @@ def test_heights_are_kept_and_heat_is_never_scaled(display):
 
 
 def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
-    plan = plan_sequence(display, everywhere(60e-6), *display.build_cold_state()).plan
-    known, focal_m = some_map(), CONFIG.scanner.focal_length_m
-    aimed_m = PLAIN.layout.x_m + known.offset_x_m, PLAIN.layout.y_m + known.offset_y_m
+    plan = plan_sequence(display, frame_of_all(60e-6), *display.build_cold_state()).plan
+    pixel_map, focal_m = some_map(), CONFIG.scanner.focal_length_m
+    aimed_m = PLAIN.layout.x_m + pixel_map.offset_x_m, PLAIN.layout.y_m + pixel_map.offset_y_m
     assert plan.x_rad == pytest.approx(aimed_m[0][plan.pixel] / (2 * focal_m), rel=1e-4)
     assert plan.y_rad == pytest.approx(aimed_m[1][plan.pixel] / (2 * focal_m), rel=1e-4)
     requirements = BoardRequirements.from_config(display.config)
@@ -150,14 +150,14 @@ def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
 
 
 def test_the_dead_are_left_out_and_named(display):
-    prepared, feasibility = check_feasibility(display, everywhere(60e-6), *display.build_cold_state())
+    prepared, feasibility = check_feasibility(display, frame_of_all(60e-6), *display.build_cold_state())
     figures = summarize_plan(prepared, feasibility)
     assert feasibility.fits
     assert figures.dead == DeadPixelSummary(
         pixels=[DEAD_PIXEL], count=1, message=f"pixel {DEAD_PIXEL} is dead: omitted"
     )
     alone = np.zeros(COUNT)
-    alone[DEAD_PIXEL] = 5e-3  # out of anyone's reach
+    alone[DEAD_PIXEL] = 5e-3  # unreachable for every pixel
     nothing, _ = check_feasibility(
         display, FrameSequence((TactileFrame("dead", 0.0, 1.0, alone),)), *display.build_cold_state()
     )

@@ -12,22 +12,22 @@ PITCH_RAD = 4e-3 / 0.44
 LONG_US = 10_000
 
 
-def changed(config, **sections):
+def modify(config, **sections):
     table = config.model_dump()
     for name, values in sections.items():
         table[name] |= values
     return Config.model_validate(table)
 
 
-RINGING = changed(
+RINGING = modify(
     CONFIG,
     scanner={"damping": 0.3, "bandwidth_hz": 400.0, "slew_rad_per_s": 300.0},
     display={"pitch_m": 2.1e-3, "missing": []},
     laser={"pwm_hz": 50_000.0},
 )
-"""A servo that rings, pixels side by side, pulses of 20 µs: whatever can go wrong with moves close together."""
+"""A ringing servo, adjacent pixels and pulses of 20 µs: the worst case of consecutive moves."""
 
-OVERSHOOTING = changed(RINGING, scanner={"damping": 0.5})
+OVERSHOOTING = modify(RINGING, scanner={"damping": 0.5})
 
 
 def test_no_move_takes_no_time():
@@ -41,7 +41,7 @@ def test_the_later_axis_decides():
 
 
 def test_axes_with_unlike_room_have_times_of_their_own():
-    moves = SettlingTable.from_config(changed(CONFIG, display={"absorber_height_m": 1.2e-3}))
+    moves = SettlingTable.from_config(modify(CONFIG, display={"absorber_height_m": 1.2e-3}))
     assert moves.settling_us(PITCH_RAD, 0.0, LONG_US) == MOVES.settling_us(PITCH_RAD, 0.0, LONG_US)
     assert moves.settling_us(0.0, PITCH_RAD, LONG_US) > MOVES.settling_us(0.0, PITCH_RAD, LONG_US)
 
@@ -73,13 +73,13 @@ def test_times_rise_and_no_detour_is_quicker(moves):
 
 
 def test_without_care_a_detour_would_be_quicker():
-    """Each by itself, two moves of this servo are quicker than the one that overshoots."""
+    """Settled separately, two moves of this servo are faster than the single one that overshoots."""
     servo, tolerance_rad = build_servo(OVERSHOOTING.scanner), 0.9 * OVERSHOOTING.tolerance_rad[0]
     moves = SettlingTable.from_config(OVERSHOOTING)
-    alone_us = [
+    separate_us = [
         1e6 * settling_s(servo, k * moves.pitch_rad, tolerance_rad) for k in range(len(moves.after_long_dwell[0]))
     ]
-    assert any(alone_us[a + b] > alone_us[a] + alone_us[b] for a in range(1, 15) for b in range(1, 15))
+    assert any(separate_us[a + b] > separate_us[a] + separate_us[b] for a in range(1, 15) for b in range(1, 15))
 
 
 def test_a_move_between_whole_pitches_takes_at_least_that_of_the_next():
@@ -97,7 +97,7 @@ def test_a_single_pixel_needs_no_lead():
 
 
 def test_from_the_middle_of_an_even_lattice_the_lead_is_long_enough():
-    config = changed(CONFIG, display={"rows": 1, "columns": 2, "missing": []})
+    config = modify(CONFIG, display={"rows": 1, "columns": 2, "missing": []})
     servo, half_rad = build_servo(config.scanner), 0.5 * PITCH_RAD
     assert SettlingTable.from_config(config).lead_in_us >= 1e6 * settling_s(
         servo, half_rad, 0.9 * config.tolerance_rad[0]

@@ -1,4 +1,4 @@
-"""In a calibrated field moves go over any distance: none is given less time than it needs."""
+"""Settling times in a calibrated field, where moves have any distance: every move gets the time that it needs."""
 
 import numpy as np
 import pytest
@@ -14,15 +14,15 @@ from optodrive.device.settling import LONG_DWELL_SHARE, SettlingTable
 
 
 class Askew:
-    """An ideal lens whose image is larger, turned and bent."""
+    """An ideal lens with a magnified, rotated and distorted image."""
 
-    def __init__(self, larger=1.02, turn_rad=0.02, bend_per_m=0.3):
-        self.larger, self.turn_rad, self.bend_per_m = larger, turn_rad, bend_per_m
+    def __init__(self, magnification=1.02, turn_rad=0.02, bend_per_m=0.3):
+        self.magnification, self.turn_rad, self.bend_per_m = magnification, turn_rad, bend_per_m
 
     def angles_rad(self, x_m, y_m):
         bent = 1.0 + self.bend_per_m * x_m
         x_m, y_m = bent * x_m - self.turn_rad * y_m, bent * y_m + self.turn_rad * x_m
-        return IdealField(CONFIG.scanner.focal_length_m * self.larger).angles_rad(x_m, y_m)
+        return IdealField(CONFIG.scanner.focal_length_m * self.magnification).angles_rad(x_m, y_m)
 
 
 def servo(**scanner):
@@ -35,36 +35,36 @@ CASES = {
     "shipped": CONFIG,
     "ringing": servo(damping=0.3, bandwidth_hz=400.0, slew_rad_per_s=300.0),
     "overshooting": servo(damping=0.5, bandwidth_hz=400.0, slew_rad_per_s=300.0),
-    "resonant": servo(damping=0.3, bandwidth_hz=400.0, slew_rad_per_s=30.0),  # some ramps end a swing, others feed it
+    "resonant": servo(damping=0.3, bandwidth_hz=400.0, slew_rad_per_s=30.0),  # a ramp may damp the ringing or excite it
 }
 MOVES = {name: SettlingTable.from_config(config, Askew()) for name, config in CASES.items()}
 
 
-def needed_us(config, axis, way_rad):
-    """What a calm move needs in this field, µs."""
+def required_us(config, axis, distance_rad):
+    """Return the settling time that a move after a long dwell needs in this field, µs."""
     tolerance_rad = tolerance_ratio(Askew(), LAYOUT, config) * config.tolerance_rad[axis]
-    room_rad = (1.0 - LONG_DWELL_SHARE) * (
+    tolerance_left_rad = (1.0 - LONG_DWELL_SHARE) * (
         tolerance_rad - 0.5 * config.scanner.rad_per_code
     ) - config.scanner.rad_per_code
-    return 1e6 * settling_s(build_servo(config.scanner), way_rad, room_rad)
+    return 1e6 * settling_s(build_servo(config.scanner), distance_rad, tolerance_left_rad)
 
 
 @settings(max_examples=300)
 @given(st.sampled_from(sorted(CASES)), st.integers(0, 1), st.floats(1e-3, 19.9))
 def test_no_move_is_given_less_than_it_needs(name, axis, pitches):
     config, moves = CASES[name], MOVES[name]
-    way_rad = pitches * moves.pitch_rad
-    way = (way_rad, 0.0) if axis == 0 else (0.0, way_rad)
-    assert moves.settling_us(*way, moves.long_dwell_us) >= needed_us(config, axis, way_rad)
+    distance_rad = pitches * moves.pitch_rad
+    move = (distance_rad, 0.0) if axis == 0 else (0.0, distance_rad)
+    assert moves.settling_us(*move, moves.long_dwell_us) >= required_us(config, axis, distance_rad)
 
 
 def test_times_of_whole_pitches_alone_would_be_too_short():
-    """The mutant: what a whole pitch needs, taken for all that is shorter."""
+    """Mutant: the time of a whole pitch for all shorter moves."""
     config, moves = CASES["resonant"], MOVES["resonant"]
     short = 0
     for pitches in np.linspace(0.05, 19.95, 400):
-        whole_us = needed_us(config, 0, np.ceil(pitches) * moves.pitch_rad)
-        short += whole_us < needed_us(config, 0, pitches * moves.pitch_rad)
+        whole_us = required_us(config, 0, np.ceil(pitches) * moves.pitch_rad)
+        short += whole_us < required_us(config, 0, pitches * moves.pitch_rad)
     assert short
 
 
@@ -99,7 +99,7 @@ def test_room_for_the_focus_in_a_field_askew():
 
 
 def test_a_single_pixel_off_the_middle_has_a_lead():
-    """Where it lies is not where the mirrors rest."""
+    """Its position is not the centre of the mirrors' range."""
     one = replace_display(rows=1, columns=1, missing=[])
     assert SettlingTable.from_config(one, Shifted()).lead_in_us > 200
     assert (
@@ -120,7 +120,7 @@ def replace_display(**display):
 
 
 def test_giving_less_away_costs_more_looking_and_saves_little(monkeypatch):
-    """What stands for all distances between costs a move few microseconds."""
+    """The bound over all distances in between costs a move few microseconds."""
     config = CASES["shipped"]
     moves = MOVES["shipped"]
     monkeypatch.setattr(settling, "INTERVAL_SHARE", 0.005)

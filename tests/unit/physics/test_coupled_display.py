@@ -1,4 +1,4 @@
-"""The display with walls: held against an adaptive integrator, a fine trace, the nominal pixel, and its own energy."""
+"""The coupled display against an adaptive integrator, a fine trace, the nominal pixel and its energy balance."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ LATTICE = Neighbours.from_display(SECTION)
 
 
 def pulses(seed, count=12, pause_s=2.0):
-    """Random pulses in order: some pixels hammered, one long pause."""
+    """Draw pulses in order of time, with repeated pixels and one long pause."""
     rng = np.random.default_rng(seed)
     width_s = rng.integers(1, 100, count) * 2e-4
     gap_s = rng.choice([0.0, 4e-4, 3e-3, 0.02], count)
@@ -34,8 +34,8 @@ def pulses(seed, count=12, pause_s=2.0):
     return pixel, np.cumsum(width_s + gap_s) - width_s, width_s, rng.uniform(0.05, 2.45, count)
 
 
-def integrated(pixel, walls, columns, at_s):
-    """[3, p] absorber, wall and gas at at_s from rest, stepped from edge to edge."""
+def integrate(pixel, walls, columns, at_s):
+    """Integrate absorber, wall and gas, [3, p], from the cold state to at_s, from edge to edge."""
     count, matrix = len(LATTICE), build_conductances_w_per_k(walls, LATTICE)
     state, now_s = np.zeros(3 * count), 0.0
 
@@ -68,7 +68,7 @@ def test_meets_an_integrator(walls, dark_s):
     heat = CoupledDisplay(Modes.diagonalise(PIXEL, walls, LATTICE))
     result = heat.apply_pulses(*columns)
     at_s = columns[1][-1] + columns[2][-1] + dark_s
-    exact = integrated(PIXEL, walls, columns, at_s)
+    exact = integrate(PIXEL, walls, columns, at_s)
     assert np.array(heat.rises_k(at_s)) == pytest.approx(exact, rel=1e-8, abs=1e-9)
     if dark_s == 0.0:
         assert result.wall_k[-1] == pytest.approx(exact[1, columns[0][-1]], rel=1e-8)
@@ -83,16 +83,16 @@ def test_gas_as_slow_as_a_mode(motion, off):
     heat = CoupledDisplay(Modes.diagonalise(pixel, CLOSE_WALLS, LATTICE))
     heat.apply_pulses(*columns)
     at_s = columns[1][-1] + columns[2][-1] + 2e-3
-    expected = integrated(pixel, CLOSE_WALLS, columns, at_s)
+    expected = integrate(pixel, CLOSE_WALLS, columns, at_s)
     assert np.array(heat.rises_k(at_s)) == pytest.approx(expected, rel=1e-6, abs=1e-7)
 
 
-def traced(walls, columns):
-    """Times [m], absorber and gas [m, p] every 20 µs through all pulses and a while after each."""
+def trace(walls, columns):
+    """Sample absorber and gas [m, p] every 20 µs through all pulses and for a while after each; with the times [m]."""
     heat, step_s, dark_s = CoupledDisplay(Modes.diagonalise(PIXEL, walls, LATTICE)), 2e-5, 0.03
     t_s, absorber_k, gas_k = [0.0], [np.zeros(len(LATTICE))], [np.zeros(len(LATTICE))]
 
-    def look(at_s):
+    def record(at_s):
         absorber, _, gas = heat.rises_k(at_s)
         for values, value in ((t_s, at_s), (absorber_k, absorber), (gas_k, gas)):
             values.append(value)
@@ -101,27 +101,27 @@ def traced(walls, columns):
     for pixel, start_s, width_s, power_w, until_s in zip(*columns, ends_s, strict=True):
         for at_s in start_s + step_s * np.arange(round(width_s / step_s)):
             heat.apply_pulses(*(np.array([value]) for value in (pixel, at_s, step_s, power_w)))
-            look(at_s + step_s)
+            record(at_s + step_s)
         end_s = start_s + width_s
         for at_s in np.arange(end_s + step_s, min(until_s, end_s + dark_s), step_s):
-            look(at_s)
-        look(until_s)
+            record(at_s)
+        record(until_s)
     return np.array(t_s), np.array(absorber_k), np.array(gas_k)
 
 
 @pytest.mark.parametrize(("walls", "rel"), [(WALLS, 3e-6), (CLOSE_WALLS, 1e-3)], ids=["laminate", "close"])
 def test_peaks_meet_a_fine_trace(walls, rel):
-    # The turn is told with the wall held: no error for the laminate, a visible one for walls as quick as the gas.
+    # The time of the peak assumes a constant wall: exact for the laminate, not for walls as fast as the gas.
     columns = pixel, start_s, _, power_w = pulses(3, pause_s=0.1)
     pixel[3], power_w[3] = pixel[2], 0.01
     peaks = CoupledDisplay(Modes.diagonalise(PIXEL, walls, LATTICE)).apply_pulses(*columns)
-    t_s, absorber_k, gas_k = traced(walls, columns)
+    t_s, absorber_k, gas_k = trace(walls, columns)
     for row, index in enumerate(pixel):
         following = start_s[row + 1 :][pixel[row + 1 :] == index]
-        seen = (t_s >= start_s[row] - 1e-9) & (t_s <= (following[0] if len(following) else np.inf) + 1e-9)
-        highest_m = PIXEL.kappa_m_per_k * gas_k[seen, index].max()
+        during = (t_s >= start_s[row] - 1e-9) & (t_s <= (following[0] if len(following) else np.inf) + 1e-9)
+        highest_m = PIXEL.kappa_m_per_k * gas_k[during, index].max()
         assert peaks.displacement_m[row] == pytest.approx(highest_m, rel=rel), row
-        assert peaks.absorber_k[row] == pytest.approx(absorber_k[seen, index].max(), rel=1e-9), row
+        assert peaks.absorber_k[row] == pytest.approx(absorber_k[during, index].max(), rel=1e-9), row
 
 
 def test_energy_closes():
@@ -134,7 +134,7 @@ def test_energy_closes():
     left_j, now_s, before_w = 0.0, 0.0, 0.0
 
     def span(to_s, light_w, index):
-        """Simpson's rule over a stretch of constant power."""
+        """Integrate the leaking power over an interval of constant power by Simpson's rule."""
         nonlocal left_j, now_s, before_w
         steps = 2 * max(1, round((to_s - now_s) / 4e-4))
         flows_w, step_s = [before_w], (to_s - now_s) / steps
@@ -145,9 +145,9 @@ def test_energy_closes():
         left_j += step_s / 3 * (flows_w[0] + flows_w[-1] + 4 * sum(flows_w[1:-1:2]) + 2 * sum(flows_w[2:-1:2]))
         now_s, before_w = to_s, flows_w[-1]
 
-    for index, begin_s, lit_s, light_w in zip(pixel, start_s, width_s, power_w, strict=True):
+    for index, begin_s, on_s, light_w in zip(pixel, start_s, width_s, power_w, strict=True):
         span(begin_s, 0.0, index)
-        span(begin_s + lit_s, light_w, index)
+        span(begin_s + on_s, light_w, index)
     absorbed_j = PIXEL.epsilon * float(power_w @ width_s)
     for dark_s in (0.0, 0.02, 0.5):
         span(start_s[-1] + width_s[-1] + dark_s, 0.0, 0)

@@ -1,4 +1,4 @@
-"""A whole display with terms: without any it is the nominal display, with them what each pixel does in `forward`."""
+"""Displays with terms: nominal without terms, and equal to single pixels in `pixel_ode` with them."""
 
 import numpy as np
 import pytest
@@ -22,12 +22,12 @@ AMBIENT_K, FULL_W = 296.15, 2.45
 SINGLE = sorted(term.key for term in TERMS if any(term.kernels))
 
 
-def values_of(*keys):
+def default_values(*keys):
     return {term.key: {item.name: item.default for item in term.parameters} for term in TERMS if term.key in keys}
 
 
 def extended(*keys, at_s=0.0):
-    return ExtendedThermalState(ARRAY, values_of(*keys), AMBIENT_K, FULL_W, SMALL, at_s)
+    return ExtendedThermalState(ARRAY, default_values(*keys), AMBIENT_K, FULL_W, SMALL, at_s)
 
 
 def some_pulses(seed, count=40, pixels=(0, 1, 5)):
@@ -37,14 +37,14 @@ def some_pulses(seed, count=40, pixels=(0, 1, 5)):
     return generator.choice(pixels, count), start_s, width_s, generator.uniform(0.2, FULL_W, count)
 
 
-def seen(keys, pixel, columns, until_s):
-    """The pixel's own run through the same pulses, finely sampled: time, absorber, displacement."""
+def simulate_alone(keys, pixel, columns, until_s):
+    """Simulate one pixel through the same pulses, finely sampled: time, absorber, displacement."""
     index, start_s, width_s, power_w = columns
     t_s = np.unique(np.concatenate([np.arange(0.0, until_s, 2e-5), start_s]))
     scene = PixelExperiment(
         np.column_stack([start_s, width_s, power_w, index]), pixel, AMBIENT_K, (t_s, t_s, t_s[:0]), dose_before=1.0
     )
-    absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(values_of(*keys)))
+    absorber_k, displacement_m, _ = simulate_signals(scene, PIXEL, ActiveTerms.from_values(default_values(*keys)))
     return t_s, absorber_k, displacement_m
 
 
@@ -72,9 +72,9 @@ def test_each_pulse_brings_its_pixel_to_what_one_pixel_alone_does(key):
     index, start_s, *_ = columns
     peaks = extended(*keys).apply_pulses(*columns).displacement_m
     for pixel in (0, 1, 5):
-        felt = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
-        own = tuple(column[felt] for column in columns)
-        t_s, _, displacement_m = seen(keys, pixel, own, start_s[-1] + 0.3)
+        acting = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
+        own = tuple(column[acting] for column in columns)
+        t_s, _, displacement_m = simulate_alone(keys, pixel, own, start_s[-1] + 0.3)
         rows = np.flatnonzero(index == pixel)
         for row, after in zip(rows, [*rows[1:], None], strict=True):
             until_s = np.inf if after is None else start_s[after]
@@ -95,7 +95,7 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
         assert 0 < duty <= 1
         one = (np.array([5]), np.array([at_s]), np.array([periods * DRIVE.period_s]), np.array([duty * FULL_W]))
         together = tuple(np.concatenate(pair) for pair in zip(before, one, strict=True))
-        t_s, _, displacement_m = seen(keys, 5, together, at_s + 0.3)
+        t_s, _, displacement_m = simulate_alone(keys, 5, together, at_s + 0.3)
         assert displacement_m[t_s >= at_s].max() == pytest.approx(target_m, rel=1e-3)
         if periods > 1:
             shorter = extended(*keys)
@@ -110,16 +110,16 @@ def test_a_pulse_asked_to_be_wide_and_to_count_late_is(key):
     heat, before = extended(*keys), some_pulses(4, 10, pixels=(5,))
     heat.apply_pulses(*before)
     at_s = before[1][-1] + 0.06
-    for least, from_s in ((60, 0.0), (20, 0.02), (1, 0.015)):
-        periods, duty = heat.solve_pulse(5, at_s, 1e-4, DRIVE, least, from_s)
-        assert periods >= least
+    for min_periods, from_s in ((60, 0.0), (20, 0.02), (1, 0.015)):
+        periods, duty = heat.solve_pulse(5, at_s, 1e-4, DRIVE, min_periods, from_s)
+        assert periods >= min_periods
         pulse = np.array([[at_s, periods * DRIVE.period_s, duty * FULL_W, 5.0]])
         t_s = at_s + max(from_s, 0.0) + np.linspace(0.0, 0.08, 1601)
         assert heat.simulate_displacement_m(pulse, 5, t_s).max() == pytest.approx(1e-4, rel=1e-3)
         if not key:
             nominal = NominalThermalState(ARRAY)
             nominal.apply_pulses(*before)
-            theirs = nominal.solve_pulse(5, at_s, 1e-4, DRIVE, least, from_s)
+            theirs = nominal.solve_pulse(5, at_s, 1e-4, DRIVE, min_periods, from_s)
             assert periods == theirs[0]
             assert duty == pytest.approx(theirs[1], rel=1e-2)
 
@@ -130,13 +130,13 @@ def test_heights_from_the_heat_there_are_those_of_the_whole_run(key):
     near = "neighbour_crosstalk" in keys
     index, *columns = some_pulses(9)
     for pixel in (0, 5):
-        felt = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
-        own = (index[felt], *(column[felt] for column in columns))
+        acting = np.isin(index, [pixel, *SMALL.indices[pixel]]) if near else index == pixel
+        own = (index[acting], *(column[acting] for column in columns))
         half = len(own[0]) // 2
         heat = extended(*keys)
         heat.apply_pulses(*(column[:half] for column in own))
         pulses = np.column_stack([*own[1:], own[0]])
-        t_s, _, displacement_m = seen(keys, pixel, own, pulses[-1, 0] + 0.1)
+        t_s, _, displacement_m = simulate_alone(keys, pixel, own, pulses[-1, 0] + 0.1)
         after = t_s > pulses[half - 1, :2].sum() + 1e-6
         untouched = heat.copy()
         ours_m = heat.simulate_displacement_m(pulses[half:], pixel, t_s[after])
@@ -155,7 +155,7 @@ def test_no_pulse_where_the_heat_left_reaches_the_height_and_the_longest_where_n
 
 
 def test_one_pixel_out_of_the_beam_reaches_less():
-    values = values_of("beam_misalignment")
+    values = default_values("beam_misalignment")
     values["beam_misalignment"]["pixel"] = 6.0
     reaches_m = ExtendedThermalState(ARRAY, values, AMBIENT_K, FULL_W, SMALL).max_displacement_m(DRIVE)
     assert reaches_m[6] < 0.97 * reaches_m[5]
@@ -163,11 +163,11 @@ def test_one_pixel_out_of_the_beam_reaches_less():
 
 
 def test_a_neighbours_light_lifts_a_pixel_only_where_they_exchange_heat():
-    for keys, least_m in ((("neighbour_crosstalk",), 1e-7), (("radiation",), 0.0)):
+    for keys, min_k in ((("neighbour_crosstalk",), 1e-7), (("radiation",), 0.0)):
         heat = extended(*keys)
         heat.apply_pulses(np.array([5]), np.zeros(1), np.array([0.05]), np.array([FULL_W]))
         beside = int(SMALL.indices[5][0])
-        assert (np.abs(heat.copy()._states[beside]).max() > least_m) == (least_m > 0)
+        assert (np.abs(heat.copy()._states[beside]).max() > min_k) == (min_k > 0)
 
 
 def test_copies_and_shifts_stand_alone():
@@ -176,10 +176,10 @@ def test_copies_and_shifts_stand_alone():
     heat.apply_pulses(*columns)
     at_s = columns[1][-1] + 0.05
     later = heat.copy_shifted(-1.0)
-    ask = (2.5e-4, DRIVE)
-    assert later.solve_pulse(1, at_s - 1.0, *ask) == pytest.approx(heat.solve_pulse(1, at_s, *ask), rel=1e-6)
-    assert twin.solve_pulse(1, 0.0, *ask) == pytest.approx(
-        extended("membrane_creep").solve_pulse(1, 0.0, *ask), rel=1e-12
+    request = (2.5e-4, DRIVE)
+    assert later.solve_pulse(1, at_s - 1.0, *request) == pytest.approx(heat.solve_pulse(1, at_s, *request), rel=1e-6)
+    assert twin.solve_pulse(1, 0.0, *request) == pytest.approx(
+        extended("membrane_creep").solve_pulse(1, 0.0, *request), rel=1e-12
     )
 
 

@@ -1,4 +1,4 @@
-"""A display's heat, pulse by pulse, held against the single pixel's closed forms."""
+"""Thermal state of a nominal display against the closed forms of a single pixel."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ WIDE = Pixel(95.0, 102e-6, 0.66, 5e-3, 3e-6, 3e-4)
 
 
 def columns_of(rows):
-    """(pixel, start_s, width_s, power_w) as traces take them."""
+    """Convert rows of (pixel, start_s, width_s, power_w) to pulses [n, 4]."""
     return np.array([(*pulse, pixel) for pixel, *pulse in rows], dtype=float).reshape(-1, 4)
 
 

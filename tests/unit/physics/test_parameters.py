@@ -1,4 +1,4 @@
-"""Parameter files: what is read, and every refusal."""
+"""Parameter files: loading, and every refusal."""
 
 from math import pi
 
@@ -16,7 +16,7 @@ def text():
     return locate_shipped("parameters", "calibrated.toml").read_text(encoding="utf-8")
 
 
-def loaded(tmp_path, text):
+def load_text(tmp_path, text):
     path = tmp_path / "own.toml"
     path.write_text(text, encoding="utf-8")
     return load_parameters(path)
@@ -64,11 +64,11 @@ def test_a_displays_pixels():
 
 
 def test_an_own_file_reads_like_a_shipped_one(tmp_path, text):
-    assert loaded(tmp_path, text) == load_parameters("calibrated")
+    assert load_text(tmp_path, text) == load_parameters("calibrated")
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "words"),
+    ("old", "new", "message"),
     [
         ('unit = "s"', 'unit = "ms"', "tau_g in s, not in 'ms'"),
         ('value = 382.0, unit = "K/W"', 'value = 382.0, unit = "W/K"', "bridge.0: got 'inconsistent values'"),
@@ -81,17 +81,17 @@ def test_an_own_file_reads_like_a_shipped_one(tmp_path, text):
         ("[epsilon]", "[epsilon", "expected valid TOML"),
     ],
 )
-def test_wrong_files_are_refused_in_one_line(tmp_path, text, old, new, words):
+def test_wrong_files_are_refused_in_one_line(tmp_path, text, old, new, message):
     assert old in text
     with pytest.raises(InputError) as refusal:
-        loaded(tmp_path, text.replace(old, new, 1))
-    assert words in str(refusal.value)
+        load_text(tmp_path, text.replace(old, new, 1))
+    assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
 
 
 def test_a_missing_value_is_named(tmp_path, text):
     with pytest.raises(InputError, match=r"tau_g: got None"):
-        loaded(tmp_path, text[: text.index("[tau_g]")] + text[text.index("[kappa]") :])
+        load_text(tmp_path, text[: text.index("[tau_g]")] + text[text.index("[kappa]") :])
 
 
 def test_unknown_names_and_missing_files_are_refused(tmp_path):
@@ -119,11 +119,11 @@ WRONG_TERMS = {
 
 @pytest.mark.parametrize("case", WRONG_TERMS)
 def test_wrong_terms_are_refused_in_one_line(case, tmp_path):
-    (term, name, value, unit), said = WRONG_TERMS[case]
+    (term, name, value, unit), message = WRONG_TERMS[case]
     path = tmp_path / "mine.toml"
     head = 'format = "optodrive-parameters"\nversion = 1\nname = "mine"\nbase = "calibrated"\nclaims = "none"\n'
     path.write_text(head + TERM.format(term=term, name=name, value=value, unit=unit))
-    with pytest.raises(InputError, match=said) as caught:
+    with pytest.raises(InputError, match=message) as caught:
         load_parameters(path)
     assert "\n" not in str(caught.value)
 

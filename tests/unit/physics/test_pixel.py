@@ -1,4 +1,4 @@
-"""The closed forms against an adaptive integrator and dense searches."""
+"""Closed forms of the nominal pixel against an adaptive integrator and dense searches."""
 
 from decimal import Decimal, localcontext
 
@@ -14,7 +14,7 @@ EQUAL = Pixel(145.0, 99e-6, 0.66, 145.0 * 99e-6, 4e-6, 2e-4)
 PIXELS = pytest.mark.parametrize("pixel", [SLOW_GAS, FAST_GAS, EQUAL], ids=["slow gas", "fast gas", "equal"])
 
 
-def integrated(pixel, theta, gamma, power, t_s):
+def integrate(pixel, theta, gamma, power, t_s):
     def slope(_, state):
         heating = (pixel.epsilon * power - state[0] / pixel.r_k_per_w) / pixel.c_j_per_k
         return [heating, (0.5 * state[0] - state[1]) / pixel.tau_g_s]
@@ -28,7 +28,7 @@ def integrated(pixel, theta, gamma, power, t_s):
 @pytest.mark.parametrize("power", [0.0, 0.7, 2.45])
 @pytest.mark.parametrize("t_s", [1e-4, 8e-3, 0.05, 0.4])
 def test_advance_meets_an_integrator(pixel, start, power, t_s):
-    exact = integrated(pixel, *start, power, t_s)
+    exact = integrate(pixel, *start, power, t_s)
     assert advance(pixel, *start, power, t_s) == pytest.approx(exact, rel=1e-8, abs=1e-7)
 
 
@@ -38,7 +38,7 @@ def test_a_drive_of_many_steps_meets_an_integrator(pixel):
     closed = step_by_step = (0.0, 0.0)
     for power, t_s in steps:
         closed = advance(pixel, *closed, power, t_s)
-        step_by_step = integrated(pixel, *step_by_step, power, t_s)
+        step_by_step = integrate(pixel, *step_by_step, power, t_s)
     assert closed == pytest.approx(step_by_step, rel=1e-8)
 
 

@@ -1,4 +1,4 @@
-"""The compiled single pixel with terms, against SciPy's solver with the right-hand sides written out here."""
+"""The compiled pixel with terms against SciPy's solver with independent right-hand sides."""
 
 from itertools import pairwise
 
@@ -20,25 +20,27 @@ SIGMA = 5.670374e-8
 
 
 def power(t, pixel=0):
-    return sum(p for start, width, p, lit in PULSES if lit == pixel and start <= t < start + width)
+    return sum(p for start, width, p, target in PULSES if target == pixel and start <= t < start + width)
 
 
 def since(t):
     return next((t - start for start, width, _, _ in PULSES if start <= t < start + width), 0.0)
 
 
-def exact(rates, count):
-    """States at T_S [count, m], piece by piece between the edges."""
+def integrate(rates, count):
+    """Integrate the states [count, m] at T_S, from edge to edge."""
     edges = np.unique(np.concatenate([[0.0, T_S[-1]], PULSES[:, 0], PULSES[:, 0] + PULSES[:, 1]]))
     y, out = np.zeros(count), np.zeros((count, len(T_S)))
     for begin, end in pairwise(edges):
         inside = (begin < T_S) & (end >= T_S)
         times = np.append(T_S[inside], end)
 
-        def inner(t, y, begin=begin, end=end):
+        def bounded_rates(t, y, begin=begin, end=end):
             return rates(min(max(t, begin + 1e-12), end - 1e-12), y)
 
-        solved = solve_ivp(inner, (begin, end), y, t_eval=np.unique(times), rtol=1e-10, atol=1e-12, method="DOP853")
+        solved = solve_ivp(
+            bounded_rates, (begin, end), y, t_eval=np.unique(times), rtol=1e-10, atol=1e-12, method="DOP853"
+        )
         out[:, inside] = solved.y[:, : inside.sum()]
         y = solved.y[:, -1]
     return out
@@ -48,15 +50,15 @@ def gas(theta, wall, gamma):
     return (0.5 * (theta + wall) - gamma) / PIXEL.tau_g_s
 
 
-def seen(terms, late_s=(0.0, 0.0, 0.0), **scene):
+def simulate(terms, late_s=(0.0, 0.0, 0.0), **scene):
     return simulate_signals(
         PixelExperiment(PULSES, 0, AMBIENT_K, (T_S, T_S, T_S), **scene), PIXEL, ActiveTerms.from_values(terms), late_s
     )
 
 
-def nominal(t, y, lit=None, r=PIXEL.r_k_per_w, c=PIXEL.c_j_per_k, leaving=0.0, wall=0.0):
-    lit = power(t) if lit is None else lit
-    return [(PIXEL.epsilon * lit - (y[0] - wall) / r - leaving) / c, gas(y[0], wall, y[1])]
+def nominal(t, y, light_w=None, r=PIXEL.r_k_per_w, c=PIXEL.c_j_per_k, leaving=0.0, wall=0.0):
+    light_w = power(t) if light_w is None else light_w
+    return [(PIXEL.epsilon * light_w - (y[0] - wall) / r - leaving) / c, gas(y[0], wall, y[1])]
 
 
 def with_capacity(t, y):
@@ -82,7 +84,7 @@ def with_wall_and_conductivity(t, y):
 
 
 def membrane_height_m(gas_k):
-    """Where a gas of 0.35 of the absorber's rise is held by plate, cap and atmosphere."""
+    """Solve for the height at which plate, cap and atmosphere balance a gas of 0.35 of the absorber's rise."""
     e, nu, h, r = 50e3, 0.49, 0.25e-3, 1.5e-3
     relative = 0.7 * gas_k / AMBIENT_K
 
@@ -99,20 +101,20 @@ def with_neighbour(t, y):
 
 
 def with_turn_on(t, y):
-    return nominal(t, y, lit=power(t) * (1 - np.exp(-since(t) / 5e-4)))
+    return nominal(t, y, light_w=power(t) * (1 - np.exp(-since(t) / 5e-4)))
 
 
 def with_droop(t, y):
     commanded = power(t) + power(t, 1)
     return [
-        *nominal(t, y, lit=power(t) * (1 - 0.05 * (y[2] + y[3]))),
+        *nominal(t, y, light_w=power(t) * (1 - 0.05 * (y[2] + y[3]))),
         (commanded / 2.45 - y[2]) / 0.03,
         (commanded / 2.45 - y[3]) / 0.12,
     ]
 
 
 def with_miss(t, y):
-    return [*nominal(t, y, lit=0.8 * power(t), wall=y[2]), (5.0 * 0.2 * power(t) - y[2]) / 0.5]
+    return [*nominal(t, y, light_w=0.8 * power(t), wall=y[2]), (5.0 * 0.2 * power(t) - y[2]) / 0.5]
 
 
 def with_leak(t, y):
@@ -198,8 +200,8 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_agrees_with_scipy(name):
     terms, rates, count, outputs = CASES[name]
-    wanted = outputs(exact(rates, count))
-    for ours, theirs in zip(seen(terms), wanted, strict=True):
+    expected = outputs(integrate(rates, count))
+    for ours, theirs in zip(simulate(terms), expected, strict=True):
         assert np.abs(ours - theirs).max() < 2e-5 * np.abs(theirs).max()
 
 
@@ -210,16 +212,16 @@ def test_every_term_with_kernels_is_checked_here_or_below():
 
 
 def test_what_only_scales_or_shifts():
-    rise_k, height_m, force_n = seen({})
-    shown_k = seen({"sensor_scale": {"gain": 1.05, "offset": 2.0}})[0]
+    rise_k, height_m, force_n = simulate({})
+    shown_k = simulate({"sensor_scale": {"gain": 1.05, "offset": 2.0}})[0]
     assert shown_k == pytest.approx(1.05 * rise_k + 2.0)
     drift = {"ambient_drift": {"offset": 0.5, "ramp": 1.0, "bend": 2.0, "rate": 3.0}}
-    shown_k = seen(drift, session_time=0.5)[0]
+    shown_k = simulate(drift, session_time=0.5)[0]
     assert shown_k == pytest.approx(rise_k + 0.5 + 0.5 + 2.0 * (1.5 * 0.25 - 0.5) + 3.0 * T_S)
-    missed = seen({"beam_misalignment": {"share": 0.2, "pixel": 0.0, "resistance": 1e-9, "time": 0.5}})
+    missed = simulate({"beam_misalignment": {"share": 0.2, "pixel": 0.0, "resistance": 1e-9, "time": 0.5}})
     for ours, theirs in zip(missed, (rise_k, height_m, force_n), strict=True):
         assert ours == pytest.approx(0.8 * theirs)
-    assert seen({"beam_misalignment": {"share": 0.2, "pixel": 3.0, "resistance": 5.0, "time": 0.5}})[
+    assert simulate({"beam_misalignment": {"share": 0.2, "pixel": 3.0, "resistance": 5.0, "time": 0.5}})[
         0
     ] == pytest.approx(rise_k)
 
@@ -238,16 +240,16 @@ def test_the_power_curve_keeps_full_power():
 def test_ageing_counts_the_dose_before_and_within_a_run():
     aged = {"absorber_ageing": {"share": 0.1}}
     energy_j = float((PULSES[:2, 1] * PULSES[:2, 2]).sum())
-    fresh, old = seen(aged)[0], seen(aged, dose_before=1.0)[0]
-    assert fresh == pytest.approx(seen({})[0])
+    fresh, old = simulate(aged)[0], simulate(aged, dose_before=1.0)[0]
+    assert fresh == pytest.approx(simulate({})[0])
     assert old == pytest.approx(0.9 * fresh)
-    within = seen(aged, dose_per_j=1.0 / energy_j)[0]
+    within = simulate(aged, dose_per_j=1.0 / energy_j)[0]
     assert np.all(within <= fresh)
     assert within.max() > old.max()
 
 
 def test_a_late_clock_shows_what_was():
-    early, late = seen({}), seen({}, (2e-3, 2e-3, 2e-3))
+    early, late = simulate({}), simulate({}, (2e-3, 2e-3, 2e-3))
     for before, after in zip(early, late, strict=True):
         shifted = np.interp(T_S - 2e-3, T_S, before)
         assert np.abs(after - shifted).max() < 0.02 * np.abs(before).max()
@@ -259,10 +261,10 @@ def test_a_servo_against_its_closed_form():
     ours = simulate_servo(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, servo)
     omega, zeta = 2 * np.pi * 500.0, 0.6
     ringing, after = omega * np.sqrt(1 - zeta**2), np.maximum(0.0, t_s - 1.2e-3)
-    wanted = 0.1 * (
+    expected = 0.1 * (
         1
         - np.exp(-zeta * omega * after)
         * (np.cos(ringing * after) + zeta / np.sqrt(1 - zeta**2) * np.sin(ringing * after))
     )
-    assert np.abs(ours - wanted).max() < 2e-3 * 0.1
+    assert np.abs(ours - expected).max() < 2e-3 * 0.1
     assert simulate_servo(np.array([0.0, 1e-3]), np.array([0.0, 0.1]), t_s, None)[[0, -1]].tolist() == [0.0, 0.1]

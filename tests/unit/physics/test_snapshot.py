@@ -1,4 +1,4 @@
-"""A whole display at one time, against the pixels one by one."""
+"""State of a whole display at one time against its pixels one by one."""
 
 import numpy as np
 import pytest
@@ -24,8 +24,8 @@ def extended():
     return ExtendedThermalState(PIXELS, TERMS, 293.15, 2.45, Neighbours.from_display(CONFIG.display))
 
 
-def lit(heat):
-    """Pixels 0 to 9, one after the other, every 10 ms."""
+def apply_test_pulses(heat):
+    """Apply a pulse to pixels 0 to 9, one every 10 ms."""
     pixel = np.arange(10)
     heat.apply_pulses(pixel, 0.01 * pixel, np.full(10, 5e-3), np.linspace(0.5, 2.4, 10))
     return heat
@@ -33,7 +33,7 @@ def lit(heat):
 
 @given(after_s=st.floats(0.0, 2.0))
 def test_nominal_pixels_are_where_each_says_it_is(after_s):
-    heat, at_s = lit(nominal()), 0.1 + after_s
+    heat, at_s = apply_test_pulses(nominal()), 0.1 + after_s
     seen = heat.state_at(at_s)
     for pixel in range(len(PIXELS)):
         absorber_k, gas_k = heat.rises_k(pixel, at_s)
@@ -43,7 +43,7 @@ def test_nominal_pixels_are_where_each_says_it_is(after_s):
 
 @pytest.mark.parametrize("make", [nominal, extended])
 def test_a_look_changes_nothing_and_a_time_before_an_event_counts_as_the_event(make):
-    heat, untouched = lit(make()), lit(make())
+    heat, untouched = apply_test_pulses(make()), apply_test_pulses(make())
     first = heat.state_at(0.12)
     heat.state_at(3.0)
     again = heat.state_at(0.12)
@@ -54,7 +54,7 @@ def test_a_look_changes_nothing_and_a_time_before_an_event_counts_as_the_event(m
 
 
 def test_stepped_pixels_looked_at_again_and_again_are_where_one_long_look_has_them():
-    heat = lit(extended())
+    heat = apply_test_pulses(extended())
     none = np.zeros((0, 4))
     for at_s in np.arange(0.1, 0.6, 0.033):
         seen = heat.state_at(at_s)
@@ -64,7 +64,7 @@ def test_stepped_pixels_looked_at_again_and_again_are_where_one_long_look_has_th
 
 
 def test_a_pulse_told_late_is_seen_from_then_on():
-    heat = lit(extended())
+    heat = apply_test_pulses(extended())
     heat.state_at(0.5)
     heat.apply_pulses(np.array([2]), np.array([0.45]), np.array([5e-3]), np.array([2.0]))
     expected_m = heat.simulate_displacement_m(np.zeros((0, 4)), 2, np.array([0.5]))[0]
@@ -73,7 +73,7 @@ def test_a_pulse_told_late_is_seen_from_then_on():
 
 
 def test_a_copy_is_looked_at_by_itself():
-    heat = lit(extended())
+    heat = apply_test_pulses(extended())
     heat.state_at(0.2)
     later = heat.copy_shifted(1.0)
     assert later.state_at(1.2).displacement_m == pytest.approx(heat.state_at(0.2).displacement_m, rel=1e-4, abs=1e-10)

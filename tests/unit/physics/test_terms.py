@@ -1,4 +1,4 @@
-"""Each term in the limits where it vanishes, the equilibria it claims, and what one file must be to be a term."""
+"""Terms in the limits where they vanish, equilibria of gas and membrane, and a new term as one file."""
 
 import subprocess
 import sys
@@ -19,7 +19,7 @@ T_S = np.array([0.040, 0.060])
 
 
 def simulate(values, ambient_k=AMBIENT_K):
-    """Rise, displacement and force of one pixel at T_S through the pulse."""
+    """Simulate rise, displacement and force of one pixel at T_S."""
     experiment = PixelExperiment(PULSE, 0, ambient_k, (T_S, T_S, T_S))
     return simulate_signals(experiment, PIXEL, ActiveTerms.from_values(values))
 
@@ -172,7 +172,7 @@ build_budget(config, parameters, build_display_pixels(config, parameters))
 
 @pytest.mark.slow
 def test_a_new_term_is_a_new_file_and_nothing_else(tmp_path):
-    """It is simulated, searched for, read from a parameter set and bounded by the limiter."""
+    """The term is simulated, searched for, loaded from a parameter set and bounded by the limiter."""
     (tmp_path / "heat_leak.py").write_text(LEAK)
     finished = subprocess.run(
         [sys.executable, "-c", USE, str(tmp_path)], capture_output=True, text=True, timeout=110, check=False
