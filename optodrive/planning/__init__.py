@@ -1,1 +1,1 @@
-"""From requested tactile stimuli to a pulse plan that keeps every limit; no board involved."""
+"""Planning: turns requested stimuli into a pulse plan within all limits, without a board."""

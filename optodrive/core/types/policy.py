@@ -1,4 +1,4 @@
-"""What the planner does with stimuli that exceed a cap."""
+"""The treatment of stimuli that exceed a cap."""
 
 from typing import Literal
 

@@ -1,4 +1,4 @@
-"""Limit the pulses of a plan to what the caps allow, given the budget state that earlier plans left.
+"""Limit the pulses of a plan by the caps, given the budget state after earlier plans.
 
 The caps define a set of absorber, wall and touch temperatures that is invariant while the gate is off: no wall is
 allowed above the temperature at which the touch surface would reach its cap in steady state. It is therefore sufficient
@@ -112,7 +112,7 @@ def shift_state(state: BudgetState, offset_s: float) -> BudgetState:
 def limit(
     plan: PulsePlan, state: BudgetState, budget: Budget, policy: Policy = "trim"
 ) -> tuple[LimitedPlan, BudgetState]:
-    """Reduce the power of each pulse to what the caps allow; times and widths do not change.
+    """Reduce the power of each pulse until it is within all caps; times and widths do not change.
 
     plan.start_s and state.at_s are on the same time line. Returns the limited plan and the state after it.
 

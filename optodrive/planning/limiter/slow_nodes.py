@@ -116,9 +116,9 @@ def _is_within_cap(
         cap_k, credit = budget.caps.touch_k, heat.touch_transit_credit
         deficit_k = credit * heat.deficit_k + heat.touch_deficit_k
         peak_k, after_k = _touch_credited_peak_k(budget, nodes, request, lower_bound_k, power_w)
-        wall_warming_k = neighbours_w / heat.wall_j_per_k[0] * LOOK_AHEAD_TAUS * min_tau_s
+        wall_increase_k = neighbours_w / heat.wall_j_per_k[0] * LOOK_AHEAD_TAUS * min_tau_s
         rate = 1.0 / heat.touch_lag_s[1]
-        drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_warming_k)
+        drive_k = heat.touch_per_wall_k * min(_wall_cap_k(budget), wall_k + wall_increase_k)
     in_transit_k = min(credit * end_k - deficit_k, rate * min_tau_s * (after_k - drive_k))
     return bool(max(peak_k, after_k - max(0.0, in_transit_k)) <= cap_k)
 
