@@ -1,19 +1,19 @@
-/* The link, the gate and a host that may die at any moment, small enough to be explored whole.
+/* Model of the link, the gate and a host that may fail at any moment, small enough for an exhaustive search.
 
-   A host connects, a user arms, points are streamed through a line that loses, repeats and holds back frames, leases
-   are renewed while the host lives. Hosts die or hang between any two steps; another connects. Time passes in ticks of
-   half a lease, whenever it likes.
+   A host connects, a user arms, points are streamed through a line that loses, duplicates and delays frames, and leases
+   are renewed while the host is alive. Hosts stop or hang between any two steps; another one connects. Time advances
+   nondeterministically in ticks of half a lease.
 
-   The line does MISCHIEF in all, and plays an arming back once; with more there is more to explore and nothing new.
+   The line injects LINE_FAULTS_MAX faults and replays an arming once; more faults enlarge the search without new results.
 
-   Never, whatever happens in whatever order:
-     gate on outside RUNNING, or without a lease (B1, B3)
-     gate on in a session in which no user armed; a reconnection or a replay arms nothing (B11)
-     a point lit twice, left out or out of order (B12)
-     gate on with nothing queued for it (B2)
-     gate on longer than a lease after the host's last word
+   Verified for all interleavings:
+     the gate is never on outside RUNNING, or without a lease (B1, B3)
+     the gate is never on in a session in which no user armed; a reconnection or a replay does not arm (B11)
+     no point is executed twice, omitted or out of order (B12)
+     the gate is never on without a queued point (B2)
+     the gate is never on for longer than a lease after the host's last message
 
-   MUTANT=n, 1 to 6, takes one rule away; each must be caught.
+   MUTANT=n, 1 to 6, removes one rule; the search must find a violation.
 
    spin -a board.pml && gcc -O3 -DSAFETY -o pan pan.c && ./pan -m2000000 -w24      4 million states, some seconds */
 
@@ -22,31 +22,31 @@
 #endif
 
 #if MUTANT == 4 || MUTANT == 3
-#define IN_PLACE(index) true
+#define IS_NEXT_INDEX(index) true
 #else
-#define IN_PLACE(index) (index == first + queued)
+#define IS_NEXT_INDEX(index) (index == first + queued)
 #endif
 #if MUTANT == 5
-#define FRESH nonce
+#define NEW_NONCE nonce
 #else
-#define FRESH nonce + 1
+#define NEW_NONCE nonce + 1
 #endif
 #if MUTANT == 3
-#define AGAIN(kind, argument) obey(kind, argument)
+#define ON_DUPLICATE(kind, argument) carry_out(kind, argument)
 #else
-#define AGAIN(kind, argument) skip
+#define ON_DUPLICATE(kind, argument) skip
 #endif
 #if MUTANT == 6
-#define EMPTY_IS_DARK state = HOLD
-#define POINT_ENDS skip
+#define ON_EMPTY_QUEUE state = HOLD
+#define ON_POINT_END skip
 #else
-#define EMPTY_IS_DARK dark(HOLD)
-#define POINT_ENDS gate = false
+#define ON_EMPTY_QUEUE close_gate(HOLD)
+#define ON_POINT_END gate = false
 #endif
 #if MUTANT == 2
-#define FORGET_ARMING skip
+#define ON_HELLO skip
 #else
-#define FORGET_ARMING dark(DISARMED)
+#define ON_HELLO close_gate(DISARMED)
 #endif
 #if MUTANT == 1
 #define LEASE_ENDS false
@@ -55,13 +55,13 @@
 #endif
 
 #define POINTS 2      /* of a job */
-#define SEQS 4        /* sequence numbers, fewer than points and orders together: they come round */
+#define SEQS 4        /* sequence numbers, fewer than all messages, so that they wrap */
 #define WINDOW 2
 #define LEASE 2       /* ticks */
-#ifndef MISCHIEF
-#define MISCHIEF 1
+#ifndef LINE_FAULTS_MAX
+#define LINE_FAULTS_MAX 1
 #endif
-#define SESSIONS 2    /* hosts that come one after the other */
+#define SESSIONS 2    /* consecutive hosts */
 
 mtype = { HELLO, ARM_REQ, CONFIRM, DATA, START, END, RENEW, ABORT, REPLY, CHALLENGE, ACK };
 mtype = { DISARMED, ARMING, ARMED, RUNNING, HOLD, FAULT };
@@ -76,22 +76,22 @@ mtype state = DISARMED;
 bool gate, nonce_good, ends;
 byte session, expected, lease, nonce = 1, queued, first, executed;
 
-/* --- what the board cannot know ----------------------------------------------------------------------------------- */
+/* --- state that the board does not know ----------------------------------------------------------------------------------- */
 
 byte host;            /* the living host's number, 0: none */
-byte user_armed;      /* the session in which a user armed */
-byte silent;          /* ticks since the board last heard a host that lives */
-byte said_nonce;      /* what a recorder of the line could play back */
+byte armed_session;      /* the session in which a user armed */
+byte silent_ticks;          /* ticks since the board's last message from a live host */
+byte recorded_nonce;      /* nonce that a recorder of the line could replay */
 
 #define leased (state == ARMING || state == ARMED || state == RUNNING || state == HOLD)
 
-inline dark(next) { gate = false; state = next }
+inline close_gate(next) { gate = false; state = next }
 inline drop() { queued = 0; ends = false }
 
-inline say(what, value) {
+inline send(what, value) {
     if
     :: nfull(up) -> up!what, session, 0, value
-    :: full(up) /* nobody reads: it is lost */
+    :: full(up) /* not read: lost */
     fi
 }
 
@@ -99,20 +99,20 @@ inline check() {
     assert(!gate || state == RUNNING);
     assert(!gate || lease > 0);
     assert(!gate || queued > 0);
-    assert(!gate || user_armed == session);
-    assert(!gate || silent <= LEASE)
+    assert(!gate || armed_session == session);
+    assert(!gate || silent_ticks <= LEASE)
 }
 
-inline obey(kind, argument) {
+inline carry_out(kind, argument) {
     if
     :: kind == ARM_REQ && state == DISARMED ->
-        state = ARMING; lease = LEASE; nonce_good = true; nonce = FRESH;
-        say(CHALLENGE, nonce)
+        state = ARMING; lease = LEASE; nonce_good = true; nonce = NEW_NONCE;
+        send(CHALLENGE, nonce)
     :: kind == CONFIRM && state == ARMING && nonce_good && argument == nonce ->
         state = ARMED; nonce_good = false
     :: kind == CONFIRM && state == ARMING && !(nonce_good && argument == nonce) ->
-        dark(DISARMED); nonce_good = false; drop()
-    :: kind == DATA && (state == ARMED || state == RUNNING || state == HOLD) && IN_PLACE(argument) ->
+        close_gate(DISARMED); nonce_good = false; drop()
+    :: kind == DATA && (state == ARMED || state == RUNNING || state == HOLD) && IS_NEXT_INDEX(argument) ->
         assert(argument == first + queued);
         queued = queued + 1;
         if
@@ -123,7 +123,7 @@ inline obey(kind, argument) {
     :: kind == END && (state == RUNNING || state == HOLD) && argument == first + queued ->
         ends = true;
         if
-        :: queued == 0 -> dark(ARMED); drop()
+        :: queued == 0 -> close_gate(ARMED); drop()
         :: else
         fi
     :: else /* refused */
@@ -138,25 +138,25 @@ end:
         if
         :: kind == ABORT ->
             if
-            :: state != FAULT -> dark(DISARMED)
+            :: state != FAULT -> close_gate(DISARMED)
             :: else
             fi;
             drop()
         :: kind == HELLO ->
-            FORGET_ARMING; /* of a FAULT too, for the model's sake: whoever connects acknowledges it */
+            ON_HELLO; /* also in FAULT, a simplification: the connecting host acknowledges it */
             drop(); session = argument; expected = 0; first = 0; executed = 0; nonce_good = false;
-            silent = 0;
-            say(REPLY, argument)
-        :: kind == RENEW && from == session && leased -> lease = LEASE; silent = 0
+            silent_ticks = 0;
+            send(REPLY, argument)
+        :: kind == RENEW && from == session && leased -> lease = LEASE; silent_ticks = 0
         :: kind == RENEW && !(from == session && leased)
         :: kind != ABORT && kind != HELLO && kind != RENEW && from == session && seq == expected ->
-            silent = 0;
-            obey(kind, argument);
+            silent_ticks = 0;
+            carry_out(kind, argument);
             expected = (expected + 1) % SEQS;
-            say(ACK, expected)
+            send(ACK, expected)
         :: kind != ABORT && kind != HELLO && kind != RENEW && from == session && seq != expected ->
-            AGAIN(kind, argument);
-            say(ACK, expected)
+            ON_DUPLICATE(kind, argument);
+            send(ACK, expected)
         :: kind != ABORT && kind != HELLO && kind != RENEW && from != session
         fi;
         check(); kind = 0; from = 0; seq = 0; argument = 0 }
@@ -165,23 +165,23 @@ end:
         assert(first == executed);
         executed = executed + 1;
         first = first + 1; queued = queued - 1;
-        POINT_ENDS;
+        ON_POINT_END;
         if
         :: queued > 0 -> skip
-        :: queued == 0 && ends -> dark(ARMED); drop()
-        :: queued == 0 && !ends -> EMPTY_IS_DARK
+        :: queued == 0 && ends -> close_gate(ARMED); drop()
+        :: queued == 0 && !ends -> ON_EMPTY_QUEUE
         fi;
         check() }
     od
 }
 
-/* Ticks come whenever they like: time is not counted between them. A board with a lease left may be lit. */
+/* Ticks are nondeterministic; time between them is not modelled. */
 active proctype Time() {
 end:
     do
-    :: atomic { (leased || silent <= LEASE) && (leased || host == 0) ->
+    :: atomic { (leased || silent_ticks <= LEASE) && (leased || host == 0) ->
         if
-        :: silent <= LEASE -> silent = silent + 1
+        :: silent_ticks <= LEASE -> silent_ticks = silent_ticks + 1
         :: else
         fi;
         if
@@ -189,59 +189,59 @@ end:
         :: else
         fi;
         if
-        :: LEASE_ENDS -> dark(FAULT); drop()
+        :: LEASE_ENDS -> close_gate(FAULT); drop()
         :: else
         fi;
         check() }
     od
 }
 
-/* The line: what waits at its head may be lost, or come twice; a copy may come at any later time, as what a host sends
-   again does; an old CONFIRM may be played back. */
+/* The line may lose or duplicate its first frame; a copy may arrive at any later time, as a retransmission does; an old
+   CONFIRM may be replayed. */
 active proctype Line() {
     mtype kind; byte from, seq, argument; bool held;
-    mtype held_kind; byte held_from, held_seq, held_argument, done, replayed;
+    mtype held_kind; byte held_from, held_seq, held_argument, line_faults, replayed;
 end:
     do
-    :: atomic { nempty(down) && done < MISCHIEF -> done = done + 1; down?kind, from, seq, argument; kind = 0; from = 0; seq = 0; argument = 0 }
-    :: atomic { nempty(up) && done < MISCHIEF -> done = done + 1; up?kind, from, seq, argument; kind = 0; from = 0; seq = 0; argument = 0 }
-    :: atomic { nempty(down) && !held && done < MISCHIEF ->
-        done = done + 1; down?<held_kind, held_from, held_seq, held_argument>; held = true }
+    :: atomic { nempty(down) && line_faults < LINE_FAULTS_MAX -> line_faults = line_faults + 1; down?kind, from, seq, argument; kind = 0; from = 0; seq = 0; argument = 0 }
+    :: atomic { nempty(up) && line_faults < LINE_FAULTS_MAX -> line_faults = line_faults + 1; up?kind, from, seq, argument; kind = 0; from = 0; seq = 0; argument = 0 }
+    :: atomic { nempty(down) && !held && line_faults < LINE_FAULTS_MAX ->
+        line_faults = line_faults + 1; down?<held_kind, held_from, held_seq, held_argument>; held = true }
     :: atomic { held && nfull(down) -> down!held_kind, held_from, held_seq, held_argument;
         held = false; held_kind = 0; held_from = 0; held_seq = 0; held_argument = 0 }
-    :: atomic { said_nonce > 0 && user_armed != session && replayed < 2 && nfull(down) ->
+    :: atomic { recorded_nonce > 0 && armed_session != session && replayed < 2 && nfull(down) ->
         replayed = replayed + 1;
         if
         :: down!ARM_REQ, session, expected, 0
-        :: down!CONFIRM, session, expected, said_nonce
+        :: down!CONFIRM, session, expected, recorded_nonce
         fi }
     od
 }
 
-/* --- hosts: one after the other; each may die between any two steps ------------------------------------------------ */
+/* --- consecutive hosts; each may stop between any two steps ------------------------------------------------ */
 
 proctype Host(byte me; bool arms) {
     mtype kind; byte from, base, next, argument, sent, challenge;
-    bool greeted, known, confirmed, started, gave_up;
+    bool hello_sent, connected, confirmed, started, aborted;
     do
-    :: break                                                    /* it dies, or hangs for good */
-    :: atomic { !greeted && nfull(down) -> greeted = true; down!HELLO, 0, 0, me }
-    :: atomic { known && arms && nfull(down) && lease < LEASE -> down!RENEW, me, 0, 0 }
-    :: atomic { confirmed && !gave_up && nfull(down) -> gave_up = true; down!ABORT, 0, 0, 0 }
-    :: atomic { known && arms && next == base && !confirmed && challenge == 0 && nfull(down) ->
-        user_armed = me; down!ARM_REQ, me, next, 0; next = (next + 1) % SEQS }
-    :: atomic { known && user_armed == me && challenge > 0 && !confirmed && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
-        said_nonce = challenge; confirmed = true; down!CONFIRM, me, next, challenge; next = (next + 1) % SEQS }
-    /* A host that does not arm streams all the same: nothing of it may be lit. */
-    :: atomic { known && (confirmed || !arms) && sent < POINTS && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
+    :: break                                                    /* it stops or hangs */
+    :: atomic { !hello_sent && nfull(down) -> hello_sent = true; down!HELLO, 0, 0, me }
+    :: atomic { connected && arms && nfull(down) && lease < LEASE -> down!RENEW, me, 0, 0 }
+    :: atomic { confirmed && !aborted && nfull(down) -> aborted = true; down!ABORT, 0, 0, 0 }
+    :: atomic { connected && arms && next == base && !confirmed && challenge == 0 && nfull(down) ->
+        armed_session = me; down!ARM_REQ, me, next, 0; next = (next + 1) % SEQS }
+    :: atomic { connected && armed_session == me && challenge > 0 && !confirmed && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
+        recorded_nonce = challenge; confirmed = true; down!CONFIRM, me, next, challenge; next = (next + 1) % SEQS }
+    /* A host that does not arm streams as well; none of its points may be executed. */
+    :: atomic { connected && (confirmed || !arms) && sent < POINTS && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
         down!DATA, me, next, sent; sent = sent + 1; next = (next + 1) % SEQS }
-    :: atomic { known && sent > 0 && !started && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
+    :: atomic { connected && sent > 0 && !started && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
         started = true; down!START, me, next, 0; next = (next + 1) % SEQS }
-    :: atomic { known && sent == POINTS && started && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
+    :: atomic { connected && sent == POINTS && started && (next + SEQS - base) % SEQS < WINDOW && nfull(down) ->
         down!END, me, next, sent; next = (next + 1) % SEQS; sent = sent + 1 }
     :: atomic { up?kind, from, _, argument ->
         if
-        :: kind == REPLY && argument == me -> known = true
+        :: kind == REPLY && argument == me -> connected = true
         :: kind == CHALLENGE && from == me -> challenge = argument
         :: kind == ACK && from == me && (argument + SEQS - base) % SEQS <= (next + SEQS - base) % SEQS -> base = argument
         :: else
