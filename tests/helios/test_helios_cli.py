@@ -126,7 +126,7 @@ def test_a_signal_ends_emission_by_a_stop(desk, capsys, number):
     before = signal.getsignal(number)
     assert desk.play() == 130
     assert len(sent) == 3
-    assert capsys.readouterr().err == f"optodrive: ended by {number.name}\n"
+    assert capsys.readouterr().err == f"optodrive: terminated by {number.name}\n"
     assert emulated.commands[-2:] == [b"\x01\x00", b"\x02\x00"]
     assert desk.bench.device.dark_from_s() <= sent[-1] + 0.02
     assert not desk.bench.device.shutter

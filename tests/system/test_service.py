@@ -228,7 +228,7 @@ def test_it_works_in_a_locked_room(board, tmp_path, monkeypatch):
         assert daemon.finished(plan)["status"] == "done"
         daemon.call("POST", "/v1/stop")
         events = [json.loads(line)["event"] for line in (state / "audit.jsonl").read_text().splitlines()]
-        assert events[:2] == ["started", "asked"]
+        assert events[:2] == ["started", "requested"]
     finally:
         daemon.stop()
 
