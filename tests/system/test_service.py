@@ -110,7 +110,7 @@ def test_ready_when_it_answers_then_fed_then_stopping(manager, board, make_daemo
 def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
     """The web server's thread lives on: only the engine's loop may feed."""
     notifier = Notifier(MonotonicClock())
-    engine.on_turn = notifier.feed_watchdog
+    engine.on_loop = notifier.feed_watchdog
     wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
     go_on = threading.Event()
     standing = engine._commands.submit(lambda: go_on.wait(30))
