@@ -20,7 +20,7 @@ def pytest_addoption(parser):
 
 
 SLOW_FOLDERS = ("blind", "property", "firmware", "servo", "calibration", "cli", "analysis", "conformance")
-SLOW_FILES = ("test_calibrate_loop.py", "test_home.py", "test_ends_dark.py")
+SLOW_FILES = ("test_calibrate_loop.py", "test_home.py", "test_safe_exits.py")
 """Slow folders and files, which run first: started last, one would occupy a worker while the others are idle."""
 
 

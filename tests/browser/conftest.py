@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from benches import at_rest, board_at_rest, daemon_at_rest, kept, make_board, make_daemon  # noqa: F401 - fixtures
+from board_fixtures import board_disarmed, daemon_disarmed, disarmed, kept, make_board, make_daemon  # noqa: F401 - fixtures
 from window import TIMEOUT_MS, PageVisit, launch_chromium
 
 

@@ -1,6 +1,6 @@
 import pytest
 
-from benches import at_rest, board, daemon, kept, make_board, make_daemon, start  # noqa: F401 - fixtures
+from board_fixtures import board, daemon, disarmed, kept, make_board, make_daemon, start  # noqa: F401 - fixtures
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.device.config import load_config

@@ -1,4 +1,4 @@
-"""A board process on a pty and a daemon on it, both real, for the system tests."""
+"""Board process on a pseudo-terminal and daemon on it, for the system tests."""
 
 import json
 import os
@@ -21,23 +21,23 @@ TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
 START_S = 60.0
 PATIENT_LEASE_S = 1.0
-"""Of what is not about the lease: the longest there is, for a busy machine may keep a host waiting for 0.1 s."""
+"""Maximum lease, for tests that are not about the lease. A busy machine may stall a host for 0.1 s."""
 ENDED = ("done", "superseded", "failed", "cancelled")
 
 
 def wait_for(condition, what, patience_s=PATIENCE_S):
-    """Poll until condition() is truthy; its value."""
+    """Poll until condition() is truthy and return its value."""
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         value = condition()
         if value:
             return value
         time.sleep(0.005)
-    raise AssertionError(f"waited {patience_s} s in vain for {what}")
+    raise AssertionError(f"timed out after {patience_s} s waiting for {what}")
 
 
 def ended(engine, plan):
-    """The report of a plan of an engine in this process, given by its id or a report, once it has ended."""
+    """Wait until a plan of an engine in this process has ended and return its report."""
     plan_id = plan if isinstance(plan, str) else plan.plan
 
     def look():
@@ -51,7 +51,7 @@ SIMULATED = (sys.executable, "-m", "optodrive.link.simulator.board_process")
 
 
 class Board:
-    """The board's process; its log is the witness. program: how it is started, the simulated board if not said."""
+    """Board process with its log. program: command line, the simulated board by default."""
 
     def __init__(self, folder, script="", limits="", disk_bytes=None, program=SIMULATED, seed=None, sensor=None):
         self.port = folder / "tty"
@@ -59,10 +59,10 @@ class Board:
         arguments = ["--pty", self.port, "--log", self.log]
         arguments += [] if seed is None else ["--seed", str(seed)]
         self.sensor = None
-        if sensor is not None:  # options of a spot sensor beside it
+        if sensor is not None:  # options of a simulated spot sensor
             self.sensor = folder / "sensor"
             arguments += ["--sensor", self.sensor, *sensor]
-        limits = limits or f"lease_ms = {PATIENT_LEASE_S * 1e3:.0f}\n"  # a host asks for less where it wants less
+        limits = limits or f"lease_ms = {PATIENT_LEASE_S * 1e3:.0f}\n"  # a host may request a shorter lease
         for option, text in (("--script", script), ("--limits", limits)):
             if text:
                 path = folder / f"board{option}.toml"
@@ -84,7 +84,7 @@ class Board:
         return [json.loads(line) for line in lines if line.endswith("\n")][self._forgotten :]
 
     def forget(self):
-        """What was logged so far is another test's."""
+        """Ignore the events logged so far."""
         self._forgotten += len(self.events())
 
     def of(self, kind):
@@ -98,7 +98,7 @@ class Board:
 
 
 def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
-    """A shipped configuration for a board at a port, and a sensor at another."""
+    """Return the text of a shipped configuration with the ports of a board and a sensor."""
     text = locate_shipped(f"{name}.toml").read_text()
     text, count = re.subn(r"(?m)^lease_s = \S+", f"lease_s = {lease_s}", text)
     assert count == 1
@@ -107,7 +107,7 @@ def config_text(port, name="display-437", sensor=None, lease_s=PATIENT_LEASE_S):
 
 
 class Command:
-    """An `optodrive` command on a board's port and its sensor's, as a process."""
+    """Process of an `optodrive` command with the ports of a board and its sensor."""
 
     def __init__(self, folder, board, *arguments, lease_s=PATIENT_LEASE_S):
         config = folder / "bench.toml"
@@ -121,7 +121,7 @@ class Command:
         )
 
     def ended(self, patience_s=90.0):
-        """Status, stdout, stderr."""
+        """Wait for the end and return status, stdout and stderr."""
         out, errors = self.process.communicate(timeout=patience_s)
         assert "Traceback" not in errors, errors
         return self.process.returncode, out, errors
@@ -133,7 +133,7 @@ class Command:
 
 
 class Daemon:
-    """`optodrive serve` on a board's port."""
+    """Process of `optodrive serve` on a board's port."""
 
     def __init__(self, folder, port, name="display-437", replace=(), options=(), lease_s=PATIENT_LEASE_S):
         text = config_text(port, name, lease_s=lease_s)
@@ -199,7 +199,7 @@ class Daemon:
 
 @contextmanager
 def running(folder, replace=(), **options):
-    """A board and a daemon on it, both ended whatever happens; replace: in its configuration; options: the board's."""
+    """Run a board and a daemon on it. replace: changes of the configuration; options: of the board."""
     board = Board(folder, **options)
     try:
         daemon = Daemon(folder, board.port, replace=replace)
@@ -212,7 +212,7 @@ def running(folder, replace=(), **options):
 
 
 def long_train(pixel=200, seconds=5.0):
-    """Pulses for a while: 10 ms on, 10 ms off."""
+    """Return a request for a train of pulses: 10 ms on, 10 ms off."""
     train = {
         "pixel": pixel,
         "start_s": 0.0,

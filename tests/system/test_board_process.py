@@ -1,4 +1,4 @@
-"""The simulated board as a process: a pty, a real serial port, real time, its log and its exits."""
+"""The simulated board as a process on a pseudo-terminal, in real time: its log and its exits."""
 
 import os
 import signal
@@ -32,7 +32,7 @@ CENTRE = 32768
 
 
 class Host:
-    """A host of a few lines on a real serial port: says and hears messages, renews the lease while it waits."""
+    """Minimal host on a serial port that renews the lease while it waits."""
 
     def __init__(self, port):
         self.port = serial.Serial(str(port), 1_000_000, timeout=0.005, exclusive=True)
@@ -64,7 +64,7 @@ class Host:
         return [m.STATES[event.state] for event in self.of(m.Event)]
 
     def hello(self):
-        """Shake hands; the board may need a moment to see that its port was opened, so HELLO is repeated."""
+        """Perform the handshake. HELLO is repeated, because the board notices the opened port with a delay."""
         for nonce in range(40):
             self.session = self.seq = 0
             self.say(m.Hello(1, 0, nonce))
@@ -85,9 +85,9 @@ class Host:
 
     def play(self, points, first=0):
         frames = [points[at : at + m.POINTS_MAX] for at in range(0, len(points), m.POINTS_MAX)]
-        for k, piece in enumerate(frames):
+        for k, chunk in enumerate(frames):
             index = first + k * m.POINTS_MAX
-            self.say(m.Data(index, b"".join(m.POINT.pack(*point) for point in piece)))
+            self.say(m.Data(index, b"".join(m.POINT.pack(*point) for point in chunk)))
         self.say(m.Start(1, first, 0, 1), m.End(1, first + len(points)))
 
     def close(self):
@@ -108,37 +108,37 @@ def open_host():
 
 
 def points(count, on_us=2000):
-    """Points in a row of cells; every fifth is dark."""
+    """Return points in a row of cells, every fifth with the gate off."""
     return [
         (CENTRE + 2000 * (k % 5 - 2), CENTRE, 3000, 0 if k % 5 == 4 else on_us, 0 if k % 5 == 4 else 20_000 + k)
         for k in range(count)
     ]
 
 
-def test_fifty_points_and_the_log_line_by_line(board, open_host):
+def test_the_log_of_fifty_points(board, open_host):
     host = open_host(board).hello().arm()
-    asked = points(50)
-    host.play(asked)
+    planned = points(50)
+    host.play(planned)
     host.wait(lambda: sum(len(x.records) for x in host.of(m.Executed)) == 50, "50 executed points")
     host.close()
-    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the board to notice the closed port")
 
     events = board.events()
     assert all(set(entry) == {"t_us", "event"} | FIELDS[entry["event"]] for entry in events)
     times = [entry["t_us"] for entry in events]
     assert all(isinstance(t_us, int) for t_us in times)
-    lit = [k for k, point in enumerate(asked) if point[3]]
+    emitting = [k for k, point in enumerate(planned) if point[3]]
     pulses = board.of("pulse")
-    assert [entry["index"] for entry in pulses] == lit
+    assert [entry["index"] for entry in pulses] == emitting
     assert [(entry["x"], entry["y"], entry["duty"]) for entry in pulses] == [
-        (asked[k][0], asked[k][1], asked[k][4]) for k in lit
+        (planned[k][0], planned[k][1], planned[k][4]) for k in emitting
     ]
     assert all(entry["off_us"] - entry["on_us"] == 2000 for entry in pulses)
     edges = [(entry["t_us"], entry["on"]) for entry in board.of("gate")]
     assert edges == [edge for entry in pulses for edge in ((entry["on_us"], True), (entry["off_us"], False))]
     assert [entry["reason"] for entry in board.of("gate")][:2] == ["point 0", "point 0 done"]
-    walk = [(entry["before"], entry["state"], entry["reason"]) for entry in board.of("state")]
-    assert walk == [
+    transitions = [(entry["before"], entry["state"], entry["reason"]) for entry in board.of("state")]
+    assert transitions == [
         ("BOOT", "DISARMED", "boot"),
         ("DISARMED", "ARMING", "arm requested"),
         ("ARMING", "ARMED", "armed"),
@@ -146,13 +146,13 @@ def test_fifty_points_and_the_log_line_by_line(board, open_host):
         ("RUNNING", "ARMED", "job done"),
         ("ARMED", "DISARMED", "link lost"),
     ]
-    told = [record for message in host.of(m.Executed) for record in message.records]
-    assert [(tick, on, duty) for tick, on, duty in told if on] == [
+    reported = [record for message in host.of(m.Executed) for record in message.records]
+    assert [(tick, on, duty) for tick, on, duty in reported if on] == [
         (entry["on_us"], 2000, entry["duty"]) for entry in pulses
     ]
 
 
-def test_port_closed_in_mid_job_is_dark_and_disarmed_and_may_be_opened_again(board, open_host):
+def test_closing_the_port_during_a_job_disarms_the_board(board, open_host):
     host = open_host(board).hello().arm()
     host.play(points(200, on_us=8000))
     host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
@@ -173,11 +173,11 @@ def test_port_closed_in_mid_job_is_dark_and_disarmed_and_may_be_opened_again(boa
     assert [entry["open"] for entry in board.of("port")] == [True, False, True]
 
 
-def test_what_a_host_wrote_before_it_closed_does_not_reach_the_next(board, open_host):
+def test_bytes_of_a_closed_host_do_not_reach_the_next(board, open_host):
     host = open_host(board).hello()
     host.say(*[m.Get()] * 400, m.ArmReq(1))
     host.close()
-    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the board to notice the closed port")
     again = open_host(board).hello()
     again.say(m.Get())
     again.wait(lambda: again.of(m.Status), "a status", lease=False)
@@ -186,8 +186,8 @@ def test_what_a_host_wrote_before_it_closed_does_not_reach_the_next(board, open_
     assert status.fault == 0
 
 
-def test_a_process_that_is_kept_from_the_processor_is_not_a_board_that_is_late(board, open_host):
-    """What a host said in time counts as heard in time; points that fell due meanwhile ran when they were due."""
+def test_a_descheduled_process_keeps_board_time(board, open_host):
+    """Messages count at the time of their arrival, and due points run at their scheduled times."""
     host = open_host(board).hello().arm()
     host.play(points(200, on_us=2000))
     host.wait(lambda: len(board.of("pulse")) > 5, "pulses")
@@ -203,7 +203,7 @@ def test_a_process_that_is_kept_from_the_processor_is_not_a_board_that_is_late(b
     assert gaps_us == {3000, 6000}
 
 
-def test_the_session_works_over_the_real_port(board):
+def test_the_session_works_over_the_port(board):
     session = BoardSession(
         SerialPort(str(board.port), 1_000_000),
         MonotonicClock(),
@@ -215,7 +215,7 @@ def test_the_session_works_over_the_real_port(board):
         assert 0 < session.collect_link_stats()["round_trip_ms"] < 50
     finally:
         session.close()
-    wait_for(lambda: board.of("port")[-1]["open"] is False, "the port to be seen closed")
+    wait_for(lambda: board.of("port")[-1]["open"] is False, "the board to notice the closed port")
 
 
 # --- scripts, limits, exits -----------------------------------------------------------------------------------------
@@ -225,7 +225,7 @@ def test_the_session_works_over_the_real_port(board):
     ("name", "unsafe"), [("interlock", "false"), pytest.param("estop", "true", marks=pytest.mark.slow)]
 )
 def test_a_scripted_input_is_a_fault_within_a_millisecond(make_board, open_host, name, unsafe):
-    # A long lease: this test's own loop may be scheduled late, and only the input is to end the job.
+    # A long lease, so that a late iteration of this test does not end the job before the input.
     script = f'[[step]]\nat_s = 5.0\nset = "{name}"\nvalue = {unsafe}\n'
     board = make_board(script=script, limits="lease_ms = 2000\n")
     host = open_host(board).hello().arm()
@@ -298,7 +298,7 @@ def test_bad_options_are_one_line_and_status_2(tmp_path, option, text, says):
         assert path.read_text() == text
 
 
-def test_exit_when_closed_ends_it_and_takes_the_link_away(tmp_path):
+def test_exit_when_closed_removes_the_port(tmp_path):
     port, log = tmp_path / "tty", tmp_path / "log"
     board = start("--pty", port, "--log", log, "--exit-when-closed", "0.3")
     try:
@@ -318,7 +318,7 @@ def test_exit_when_closed_ends_it_and_takes_the_link_away(tmp_path):
         board.communicate()
 
 
-def test_sigterm_goes_dark_first(tmp_path, make_board, open_host):
+def test_sigterm_turns_the_gate_off_first(tmp_path, make_board, open_host):
     board = make_board()
     host = open_host(board).hello().arm()
     host.play(points(200, on_us=20_000))
@@ -329,7 +329,7 @@ def test_sigterm_goes_dark_first(tmp_path, make_board, open_host):
     assert board.of("state")[-1]["reason"] == "link lost"
 
 
-def test_bytes_come_no_faster_than_the_line_carries_them(tmp_path):
+def test_bytes_arrive_at_the_line_rate(tmp_path):
     port = tmp_path / "tty"
     board = start("--pty", port, "--baud", 115_200)
     try:
@@ -337,7 +337,7 @@ def test_bytes_come_no_faster_than_the_line_carries_them(tmp_path):
         host = Host(port).hello()
         frame = encode_frame(Frame(m.ClockRequest.TYPE, 0, host.session, m.ClockRequest(0x01010101).encode_body()))
         count = -(-2000 // len(frame))
-        time.sleep(0.5)  # an idle line saves nothing up
+        time.sleep(0.5)  # an idle line accumulates no credit
         began = time.monotonic()
         host.port.write(frame * count)
         host.wait(lambda: len(host.of(m.ClockReply)) == count, "all answers", lease=False)

@@ -1,4 +1,4 @@
-"""`serve --field` and `serve --pixel-map`: light lands at the codes that field and map say, by the board's own log."""
+"""`serve --field` and `serve --pixel-map`: the board's log has the codes of field and map."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ DEAD_PIXEL, LOW = 218, 0
 
 
 def shown(folder, *options):
-    """The board's pulses of a frame of all PIXELS, in order, and the daemon's answer."""
+    """Return the board's pulses of a frame of all PIXELS in order, and the daemon's response."""
     board = Board(folder)
     try:
         daemon = Daemon(folder, board.port, options=options)
@@ -30,8 +30,8 @@ def shown(folder, *options):
 
 
 @pytest.mark.parametrize("mapped", [pytest.param(False, marks=pytest.mark.slow), True])
-def test_a_frame_lands_where_the_field_and_the_map_lead_it(tmp_path, mapped):
-    """Pixels 0 and 20 lie as planned in the map too: there the field alone leads the beam."""
+def test_a_frame_uses_the_codes_of_field_and_map(tmp_path, mapped):
+    """The map does not move pixels 0 and 20, so the field alone determines their codes."""
     path, map_path, count = tmp_path / "field.toml", tmp_path / "pixels.toml", len(LAYOUT)
     calibrate_hidden_field(path, seed=3)
     offset_m, gain, state = np.zeros((2, count)), np.ones(count), np.full(count, MEASURED)
@@ -49,7 +49,7 @@ def test_a_frame_lands_where_the_field_and_the_map_lead_it(tmp_path, mapped):
     landed = np.array([[pulse["x"], pulse["y"]] for pulse in pulses])
     assert np.abs(landed - codes).max() <= 0.51
     code_m = 2.0 * CONFIG.scanner.focal_length_m * CONFIG.scanner.rad_per_code
-    assert np.abs(codes - (32768 + places_m.T / code_m)).max() > 100  # without the field they would land far off
+    assert np.abs(codes - (32768 + places_m.T / code_m)).max() > 100  # without the field the codes differ
 
     assert answer["summary"]["dead"]["message"] == (f"pixel {DEAD_PIXEL} is dead: omitted" if mapped else None)
     assert answer["pulses"]["predicted_um"] == pytest.approx([60.0] * len(order), rel=1e-3)

@@ -1,4 +1,4 @@
-"""`optodrive.client` against a real daemon on a simulated board; the board's log is the witness."""
+"""`optodrive.client` with a daemon on a simulated board, checked by the board's log."""
 
 import asyncio
 import socket
@@ -9,7 +9,7 @@ from contextlib import suppress
 import numpy as np
 import pytest
 
-from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
+from board_fixtures import board_disarmed, daemon_disarmed  # noqa: F401 - fixtures
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import BoardFaultError, InputError, LinkError, NotReadyError, OptodriveError, RefusedError
 from rig import TOKEN, long_train, wait_for
@@ -26,7 +26,7 @@ def dark_and_disarmed(board):
     return board.of("gate")[-1]["on"] is False
 
 
-def test_arm_show_and_what_came_of_it(board, daemon):
+def test_arm_show_and_the_result(board, daemon):
     with Display(daemon.url, TOKEN) as display:
         assert not display.state().board.is_armed
         assert display.arm().board.is_armed
@@ -43,7 +43,7 @@ def test_arm_show_and_what_came_of_it(board, daemon):
     assert [pulse["on"] for pulse in board.of("gate")].count(True) == 3
 
 
-def test_a_preview_moves_nothing_and_whoever_only_looks_stops_nobody(board, daemon):
+def test_a_preview_and_a_read_only_client_have_no_effect(board, daemon):
     daemon.arm()
     with Display(daemon.url, TOKEN) as display:
         plan = display.preview({17: 90.0})
@@ -58,7 +58,7 @@ def test_a_preview_moves_nothing_and_whoever_only_looks_stops_nobody(board, daem
     assert not board.of("pulse")
 
 
-def test_an_exception_stops_what_was_lit(board, daemon):
+def test_an_exception_stops_the_plan(board, daemon):
     plans = []
 
     def session():
@@ -74,7 +74,7 @@ def test_an_exception_stops_what_was_lit(board, daemon):
     assert daemon.finished(plans[0].plan)["error"] == "ended by stop"
 
 
-def test_errors_are_the_packages_own_with_the_problems_fields(daemon, display):
+def test_errors_have_the_fields_of_the_problem_document(daemon, display):
     with pytest.raises(NotReadyError, match="arm it first") as refused:
         display.show({17: 50.0})
     assert refused.value.problem["status"] == 409
@@ -94,7 +94,7 @@ def test_errors_are_the_packages_own_with_the_problems_fields(daemon, display):
             assert refused.value.code == "bad_token"
 
 
-def test_a_fault_while_something_is_shown_is_an_error(make_board, make_daemon):
+def test_a_fault_during_a_plan_is_an_error(make_board, make_daemon):
     board = make_board(script='[[step]]\nfrom = "light"\nat_s = 1.0\nset = "interlock"\nvalue = false\n')
     daemon = make_daemon(board)
     with Display(daemon.url, TOKEN) as display:
@@ -108,7 +108,7 @@ def test_a_fault_while_something_is_shown_is_an_error(make_board, make_daemon):
             display.arm()
 
 
-def test_a_stream_says_what_became_of_each_frame(board, daemon):
+def test_a_stream_reports_the_result_of_each_frame(board, daemon):
     with Display(daemon.url, TOKEN) as display:
         before = display.arm().board.underruns
         with display.stream() as stream:
@@ -129,8 +129,8 @@ def test_a_stream_says_what_became_of_each_frame(board, daemon):
     assert dark_and_disarmed(board)
 
 
-def test_a_daemon_that_restarts_is_found_again_and_is_not_armed(make_board, make_daemon, tmp_path, monkeypatch):
-    """The new daemon has the old one's port and another token, which is read from its file again."""
+def test_the_client_reconnects_to_a_restarted_daemon_that_is_not_armed(make_board, make_daemon, tmp_path, monkeypatch):
+    """The new daemon has the same port and another token, which the client reads from its file again."""
     board = make_board()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
     monkeypatch.delenv("OPTODRIVE_TOKEN", raising=False)
@@ -151,13 +151,13 @@ def test_a_daemon_that_restarts_is_found_again_and_is_not_armed(make_board, make
                 stream.wait(stream.send({6: 60.0}))
         with pytest.raises(NotReadyError, match="arm it first"):
             display.show({5: 60.0})
-        assert [state["state"] for state in board.of("state")].count("ARMED") <= 2  # before and after the one plan
+        assert [state["state"] for state in board.of("state")].count("ARMED") <= 2  # before and after the plan
         assert display.arm().board.is_armed
         assert display.show({5: 60.0}).status == "done"
 
 
-class Swallowing:
-    """A proxy whose first connections go through until it is told to swallow them; later ones go through."""
+class DroppingProxy:
+    """Proxy that drops the bytes of its first connections on request. Later connections work."""
 
     def __init__(self, port):
         self._port = port
@@ -197,8 +197,8 @@ class Swallowing:
             link.close()
 
 
-def test_stop_is_heard_though_the_old_connection_swallows_everything(board, daemon):
-    proxy = Swallowing(daemon.client.base_url.port)
+def test_stop_arrives_although_the_old_connection_drops_everything(board, daemon):
+    proxy = DroppingProxy(daemon.client.base_url.port)
     try:
         began_s = time.monotonic()
         with Display(f"http://127.0.0.1:{proxy.port}", TOKEN) as display:
@@ -213,7 +213,7 @@ def test_stop_is_heard_though_the_old_connection_swallows_everything(board, daem
     assert board.of("state")[-1]["reason"] == "abort"
 
 
-def test_a_stop_that_nobody_hears_is_told_and_hides_no_error(make_board, make_daemon):
+def test_a_failed_stop_is_reported_and_hides_no_error(make_board, make_daemon):
     daemon = make_daemon(make_board())
 
     def session(error):
@@ -231,7 +231,7 @@ def test_a_stop_that_nobody_hears_is_told_and_hides_no_error(make_board, make_da
     assert "emergency stop" in raised.value.__notes__[0]
 
 
-def test_the_same_with_await(board, daemon):
+def test_the_async_client(board, daemon):
     async def session():
         async with AsyncDisplay(daemon.url, TOKEN) as display:
             assert (await display.arm()).board.is_armed
@@ -257,14 +257,14 @@ def test_the_same_with_await(board, daemon):
     assert dark_and_disarmed(board)
 
 
-def test_a_task_that_is_cancelled_stops_what_it_lit(board, daemon):
-    async def lit():
+def test_a_cancelled_task_stops_its_plan(board, daemon):
+    async def emit():
         async with AsyncDisplay(daemon.url, TOKEN) as display:
             await display.arm()
             await display.push(long_train(seconds=30.0))
 
     async def session():
-        task = asyncio.create_task(lit())
+        task = asyncio.create_task(emit())
         await asyncio.to_thread(wait_for, lambda: len(board.of("pulse")) > 10, "pulses")
         task.cancel()
         with pytest.raises(asyncio.CancelledError):

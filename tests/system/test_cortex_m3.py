@@ -1,4 +1,4 @@
-"""The paper's six experiments on the firmware's core, on an emulated Cortex-M3, under the whole daemon."""
+"""The paper's six experiments with the daemon and the firmware core on an emulated Cortex-M3."""
 
 import numpy as np
 import pytest
@@ -12,8 +12,8 @@ def options(tmp_path_factory):
     return {"program": build_board(tmp_path_factory.mktemp("cortex-m3"), port="mps2-an385")}
 
 
-def test_the_pin_followed_the_log_and_was_never_early(bench):
-    """How late it was is the emulator's and not a chip's: it depends on what else this machine does."""
+def test_the_pin_follows_the_log_and_is_never_early(bench):
+    """The delay of the pin is a property of the emulator and depends on the load of this machine."""
     board, _ = bench
     pulses, pins = board.of("pulse"), board.of("pin")
     assert len(pulses) > 200

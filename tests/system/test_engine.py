@@ -1,4 +1,4 @@
-"""The engine on the simulated board's process, real clock, real threads."""
+"""Engine on a simulated board process, in real time."""
 
 import threading
 import time
@@ -22,11 +22,11 @@ def train(seconds):
     return FrameSequence((), (PulseTrain(200, 0.0, seconds, 0.01, 0.01, 1.0),))
 
 
-def test_a_planner_that_hangs_costs_the_lease(armed, board):
+def test_a_stalled_planner_lets_the_lease_expire(armed, board):
     hang = threading.Event()
     future = armed.submit(lambda: hang.wait() and frame(), "hangs")
     begun_s = time.monotonic()
-    wait_for(lambda: armed.board_state == "FAULT", "the lease to lapse")
+    wait_for(lambda: armed.board_state == "FAULT", "the lease to expire")
     assert time.monotonic() - begun_s > 0.9 * STALL_TIMEOUT_S
     assert board.of("fault")[-1]["fault"] == "LINK"
     hang.set()
@@ -34,7 +34,7 @@ def test_a_planner_that_hangs_costs_the_lease(armed, board):
         future.result(10)
 
 
-def test_a_planner_at_work_keeps_the_lease(armed):
+def test_a_busy_planner_keeps_the_lease(armed):
     long_one = train(200.0)
     answers = [armed.submit(lambda: long_one, "long", dry_run=True) for _ in range(3)]
     for answer in answers:
@@ -42,7 +42,7 @@ def test_a_planner_at_work_keeps_the_lease(armed):
     assert armed.board_state == "ARMED"
 
 
-def test_plans_queue_and_the_next_knows_the_heat_of_the_last(armed):
+def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
     first = armed.submit(lambda: frame(300.0), "first").result(10)
     second = armed.submit(lambda: frame(350.0), "second").result(10)
     rest = armed.submit(lambda: frame(350.0, pixel=300), "rest", dry_run=True).result(10)
@@ -63,7 +63,7 @@ def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
     assert armed.get_plan(waiting.plan).executed == 0
 
 
-def test_the_queue_is_bounded_and_ended_plans_are_forgotten(armed, monkeypatch):
+def test_the_queue_is_bounded_and_ended_plans_are_dropped(armed, monkeypatch):
     monkeypatch.setattr("optodrive.daemon.engine.engine.QUEUE_MAX", 2)
     monkeypatch.setattr("optodrive.daemon.engine.plan_record.RECORDS_MAX", 3)
     first = armed.submit(lambda: train(1.0), "first").result(10)
@@ -84,9 +84,9 @@ def test_a_blank_plan_is_done_at_once(armed):
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_crash_of_the_loop_ends_dark_and_is_told(armed, board, monkeypatch):
-    told = threading.Event()
-    armed.on_failure = told.set
+def test_a_crash_of_the_loop_aborts_the_board_and_is_reported(armed, board, monkeypatch):
+    failed = threading.Event()
+    armed.on_failure = failed.set
     armed.submit(lambda: train(5.0), "long").result(10)
     wait_for(lambda: len(board.of("pulse")) > 10, "pulses")
 
@@ -94,14 +94,14 @@ def test_a_crash_of_the_loop_ends_dark_and_is_told(armed, board, monkeypatch):
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr(armed._session, "step", crash)
-    assert told.wait(10)
+    assert failed.wait(10)
     assert isinstance(armed.failure, ZeroDivisionError)
     wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
     assert board.of("gate")[-1]["on"] is False
     assert board.of("state")[-1]["reason"] == "abort"
 
 
-def test_an_unarmed_board_gets_no_plan_but_answers_dry_runs(engine):
+def test_an_unarmed_board_accepts_only_dry_runs(engine):
     with pytest.raises(NotReadyError, match="arm it first"):
         engine.submit(frame, "x").result(10)
     assert engine.submit(frame, "x", dry_run=True).result(10).status == "planned"
@@ -112,7 +112,7 @@ def test_arming_twice_is_refused(armed):
         armed.arm().result(10)
 
 
-def test_a_failed_plan_leaves_its_heat_uncounted_and_its_energy_counted(armed):
+def test_after_a_failed_plan_the_board_can_be_armed_again(armed):
     answer = armed.submit(lambda: train(5.0), "long").result(10)
     wait_for(lambda: armed.get_plan(answer.plan).executed > 10, "pulses")
     armed.stop().result(10)
@@ -124,7 +124,7 @@ def test_a_failed_plan_leaves_its_heat_uncounted_and_its_energy_counted(armed):
     assert ended(armed, again).status == "done"
 
 
-def test_what_cannot_be_planned_is_refused_by_name(armed):
+def test_an_infeasible_plan_is_rejected_by_name(armed):
     with pytest.raises(InputError, match="target_um of pixel 17"):
         armed.submit(lambda: frame(5000.0), "x").result(10)
     with pytest.raises(RefusedError, match="needs"):

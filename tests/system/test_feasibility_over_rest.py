@@ -1,4 +1,4 @@
-"""Whether it fits, said by every face on the real board process, and what is shown in its place on request."""
+"""Feasibility check over REST and on the command line, and reduced plans, on a board process."""
 
 import json
 import os
@@ -25,13 +25,13 @@ def run(*arguments):
     return subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=60, env=environment)
 
 
-def test_what_fits_says_so(armed):
+def test_a_feasible_sequence_is_reported(armed):
     answer = armed.call("POST", "/v1/plans", json=EASY, params={"dry_run": True})
     feasibility = answer["summary"]["feasibility"]
     assert (feasibility["fits"], feasibility["proof"], feasibility["plans_tried"]) == (True, "planned", 0)
 
 
-def test_what_does_not_fit_names_who_breaks_it_before_anything_moves(armed):
+def test_an_infeasible_sequence_names_the_cause_before_execution(armed):
     before = armed.state()["totals"]
     feasibility = armed.call("POST", "/v1/plans", json=LATE, params={"dry_run": True})["summary"]["feasibility"]
     assert (feasibility["fits"], feasibility["proof"], feasibility["name"]) == (False, "bound", "late")
@@ -58,7 +58,7 @@ def test_best_effort_is_executed_in_time(armed, fit):
     assert executed["start_s"][-1] + executed["width_s"][-1] <= summary["lead_in_s"] + 0.1 + 1e-4
 
 
-def test_a_pattern_takes_it_too(armed):
+def test_a_pattern_accepts_the_same_options(armed):
     params = {"fit": "even", "dry_run": True}
     answer = armed.call("POST", "/v1/patterns/dot", json={"step_s": 0.02}, params=params)
     assert answer["summary"]["feasibility"]["fit"] == "even"
@@ -88,7 +88,7 @@ def test_wrong_input(armed, tmp_path):
         assert naming in done.stderr
 
 
-def test_the_command_line_says_it_in_one_line(armed, tmp_path):
+def test_the_command_line_reports_it_in_one_line(armed, tmp_path):
     path = tmp_path / "frames.json"
     path.write_text(json.dumps(EASY))
     assert run("plan", path).stdout.startswith("fits: yes\n")

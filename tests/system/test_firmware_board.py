@@ -1,4 +1,4 @@
-"""The firmware's core as a process: the simulated board's own tests on it, its bad options, a daemon on its port."""
+"""The firmware core as a process, with the tests of the simulated board and a daemon on its port."""
 
 import subprocess
 
@@ -9,9 +9,9 @@ from firmware_ports import build_board
 from rig import long_train, wait_for
 from test_board_process import *  # noqa: F403
 
-del test_bad_options_are_one_line_and_status_2  # noqa: F821 - below, with this board's name
+del test_bad_options_are_one_line_and_status_2  # noqa: F821 - replaced below
 # This port's time is its own: kept from the processor, it is a board whose lease is over.
-del test_a_process_that_is_kept_from_the_processor_is_not_a_board_that_is_late  # noqa: F821
+del test_a_descheduled_process_keeps_board_time  # noqa: F821
 
 
 @pytest.fixture(scope="session")
@@ -73,7 +73,7 @@ def test_bad_options(tmp_path, program, option, text, says):
     assert not (tmp_path / "tty").exists()
 
 
-def test_a_full_disk_ends_it_dark_and_says_so(make_board, open_host):
+def test_a_full_disk_ends_it_with_the_gate_off_and_a_message(make_board, open_host):
     board = make_board(disk_bytes=2000)
     host = open_host(board).hello().arm()
     host.play(simulated.points(200))
@@ -83,7 +83,7 @@ def test_a_full_disk_ends_it_dark_and_says_so(make_board, open_host):
     assert not board.port.is_symlink()
 
 
-def test_a_main_loop_that_stops_is_reset_by_the_watchdog(make_board, open_host):
+def test_the_watchdog_resets_a_stopped_main_loop(make_board, open_host):
     board = make_board(script='[[step]]\nat_s = 3.5\ndo = "stop_loop"\n', limits="lease_ms = 2000\n")
     host = open_host(board).hello().arm()
     host.play(simulated.points(600, on_us=8000))
@@ -95,7 +95,7 @@ def test_a_main_loop_that_stops_is_reset_by_the_watchdog(make_board, open_host):
 
 
 @pytest.mark.parametrize(("do", "fault"), [("late_tick", "TICK"), ("stick_gate", "READBACK")])
-def test_a_board_that_fails_itself_says_so(make_board, open_host, do, fault):
+def test_a_board_reports_its_own_failures(make_board, open_host, do, fault):
     board = make_board(script=f'[[step]]\nat_s = 3.5\ndo = "{do}"\n', limits="lease_ms = 2000\n")
     host = open_host(board).hello().arm()
     host.play(simulated.points(600, on_us=8000))
@@ -108,7 +108,7 @@ def test_a_board_that_fails_itself_says_so(make_board, open_host, do, fault):
 # --- with a daemon --------------------------------------------------------------------------------------------------
 
 
-def test_a_daemon_plays_on_it_and_every_pulse_is_accounted_for(board, make_daemon):
+def test_a_daemon_plays_on_it_and_every_pulse_is_logged(board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
     plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=1.0))["plan"]
@@ -122,7 +122,7 @@ def test_a_daemon_plays_on_it_and_every_pulse_is_accounted_for(board, make_daemo
     assert not board.of("fault")
 
 
-def test_a_daemon_that_is_killed_leaves_it_dark(board, make_daemon):
+def test_a_killed_daemon_leaves_the_gate_off(board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
     daemon.call("POST", "/v1/plans", json=long_train())

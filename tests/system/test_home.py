@@ -1,4 +1,4 @@
-"""`optodrive home` on a board's process: what it finds, how it refuses, and that every way out ends dark."""
+"""`optodrive home` on a board process: results, refusals and exits with the gate off."""
 
 import json
 import signal
@@ -24,7 +24,7 @@ def step_of(at_s, kind, value):
     return f'[[step]]\nat_s = {at_s}\n{kind} = "{value}"\n'
 
 
-def test_in_the_dark(make_board, start):
+def test_without_emission(make_board, start):
     board = make_board(sensor=())
     status, out, errors = start(board, "home", "--json").ended()
     assert status == 0, errors
@@ -52,7 +52,7 @@ def test_with_a_spot_and_no_position_outputs(make_board, start):
     )
 
 
-def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
+def test_without_a_sensor_the_mirrors_are_not_observed(board, start):
     status, out, errors = start(board, "home").ended()
     assert status == 0, errors
     assert "no sensor" in out
@@ -79,7 +79,7 @@ def test_without_a_sensor_it_says_that_nothing_sees_the_mirrors(board, start):
         ),
     ],
 )
-def test_what_is_broken_is_named(make_board, start, script, arguments, says):
+def test_a_defect_is_named(make_board, start, script, arguments, says):
     board = make_board(sensor=(), script=step_of(0.0, "do", script))
     status, _, errors = start(board, "home", *arguments).ended()
     assert status == 1
@@ -91,7 +91,7 @@ def test_what_is_broken_is_named(make_board, start, script, arguments, says):
 @pytest.mark.parametrize(
     ("name", "value"), [("interlock", "false"), pytest.param("key", "false", marks=pytest.mark.slow), ("estop", "true")]
 )
-def test_an_input_that_is_not_safe(make_board, start, name, value):
+def test_an_unsafe_input(make_board, start, name, value):
     board = make_board(script=step_of(0.0, "set", name) + f"value = {value}\n")
     status, _, errors = start(board, "home").ended()
     assert status == 1
@@ -106,7 +106,7 @@ def armed(board):
 @pytest.mark.parametrize(
     "number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM, signal.SIGKILL]
 )
-def test_ended_from_outside(make_board, start, number):
+def test_a_signal_ends_it(make_board, start, number):
     board = make_board(sensor=())
     command = start(board, "home", "--spot-power-mw", "5")
     armed(board)
@@ -127,7 +127,7 @@ def test_ended_from_outside(make_board, start, number):
     ("script", "says"),
     [(step_of(3.5, "set", "interlock"), "INTERLOCK"), (step_of(3.5, "do", "close"), "lost")],
 )
-def test_what_happens_midway(make_board, start, script, says):
+def test_a_failure_during_the_run(make_board, start, script, says):
     board = make_board(sensor=(), script=script)
     status, _, errors = start(board, "home", "--spot-power-mw", "5").ended()
     assert status == 1
@@ -135,14 +135,14 @@ def test_what_happens_midway(make_board, start, script, says):
     assert_dark(board, ("DISARMED", "FAULT"))
 
 
-def test_a_board_that_a_daemon_holds(board, daemon, start):
+def test_a_board_in_use_by_a_daemon(board, daemon, start):
     status, _, errors = start(board, "home").ended()
     assert status == 1
     assert "optodrive serve" in errors
     assert daemon.board_state() == "DISARMED"
 
 
-def test_a_sensor_that_is_not_there(make_board, start):
+def test_a_missing_sensor(make_board, start):
     board = make_board(sensor=(), script=step_of(0.0, "do", "unplug_sensor"))
     wait_for(lambda: not board.sensor.exists(), "the sensor to be gone")
     status, _, errors = start(board, "home").ended()

@@ -1,4 +1,4 @@
-"""The link goes, for real: what the state, the failed plan and the daemon's log say of it, and what is on the tape."""
+"""Link failures on a board process: reports of the state, the failed plan and the log, and link captures."""
 
 import json
 import signal
@@ -11,15 +11,15 @@ from rig import OPTODRIVE, Board, long_train, wait_for
 
 
 def play(daemon, seconds=5.0):
-    """Arm, and a train that runs; its id."""
+    """Arm, start a train and return its id."""
     daemon.arm()
     plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds))["plan"]
     wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
     return plan
 
 
-def told(daemon, words):
-    """The state's likely cause, once it has these words; in the log by then too."""
+def wait_for_cause(daemon, words):
+    """Wait until the likely cause contains these words and the log has it, and return it."""
 
     def look():
         cause = daemon.state()["link"]["likely_cause"]
@@ -30,20 +30,20 @@ def told(daemon, words):
     return cause
 
 
-def test_a_board_whose_process_is_killed_is_gone_and_a_timing_error_was_known_before(board, daemon):
+def test_a_killed_board_process_is_missing_and_the_timing_error_was_reported(board, daemon):
     first = daemon.call("POST", "/v1/plans", status=409, json=long_train())
     assert "arm it first" in first["detail"]
     plan = play(daemon, 0.1)
     answer = daemon.finished(plan)
     timing = answer["timing_error"]
     assert timing["pulses"] == answer["executed"] == 5
-    # Without an underrun the simulated board is off by nothing but ticks.
+    # Without an underrun the timing error of the simulated board is below one tick.
     assert abs(timing["max_abs_s"]) <= 1e-6
     assert daemon.state()["totals"]["timing_error"]["pulses"] == 5
     plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
     wait_for(lambda: daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["executed"], "light")
     board.process.kill()
-    cause = told(daemon, "is missing")
+    cause = wait_for_cause(daemon, "is missing")
     assert str(board.port) in cause
     failed = daemon.finished(plan)
     assert failed["status"] == "failed"
@@ -52,17 +52,17 @@ def test_a_board_whose_process_is_killed_is_gone_and_a_timing_error_was_known_be
 
 
 @pytest.mark.slow
-def test_a_pty_that_closes_and_a_board_that_was_reset(make_board, make_daemon):
+def test_a_closed_pty_and_a_reset_board(make_board, make_daemon):
     script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "close"\n[[step]]\nfrom = "light"\nat_s = 6.0\ndo = "reset"\n'
     board = make_board(script=script)
     daemon = make_daemon(board)
     plan = play(daemon, 30.0)
-    told(daemon, "is available again: replugged")
-    # When the plan failed the port was either gone for a moment, or there again already.
+    wait_for_cause(daemon, "is available again: replugged")
+    # When the plan failed, the port was either missing or available again.
     assert f"likely cause: {board.port}" in daemon.finished(plan)["error"]
     wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link")
     assert daemon.board_state() == "DISARMED"
-    assert "(reset)" in told(daemon, "the board restarted")
+    assert "(reset)" in wait_for_cause(daemon, "the board restarted")
 
 
 @pytest.mark.slow
@@ -70,25 +70,25 @@ def test_flipped_bits_are_named(make_board, make_daemon):
     script = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "flip_bits"\nrate = 0.3\n'
     daemon = make_daemon(make_board(script=script))
     plan = play(daemon, 30.0)
-    cause = told(daemon, "damaged")
+    cause = wait_for_cause(daemon, "damaged")
     assert "cable" in cause
     assert daemon.finished(plan)["status"] == "failed"
 
 
-def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_daemon, tmp_path):
-    tape = tmp_path / "tape"
-    daemon = make_daemon(board, options=("--capture", str(tape)))
+def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tmp_path):
+    capture = tmp_path / "capture"
+    daemon = make_daemon(board, options=("--capture", str(capture)))
     plan = play(daemon)
     daemon.process.send_signal(signal.SIGSTOP)
-    wait_for(lambda: board.of("fault"), "the lease to lapse")
+    wait_for(lambda: board.of("fault"), "the lease to expire")
     daemon.process.send_signal(signal.SIGCONT)
-    cause = told(daemon, "this computer stalled")
+    cause = wait_for_cause(daemon, "this computer stalled")
     failed = daemon.finished(plan)
     assert cause in failed["error"]
     assert "FAULT (LINK: this computer" in failed["error"]
     daemon.stop()
-    assert LinkCapture(tape).ignored_bytes == 0
-    run = subprocess.run([OPTODRIVE, "wire", "dump", tape, "--json"], capture_output=True, text=True, check=True)
+    assert LinkCapture(capture).ignored_bytes == 0
+    run = subprocess.run([OPTODRIVE, "wire", "dump", capture, "--json"], capture_output=True, text=True, check=True)
     *lines, last = map(json.loads, run.stdout.splitlines())
     names = [line["message"] for line in lines if "message" in line]
     assert {"HELLO", "HELLO_REPLY", "ARM_CONFIRM", "DATA", "START", "EXECUTED", "LEASE"} <= set(names)
@@ -104,7 +104,7 @@ def test_a_host_that_stalls_is_named_and_its_session_is_on_the_tape(board, make_
 
 @pytest.fixture
 def seeded(tmp_path):
-    """A board whose nonces repeat; the same again for the replay."""
+    """Return a function that starts boards with repeating nonces."""
     boards = []
 
     def make(folder):
@@ -127,21 +127,21 @@ def replay(*arguments):
 
 
 @pytest.mark.slow
-def test_a_recorded_session_is_replayed_into_a_simulated_board_and_does_not_arm_one_on_a_port(
+def test_a_captured_session_is_replayed_to_a_simulated_board_and_does_not_arm_one_on_a_port(
     seeded, make_daemon, tmp_path
 ):
-    tape = tmp_path / "tape"
-    daemon = make_daemon(seeded(tmp_path / "first"), options=("--capture", str(tape)))
+    capture = tmp_path / "capture"
+    daemon = make_daemon(seeded(tmp_path / "first"), options=("--capture", str(capture)))
     plan = play(daemon, 0.3)
     assert daemon.finished(plan)["status"] == "done"
     daemon.stop()
     own = ("--limits", tmp_path / "first" / "board--limits.toml")
-    verdict = replay(tape, "--board", "simulated", "--seed", "7", *own)
+    verdict = replay(capture, "--board", "simulated", "--seed", "7", *own)
     assert verdict["identical"], verdict
     assert verdict["executed"]["recorded"] >= 15
-    assert not replay(tape, "--board", "simulated", *own)["identical"]
+    assert not replay(capture, "--board", "simulated", *own)["identical"]
     board = seeded(tmp_path / "second")
-    verdict = replay(tape, "--board", str(board.port))
+    verdict = replay(capture, "--board", str(board.port))
     assert not verdict["identical"]
     assert verdict["executed"]["replayed"] == 0
     assert "ARMED" not in [event["state"] for event in board.of("state")]
@@ -156,7 +156,7 @@ def doctor(config):
 
 
 @pytest.mark.slow
-def test_the_doctor_leaves_a_running_daemon_alone_and_greets_a_free_board(board, daemon):
+def test_the_doctor_does_not_disturb_a_daemon_and_checks_a_free_board(board, daemon):
     plan = play(daemon, 4.0)
     findings = doctor(daemon.config)
     assert findings["holder"]["status"] == "warning"
@@ -173,10 +173,10 @@ def test_the_doctor_leaves_a_running_daemon_alone_and_greets_a_free_board(board,
     assert not board.of("fault")
 
 
-def test_a_tape_is_never_overwritten(board, tmp_path):
-    tape = tmp_path / "tape"
-    tape.write_text("precious")
-    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--capture", tape], capture_output=True, text=True)
+def test_a_capture_is_never_overwritten(board, tmp_path):
+    capture = tmp_path / "capture"
+    capture.write_text("precious")
+    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--capture", capture], capture_output=True, text=True)
     assert run.returncode == 2
     assert run.stderr.splitlines()[-1].startswith("optodrive: --capture")
-    assert tape.read_text() == "precious"
+    assert capture.read_text() == "precious"

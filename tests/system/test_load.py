@@ -1,4 +1,4 @@
-"""`scripts/load`, a few seconds of it: it runs, and says what it is asked for. Its figures are the computer's."""
+"""`scripts/load` for a few seconds: it runs and prints its statistics, which depend on the computer."""
 
 import re
 import subprocess
@@ -11,10 +11,10 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-def test_a_short_load_is_answered_and_told():
+def test_a_short_load_prints_its_statistics():
     command = [sys.executable, ROOT / "scripts" / "load.py", "--minutes", "0.15", "--clients", "6", "--watchers", "3"]
     finished = subprocess.run(command, text=True, capture_output=True, timeout=110)
-    told = finished.stdout
+    output = finished.stdout
     for name in (
         "push",
         "dry run",
@@ -27,8 +27,8 @@ def test_a_short_load_is_answered_and_told():
         "engine",
         "computer",
     ):
-        assert re.search(rf"^{name}\b", told, re.MULTILINE), told + finished.stderr
-    statuses = set(re.findall(r"'(\d+)': \d+", told))
-    assert {"200", "201"} <= statuses <= {"200", "201", "409"}  # 409: pushed while nothing is armed, after a stop
-    underran = int(re.search(r"underruns +(\d+)", told)[1])
+        assert re.search(rf"^{name}\b", output, re.MULTILINE), output + finished.stderr
+    statuses = set(re.findall(r"'(\d+)': \d+", output))
+    assert {"200", "201"} <= statuses <= {"200", "201", "409"}  # 409: pushed while the board is not armed, after a stop
+    underran = int(re.search(r"underruns +(\d+)", output)[1])
     assert (finished.returncode == 1) == (underran > 0 or "memory grew" in finished.stderr), finished.stderr

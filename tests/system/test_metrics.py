@@ -1,4 +1,4 @@
-"""GET /metrics, read by Prometheus' own parser."""
+"""GET /metrics, parsed by Prometheus' parser."""
 
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
@@ -19,13 +19,13 @@ def read(text):
     return found
 
 
-def test_figures_before_and_after_plans_and_a_stop(board, daemon):
-    def figures():
+def test_metrics_before_and_after_plans_and_a_stop(board, daemon):
+    def read_metrics():
         response = daemon.client.get("/metrics")
         assert response.headers["content-type"].startswith("text/plain; version=0.0.4")
         return read(response.text)
 
-    before = figures()
+    before = read_metrics()
     assert before["optodrive_board_state", "DISARMED"] == before["optodrive_link_up"] == 1
     assert before["optodrive_pulses_total", "executed"] == 0
     assert "optodrive_plan_headroom_kelvin" not in before
@@ -35,13 +35,14 @@ def test_figures_before_and_after_plans_and_a_stop(board, daemon):
     daemon.call("POST", "/v1/plans", json=long_train())
     wait_for(lambda: len(board.of("pulse")) > 15, "pulses")
     daemon.call("POST", "/v1/stop")
-    wait_for(lambda: figures()["optodrive_plans_total", "failed"], "the plan's end")
+    wait_for(lambda: read_metrics()["optodrive_plans_total", "failed"], "the plan's end")
     at_full_power_s = 0.010 * daemon.state()["totals"]["executed"] * 1.0 / 2.45
     wait_for(
-        lambda: figures()["optodrive_laser_on_seconds_total"] >= 0.99 * at_full_power_s, "the board's next word of it"
+        lambda: read_metrics()["optodrive_laser_on_seconds_total"] >= 0.99 * at_full_power_s,
+        "the board's next word of it",
     )
-    assert figures()["optodrive_laser_on_seconds_total"] < 1.2 * at_full_power_s + 0.01
-    after = figures()
+    assert read_metrics()["optodrive_laser_on_seconds_total"] < 1.2 * at_full_power_s + 0.01
+    after = read_metrics()
     assert after["optodrive_plans_total", "done"] == after["optodrive_plans_total", "failed"] == 1
     assert after["optodrive_pulses_total", "executed"] == daemon.state()["totals"]["executed"] > 10
     assert after["optodrive_first_light_seconds_bucket", "+Inf"] == after["optodrive_first_light_seconds_count"] == 2
@@ -53,11 +54,11 @@ def test_figures_before_and_after_plans_and_a_stop(board, daemon):
     assert after["optodrive_lease_seconds"] == 1.0
 
 
-def test_faults_are_counted_by_their_name_and_once(armed):
+def test_faults_are_counted_once_by_name(armed):
     engine = armed
     plan = engine.submit(lambda: _frames(engine), "asked").result(10)
     ended(engine, plan)
-    engine._planner._progress_at_s = -1e9  # as if it hung: no lease from now on
+    engine._planner._progress_at_s = -1e9  # as if it had stalled: no lease from now on
     engine._planner._pending_count = 1
     wait_for(lambda: engine.board_state == "FAULT", "the lease to lapse")
     for _ in range(3):
@@ -65,11 +66,11 @@ def test_faults_are_counted_by_their_name_and_once(armed):
     engine._planner._pending_count = 0
 
 
-def test_without_a_token_there_are_no_figures(daemon):
+def test_without_a_token_there_are_no_metrics(daemon):
     assert httpx.get(f"{daemon.url}/metrics").status_code == 401
 
 
-def test_a_tally_starts_with_every_status_at_nought():
+def test_the_counters_start_at_zero_for_every_status():
     assert set(PlanCounters().ended) == {"done", "superseded", "failed", "cancelled"}
 
 

@@ -1,4 +1,4 @@
-"""`--model`: plan, simulate and serve with a parameter set as `diagnose` writes it."""
+"""`--model`: plan, simulate and serve with a parameter set in the format of `diagnose`."""
 
 import json
 import subprocess
@@ -41,7 +41,7 @@ def answer(*arguments):
     return json.loads(finished.stdout)
 
 
-def test_plan_lights_longer_for_a_diode_that_starts_slowly(files):
+def test_plan_extends_pulses_of_a_diode_with_a_slow_turn_on(files):
     model, frames = files
     plain, slow = answer("plan", frames), answer("plan", frames, "--model", model)
     assert slow["pulses"] == plain["pulses"] == 3
@@ -49,21 +49,21 @@ def test_plan_lights_longer_for_a_diode_that_starts_slowly(files):
     assert slow["predicted_max_um"] == pytest.approx(350, rel=1e-3)
 
 
-def test_simulate_shows_what_a_display_does_that_is_not_as_planned(files):
+def test_simulate_shows_the_deviation_of_another_display(files):
     model, frames = files
     looked_at = ("--pixels", "5,6,9", "--dt", "2e-4")
     hidden = answer("simulate", frames, "--truth", model, *looked_at)
     known = answer("simulate", frames, "--truth", model, "--model", model, *looked_at)
-    asked = FRAMES["frames"][0]["target_um"]
+    targets = FRAMES["frames"][0]["target_um"]
     for short, right in zip(hidden["pixels"], known["pixels"], strict=True):
-        wanted_um = asked[str(short["pixel"])]
-        assert short["measured_max_um"] < 0.97 * wanted_um
-        assert short["predicted_max_um"] == pytest.approx(wanted_um, rel=1e-3)
-        assert right["measured_max_um"] == pytest.approx(wanted_um, rel=3e-3)
+        target_um = targets[str(short["pixel"])]
+        assert short["measured_max_um"] < 0.97 * target_um
+        assert short["predicted_max_um"] == pytest.approx(target_um, rel=1e-3)
+        assert right["measured_max_um"] == pytest.approx(target_um, rel=3e-3)
     assert known["simulated_max_um"] == pytest.approx(350, rel=2e-3)
 
 
-def test_the_daemon_plans_with_the_model_and_says_so(files, tmp_path):
+def test_the_daemon_plans_with_the_model_and_reports_it(files, tmp_path):
     model, _ = files
     board = Board(tmp_path)
     try:
@@ -102,7 +102,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("what", WRONG)
-def test_a_wrong_model_is_refused_in_one_line(what, files, capsys):
+def test_a_wrong_model_is_rejected_in_one_line(what, files, capsys):
     model, frames = files
     text, expected = WRONG[what]
     if text is None:

@@ -1,4 +1,4 @@
-"""The OpenAPI document against the daemon, by schemathesis: no 5xx, no answer that is not in it."""
+"""OpenAPI document and daemon, compared by schemathesis: no status 5xx and no undocumented response."""
 
 import json
 import subprocess
@@ -12,7 +12,7 @@ from rig import TOKEN
 SCHEMATHESIS = Path(sys.executable).with_name("schemathesis")
 BOUNDS = 'lease_s = 1.0\n[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000\naudit = "{}/audit.jsonl"\n#'
 TELEMETRY = "/v1/telemetry"
-"""It does not end by itself: each case takes as long as it may."""
+"""This route has no end, so each case lasts until its timeout."""
 KEEPS_ARMED = [part for path in ("arm", "disarm", "stop") for part in ("--exclude-path", f"/v1/{path}")]
 # What a display can show is more than a schema can say: 422 for what one allows is an answer, and documented.
 CHECKS = ["--checks", "all", "--exclude-checks", "positive_data_acceptance"]
@@ -45,7 +45,7 @@ def open_daemon(make_daemon, board, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_document_as_it_comes(open_daemon):
+def test_the_document(open_daemon):
     said = schemathesis(open_daemon, "--exclude-path", TELEMETRY, examples=10)
     paths = open_daemon.call("GET", "/openapi.json")["paths"]
     total = sum(map(len, paths.values()))
@@ -53,7 +53,7 @@ def test_the_document_as_it_comes(open_daemon):
 
 
 @pytest.mark.slow
-def test_what_would_disarm_is_as_documented(open_daemon):
+def test_the_routes_that_disarm_are_as_documented(open_daemon):
     only = [word.replace("exclude", "include") for word in KEEPS_ARMED]
     assert "3 selected" in schemathesis(open_daemon, *only, "--phases", "coverage,fuzzing", examples=5)
 
@@ -76,8 +76,8 @@ def test_the_document_for_longer(open_daemon):
 
 
 @pytest.mark.slow
-def test_a_document_that_lies_is_caught(open_daemon):
-    """A mutant: the document without a status that the daemon answers."""
+def test_a_wrong_document_is_detected(open_daemon):
+    """Mutant: the document without a status that the daemon returns."""
     document = open_daemon.call("GET", "/openapi.json")
     del document["paths"]["/v1/plans/{plan_id}"]["get"]["responses"]["404"]
     path = open_daemon.config.parent / "lies.json"

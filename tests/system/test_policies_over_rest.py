@@ -1,4 +1,4 @@
-"""What a cap does not allow, over REST on the real board process: trimmed, delayed or refused as asked."""
+"""Policies over REST on a board process: trim, delay or refuse pulses that exceed a cap."""
 
 import pytest
 
@@ -17,7 +17,7 @@ def armed(tmp_path_factory):
         yield daemon
 
 
-def test_trim_names_pixel_cap_and_when_all_would_fit(armed):
+def test_trim_names_pixel_cap_and_the_time_after_which_all_fits(armed):
     shortfall = armed.call("POST", "/v1/plans", json=FRAMES, params={"dry_run": True})["summary"]["shortfall"]
     assert shortfall["pixel"] in (200, 201)
     assert shortfall["cap"] == "touch_temperature"
@@ -25,7 +25,7 @@ def test_trim_names_pixel_cap_and_when_all_would_fit(armed):
     assert 0 < shortfall["fits_after_s"] < 10
 
 
-def test_refuse_is_a_problem_document_and_nothing_moves(armed):
+def test_refuse_is_a_problem_document_without_execution(armed):
     answer = armed.call("POST", "/v1/plans", status=409, json=FRAMES, params={"policy": "refuse"})
     assert answer["code"] == "over_budget"
     assert answer["cap"] == "touch_temperature"
@@ -34,7 +34,7 @@ def test_refuse_is_a_problem_document_and_nothing_moves(armed):
     assert armed.state()["totals"] == {"planned": 0, "sent": 0, "executed": 0, "timing_error": None}
 
 
-def test_delayed_frames_are_executed_as_tall_as_asked(armed):
+def test_delayed_frames_reach_their_targets(armed):
     plan = armed.call("POST", "/v1/plans", json=FRAMES, params={"policy": "delay"})["plan"]
     answer = armed.finished(plan)
     assert answer["status"] == "done", answer["error"]
@@ -42,11 +42,11 @@ def test_delayed_frames_are_executed_as_tall_as_asked(armed):
     assert answer["summary"]["trimmed"]["pulses"] == 0
     delays = answer["summary"]["delays"]
     assert {delay["cap"] for delay in delays} == {"touch_temperature"}
-    # What was waited for in the plan was waited for on the board.
+    # The board executes the delays of the plan.
     starts = answer["executed_pulses"]["start_s"]
     assert starts[-1] > 0.5 + sum(delay["wait_s"] for delay in delays) - 0.1
 
 
 @pytest.mark.parametrize("wrong", [{"policy": "perhaps"}, {"policy": "delay", "strict": True}])
-def test_a_wrong_policy_is_refused(armed, wrong):
+def test_a_wrong_policy_is_rejected(armed, wrong):
     assert armed.call("POST", "/v1/plans", status=422, json=FRAMES, params=wrong)["code"] == "bad_input"

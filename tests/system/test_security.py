@@ -1,4 +1,4 @@
-"""Who may call what: every route there is, with every way of not being allowed to."""
+"""Access control of every route, with every reason for refusal."""
 
 import asyncio
 import json
@@ -35,11 +35,11 @@ LAST_LINE = "lease_s = 1.0"
 
 
 LOGIN_ROUTES = {f"GET {path}" for path in LOGIN_PATHS}
-"""Entries of their own within the page's route."""
+"""Separate entries within the page's route."""
 
 
 def build_daemon_replacement(text):
-    """Replaces the configuration's last line by itself and a [daemon] section."""
+    """Return the replacement that appends a [daemon] section to the configuration."""
     return ((LAST_LINE, f"{LAST_LINE}\n[daemon]\n{text}\n#"),)
 
 
@@ -64,19 +64,19 @@ def running(folder):
 
 @pytest.fixture(scope="module")
 def app():
-    """The application, whose engine was never started."""
+    """Application with an engine that is not started."""
     engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
     return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
 
 def list_routes(application):
-    """Every route of an application, as the table writes them."""
+    """Return every route of an application in the form of the table."""
     found = set()
     for route in application.routes:
         if isinstance(route, WebSocketRoute):
             found.add(f"WEBSOCKET {route.path}")
         elif isinstance(route, Route):
-            # Starlette answers HEAD wherever it answers GET; the guard answers neither unless the table has it.
+            # Starlette adds HEAD to every GET. The guard rejects routes that are not in the table.
             found |= {f"{method} {route.path}" for method in route.methods - {"HEAD"}}
         elif isinstance(route, Mount):
             found.add(f"GET {route.path}/{{path:path}}")
@@ -96,7 +96,7 @@ def build_bearer_header(secret):
 
 
 def request_route(daemon, key, headers):
-    """Status and code that a route answers with."""
+    """Return status and code of a route's response."""
     method, _, template = key.partition(" ")
     path = template.replace("{plan_id}", "p1").replace("{name}", "pixel").replace("{path:path}", "x")
     path = path.replace("{name:path}", "index.html")
@@ -123,14 +123,14 @@ def test_the_table_has_every_route_and_no_other(app):
     assert list_routes(app) == set(ROUTES) - LOGIN_ROUTES
 
 
-def test_what_the_login_needs_is_open_and_holds_no_secret(running):
+def test_the_files_of_the_login_are_public_and_hold_no_secret(running):
     for key in LOGIN_ROUTES:
         response = httpx.get(running.url + key.partition(" ")[2])
         assert response.status_code == 200
         assert TOKEN not in response.text
 
 
-def test_a_route_without_an_entry_is_not_answered_and_is_caught():
+def test_a_route_without_an_entry_is_rejected_and_detected():
     engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
     mutant = build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
@@ -148,7 +148,7 @@ def test_a_route_without_an_entry_is_not_answered_and_is_caught():
     assert (response.status_code, response.json()["code"]) == (404, "route_not_found")
 
 
-def test_a_guard_that_is_forgotten_is_caught():
+def test_a_missing_guard_is_detected():
     assert list_routes(FastAPI()) - set(ROUTES)
 
 
@@ -169,14 +169,14 @@ REFUSALS = {
 def test_every_route_refuses(running, key, case):
     headers, expected = REFUSALS[case]
     if expected[0] == 401 and is_page_request(*key.split(" ")):
-        expected = (401, None)  # the page that asks for the token
+        expected = (401, None)  # the page that requests the token
     if ROUTES[key] is None and expected[0] == 401:
         expected = (200, None)
     assert request_route(running, key, dict(headers)) == expected
 
 
-@pytest.mark.parametrize("key", sorted(key for key, least in ROUTES.items() if least not in (None, ROLES[0])))
-def test_every_route_refuses_a_role_too_low(running, key):
+@pytest.mark.parametrize("key", sorted(key for key, min_role in ROUTES.items() if min_role not in (None, ROLES[0])))
+def test_every_route_refuses_an_insufficient_role(running, key):
     for role in ROLES[: ROLES.index(ROUTES[key])]:
         assert request_route(running, key, build_bearer_header(read_role_tokens(running)[role])) == (
             403,
@@ -185,9 +185,9 @@ def test_every_route_refuses_a_role_too_low(running, key):
 
 
 @pytest.mark.parametrize("key", sorted(ROUTES.keys() - {ARM}))  # armed below
-def test_every_route_lets_its_role_pass(running, key):
-    least = ROUTES[key] or ROLES[0]
-    assert request_route(running, key, build_bearer_header(read_role_tokens(running)[least]))[0] not in (
+def test_every_route_accepts_its_role(running, key):
+    min_role = ROUTES[key] or ROLES[0]
+    assert request_route(running, key, build_bearer_header(read_role_tokens(running)[min_role]))[0] not in (
         401,
         403,
         421,
@@ -198,7 +198,7 @@ def test_every_route_lets_its_role_pass(running, key):
 @pytest.mark.parametrize(
     ("method", "path", "status"), [("GET", "/v1/nothing", 404), ("PUT", "/v1/arm", 405), ("OPTIONS", "/v1/state", 405)]
 )
-def test_what_is_not_there_asks_for_a_token_first(running, method, path, status):
+def test_an_unknown_route_requires_a_token_first(running, method, path, status):
     assert httpx.request(method, running.url + path).status_code == 401
     response = httpx.request(method, running.url + path, headers=build_bearer_header(TOKEN))
     assert response.status_code == status
@@ -206,7 +206,7 @@ def test_what_is_not_there_asks_for_a_token_first(running, method, path, status)
     assert "access-control-allow-origin" not in response.headers
 
 
-def test_the_unix_socket_asks_for_the_token_too(running, folder):
+def test_the_unix_socket_requires_the_token(running, folder):
     assert (folder / "s").stat().st_mode & 0o777 == 0o660
     with httpx.Client(transport=httpx.HTTPTransport(uds=str(folder / "s")), base_url="http://localhost") as client:
         assert client.get("/v1/health").status_code == 200
@@ -215,12 +215,12 @@ def test_the_unix_socket_asks_for_the_token_too(running, folder):
         assert client.get("/v1/state", headers=build_bearer_header(TOKEN) | {"Host": "evil.example"}).status_code == 421
 
 
-def test_command_line_and_client_reach_the_unix_socket(running, folder):
+def test_command_line_and_client_use_the_unix_socket(running, folder):
     place = f"unix:{folder / 's'}"
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
     command = [OPTODRIVE, "status", "--url", place, "--json"]
-    told = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
-    assert json.loads(told)["display"] == running.state()["display"]
+    output = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+    assert json.loads(output)["display"] == running.state()["display"]
     with Display(place, TOKEN) as display:
         assert display.preview({5: 60.0}).planned == 1
         with display.stream() as stream, pytest.raises(NotReadyError):
@@ -248,7 +248,7 @@ def send_raw(daemon, request):
 @pytest.mark.parametrize(
     "body", ["Content-Length: 100000000\r\n\r\n", "Transfer-Encoding: chunked\r\n\r\nffffff\r\n", "\r\n"]
 )
-def test_stop_waits_for_no_body(running, body):
+def test_stop_does_not_wait_for_the_body(running, body):
     path = STOP.partition(" ")[2]
     secret = read_role_tokens(running)["viewer"]
     given = send_raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
@@ -259,7 +259,7 @@ def read_audit(folder):
     return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines()]
 
 
-def test_the_audit_file_says_who_did_what(running, folder):
+def test_the_audit_file_names_user_and_action(running, folder):
     secrets = read_role_tokens(running)
     running.arm()
     body = json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50}}]})
@@ -288,7 +288,7 @@ def test_the_audit_file_says_who_did_what(running, folder):
     assert {line["address"] for line in lines} == {"127.0.0.1"}
 
 
-def test_no_token_is_ever_written(running, folder):
+def test_no_token_is_written(running, folder):
     running.call("GET", "/v1/state", status=401, headers=build_bearer_header("s3cret-that-is-wrong"))
     httpx.get(f"{running.url}/v1/state?token={TOKEN}")
     secrets = [*read_role_tokens(running).values(), "s3cret-that-is-wrong"]
@@ -297,7 +297,7 @@ def test_no_token_is_ever_written(running, folder):
         assert not [secret for secret in secrets if secret in text], path
 
 
-def test_a_caller_that_asks_too_often_waits_others_and_stop_do_not(make_daemon, board, tmp_path):
+def test_the_rate_limit_applies_per_client_and_not_to_stop(make_daemon, board, tmp_path):
     daemon = make_daemon(board, replace=build_daemon_replacement("requests_per_s = 1\nrequests_burst = 20"))
     secrets = read_role_tokens(daemon)
     with httpx.Client(base_url=daemon.url, headers=build_bearer_header(secrets["viewer"])) as viewer:
@@ -313,8 +313,8 @@ def test_a_caller_that_asks_too_often_waits_others_and_stop_do_not(make_daemon, 
     assert httpx.post(f"{daemon.url}/v1/stop").status_code == 401
 
 
-def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board, tmp_path):
-    """A disk that is full: begun while there is room, then there is none."""
+def test_without_an_audit_file_arming_fails_and_stop_works(make_board, tmp_path):
+    """The disk fills up after the start."""
     board = make_board()
     audit = tmp_path / "audit.jsonl"
     daemon = Daemon(tmp_path, board.port, replace=build_daemon_replacement(f'audit = "{audit}"'))
@@ -325,7 +325,7 @@ def test_without_an_audit_file_nothing_is_armed_and_stop_still_stops(make_board,
         full = partial(resource.prlimit, daemon.process.pid, resource.RLIMIT_FSIZE)
         before = full()
         full((audit.stat().st_size, before[1]))
-        # What runs goes on, and STOP ends it.
+        # The running plan continues until STOP.
         assert daemon.call("GET", f"/v1/plans/{plan}?pulses=false")["status"] == "running"
         stopped = daemon.call("POST", "/v1/stop")["board"]
         assert stopped["state"] == "DISARMED", (stopped, board.events()[-6:])

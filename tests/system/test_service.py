@@ -1,4 +1,4 @@
-"""The daemon as a service: what systemd makes of the unit, what it is told, what SIGHUP does, a locked room."""
+"""The daemon as a systemd service: the unit, notifications, SIGHUP and the sandbox."""
 
 import json
 import shutil
@@ -12,12 +12,12 @@ from pathlib import Path
 
 import pytest
 
-from locked_room import locked, why_not
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.kernels import code_folder
 from optodrive.daemon.notify import Notifier
 from optodrive.device.config import locate_shipped
 from rig import TOKEN, Daemon, long_train, wait_for
+from sandbox import build_sandboxed, find_obstacle
 
 TRANSPORTS = {
     "serial": 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n',
@@ -26,12 +26,12 @@ TRANSPORTS = {
 HEAD = 'format = "optodrive-tokens"\nversion = 1\n'
 ENTRY = '[[token]]\nname = "{}"\nrole = "armer"\nsecret = "{}"\n'
 EXPOSURE_MAX = "15"
-"""As --threshold= has it: 1.5."""
+"""Value of --threshold=, in tenths: 1.5."""
 
 
 @pytest.fixture(params=sorted(TRANSPORTS))
 def unit(request, tmp_path):
-    """The unit as it is installed for a board."""
+    """Return the unit as it is installed for a board."""
     config = tmp_path / "mine.toml"
     text = locate_shipped("display-437.toml").read_text()
     config.write_text(text.replace('transport = "simulated"', TRANSPORTS[request.param]))
@@ -46,31 +46,31 @@ def analyze(*arguments):
     return subprocess.run([program, *arguments], capture_output=True, text=True, timeout=60)
 
 
-def test_the_unit_is_in_order(unit):
+def test_the_unit_is_valid(unit):
     done = analyze("verify", "--man=no", unit)
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
-def test_the_unit_exposes_little(unit):
+def test_the_exposure_of_the_unit_is_low(unit):
     done = analyze("security", "--offline=true", f"--threshold={EXPOSURE_MAX}", "--no-pager", unit)
     assert done.returncode == 0, done.stdout
 
 
-def test_a_unit_that_is_open_is_caught(unit):
+def test_an_exposed_unit_is_detected(unit):
     unit.write_text(unit.read_text().replace("CapabilityBoundingSet=\n", "").replace("ProtectSystem=strict\n", ""))
     assert analyze("security", "--offline=true", f"--threshold={EXPOSURE_MAX}", "--no-pager", unit).returncode != 0
 
 
-def test_a_unit_that_is_wrong_is_caught(unit):
+def test_an_invalid_unit_is_detected(unit):
     unit.write_text(unit.read_text().replace("WatchdogSec=20", "WatchdogSecs=20"))
     assert "WatchdogSecs" in analyze("verify", "--man=no", unit).stderr
 
 
-# --- what systemd is told ---------------------------------------------------------------------------------------
+# --- notifications -----------------------------------------------------------------------------------------------
 
 
 class Manager:
-    """Hears what a service says, as systemd would."""
+    """Receiver of notifications in place of systemd."""
 
     def __init__(self, folder, monkeypatch, watchdog_us=200_000):
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -98,7 +98,7 @@ def manager(tmp_path, monkeypatch):
     manager.close()
 
 
-def test_ready_when_it_answers_then_fed_then_stopping(manager, board, make_daemon):
+def test_ready_then_watchdog_then_stopping(manager, board, make_daemon):
     daemon = make_daemon(board)
     wait_for(lambda: manager.listen().count("WATCHDOG=1") >= 5, "the watchdog to be fed")
     assert manager.heard.count("READY=1") == 1
@@ -107,8 +107,8 @@ def test_ready_when_it_answers_then_fed_then_stopping(manager, board, make_daemo
     assert daemon.process.returncode == 0
 
 
-def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
-    """The web server's thread lives on: only the engine's loop may feed."""
+def test_a_stalled_loop_does_not_feed_the_watchdog(manager, engine):
+    """Only the engine's loop feeds the watchdog, although the web server's thread still runs."""
     notifier = Notifier(MonotonicClock())
     engine.on_loop = notifier.feed_watchdog
     wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
@@ -126,7 +126,7 @@ def test_a_loop_that_stands_still_starves_the_watchdog(manager, engine):
     notifier.close()
 
 
-def test_a_service_that_starts_again_is_not_armed(manager, board, make_daemon):
+def test_a_restarted_service_is_not_armed(manager, board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
     daemon.process.kill()
@@ -140,7 +140,7 @@ def test_a_service_that_starts_again_is_not_armed(manager, board, make_daemon):
 
 
 def reload(daemon, manager, edit):
-    """Edit the configuration and ask for a reload; the line that came of it."""
+    """Edit the configuration, request a reload and return the log line."""
     daemon.config.write_text(edit(daemon.config.read_text()))
     lines, ready = daemon.errors.read_text(), manager.listen().count("READY=1")
     daemon.process.send_signal(signal.SIGHUP)
@@ -179,7 +179,7 @@ def test_sighup_while_armed_changes_nothing_and_keeps_the_board_armed(manager, b
     daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab"})
 
 
-def test_sighup_takes_tokens_away(manager, board, make_daemon, tmp_path):
+def test_sighup_revokes_tokens(manager, board, make_daemon, tmp_path):
     kept = tmp_path / "kept.toml"
     kept.write_text(HEAD + ENTRY.format("rig", TOKEN) + ENTRY.format("ben", "another-token-for-ben"))
     kept.chmod(0o600)
@@ -194,7 +194,7 @@ def test_sighup_takes_tokens_away(manager, board, make_daemon, tmp_path):
     assert "chmod 600" in reload(daemon, manager, lambda text: text)
 
 
-def test_sighup_from_a_terminal_that_closes_ends_dark(board, make_daemon):
+def test_sighup_of_a_closed_terminal_ends_the_daemon_with_the_gate_off(board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
     daemon.process.send_signal(signal.SIGHUP)
@@ -202,18 +202,18 @@ def test_sighup_from_a_terminal_that_closes_ends_dark(board, make_daemon):
     wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
 
 
-# --- a locked room ----------------------------------------------------------------------------------------------
+# --- sandbox ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
-def test_it_works_in_a_locked_room(board, tmp_path, monkeypatch):
-    """Under the unit's system calls, without capabilities or new privileges, on a file system that is read-only."""
+@pytest.mark.skipif(find_obstacle() is not None, reason=str(find_obstacle()))
+def test_the_daemon_works_in_the_sandbox(board, tmp_path, monkeypatch):
+    """The sandbox has the unit's system calls, no capabilities and a read-only file system."""
     state = tmp_path / "state"
     state.mkdir()
-    monkeypatch.setattr("rig.OPTODRIVE", locked(tmp_path, writable=state))
+    monkeypatch.setattr("rig.OPTODRIVE", build_sandboxed(tmp_path, writable=state))
     monkeypatch.setenv("XDG_CACHE_HOME", str(state))
     kernels = code_folder()
-    if kernels is not None:  # else they are compiled in there, which takes a minute
+    if kernels is not None:  # otherwise they would be compiled in the sandbox, which takes a minute
         shutil.copytree(kernels, state / "optodrive" / "kernels" / kernels.name)
     (state / "tokens.toml").write_text(HEAD + ENTRY.format("rig", TOKEN))
     (state / "tokens.toml").chmod(0o600)
@@ -233,13 +233,13 @@ def test_it_works_in_a_locked_room(board, tmp_path, monkeypatch):
         daemon.stop()
 
 
-@pytest.mark.skipif(why_not() is not None, reason=str(why_not()))
-def test_a_room_that_is_open_is_caught(tmp_path, monkeypatch):
-    """What the walls are for: outside they do not hold this back, inside they do."""
+@pytest.mark.skipif(find_obstacle() is not None, reason=str(find_obstacle()))
+def test_the_test_fails_without_the_sandbox(tmp_path, monkeypatch):
+    """The same accesses succeed outside the sandbox and fail inside."""
     state = tmp_path / "state"
     state.mkdir()
-    monkeypatch.setattr("locked_room.OPTODRIVE", sys.executable)
-    inside = locked(tmp_path, writable=state)
+    monkeypatch.setattr("sandbox.OPTODRIVE", sys.executable)
+    inside = build_sandboxed(tmp_path, writable=state)
     tries = {
         "a file of the system": f"open({str(tmp_path / 'elsewhere')!r}, 'w')",
         "a call that the unit does not allow": "import os; os.setpriority(os.PRIO_PROCESS, 0, 5)",
@@ -253,7 +253,7 @@ def test_a_room_that_is_open_is_caught(tmp_path, monkeypatch):
 
 
 def innermost_status(pid):
-    """/proc/PID/status of the daemon; bubblewrap waits outside it."""
+    """Return /proc/PID/status of the daemon, a descendant of bubblewrap."""
     while children := Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
         pid = int(children[0])
     lines = Path(f"/proc/{pid}/status").read_text().splitlines()

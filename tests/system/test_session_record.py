@@ -1,4 +1,4 @@
-"""`optodrive serve --record-session`: the file against what the daemon answered and the board's log."""
+"""`optodrive serve --record-session`: the file compared with the daemon's responses and the board's log."""
 
 import subprocess
 import sys
@@ -39,10 +39,10 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
         assert [plans[f"p{k}"].attrs["status"] for k in (1, 2, 3)] == ["done", "done", "failed"]
         np.testing.assert_allclose(plans["p1/target_um"][0, [17, 18]], [90, 60])
         for answer in answers:
-            kept, told = plans[answer["plan"]], answer["executed_pulses"]
-            np.testing.assert_allclose(1e6 * kept["simulated_m"][:], told["simulated_um"])
-            np.testing.assert_allclose(kept["executed"][:, 1], told["width_s"])
-            assert kept["executed"][:, 3].tolist() == told["pixel"]
+            kept, columns = plans[answer["plan"]], answer["executed_pulses"]
+            np.testing.assert_allclose(1e6 * kept["simulated_m"][:], columns["simulated_um"])
+            np.testing.assert_allclose(kept["executed"][:, 1], columns["width_s"])
+            assert kept["executed"][:, 3].tolist() == columns["pixel"]
             np.testing.assert_allclose(kept["planned"][:, 0], answer["pulses"]["start_s"])
         assert len(plans["p3/executed"]) == len(plans["p3/simulated_m"]) == stopped["executed"]
         run = plans["p1"].attrs["run"]
@@ -59,7 +59,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
 
 
 @pytest.mark.slow
-def test_a_full_disk_ends_the_recording_and_the_display_goes_on(board, make_daemon, tmp_path):
+def test_a_full_disk_ends_the_recording_and_not_the_display(board, make_daemon, tmp_path):
     folder = tmp_path / "sessions"
     folder.mkdir()
     record = f'[daemon]\nrecord = "{folder}"\n\n[board]'
@@ -82,7 +82,7 @@ def test_a_full_disk_ends_the_recording_and_the_display_goes_on(board, make_daem
         assert list(file["plans"]) == ["config"]
 
 
-def test_a_name_that_is_taken_is_refused_before_anything_starts(board, make_daemon, tmp_path):
+def test_an_existing_file_is_rejected_at_startup(board, make_daemon, tmp_path):
     (tmp_path / "taken.h5").write_text("dear")
     with pytest.raises(AssertionError, match="does not exist"):
         make_daemon(board, options=("--record-session", str(tmp_path / "taken.h5")))

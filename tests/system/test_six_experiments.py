@@ -1,4 +1,4 @@
-"""The paper's six experiments, played over REST, come back executed with its timings (Text S5, Fig. S17)."""
+"""The paper's six experiments over REST, executed with its timings (Text S5, Fig. S17)."""
 
 from functools import cache, partial
 
@@ -14,7 +14,7 @@ PWM_S = 2e-4
 
 @pytest.fixture(scope="module")
 def options():
-    """How board and daemon are started."""
+    """Options of board and daemon."""
     return {}
 
 
@@ -46,7 +46,7 @@ def play(board, daemon, name, **parameters):
 
 
 def assert_logged(board, columns, executed_in_all):
-    """The board's own log has all these pulses and no other, at their times, as wide, in their cells, then darkness."""
+    """Assert that the board's log has exactly these pulses, with their times, widths and cells, and ends gate off."""
     pulses = board.of("pulse")
     assert len(pulses) == executed_in_all
     pulses = pulses[-len(columns["pixel"]) :]
@@ -65,7 +65,7 @@ def assert_logged(board, columns, executed_in_all):
 
 @cache
 def cell_codes():
-    """Codes of every pixel's centre, [p, 2]."""
+    """Return the codes of every pixel's centre, [p, 2]."""
     config = load_config()
     layout, angle = build_pixel_layout(config.display), 1.0 / (2.0 * config.scanner.focal_length_m)
     scale = BoardRequirements.from_config(config).scale
@@ -73,7 +73,7 @@ def cell_codes():
 
 
 def by_visit(pulses):
-    """Indices of pulses grouped by runs on one pixel."""
+    """Return the pulse indices grouped by runs on one pixel."""
     return np.split(np.arange(len(pulses["pixel"])), np.flatnonzero(np.diff(pulses["pixel"])) + 1)
 
 

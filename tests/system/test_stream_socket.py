@@ -1,4 +1,4 @@
-"""The WebSocket of a real daemon: frames in, what became of them out, and who may."""
+"""WebSocket of the daemon: frames, their results and access control."""
 
 import json
 import struct
@@ -35,18 +35,18 @@ def binary(number, pixels, height_um=80.0):
     return struct.pack("<4sI", b"ODF1", number) + heights.tobytes()
 
 
-def until(stream, wanted):
-    """Answers up to the first that has all of `wanted`."""
+def until(stream, expected):
+    """Return the results up to the first that contains `expected`."""
     answers = []
     while True:
         text = stream.recv(timeout=20)
         FrameResult.model_validate_json(text)
         answers.append(json.loads(text))
-        if wanted.items() <= answers[-1].items():
+        if expected.items() <= answers[-1].items():
             return answers
 
 
-def test_a_frame_is_planned_then_done_and_says_how_long_it_took(daemon):
+def test_a_frame_is_planned_then_done_with_its_latency(daemon):
     with socket(daemon) as stream:
         stream.send('{"frame": 3, "target_um": {"17": 120, "18": 90}}')
         planned, done = until(stream, {"frame": 3, "status": "done"})
@@ -57,7 +57,7 @@ def test_a_frame_is_planned_then_done_and_says_how_long_it_took(daemon):
         assert 0 < latency["planned_s"] < latency["first_byte_s"] < latency["first_light_s"] < 1.0
 
 
-def test_frames_faster_than_light_are_superseded_and_say_so(daemon):
+def test_frames_faster_than_their_emission_are_superseded(daemon):
     with socket(daemon) as stream:
         for number in range(60):
             stream.send(binary(number, range(100)))
@@ -78,7 +78,7 @@ def test_frames_faster_than_light_are_superseded_and_say_so(daemon):
     assert daemon.state()["board"]["underruns"] == 0
 
 
-def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
+def test_a_wrong_frame_is_refused_and_the_stream_continues(daemon):
     with socket(daemon) as stream:
         stream.send('{"target_um": {"9999": 1}}')
         (refused,) = until(stream, {"status": "refused"})
@@ -90,10 +90,10 @@ def test_a_wrong_frame_is_refused_and_the_stream_goes_on(daemon):
         until(stream, {"frame": 2, "status": "done"})
 
 
-def test_a_caller_that_leaves_takes_the_light_with_it(daemon):
+def test_a_disconnect_ends_the_emission(daemon):
     before = daemon.state()["totals"]["executed"]
     with socket(daemon) as stream:
-        stream.send(binary(0, range(400), 100.0))  # three seconds of light
+        stream.send(binary(0, range(400), 100.0))  # three seconds of emission
         (planned,) = until(stream, {"frame": 0, "status": "planned"})
         wait_for(lambda: daemon.state()["totals"]["executed"] > before, "the first light")
     wait_for(lambda: daemon.board_state() == "ARMED", "the board to rest", patience_s=1.5)
@@ -101,7 +101,7 @@ def test_a_caller_that_leaves_takes_the_light_with_it(daemon):
     assert daemon.finished(planned["plan"])["status"] == "superseded"
 
 
-def test_sigterm_ends_it_dark_at_once_though_a_caller_stays(make_board, make_daemon):
+def test_sigterm_turns_the_gate_off_at_once_despite_a_connected_client(make_board, make_daemon):
     board = make_board()
     daemon = make_daemon(board)
     daemon.arm()
@@ -113,7 +113,7 @@ def test_sigterm_ends_it_dark_at_once_though_a_caller_stays(make_board, make_dae
         wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
         assert board.of("state")[-1]["reason"] == "abort"
         assert board.of("gate")[-1]["on"] is False
-        assert board.of("gate")[-1]["t_us"] < signalled_us + 100_000  # the server itself waits for callers for seconds
+        assert board.of("gate")[-1]["t_us"] < signalled_us + 100_000  # the server waits for clients for seconds
         assert daemon.process.wait(timeout=15) == 0
     assert "Traceback" not in daemon.errors.read_text()
 
@@ -134,13 +134,13 @@ def test_without_arming_a_frame_is_refused(make_board, make_daemon):
         ({"host": "elsewhere.example"}, 421),
     ],
 )
-def test_a_stream_is_guarded_as_every_route(daemon, headers, status):
+def test_a_stream_has_the_access_control_of_a_route(daemon, headers, status):
     with pytest.raises(InvalidStatus) as refused:
         socket(daemon, **headers)
     assert refused.value.response.status_code == status
 
 
-def test_rest_has_the_newest_win_too(daemon):
+def test_the_newest_plan_wins_over_rest(daemon):
     frames = {"frames": [{"show_at_s": 0, "duration_s": 9, "target_um": [100.0] * PIXELS}]}
     first = daemon.call("POST", "/v1/plans", json=frames)
     frames["frames"][0]["target_um"] = {"5": 100}

@@ -1,4 +1,4 @@
-"""Frames that keep coming: the newest wins, what has left stays, and every frame says what became of it."""
+"""Streamed frames: the newest replaces all unsent pulses, and every frame reports its result."""
 
 import time
 from itertools import pairwise
@@ -23,7 +23,7 @@ def stream(armed, sequence):
 
 
 def test_the_newest_frame_wins_without_a_pause(armed, board):
-    """Sixty pixels a frame take 0.4 s of light; a new frame comes when a third of the last one has left."""
+    """A frame of sixty pixels takes 0.4 s. A new one follows when a third of the previous one was sent."""
     answers = []
     for k in range(5):
         answers.append(stream(armed, frame(range(60 * k, 60 * k + 60))))
@@ -38,14 +38,14 @@ def test_the_newest_frame_wins_without_a_pause(armed, board):
     pulses = board.of("pulse")
     assert len(pulses) == sum(record.executed for record in records)
     assert [pulse["index"] for pulse in pulses] == sorted({pulse["index"] for pulse in pulses})
-    # One job from START to END: between frames the beam is dark for no longer than a move takes.
+    # One job from START to END: the gate is off between frames for no longer than a move.
     gaps_us = [after["on_us"] - before["off_us"] for before, after in pairwise(pulses)]
     assert max(gaps_us) < 3_000
     assert armed.snapshot().board.underruns == 0
 
 
-def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where_light_came_late(armed, monkeypatch):
-    """What runs ends by itself when two plans came too late to follow it; the third is in time however slow."""
+def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
+    """After two late splices the running stream is truncated, so the third plan has no deadline."""
     stream(armed, frame(range(30)))
     first = stream(armed, frame(range(300)))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 4, "a part of the frame")
@@ -59,7 +59,7 @@ def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where
     monkeypatch.setattr(planner, "plan_sequence", slowly)
     second = stream(armed, frame(range(40, 60)))
     records = [ended(armed, answer) for answer in (first, second)]
-    assert len(tries) in (3, 4)  # once more where what ran came late, so that its heat was otherwise
+    assert len(tries) in (3, 4)  # once more if the running plan was late, which changed the heat
     assert [record.status for record in records] == ["superseded", "done"]
     for record in records:
         assert record.executed + record.dropped == record.planned
@@ -67,8 +67,8 @@ def test_a_planner_slower_than_ever_plans_a_frame_three_times_or_once_more_where
     assert armed.snapshot().board.underruns == 0
 
 
-def test_heights_come_out_as_asked_across_frames(armed):
-    """The same pixels again and again: each frame is planned from the heat that the frames before really left."""
+def test_frames_reach_their_targets_in_sequence(armed):
+    """With the same pixels in every frame, each plan accounts for the heat of the executed ones."""
     answers = []
     for height_um in (100.0, 250.0, 120.0, 300.0):
         answers.append(stream(armed, frame(range(20), height_um)))
@@ -79,7 +79,7 @@ def test_heights_come_out_as_asked_across_frames(armed):
         assert simulated_um == pytest.approx(height_um, rel=0.01)
 
 
-def test_an_empty_frame_ends_what_was_shown(armed, board):
+def test_an_empty_frame_ends_the_previous_one(armed, board):
     first = stream(armed, frame(range(100)))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     nothing = stream(armed, frame(()))
@@ -90,7 +90,7 @@ def test_an_empty_frame_ends_what_was_shown(armed, board):
     assert ended(armed, stream(armed, frame((3,)))).executed == 1
 
 
-def test_a_frame_takes_the_place_of_plans_that_run_or_wait(armed, board):
+def test_a_frame_supersedes_running_and_waiting_plans(armed, board):
     train = FrameSequence((), (PulseTrain(200, 0.0, 5.0, 0.01, 0.01, 1.0),))
     running = armed.submit(lambda: train, "train").result(10)
     waiting = armed.submit(lambda: frame(range(50)), "waiting").result(10)
@@ -111,7 +111,7 @@ def test_a_plan_after_a_stream_waits_for_its_end(armed):
         assert record.executed_pulses.simulated_um == pytest.approx([100.0] * 30, rel=0.01)
 
 
-def test_a_stop_ends_a_stream_dark_and_the_heat_is_remembered(armed, board):
+def test_a_stop_ends_a_stream_and_the_heat_is_kept(armed, board):
     first = stream(armed, frame(range(60), 300.0))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     second = stream(armed, frame(range(60, 120), 300.0))
@@ -124,8 +124,8 @@ def test_a_stop_ends_a_stream_dark_and_the_heat_is_remembered(armed, board):
     assert ended(armed, stream(armed, frame(range(60), 300.0))).status == "done"
 
 
-def test_every_pixel_has_its_turn_when_frames_outrun_the_light(armed):
-    """Each of these frames has time for a few of its hundred pixels; together they show them all, once."""
+def test_a_refresh_cycle_reaches_every_pixel(armed):
+    """Each frame has time for a few of its hundred pixels. Together the frames draw all of them once."""
     whole = frame(range(100), 60.0)
     shown = []
     for _ in range(40):
@@ -136,4 +136,4 @@ def test_every_pixel_has_its_turn_when_frames_outrun_the_light(armed):
             break
     ended(armed, stream(armed, frame(())))
     pixels = [pixel for plan in shown for pixel in ended(armed, plan).executed_pulses.pixel]
-    assert len(set(pixels[:100])) >= 98  # a pixel or two are lit on the way again where a sweep begins anew
+    assert len(set(pixels[:100])) >= 98  # one or two pixels repeat at the start of a new cycle

@@ -1,4 +1,4 @@
-"""The telemetry of a real daemon: what comes, how often, and that nothing waits for who reads it."""
+"""Telemetry of the daemon: contents and rate of the events, and slow readers."""
 
 import base64
 import json
@@ -14,7 +14,7 @@ import httpx
 import numpy as np
 import pytest
 
-from benches import board_at_rest, daemon_at_rest  # noqa: F401 - fixtures
+from board_fixtures import board_disarmed, daemon_disarmed  # noqa: F401 - fixtures
 from optodrive.daemon.responses.telemetry import EVENTS
 from optodrive.device.config import load_config
 from optodrive.planning.display_model import DisplayModel
@@ -22,7 +22,7 @@ from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 
 
 class Reader:
-    """Follows the telemetry in a thread: events as (time, kind, data)."""
+    """Reader of the telemetry in a thread, with events as (time, kind, data)."""
 
     def __init__(self, daemon, query=""):
         self.events = []
@@ -77,9 +77,9 @@ def reader(daemon):
 
 
 def executed(follower, plan):
-    """What was told of a plan's pulses; of those before it something may be told once more."""
-    told = [batch for _, event in follower.of("pulses") for batch in event["executed"]]
-    return [batch for batch in told if batch["plan"] == plan]
+    """Return the executed batches of a plan. Batches of earlier plans may be repeated."""
+    batches = [batch for _, event in follower.of("pulses") for batch in event["executed"]]
+    return [batch for batch in batches if batch["plan"] == plan]
 
 
 def heights_um(event):
@@ -90,7 +90,7 @@ def celsius(event):
     return np.frombuffer(base64.b64decode(event["absorber"]), dtype="<u2") / 10
 
 
-def test_everything_is_told_at_once_and_state_goes_on(daemon, reader):
+def test_a_new_reader_gets_all_events_at_once(daemon, reader):
     follower = reader()
     wait_for(lambda: {"state", "display", "budget", "fault"} <= {kind for _, kind, _ in follower.events}, "one of each")
     assert follower.last("state")["board"]["state"] == "DISARMED"
@@ -103,7 +103,7 @@ def test_everything_is_told_at_once_and_state_goes_on(daemon, reader):
     assert (times[-1] - times[0]) / (len(times) - 1) < 0.8
 
 
-def test_what_is_shown_is_what_was_executed(daemon, reader):
+def test_the_display_event_agrees_with_the_executed_pulses(daemon, reader):
     follower = reader("?rate_hz=60")
     daemon.arm()
     answer = daemon.call(
@@ -123,24 +123,24 @@ def test_what_is_shown_is_what_was_executed(daemon, reader):
     (batch,) = batches
     heat = DisplayModel.from_config(load_config()).build_cold_heat()
     heat.apply_pulses(*(np.array(batch[key]) for key in ("pixel", "start_s", "width_s", "power_w")))
-    told = [event for _, event in follower.of("display") if heights_um(event).any()]
-    assert len(told) > 3
-    for event in told:
+    events = [event for _, event in follower.of("display") if heights_um(event).any()]
+    assert len(events) > 3
+    for event in events:
         expected = heat.state_at(event["board_s"])
         assert heights_um(event) == pytest.approx(expected.displacement_m * 1e6, abs=0.2)
         assert celsius(event) == pytest.approx(20.0 + expected.absorber_k, abs=0.2)
-    assert max(heights_um(event)[17] for event in told) < done["simulated_max_um"] + 0.2
-    told = [batch for _, event in follower.of("pulses") for batch in event["planned"]]
-    planned = [batch for batch in told if batch["plan"] == answer["plan"]]
+    assert max(heights_um(event)[17] for event in events) < done["simulated_max_um"] + 0.2
+    announced = [batch for _, event in follower.of("pulses") for batch in event["planned"]]
+    planned = [batch for batch in announced if batch["plan"] == answer["plan"]]
     assert planned[0]["start_s"] == pytest.approx(batches[0]["start_s"], abs=2e-3)
     assert planned[0]["width_s"] == pytest.approx(batches[0]["width_s"], abs=1e-6)
 
 
-def test_every_executed_pulse_is_told_once_though_nobody_looked_at_first(daemon, reader):
+def test_every_executed_pulse_is_reported_once_even_without_a_reader_at_first(daemon, reader):
     daemon.arm()
     before = daemon.state()["totals"]["executed"]
     answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=2.0))
-    wait_for(lambda: daemon.state()["totals"]["executed"] > before + 20, "light before anyone looks")
+    wait_for(lambda: daemon.state()["totals"]["executed"] > before + 20, "emission before the first reader")
     follower = reader()
     daemon.finished(answer["plan"])
 
@@ -151,13 +151,13 @@ def test_every_executed_pulse_is_told_once_though_nobody_looked_at_first(daemon,
     assert sorted(rows()) == list(range(answer["planned"]))
 
 
-def test_a_stop_is_told_and_what_was_not_executed_never_counts(daemon, reader):
+def test_a_stop_is_reported_and_unexecuted_pulses_do_not_count(daemon, reader):
     follower = reader()
     daemon.arm()
     answer = daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
     wait_for(lambda: executed(follower, answer["plan"]), "pulses")
     daemon.call("POST", "/v1/stop")
-    wait_for(lambda: follower.last("state")["board"]["state"] == "DISARMED", "it is told")
+    wait_for(lambda: follower.last("state")["board"]["state"] == "DISARMED", "the state event")
     plan = daemon.finished(answer["plan"])
 
     def rows():
@@ -167,7 +167,7 @@ def test_a_stop_is_told_and_what_was_not_executed_never_counts(daemon, reader):
     wait_for(lambda: not follower.last("display")["warm"], "cold")
 
 
-def test_trimmed_pulses_come_with_their_reason_and_the_budget_rises(daemon, reader):
+def test_trimmed_pulses_have_their_reason_and_the_budget_rises(daemon, reader):
     follower = reader()
     daemon.arm()
     train = long_train(seconds=3.0)
@@ -175,9 +175,9 @@ def test_trimmed_pulses_come_with_their_reason_and_the_budget_rises(daemon, read
     answer = daemon.call("POST", "/v1/plans", json=train)
     assert answer["summary"]["trimmed"]["pulses"]
     daemon.finished(answer["plan"])
-    told = executed(follower, answer["plan"])
+    batches = executed(follower, answer["plan"])
     reasons = {
-        reason for batch in told for reason, taken in zip(batch["reason"], batch["trimmed_j"], strict=True) if taken
+        reason for batch in batches for reason, taken in zip(batch["reason"], batch["trimmed_j"], strict=True) if taken
     }
     assert reasons == set(answer["summary"]["trimmed"]["by_reason"])
     shares = {cap["cap"]: [] for cap in follower.last("budget")["caps"]}
@@ -188,7 +188,7 @@ def test_trimmed_pulses_come_with_their_reason_and_the_budget_rises(daemon, read
     assert max(max(values) for values in shares.values()) > 0.7
 
 
-def test_a_reader_that_does_not_read_holds_nothing_up(daemon, reader):
+def test_a_stalled_reader_does_not_block(daemon, reader):
     stuck = socket.create_connection(("127.0.0.1", daemon.client.base_url.port))
     stuck.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     request = f"GET /v1/telemetry?rate_hz=60 HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
@@ -203,7 +203,7 @@ def test_a_reader_that_does_not_read_holds_nothing_up(daemon, reader):
     assert daemon.call("POST", "/v1/stop")["board"]["state"] == "DISARMED"
 
 
-def test_a_pushed_state_is_not_waited_for_by_sigterm(make_board, make_daemon):
+def test_sigterm_does_not_wait_for_telemetry_readers(make_board, make_daemon):
     daemon = make_daemon(make_board())
     follower = Reader(daemon)
     wait_for(lambda: follower.events, "events")
@@ -213,12 +213,12 @@ def test_a_pushed_state_is_not_waited_for_by_sigterm(make_board, make_daemon):
     assert "Traceback" not in daemon.errors.read_text()
 
 
-def test_rates_out_of_bounds_are_refused(daemon):
+def test_rates_out_of_range_are_rejected(daemon):
     for rate in ("0", "61", "fast", "nan"):
         daemon.call("GET", f"/v1/telemetry?rate_hz={rate}", status=422)
 
 
-def test_the_page_is_served_whole_and_nothing_else(daemon):
+def test_the_files_of_the_page_and_no_others_are_served(daemon):
     index = daemon.client.get("/")
     assert index.headers["content-type"].startswith("text/html")
     assert "default-src 'self'" in index.headers["content-security-policy"]

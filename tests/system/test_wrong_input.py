@@ -1,4 +1,4 @@
-"""Wrong input, over REST and on the command line: one line, the right status, nothing changed."""
+"""Wrong input over REST and on the command line: one line, the right status and no effect."""
 
 import contextlib
 import io
@@ -91,18 +91,18 @@ def test_the_same_on_the_command_line_is_one_line_and_exit_2(case, tmp_path):
 
 
 def assert_one_line(arguments, naming, environment=None):
-    """In this process, for a start would take longer than all else; a daemon, and who calls one, has its own."""
+    """Run a command in this process, to save its start. The daemon and its clients run in their own processes."""
     if arguments[0] == "serve" or "--url" in arguments:
         command = [OPTODRIVE, *arguments]
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment})
-        status, told, errors = done.returncode, done.stdout, done.stderr
+        status, output, errors = done.returncode, done.stdout, done.stderr
     else:
         out, err = io.StringIO(), io.StringIO()
         with patch.dict(os.environ, environment or {}), redirect_stdout(out), redirect_stderr(err):
             status = run([str(argument) for argument in arguments])
-        told, errors = out.getvalue(), err.getvalue()
+        output, errors = out.getvalue(), err.getvalue()
     assert status == 2, errors
-    assert told == ""
+    assert output == ""
     assert errors.count("\n") == 1, errors
     assert naming in errors
 

@@ -1,7 +1,7 @@
-"""As much of the unit's walls as bubblewrap can build where systemd does not run as the first process.
+"""Sandbox with the restrictions of the systemd unit, built by bubblewrap, for machines not booted with systemd.
 
-Nothing of systemd is started: `systemd-analyze syscall-filter` prints what its sets of system calls hold, libseccomp
-makes the filter of them.
+`systemd-analyze syscall-filter` lists the system calls of each set, and libseccomp builds the filter from them. No part
+of systemd is started.
 """
 
 import ctypes
@@ -22,26 +22,26 @@ SCMP_ACT_EPERM = 0x00050001
 
 
 @cache
-def why_not():
-    """Why there is no locked room here; None where there is."""
+def find_obstacle():
+    """Return why the sandbox is not available, None if it is."""
     for program in ("bwrap", "systemd-analyze"):
         if shutil.which(program) is None:
             return f"{program} is missing: apt-get install {'bubblewrap' if program == 'bwrap' else 'systemd'}"
     if ctypes.util.find_library("seccomp") is None:
         return "libseccomp is missing: apt-get install libseccomp2"
     tried = subprocess.run(["bwrap", "--ro-bind", "/", "/", "--unshare-user", "true"], capture_output=True, text=True)
-    return f"bubblewrap may not make a room here: {tried.stderr.strip()}" if tried.returncode else None
+    return f"bubblewrap cannot create a sandbox: {tried.stderr.strip()}" if tried.returncode else None
 
 
-def locked(folder, writable):
-    """A program in `folder` that runs optodrive in the room, where only `writable` may be written."""
+def build_sandboxed(folder, writable):
+    """Create a program in `folder` that runs optodrive in the sandbox, where only `writable` is writable."""
     filtered = folder / "calls.bpf"
     write_filter(filtered)
-    program = folder / "locked-optodrive"
-    # Where the checkout lies in /tmp it must be seen all the same.
-    seen = " ".join(f"--ro-bind {place} {place}" for place in (sys.prefix, Path(optodrive.__file__).parents[1]))
+    program = folder / "sandboxed-optodrive"
+    # The checkout must be visible even if it is in /tmp.
+    visible = " ".join(f"--ro-bind {place} {place}" for place in (sys.prefix, Path(optodrive.__file__).parents[1]))
     program.write_text(
-        f"#!/bin/sh\nexec 9<{filtered}\nexec bwrap --die-with-parent --ro-bind / / --tmpfs /tmp --tmpfs /run {seen} "
+        f"#!/bin/sh\nexec 9<{filtered}\nexec bwrap --die-with-parent --ro-bind / / --tmpfs /tmp --tmpfs /run {visible} "
         f"--bind {folder} {folder} --remount-ro {folder} --bind {writable} {writable} "
         "--dev-bind /dev /dev --proc /proc --unshare-ipc --unshare-uts --unshare-cgroup-try "
         f'--cap-drop ALL --seccomp 9 -- {OPTODRIVE} "$@"\n'
@@ -51,12 +51,12 @@ def locked(folder, writable):
 
 
 def write_filter(path):
-    """The unit's SystemCallFilter= as a program for the kernel: what it does not name is answered with EPERM."""
+    """Write the unit's SystemCallFilter= as a kernel filter that answers all other calls with EPERM."""
     library = ctypes.CDLL(ctypes.util.find_library("seccomp"))
     library.seccomp_init.restype = ctypes.c_void_p
     context = ctypes.c_void_p(library.seccomp_init(ctypes.c_uint32(SCMP_ACT_EPERM)))
     assert context
-    for name in sorted(allowed_calls()):
+    for name in sorted(list_allowed_calls()):
         number = library.seccomp_syscall_resolve_name(name.encode())
         if number >= 0:
             result = library.seccomp_rule_add_array(context, ctypes.c_uint32(SCMP_ACT_ALLOW), number, 0, None)
@@ -66,23 +66,23 @@ def write_filter(path):
     library.seccomp_release(context)
 
 
-def allowed_calls():
-    """The system calls that the unit allows, its sets taken apart."""
+def list_allowed_calls():
+    """Return the system calls that the unit permits, with its sets expanded."""
     allowed = set()
     unit = locate_shipped("systemd", "optodrive.service").read_text()
     for line in re.findall(r"^SystemCallFilter=(.+)$", unit, re.MULTILINE):
-        calls = {call for word in line.lstrip("~").split() for call in taken_apart(word)}
+        calls = {call for word in line.lstrip("~").split() for call in expand_set(word)}
         allowed = allowed - calls if line.startswith("~") else allowed | calls
-    # systemd lets a service be started at all: what is done before the program runs is done under the filter here.
+    # Here the filter also applies to the start of the program, which systemd does before it applies the filter.
     return allowed | {"execve", "prctl", "seccomp"}
 
 
 @cache
-def taken_apart(word):
-    """A call, or all calls of a set."""
+def expand_set(word):
+    """Return a call, or all calls of a set."""
     if not word.startswith("@"):
         return frozenset({word})
     listed = subprocess.run(["systemd-analyze", "syscall-filter", word], capture_output=True, text=True, check=True)
     lines = [line.strip() for line in listed.stdout.splitlines()[1:]]
     words = [line for line in lines if line and not line.startswith("#")]
-    return frozenset(call for inner in words for call in taken_apart(inner))
+    return frozenset(call for inner in words for call in expand_set(inner))

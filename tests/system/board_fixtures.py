@@ -1,4 +1,4 @@
-"""Fixtures: a board's process, a daemon on it, commands, all ended whatever happens."""
+"""Fixtures for board processes, daemons and commands, all of which end with the test."""
 
 import pytest
 
@@ -33,7 +33,7 @@ def make_daemon(tmp_path):
 
 @pytest.fixture
 def start(tmp_path):
-    """Start an `optodrive` command on a board."""
+    """Return a function that starts an `optodrive` command on a board."""
     commands = []
 
     def start_command(board, *arguments):
@@ -62,8 +62,8 @@ def kept(tmp_path_factory):
 
 
 @pytest.fixture
-def at_rest(kept):
-    """One board and one daemon for all tests of a module, before each of them disarmed; the log begins anew."""
+def disarmed(kept):
+    """One board and one daemon for all tests of a module, disarmed and with a cleared log before each test."""
     board, daemon = kept
     daemon.call("POST", "/v1/stop")
     board.forget()
@@ -71,12 +71,12 @@ def at_rest(kept):
 
 
 @pytest.fixture(name="board")
-def board_at_rest(at_rest):
-    """In place of a new one, where a module imports it."""
-    return at_rest[0]
+def board_disarmed(disarmed):
+    """Shared fixture that replaces the per-test one in modules that import it."""
+    return disarmed[0]
 
 
 @pytest.fixture(name="daemon")
-def daemon_at_rest(at_rest):
-    """In place of a new one, where a module imports it."""
-    return at_rest[1]
+def daemon_disarmed(disarmed):
+    """Shared fixture that replaces the per-test one in modules that import it."""
+    return disarmed[1]

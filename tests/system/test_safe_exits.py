@@ -1,4 +1,4 @@
-"""Every way out ends dark, and the board's own log is the witness."""
+"""Every kind of exit turns the gate off, according to the board's log."""
 
 import os
 import signal
@@ -10,7 +10,7 @@ from rig import PATIENT_LEASE_S, long_train, wait_for
 
 LEASE_US = round(PATIENT_LEASE_S * 1e6)
 LATENESS_US = 30_000
-"""The board's process and this test may each be scheduled late by so much; the gate's times in the log are exact."""
+"""Maximum scheduling delay of the board process and of this test. The gate times in the log are exact."""
 
 
 def start_pulses(board, daemon, seconds=5.0):
@@ -21,11 +21,11 @@ def start_pulses(board, daemon, seconds=5.0):
 
 
 def ends(board):
-    """The last gate edge and the last state in the log."""
+    """Return the last gate edge and the last state in the log."""
     return board.of("gate")[-1], board.of("state")[-1]
 
 
-def assert_dark_and_unarmed(board, states):
+def assert_off_and_unarmed(board, states):
     gate, state = ends(board)
     assert gate["on"] is False
     assert state["state"] in states
@@ -38,7 +38,7 @@ def test_kill_9_while_pulses_run(board, make_daemon):
     killed_us = board.events()[-1]["t_us"]
     daemon.process.wait()
     wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the board to leave RUNNING")
-    assert_dark_and_unarmed(board, ("DISARMED", "FAULT"))
+    assert_off_and_unarmed(board, ("DISARMED", "FAULT"))
     assert board.of("gate")[-1]["t_us"] <= killed_us + LEASE_US + LATENESS_US
 
     again = make_daemon(board)
@@ -56,7 +56,7 @@ def test_sigstop_while_pulses_run(board, make_daemon, lease_s):
     stopped_us = board.events()[-1]["t_us"]
     wait_for(lambda: board.of("fault"), "the board's fault")
     assert board.of("fault") == [{"t_us": board.of("fault")[0]["t_us"], "event": "fault", "fault": "LINK"}]
-    assert_dark_and_unarmed(board, ("FAULT",))
+    assert_off_and_unarmed(board, ("FAULT",))
     assert board.of("gate")[-1]["t_us"] <= stopped_us + lease_us + LATENESS_US
     time.sleep(0.3)
     assert board.of("pulse")[-1]["t_us"] <= stopped_us + lease_us + LATENESS_US
@@ -77,7 +77,7 @@ def test_sigterm_while_pulses_run(board, daemon):
     daemon.stop()
     assert daemon.process.returncode == 0
     wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
-    assert_dark_and_unarmed(board, ("DISARMED",))
+    assert_off_and_unarmed(board, ("DISARMED",))
     assert board.of("state")[-1]["reason"] == "abort"
     assert "Traceback" not in daemon.errors.read_text()
 
@@ -86,18 +86,18 @@ def test_stop_while_pulses_run(board, daemon):
     plan = start_pulses(board, daemon)
     answer = daemon.call("POST", "/v1/stop")
     assert answer["board"]["state"] == "DISARMED"
-    assert_dark_and_unarmed(board, ("DISARMED",))
+    assert_off_and_unarmed(board, ("DISARMED",))
     stopped = daemon.finished(plan)
     assert stopped["status"] == "failed"
     assert stopped["error"] == "ended by stop"
     assert 0 < stopped["executed"] < stopped["planned"]
 
 
-def test_cancel_ends_dark_and_stays_armed(board, daemon):
+def test_cancel_turns_the_gate_off_and_keeps_the_board_armed(board, daemon):
     plan = start_pulses(board, daemon)
     assert daemon.call("DELETE", f"/v1/plans/{plan}")["status"] == "cancelled"
     wait_for(lambda: board.of("state")[-1]["state"] == "ARMED", "ARMED")
-    assert_dark_and_unarmed(board, ("ARMED",))
+    assert_off_and_unarmed(board, ("ARMED",))
     following = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.1))["plan"]
     assert daemon.finished(following)["status"] == "done"
 
@@ -105,7 +105,7 @@ def test_cancel_ends_dark_and_stays_armed(board, daemon):
 @pytest.mark.parametrize(
     "name", ["interlock", pytest.param("key", marks=pytest.mark.slow), pytest.param("estop", marks=pytest.mark.slow)]
 )
-def test_inputs_end_it_and_are_named(make_board, make_daemon, name):
+def test_safety_inputs_end_a_plan_and_are_named(make_board, make_daemon, name):
     value = "true" if name == "estop" else "false"
     board = make_board(script=f'[[step]]\nfrom = "light"\nat_s = 1.0\nset = "{name}"\nvalue = {value}\n')
     daemon = make_daemon(board)
@@ -119,7 +119,7 @@ def test_inputs_end_it_and_are_named(make_board, make_daemon, name):
     daemon.call("POST", "/v1/disarm", status=409)
 
 
-def test_unplugged_in_mid_plan(make_board, make_daemon):
+def test_unplugging_during_a_plan(make_board, make_daemon):
     board = make_board(script='[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "close"\n')
     daemon = make_daemon(board)
     plan = start_pulses(board, daemon, 30.0)
@@ -127,7 +127,7 @@ def test_unplugged_in_mid_plan(make_board, make_daemon):
     assert answer["status"] == "failed"
     assert "lost" in answer["error"]
     assert 0 < answer["executed"] < answer["planned"]
-    assert_dark_and_unarmed(board, ("DISARMED",))
+    assert_off_and_unarmed(board, ("DISARMED",))
     state = wait_for(lambda: (s := daemon.state())["link"]["state"] == "up" and s, "the link to come back")
     assert state["board"]["state"] == "DISARMED"
     assert state["totals"]["executed"] == answer["executed"]
@@ -148,7 +148,7 @@ def test_a_full_disk_under_the_boards_log(make_board, make_daemon):
     assert "Traceback" not in daemon.errors.read_text()
 
 
-def test_a_board_that_falls_silent(make_board, make_daemon):
+def test_a_silent_board(make_board, make_daemon):
     steps = '[[step]]\nfrom = "light"\nat_s = 1.0\ndo = "hang"\n[[step]]\nfrom = "light"\nat_s = 5.0\ndo = "repair"\n'
     board = make_board(script=steps)
     daemon = make_daemon(board)
@@ -156,5 +156,5 @@ def test_a_board_that_falls_silent(make_board, make_daemon):
     answer = daemon.finished(plan)
     assert answer["status"] == "failed"
     assert "sent nothing" in answer["error"]
-    assert_dark_and_unarmed(board, ("FAULT", "DISARMED"))
+    assert_off_and_unarmed(board, ("FAULT", "DISARMED"))
     wait_for(lambda: daemon.state()["link"]["state"] == "up", "the link to come back")

@@ -1,8 +1,8 @@
-"""A host that arms a board and keeps it lit until it is ended: python lit_host.py PORT; it tells lines of JSON.
+"""Host that arms a board and keeps it emitting until it ends: python emitting_host.py PORT.
 
-`clock_s`: the board's time less this machine's monotonic time, and `within_s`, how far off that may be; `lit`: a point
-that was executed, its tick. On a line on stdin it closes the port without a word to the board, tells `closed_s`, the
-time just before, and lives on in silence until stdin ends.
+It prints lines of JSON: `clock_s`, board time minus this machine's monotonic time, with its uncertainty `within_s`;
+`emitted`, index and tick of an executed point. After a line on stdin it closes the port without a message to the board,
+prints `closed_s`, the time just before, and waits until stdin ends.
 """
 
 import json
@@ -25,16 +25,16 @@ PLACES = np.array([(30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000
 POINTS, DARK_US, ON_US, DUTY = 4000, 600, 8000, 2000
 AHEAD_S = 0.5
 BAUD = 115_200
-"""What an emulated UART takes in surely; of a faster line a burst would hold up the LEASE behind it."""
+"""Rate that an emulated UART receives reliably. On a faster line a burst would delay the LEASE behind it."""
 PATIENCE_S = 4.0
 
 
-def tell(**what):
-    print(json.dumps(what), flush=True)
+def print_json(**fields):
+    print(json.dumps(fields), flush=True)
 
 
-class NotedPort(SerialPort):
-    """Keeps the first report of executed points."""
+class RecordingPort(SerialPort):
+    """Serial port that keeps the first report of executed points."""
 
     def __init__(self, port):
         super().__init__(port, BAUD)
@@ -50,7 +50,7 @@ class NotedPort(SerialPort):
 
 
 def until(session, condition, patience_s=PATIENCE_S):
-    """Step until condition(); SystemExit where that takes too long, as when its lease ran out."""
+    """Step the session until condition(). Raise SystemExit on a timeout, for example after the lease expired."""
     give_up_s = time.monotonic() + patience_s
     while not condition():
         if time.monotonic() > give_up_s:
@@ -68,7 +68,7 @@ def main(name):
     request_realtime_scheduling()  # as the daemon's loop does
     table = load_config("display-16").model_dump()
     table["board"]["baud"] = BAUD
-    port = NotedPort(name)
+    port = RecordingPort(name)
     session = BoardSession(port, MonotonicClock(), BoardRequirements.from_config(Config.model_validate(table)))
     session.connect()
     if session.board.state == "FAULT":
@@ -76,12 +76,14 @@ def main(name):
         until(session, lambda: session.board.state == "DISARMED")
     session.arm()
     until(session, lambda: session.is_ready)
-    tell(clock_s=session.board_s() - time.monotonic(), within_s=session.collect_link_stats()["round_trip_ms"] * 0.5e-3)
+    print_json(
+        clock_s=session.board_s() - time.monotonic(), within_s=session.collect_link_stats()["round_trip_ms"] * 0.5e-3
+    )
     session.begin(train(), session.board_s() + 0.05, AHEAD_S)
     until(session, lambda: port.report is not None)
-    tell(lit={"index": port.report.first_index, "tick": port.report.records[0][0]})
+    print_json(emitted={"index": port.report.first_index, "tick": port.report.records[0][0]})
     until(session, lambda: select.select([sys.stdin], [], [], 0)[0])
-    tell(closed_s=time.monotonic())
+    print_json(closed_s=time.monotonic())
     session.disconnect()
     sys.stdin.read()
 
