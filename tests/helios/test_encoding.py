@@ -100,7 +100,7 @@ def test_plans_trimmed_by_the_limiter_pass_verification(data):
 AT_THE_CAP = tuple(
     PulseTrain(pixel, at_s, 0.6, 2e-4, gap_s, 2.45) for pixel, at_s, gap_s in ((12, 0.013, 1e-3), (11, 0.009, 2e-4))
 )
-"""Trains with so many moves that the galvo cap removes pulses."""
+"""Trains whose number of moves makes the galvo cap remove pulses."""
 
 
 def test_a_plan_at_the_galvo_cap_passes_verification():

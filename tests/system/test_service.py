@@ -113,7 +113,7 @@ def test_a_stalled_loop_does_not_feed_the_watchdog(manager, engine):
     engine.on_loop = notifier.feed_watchdog
     wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
     go_on = threading.Event()
-    standing = engine._commands.submit(lambda: go_on.wait(30))
+    blocked = engine._commands.submit(lambda: go_on.wait(30))
     try:
         time.sleep(0.1)
         before = len(manager.listen())
@@ -121,7 +121,7 @@ def test_a_stalled_loop_does_not_feed_the_watchdog(manager, engine):
         assert len(manager.listen()) == before
     finally:
         go_on.set()
-        standing.result(10)
+        blocked.result(10)
     wait_for(lambda: len(manager.listen()) > before, "the watchdog to be fed again")
     notifier.close()
 

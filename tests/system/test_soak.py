@@ -27,8 +27,8 @@ def test_a_missing_pulse_is_detected(tmp_path, missing):
     log = tmp_path / "log"
     pulse = '{{"t_us": 0, "event": "pulse", "index": {0}, "x": 0, "y": 0, "duty": 1, "on_us": 0, "off_us": {1}}}\n'
     lines = [pulse.format(k, bench_soak.WIDTH_US + k % bench_soak.WIDTHS) for k in range(9)]
-    for kept, astray in ((lines, 0), (lines[:missing] + lines[missing + 1 :], 8 - missing)):
+    for kept, out_of_order in ((lines, 0), (lines[:missing] + lines[missing + 1 :], 8 - missing)):
         log.write_text("".join(kept))
-        command = [sys.executable, SCRIPTS / "bench_soak.py", "--witness", log]
+        command = [sys.executable, SCRIPTS / "bench_soak.py", "--check-log", log]
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-        assert f'"pulses": {len(kept)}, "astray": {astray}, "holds": 0' in output
+        assert f'"pulses": {len(kept)}, "out_of_order": {out_of_order}, "holds": 0' in output
