@@ -1,4 +1,4 @@
-"""The firmware's ports, built outside the source tree and told how to start."""
+"""Builds of the firmware's ports outside the source tree, and their commands."""
 
 import shutil
 import subprocess
@@ -16,13 +16,13 @@ NEEDS = {"host": ("gcc", "make"), "mps2-an385": ("arm-none-eabi-gcc", "qemu-syst
 
 
 def require(*tools):
-    """AssertionError naming the Debian packages of the tools that are not there."""
+    """Raise AssertionError with the Debian packages of missing tools."""
     missing = [PACKAGES[tool] for tool in tools if shutil.which(tool) is None]
-    assert not missing, f"the firmware's tests need more: apt-get install {' '.join(missing)}"
+    assert not missing, f"the firmware's tests need: apt-get install {' '.join(missing)}"
 
 
 def build_board(folder, mutant=0, port="host"):
-    """A port of the core as a board's process; its command without options. mutant: the guard it lacks."""
+    """Build a port and return its command without options. mutant: number of the disabled guard."""
     require(*NEEDS[port])
     build = ["make", "-s", "-C", PORTS / port, f"BUILD={folder}", f"MUTANT={mutant}"]
     built = subprocess.run(build, capture_output=True, text=True)

@@ -1,9 +1,9 @@
-"""The board's core on an emulated Cortex-M3, run as any board process: the same options, the same log.
+"""The board's core on an emulated Cortex-M3, as a board process with the usual options and log.
 
 python firmware_protocol/ports/mps2-an385/board.py [--image FILE] --pty LINK [--log FILE] [--limits FILE] …
 
-Needs qemu-system-arm, the image (make) and the package optodrive, whose process around a board it uses. QEMU's own pty
-would not tell the guest that a host has closed it, so bytes go through sockets and this process has the pty.
+Requires qemu-system-arm, the image (make) and the package optodrive, whose board process it uses. QEMU's own pty does not
+report to the guest that a host has closed it; the bytes therefore pass through sockets, and this process owns the pty.
 """
 
 import atexit
@@ -32,141 +32,151 @@ IMAGE = Path(__file__).parent / "build" / "board.elf"
 INPUT_BITS = {"interlock": 1, "key": 2, "estop": 4}
 SAFE_INPUTS = 3
 FIRMWARE = 0x0001_0000
-LOOK_US = 1_000
-"""The sockets are looked at so often."""
-PATIENCE_S = 5.0
-START_S = 40.0
-"""An emulator that is read from a disk for the first time, beside others, may take so long to open its sockets."""
-FAILURES = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}
+POLL_US = 1_000
+"""Polling period of the sockets."""
+TIMEOUT_S = 5.0
+START_TIMEOUT_S = 40.0
+"""Time limit for the emulator to open its sockets, if several start from disk at once."""
+FAULT_COMMANDS = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}
 KINDS = ("gate", "state", "fault", "pulse", "rx_error")
 
 
 PR_SET_PDEATHSIG = 1
 
 
-def _end_with_me() -> None:
-    """No emulator outlives its bench, however that ends (prctl(2))."""
+def _die_with_parent() -> None:
+    """Let the kernel kill the emulator when this process ends (prctl(2))."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 class QemuCore:
-    """The core in the emulator: bytes and inputs in, bytes and what its witness writes out."""
+    """Backend of the core in the emulator: bytes and inputs in, bytes and log events out."""
 
     def __init__(self, image: Path, settings: BoardSettings, sink: Callable[[dict[str, Any]], None]) -> None:
         self._sink = sink
-        self._ahead_us: int | None = None
-        self._lit = False
-        self._turned: deque[tuple[str, bool]] = deque()
+        self._clock_offset_us: int | None = None
+        self._gate_on = False
+        self._pending_inputs: deque[tuple[str, bool]] = deque()
         self._inputs = SAFE_INPUTS
-        self._began_s = time.monotonic()
-        self._lines = b""
-        self._states = 0
+        self._started_s = time.monotonic()
+        self._log_buffer = b""
+        self._state_count = 0
         self._folder = tempfile.TemporaryDirectory(prefix="board-")
-        self._complaints = Path(self._folder.name) / "complaints"  # that it waits for us is one: shown where it ends
+        self._stderr_path = Path(self._folder.name) / "stderr"  # stderr of QEMU, printed if it fails to start
         ports = [Path(self._folder.name) / f"uart{k}" for k in range(3)]
         options = [
             item
             for k, port in enumerate(ports)
             for item in ("-chardev", f"socket,id=c{k},path={port},server=on,wait=on", "-serial", f"chardev:c{k}")
         ]
-        command = ["qemu-system-arm", "-M", "mps2-an385", "-kernel", str(image), "-display", "none", "-monitor", "none"]
-        with self._complaints.open("wb") as complaints:
+        arguments = [
+            "qemu-system-arm",
+            "-M",
+            "mps2-an385",
+            "-kernel",
+            str(image),
+            "-display",
+            "none",
+            "-monitor",
+            "none",
+        ]
+        with self._stderr_path.open("wb") as stderr:
             self._emulator = subprocess.Popen(
-                [*command, "-nodefaults", "-nic", "none", *options],
+                [*arguments, "-nodefaults", "-nic", "none", *options],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
-                stderr=complaints,
+                stderr=stderr,
                 start_new_session=True,
-                preexec_fn=_end_with_me,
+                preexec_fn=_die_with_parent,
             )
         atexit.register(self.close)
-        self._host, self._witness, self._bench = (self._connected(port) for port in ports)
+        self._host_socket, self._log_socket, self._bench_socket = (self._connect(port) for port in ports)
         self._settings = settings
-        self._until(lambda: self._states > 0)
+        self._poll_until(lambda: self._state_count > 0)
 
-    def _connected(self, port: Path) -> socket.socket:
-        give_up_s = time.monotonic() + START_S
+    def _connect(self, port: Path) -> socket.socket:
+        deadline_s = time.monotonic() + START_TIMEOUT_S
         while True:
             link = socket.socket(socket.AF_UNIX)
             try:
                 link.connect(str(port))
             except OSError:
                 link.close()
-                if time.monotonic() > give_up_s or self._emulator.poll() is not None:
-                    sys.stderr.write(self._complaints.read_text())
+                if time.monotonic() > deadline_s or self._emulator.poll() is not None:
+                    sys.stderr.write(self._stderr_path.read_text())
                     raise
                 time.sleep(0.005)
                 continue
             link.setblocking(False)
             return link
 
-    def _packed(self, settings: BoardSettings) -> bytes:
+    def _pack_config(self, settings: BoardSettings) -> bytes:
         seed = int.from_bytes(os.urandom(4), "little")
         head = struct.pack("<II12sHHBB", seed, FIRMWARE, bytes.fromhex(settings.uid), settings.cell_codes,
                            settings.queue_points, settings.key_edge, self._inputs)  # fmt: skip
         return head + settings.limits.encode_body()
 
-    def _until(self, condition: Callable[[], bool]) -> None:
-        """Look at the witness until something is so."""
-        give_up_s = time.monotonic() + PATIENCE_S
-        while not condition() and time.monotonic() < give_up_s and self._emulator.poll() is None:
-            select.select([self._witness], [], [], 0.01)
-            self._look()
+    def _poll_until(self, condition: Callable[[], bool]) -> None:
+        """Poll the log until a condition holds or TIMEOUT_S has passed."""
+        deadline_s = time.monotonic() + TIMEOUT_S
+        while not condition() and time.monotonic() < deadline_s and self._emulator.poll() is None:
+            select.select([self._log_socket], [], [], 0.01)
+            self._poll()
 
-    # --- what the process around it asks ------------------------------------------------------------------------
+    # --- backend of the board process ---------------------------------------------------------------------------
 
     def advance(self, now_us: int) -> None:
-        """The emulator keeps its own time; only what it wrote meanwhile is taken."""
-        self._look()
+        """Process the log; the emulator has its own clock."""
+        self._poll()
 
     def receive(self, data: bytes, now_us: int) -> None:
-        """Bytes from the host."""
+        """Pass bytes from the host to the emulator."""
         while data:
-            select.select([], [self._host], [], PATIENCE_S)
-            data = data[self._host.send(data) :]
+            select.select([], [self._host_socket], [], TIMEOUT_S)
+            data = data[self._host_socket.send(data) :]
 
     def bytes_to_send(self) -> bytes:
-        """Bytes for the host."""
-        return self._read(self._host)
+        """Return the bytes for the host."""
+        return self._read(self._host_socket)
 
     def on_link_lost(self, now_us: int) -> None:
-        """Tell the bench, and wait until the board is dark."""
-        before = self._states
-        self._bench.sendall(b"L")
-        self._until(lambda: self._states > before or self._dark)
+        """Report the lost link and wait until the board is disarmed."""
+        before = self._state_count
+        self._bench_socket.sendall(b"L")
+        self._poll_until(lambda: self._state_count > before or self._is_idle)
 
     @property
-    def _dark(self) -> bool:
+    def _is_idle(self) -> bool:
         return self._state in IDLE_STATES
 
     def set_input(self, name: str, value: bool, now_us: int) -> None:
-        """What an input reads from now on."""
+        """Change the level of an input."""
         self._inputs = self._inputs | INPUT_BITS[name] if value else self._inputs & ~INPUT_BITS[name]
-        self._turned.append((name, value))
-        self._bench.sendall(bytes([ord("I"), self._inputs]))
+        self._pending_inputs.append((name, value))
+        self._bench_socket.sendall(bytes([ord("I"), self._inputs]))
 
     def reset(self, now_us: int) -> None:
-        """A reset of the core."""
-        self._bench.sendall(b"R")
+        """Reset the core."""
+        self._bench_socket.sendall(b"R")
 
     def next_event_us(self) -> int | None:
-        """Soon: nobody tells when the emulator has written something."""
-        return self._now_us() + LOOK_US
+        """Return the time of the next poll."""
+        return self._now_us() + POLL_US
 
-    def fail(self, order: bytes) -> None:
-        """Something in the board itself fails: H, T or S, as main.c says."""
-        self._bench.sendall(order)
+    def inject_fault(self, command: bytes) -> None:
+        """Inject a fault of the board: H, T or S, as in main.c."""
+        self._bench_socket.sendall(command)
 
     def close(self) -> None:
-        """End the emulator."""
+        """Stop the emulator."""
         self._emulator.kill()
-        self._emulator.wait(timeout=PATIENCE_S)
+        self._emulator.wait(timeout=TIMEOUT_S)
         self._folder.cleanup()
 
     def _now_us(self) -> int:
-        return int((time.monotonic() - self._began_s) * 1e6)
+        return int((time.monotonic() - self._started_s) * 1e6)
 
-    # --- the witness --------------------------------------------------------------------------------------------
+    # --- log ----------------------------------------------------------------------------------------------------
 
     def _read(self, link: socket.socket) -> bytes:
         try:
@@ -174,60 +184,62 @@ class QemuCore:
         except BlockingIOError:
             return b""
 
-    def _look(self) -> None:
-        *whole, self._lines = (self._lines + self._read(self._witness)).split(b"\n")
+    def _poll(self) -> None:
+        *whole, self._log_buffer = (self._log_buffer + self._read(self._log_socket)).split(b"\n")
         for line in whole:
-            if not line.endswith(b"."):  # a reset cut it short
+            if not line.endswith(b"."):  # truncated by a reset
                 continue
             kind, *numbers = line[:-1].decode("ascii").split()
             values = [int(number) for number in numbers]
             if kind == "C":
                 self._configure()
                 continue
-            if self._ahead_us is None:  # the emulator's clock begins later than this process
-                self._ahead_us = self._now_us() - values[0]
-            event = {"T": self._event, "G": self._pin, "I": self._input, "P": self._permit}[kind](*values)
+            if self._clock_offset_us is None:  # the emulator's clock starts later than this process
+                self._clock_offset_us = self._now_us() - values[0]
+            event = {"T": self._log_event, "G": self._pin_event, "I": self._input_event, "P": self._lease_event}[kind](
+                *values
+            )
             if event["event"] == "gate":
-                self._lit = event["on"]
-            self._sink(event | {"t_us": values[0] + self._ahead_us})
+                self._gate_on = event["on"]
+            self._sink(event | {"t_us": values[0] + self._clock_offset_us})
 
     def _configure(self) -> None:
-        """The chip begins, at power-up or after its watchdog's reset: its clock is new, its pins are dark."""
-        if self._lit:
+        """Configure the chip at power-up or after a watchdog reset: its clock restarts, its gate is off."""
+        if self._gate_on:
             self._sink({"t_us": self._now_us(), "event": "gate", "on": False, "reason": "reset"})
-        self._lit, self._ahead_us = False, None
-        self._turned.clear()
-        self._bench.sendall(self._packed(self._settings))
+        self._gate_on, self._clock_offset_us = False, None
+        self._pending_inputs.clear()
+        self._bench_socket.sendall(self._pack_config(self._settings))
 
-    def _event(self, *values: int) -> dict[str, Any]:
+    def _log_event(self, *values: int) -> dict[str, Any]:
         at_us, kind, on, is_point, state, before, reason, fault, x, y, duty, index, on_us, off_us = values
         event: dict[str, Any] = {"t_us": at_us, "event": KINDS[kind]}
         if event["event"] == "gate":
             point = f"point {index}" if on else f"point {index} done"
             return event | {"on": bool(on), "reason": point if is_point else m.EVENT_REASONS[reason]}
         if event["event"] == "state":
-            self._states += 1
+            self._state_count += 1
             self._state = m.STATES[state]
             return event | {"state": m.STATES[state], "before": m.STATES[before], "reason": m.EVENT_REASONS[reason]}
         if event["event"] == "fault":
             return event | {"fault": m.FAULTS[fault]}
         if event["event"] == "pulse":
-            ahead_us = self._ahead_us or 0
-            times = {"on_us": on_us + ahead_us, "off_us": off_us + ahead_us}
+            offset_us = self._clock_offset_us or 0
+            times = {"on_us": on_us + offset_us, "off_us": off_us + offset_us}
             return event | {"index": index, "x": x, "y": y, "duty": duty, **times}
         return event | {"bad_frames": index}
 
-    def _pin(self, at_us: int, on: int, duty: int) -> dict[str, Any]:
-        """When the pin itself changed."""
+    def _pin_event(self, at_us: int, on: int, duty: int) -> dict[str, Any]:
+        """Return the actual change of the gate's pin."""
         return {"t_us": at_us, "event": "pin", "on": bool(on)}
 
-    def _permit(self, at_us: int, until_us: int) -> dict[str, Any]:
-        """When a LEASE was taken, and until when the board may emit by it."""
-        return {"t_us": at_us, "event": "lease", "until_us": until_us + (self._ahead_us or 0)}
+    def _lease_event(self, at_us: int, until_us: int) -> dict[str, Any]:
+        """Return the receipt of a LEASE and its expiry."""
+        return {"t_us": at_us, "event": "lease", "until_us": until_us + (self._clock_offset_us or 0)}
 
-    def _input(self, at_us: int, bits: int) -> dict[str, Any]:
-        """When the core could first see that an input had changed."""
-        name, value = self._turned.popleft()
+    def _input_event(self, at_us: int, bits: int) -> dict[str, Any]:
+        """Return the first time at which the core could detect a change of an input."""
+        name, value = self._pending_inputs.popleft()
         return {"t_us": at_us, "event": "input", "input": name, "value": value}
 
 
@@ -238,5 +250,5 @@ if __name__ == "__main__":
         at = arguments.index("--image")
         image = Path(arguments[at + 1])
         del arguments[at : at + 2]
-    actions = {name: partial(QemuCore.fail, order=order) for name, order in FAILURES.items()}
+    actions = {name: partial(QemuCore.inject_fault, command=command) for name, command in FAULT_COMMANDS.items()}
     sys.exit(main(arguments, partial(QemuCore, image), actions))
