@@ -19,7 +19,7 @@ from scipy.integrate import solve_ivp
 from scipy.sparse import csr_array
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.device.neighbours import Neighbours
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.board_requirements import BoardRequirements

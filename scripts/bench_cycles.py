@@ -15,7 +15,7 @@ from rich.table import Table
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain, PulseTrain, TactileFrame
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler import scheduler

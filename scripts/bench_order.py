@@ -12,7 +12,7 @@ import elkai
 import numpy as np
 
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.scheduler.visiting_path import compute_visiting_order

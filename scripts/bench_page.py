@@ -19,7 +19,7 @@ def measure_snapshots():
     import numpy as np
 
     from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.pipeline import warm_up
 

@@ -22,7 +22,7 @@ from rich.table import Table
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import OptodriveError
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements

@@ -54,7 +54,7 @@ def build_random_frame(rng):
 def measure_planning():
     """Measure the CPU time from a frame to verified bytes: plan, limit, predict, quantise, decode, verify."""
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.link.protocol.quantisation import decode, quantise
     from optodrive.link.session.board_requirements import BoardRequirements
     from optodrive.planning.display_model import DisplayModel
@@ -141,7 +141,7 @@ def measure_full_frames():
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.daemon.engine.engine import Engine
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.link.transport.simulated import SimulatedBoard
     from optodrive.planning.display_model import DisplayModel
 

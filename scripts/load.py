@@ -49,7 +49,7 @@ class LoadRig:
     """A board process and a daemon process."""
 
     def __init__(self, folder, config):
-        from optodrive.device.config import locate_shipped
+        from optodrive.device.config_file import locate_shipped
 
         self.log = folder / "board.jsonl"
         port = folder / "tty"

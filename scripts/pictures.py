@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.simulator.traces import compute_traces
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.planning.display_model import DisplayModel

@@ -4,7 +4,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.display_model import DisplayModel
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from optodrive.device.config import Config, build_pixel_layout, load_config
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.config_file import load_config
 from optodrive.lab.calibration.field_fit import fit_field
 from optodrive.lab.calibration.field_prior import FieldPrior
 from optodrive.lab.calibration.field_writer import write_field

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from optodrive.cli.main import run
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.device.pixel_map import load_pixel_map, replace_pixel_map
 from optodrive.link.simulator.true_pixels import GroundTruthPixels
 

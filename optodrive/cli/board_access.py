@@ -30,7 +30,7 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     LinkError where a port cannot be opened.
     """
     from optodrive.core.clock import MonotonicClock
-    from optodrive.device.config import DEFAULT_CONFIG, load_config
+    from optodrive.device.config_file import DEFAULT_CONFIG, load_config
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
     from optodrive.lab.commissioning.spot_reader import SpotReader
     from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient

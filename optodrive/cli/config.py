@@ -16,7 +16,7 @@ def register(app: typer.Typer) -> None:
 
 def show(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Show the effective configuration with every pixel and number."""
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.effective_config import build_effective_config
 
@@ -39,7 +39,7 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
     """Check a configuration file and the files that it names."""
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
 
     display = DisplayModel.from_config(load_config(config))

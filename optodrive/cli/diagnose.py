@@ -62,7 +62,7 @@ def diagnose(
 ) -> None:
     """Name the errors of the model in measured data, and the gain from correcting them."""
     _require_scipy()
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.lab.diagnosis.display_diagnosis import MAX_JOINT_PIXELS
     from optodrive.lab.recording import DisplayRuns
 

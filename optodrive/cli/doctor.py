@@ -45,7 +45,7 @@ def examine(config: str | None, root: Path = Path("/")) -> list["Finding"]:
     from optodrive.cli.doctor_port import check_port
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.errors import InputError
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
 
     clock = MonotonicClock()
     findings = [host.check_python(), *host.check_packages()]

@@ -126,7 +126,7 @@ def _export(calibrated_field: "CalibratedField", export: Path) -> dict[str, Any]
 
 def _import(grid: Path, out: Path, config: str | None) -> dict[str, Any]:
     from optodrive.core.files import atomic_write
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.device.field_file import format_field, strip_toml_specials
     from optodrive.lab.calibration.correction_grid import fit_correction_grid
     from optodrive.lab.calibration.field_prior import FieldPrior

@@ -65,7 +65,7 @@ def load_run_config(
 
     Raises InputError for a file that cannot be used.
     """
-    from optodrive.device.config import apply_measured_servo, load_config
+    from optodrive.device.config_file import apply_measured_servo, load_config
     from optodrive.device.pixel_map import replace_pixel_map
 
     # mirrors.toml lowers a cap: the given file replaces that of the configuration instead of lowering the cap twice.

@@ -11,7 +11,8 @@ from typing import Literal
 
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.files import atomic_write
-from optodrive.device.config import DEFAULT_CONFIG, Config, load_config, locate_shipped
+from optodrive.device.config import Config
+from optodrive.device.config_file import DEFAULT_CONFIG, load_config, locate_shipped
 
 CONFIG_PATH = Path("/etc/optodrive/config.toml")
 UNIT_PATH = Path("/etc/systemd/system/optodrive.service")

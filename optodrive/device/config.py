@@ -1,24 +1,16 @@
-"""The configuration of one display, read from a versioned TOML file and checked before use."""
+"""The configuration of one display as a model that is checked as a whole."""
 
 from dataclasses import dataclass
-from importlib.resources import files
-from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
-from optodrive.core.errors import InputError, suggest_nearest
-from optodrive.core.files import read_toml
+from optodrive.core.toml_model import Section
 from optodrive.core.types.arrays import FloatArray, IntArray, freeze_arrays
 
 FORMAT = "optodrive-config"
 VERSION = 4
-RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
-"""Keys that version 4 renamed, with their new names."""
-MIRRORS_FORMAT = "optodrive-mirrors"
-MIRRORS_VERSION = 1
-DEFAULT_CONFIG = "display-437"
 WIRE_ON_MAX_S = 65_535e-6
 """Longest gate-on time that one point of the protocol can carry (16 bit, microseconds), s."""
 
@@ -39,12 +31,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 HalfWidth = Annotated[float, Field(ge=0, le=0.5)]
 UsbId = Annotated[int, Field(ge=0, le=0xFFFF)]
-
-
-class Section(BaseModel):
-    """Base of all configuration tables: immutable, without unknown keys; field docstrings are their descriptions."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class DisplaySection(Section):
@@ -402,115 +388,3 @@ def build_pixel_layout(display: DisplaySection) -> PixelLayout:
         row=row.copy(),
         column=column.copy(),
     )
-
-
-def locate_shipped(*parts: str) -> Path:
-    """Return the path of a file that ships with the package, in the wheel or in the source tree."""
-    package = Path(str(files("optodrive")))
-    installed = package / "_shipped" / "configs"
-    return (installed if installed.is_dir() else package.parent / "configs").joinpath(*parts)
-
-
-def list_shipped_configs() -> list[str]:
-    """Return the names of the shipped configurations."""
-    return sorted(path.stem for path in locate_shipped().glob("display-*.toml"))
-
-
-def load_config(source: str | Path | None = None, measured_servo: bool = True) -> Config:
-    """Read a configuration file, or a shipped one by its name. Raise InputError with one line.
-
-    measured_servo: apply the file of measured servos that the configuration names
-    """
-    source = DEFAULT_CONFIG if source is None else source
-    path = Path(source)
-    if not path.exists():
-        if str(source) not in list_shipped_configs():
-            raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
-        path = locate_shipped(f"{source}.toml")
-    table = read_toml(path)
-    if table.get("format") == FORMAT and table.get("version") == 3:
-        renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
-        raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
-    check_format(path, table, FORMAT, VERSION)
-    _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
-    _resolve_paths(path, table.get("display"), ("pixel_map",))
-    try:
-        config = Config.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), Config) from None
-    mirrors = config.scanner.mirrors
-    return apply_measured_servo(config, Path(mirrors)) if measured_servo and mirrors is not None else config
-
-
-def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:
-    """Resolve the files that a table names relative to the configuration's folder."""
-    for key in keys:
-        if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
-            section[key] = str(path.parent / section[key])
-
-
-class GalvoSection(Section):
-    """Correction of the galvo cap for mirrors that accelerate more than the common servo."""
-
-    share: Annotated[float, Field(gt=0, le=1)] = 1.0
-    """Remaining fraction of the cap."""
-
-
-class MirrorsFile(Section):
-    """mirrors.toml as `optodrive calibrate servo` writes it; about and axes are informative."""
-
-    format: Literal["optodrive-mirrors"]
-    version: Literal[1]
-    scanner: ServoSection
-    galvo: GalvoSection = GalvoSection()
-    about: dict[str, Any] = {}
-    axes: dict[str, Any] = {}
-
-
-def apply_measured_servo(config: Config, path: Path) -> Config:
-    """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
-    table = read_toml(path)
-    check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
-    try:
-        measured = MirrorsFile.model_validate(table)
-    except ValidationError as error:
-        raise build_input_error(error, str(path), MirrorsFile) from None
-    scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
-    stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
-    cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}
-    return config.model_copy(update={"scanner": scanner, "limits": config.limits.model_copy(update=cap)})
-
-
-def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:
-    """Raise InputError for a file of another format or version."""
-    if table.get("format") != expected:
-        raise InputError(f"{path}: format", table.get("format"), f"'{expected}'")
-    if table.get("version") != version:
-        raise InputError(f"{path}: version", table.get("version"), f"{version}, the one this release reads")
-
-
-def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
-    """Convert pydantic's first complaint to one line; suggest the nearest known key for an unknown one."""
-    complaints = error.errors(include_url=False)
-    first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
-    place = ".".join(str(part) for part in first["loc"])
-    label = f"{where}: {place}" if place else where
-    if first["type"] == "extra_forbidden":
-        known = _list_known_keys(model, first["loc"][:-1]) if model else []
-        expected = f"a known key, {suggest_nearest(str(first['loc'][-1]), known)}" if known else "no such key"
-        return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
-    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-    if first["type"] == "missing":
-        return InputError(label, None, "this key")
-    if first["type"] == "value_error":
-        return InputError(label, "inconsistent values", message)
-    return InputError(label, first["input"], message)
-
-
-def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
-    for part in path:
-        item = model.model_fields.get(str(part))
-        if item is None or not (isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel)):
-            return []
-        model = item.annotation
-    return list(model.model_fields)

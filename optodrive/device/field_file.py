@@ -9,8 +9,8 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
+from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.calibrated_field import CalibratedField
-from optodrive.device.config import Section, build_input_error, check_format
 from optodrive.device.field_geometry import FieldGeometry
 from optodrive.device.field_surface import ORDER, TERM_COUNT, Extent
 

@@ -11,16 +11,9 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import atomic_write, read_toml
+from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.core.types.arrays import BoolArray, FloatArray, StrArray, freeze_arrays
-from optodrive.device.config import (
-    Config,
-    DisplaySection,
-    PixelLayout,
-    Section,
-    build_input_error,
-    build_pixel_layout,
-    check_format,
-)
+from optodrive.device.config import Config, DisplaySection, PixelLayout, build_pixel_layout
 
 FORMAT = "optodrive-pixels"
 VERSION = 1

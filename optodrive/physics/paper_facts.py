@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal, cast
 
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 
 AMBIENT_C = 20.0
 """Ambient temperature of the paper's single-pixel runs: 527 °C at a rise of 507 K."""

@@ -10,8 +10,10 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
+from optodrive.core.toml_model import build_input_error, check_format
 from optodrive.core.types.arrays import FloatArray, freeze_arrays
-from optodrive.device.config import Config, build_input_error, build_pixel_layout, check_format, locate_shipped
+from optodrive.device.config import Config, build_pixel_layout
+from optodrive.device.config_file import locate_shipped
 from optodrive.device.pixel_map import load_pixel_map
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.terms import check_requirements, discover_terms, find_term

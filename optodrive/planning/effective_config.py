@@ -2,14 +2,8 @@
 
 from typing import TYPE_CHECKING
 
-from optodrive.device.config import (
-    Config,
-    DisplaySection,
-    LimitsSection,
-    PixelModelSection,
-    ScannerSection,
-    Section,
-)
+from optodrive.core.toml_model import Section
+from optodrive.device.config import Config, DisplaySection, LimitsSection, PixelModelSection, ScannerSection
 from optodrive.planning.limiter.caps import CAPS
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hidden_servo import SIZES_RAD, HiddenServo, commands, recording
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Signal
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.step_response import Steps, step_response_rad

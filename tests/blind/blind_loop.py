@@ -14,7 +14,7 @@ from blind_lab import Case
 from optodrive.core.types.discrepancy import Discrepancy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.core.units import ZERO_CELSIUS_K
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.model_file import build_model_toml
 from optodrive.lab.diagnosis.priors import build_prior

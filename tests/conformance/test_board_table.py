@@ -2,7 +2,7 @@
 
 from board_table import table
 
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 
 PAGE = locate_shipped().parent / "docs" / "reference" / "board-conformance.md"
 

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 
 MODEL = locate_shipped().parent / "firmware_protocol" / "model" / "board.pml"
 MUTANTS = range(1, 7)

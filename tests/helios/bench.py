@@ -7,7 +7,8 @@ import numpy as np
 from helios.emulated import EmulatedHelios
 from optodrive.core.clock import ManualClock
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.device.config import Config, load_config
+from optodrive.device.config import Config
+from optodrive.device.config_file import load_config
 from optodrive.link.helios.dac import Helios
 from optodrive.link.helios.encoding import PointScale
 from optodrive.link.helios.verification import encode_verified

@@ -11,7 +11,7 @@ from helios.emulated import HostDeadError
 from optodrive.cli import helios as helios_cli
 from optodrive.cli.main import run
 from optodrive.core.errors import LinkError
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
 DAY_S = 1.7e9

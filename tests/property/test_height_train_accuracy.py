@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, HeightTrain
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from reference_models.nominal_pixel import height_um

@@ -5,7 +5,7 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.protocol.quantisation import decode, quantise
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.display_model import DisplayModel

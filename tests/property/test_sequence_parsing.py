@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json

@@ -13,7 +13,8 @@ import time
 import numpy as np
 
 from optodrive.core.clock import MonotonicClock, request_realtime_scheduling
-from optodrive.device.config import Config, load_config
+from optodrive.device.config import Config
+from optodrive.device.config_file import load_config
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder
 from optodrive.link.protocol.quantisation import WirePoints

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import httpx
 
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"

@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 
 import optodrive
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from rig import OPTODRIVE
 
 SCMP_ACT_ALLOW = 0x7FFF0000

@@ -11,7 +11,7 @@ import pytest
 import serial
 
 from optodrive.core.clock import MonotonicClock
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.session.board_requirements import BoardRequirements

@@ -7,7 +7,7 @@ import signal
 import numpy as np
 import pytest
 
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.device.field_file import load_field
 from optodrive.lab.calibration.spots import read_spots
 from optodrive.lab.commissioning.predicted_error import build_code_grid

@@ -26,7 +26,7 @@ from optodrive.daemon.web.roles import ROLES
 from optodrive.daemon.web.route_table import ARM, ROUTES, STOP
 from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for

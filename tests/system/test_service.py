@@ -15,7 +15,7 @@ import pytest
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.kernels import code_folder
 from optodrive.daemon.notify import Notifier
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from rig import TOKEN, Daemon, long_train, wait_for
 from sandbox import build_sandboxed, find_obstacle
 

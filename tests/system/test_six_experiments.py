@@ -5,7 +5,8 @@ from functools import cache, partial
 import numpy as np
 import pytest
 
-from optodrive.device.config import build_pixel_layout, load_config
+from optodrive.device.config import build_pixel_layout
+from optodrive.device.config_file import load_config
 from optodrive.link.session.board_requirements import BoardRequirements
 from rig import running
 

@@ -16,7 +16,7 @@ import pytest
 
 from board_fixtures import board_disarmed, daemon_disarmed  # noqa: F401 - fixtures
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, config_text, long_train, wait_for
 

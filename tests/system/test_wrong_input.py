@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from rig import TOKEN, running
 
 OPTODRIVE = Path(sys.executable).with_name("optodrive")

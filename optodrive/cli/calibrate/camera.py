@@ -36,7 +36,7 @@ def calibrate_by_camera(folder: Path, config: str | None) -> FieldCalibration:
 
     Raises InputError for a folder, a picture or spots that cannot be used.
     """
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.lab.calibration.camera.folder import SPOTS_FILE
     from optodrive.lab.calibration.camera.measure import measure_folder
     from optodrive.lab.calibration.field_fit import fit_field

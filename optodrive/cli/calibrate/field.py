@@ -17,7 +17,7 @@ def field(
     json: JsonOption = False,
 ) -> None:
     """Fit the field to a file of measured spots."""
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.lab.calibration.field_fit import fit_field
     from optodrive.lab.calibration.field_prior import FieldPrior
     from optodrive.lab.calibration.spot_checks import check_fit, check_spots

@@ -20,7 +20,7 @@ def servo(
     """Identify both mirror servos from a recording of steps, and compare them with the configuration."""
     if find_spec("scipy") is None:
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
-    from optodrive.device.config import load_config
+    from optodrive.device.config_file import load_config
     from optodrive.lab.recording import read_recording
     from optodrive.lab.servo_identification.common_servo import find_common_servo
     from optodrive.lab.servo_identification.identify import identify

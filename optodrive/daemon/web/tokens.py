@@ -14,8 +14,8 @@ from pydantic import Field, ValidationError
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
+from optodrive.core.toml_model import Section, check_format
 from optodrive.daemon.web.roles import ROLES, Role
-from optodrive.device.config import Section, check_format
 
 ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKEN"
 FILE_ENVIRONMENT_VARIABLE = "OPTODRIVE_TOKENS"

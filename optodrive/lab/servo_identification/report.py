@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from optodrive.core.files import atomic_write
-from optodrive.device.config import MIRRORS_FORMAT, MIRRORS_VERSION, Config
+from optodrive.device.config import Config
+from optodrive.device.config_file import MIRRORS_FORMAT, MIRRORS_VERSION
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.device.servo import Servo
 from optodrive.lab.servo_identification.common_servo import CommonServo

@@ -8,7 +8,7 @@ import pytest
 from labs import lab
 from optodrive.cli.main import run
 from optodrive.core.types.measurements import Measurement, Run
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from optodrive.lab.recording import write_recording
 
 DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}

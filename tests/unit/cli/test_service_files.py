@@ -6,7 +6,7 @@ import pytest
 
 from optodrive.cli.main import run
 from optodrive.cli.service_files import CONFIG_PATH, MANIFEST_PATH, RULES_PATH, UNIT_PATH, USERS_PATH
-from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.config_file import load_config, locate_shipped
 
 PROGRAM = "/opt/optodrive/bin/optodrive"
 USB_BOARD = 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n'

@@ -7,7 +7,7 @@ from optodrive.daemon.reload import (
     require_disarmed,
     split_changed_keys,
 )
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.protocol.states import LEASED_STATES
 
 

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import build_pixel_layout, list_shipped_configs, load_config, locate_shipped
+from optodrive.device.config import build_pixel_layout
+from optodrive.device.config_file import list_shipped_configs, load_config, locate_shipped
 from optodrive.physics.parameters import load_parameters
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config

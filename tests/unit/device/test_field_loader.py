@@ -6,7 +6,7 @@ import pytest
 from hidden_field import CONFIG, LAYOUT, calibrate_hidden_field, config_with_field
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.scan_field import IdealField
 from optodrive.link.protocol.quantisation import decode, quantise

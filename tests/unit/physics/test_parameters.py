@@ -5,7 +5,7 @@ from math import pi
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.physics.parameters import build_display_pixels, load_parameters
 
 SETS = ["calibrated", "paper_s1_literal"]

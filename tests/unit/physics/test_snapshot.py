@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.extended_display import ExtendedThermalState
 from optodrive.physics.nominal_display import NominalThermalState

@@ -138,7 +138,7 @@ terms.__path__.append(sys.argv[1])
 
 import numpy as np
 
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.physics.hypothesis import RecordingScope
 from optodrive.physics.parameters import build_display_pixels, load_parameters
 from optodrive.physics.pixel import Pixel

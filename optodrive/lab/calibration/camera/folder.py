@@ -11,7 +11,7 @@ from pydantic import ValidationError, model_validator
 
 from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
-from optodrive.device.config import Section, build_input_error, check_format
+from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.field_geometry import CODE_MAX
 
 FORMAT = "optodrive-pictures"

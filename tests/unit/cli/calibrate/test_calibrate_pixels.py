@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from optodrive.cli.main import run
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.simulator.true_pixels import GroundTruthPixels
 from pixel_lab import calibrate_map, map_errors, measured_um, record_sweep, run_json
 

@@ -8,7 +8,7 @@ import pytest
 
 from hidden_servo import SIZES_RAD, HiddenServo, recording
 from optodrive.cli.main import run
-from optodrive.device.config import load_config, locate_shipped
+from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table
 from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.lab.recording import write_recording

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 
 DISPLAY = DisplayModel.from_config(load_config("display-16"))

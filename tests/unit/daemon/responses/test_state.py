@@ -7,7 +7,7 @@ import numpy as np
 from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.responses.state import StateReport
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.summary_schema import PulseColumns

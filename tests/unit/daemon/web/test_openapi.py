@@ -8,7 +8,8 @@ from optodrive.daemon.responses.telemetry import EVENTS
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.tokens import Tokens
-from optodrive.device.config import DaemonSection, load_config
+from optodrive.device.config import DaemonSection
+from optodrive.device.config_file import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 

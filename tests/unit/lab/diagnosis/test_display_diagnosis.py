@@ -12,7 +12,7 @@ from display_lab import display_lab
 from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.lab.diagnosis.dask_workers import open_client, run_tasks
 from optodrive.lab.diagnosis.display_diagnosis import DisplayAnswer, PixelTask, compile_kernels, diagnose_pixel
 from optodrive.lab.diagnosis.display_narrative import build_display_answer, build_display_narrative, format_ranges

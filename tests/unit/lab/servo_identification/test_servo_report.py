@@ -7,7 +7,7 @@ import pytest
 
 from hidden_servo import HiddenServo, recording
 from optodrive.core.types.measurements import Measurement, Signal
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.lab.servo_identification.common_servo import DAMPING_MAX, find_common_servo
 from optodrive.lab.servo_identification.identify import identify
 from optodrive.lab.servo_identification.report import build_report, format_report_lines

@@ -5,7 +5,7 @@ from math import exp, pi
 
 import pytest
 
-from optodrive.device.config import locate_shipped
+from optodrive.device.config_file import locate_shipped
 from optodrive.lab.validation.paper_outcomes import (
     DERIVED_FROM_FITTED,
     FITTED_ON,

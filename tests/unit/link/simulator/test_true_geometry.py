@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from optodrive.device.config import build_pixel_layout, load_config
+from optodrive.device.config import build_pixel_layout
+from optodrive.device.config_file import load_config
 from optodrive.link.simulator.true_geometry import CENTRE_CODE, GroundTruthGeometry
 
 CONFIG = load_config()

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import build_cold_budget_state, commit_executed, shift_state
 from optodrive.planning.limiter.usage import compute_usage

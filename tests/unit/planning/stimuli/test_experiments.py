@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.experiments import (
     build_intensity,
     build_linear_motion,

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image, ImageDraw, PngImagePlugin
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import images
 from optodrive.planning.stimuli.images import build_animation, build_image, compute_lattice_brightness
 from optodrive.planning.stimuli.pixel_lattice import Lattice

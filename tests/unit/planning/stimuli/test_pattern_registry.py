@@ -12,7 +12,7 @@ from PIL import Image
 
 from optodrive.core.errors import InputError
 from optodrive.daemon.responses.patterns import PatternList
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.pattern_registry import PATTERNS, build_pattern, describe_patterns, find_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 

@@ -9,7 +9,7 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli import sequence_file, train_json
 from optodrive.planning.stimuli.sequence_file import (
     load_sequence,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import list_shipped_configs, load_config
+from optodrive.device.config_file import list_shipped_configs, load_config
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pixel import advance, cooling_peak
 from optodrive.planning.stimuli.experiments import build_intensity

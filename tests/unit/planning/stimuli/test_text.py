@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import list_shipped_configs, load_config
+from optodrive.device.config_file import list_shipped_configs, load_config
 from optodrive.planning.stimuli.braille import SPACE, encode_word
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 from optodrive.planning.stimuli.text import Spacing, build_text, find_line_slots, wrap_words

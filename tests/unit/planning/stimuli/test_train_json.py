@@ -8,7 +8,7 @@ import pytest
 
 from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import HeightTrain, PulseTrain
-from optodrive.device.config import load_config
+from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 from optodrive.planning.stimuli.train_json import check_trains, count_pulses, validate_train
 

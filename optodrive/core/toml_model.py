@@ -1,0 +1,49 @@
+"""Tables of TOML files as pydantic models, with one-line errors."""
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from optodrive.core.errors import InputError, suggest_nearest
+
+
+class Section(BaseModel):
+    """Base of all configuration tables: immutable, without unknown keys; field docstrings are their descriptions."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, use_attribute_docstrings=True)
+
+
+def check_format(path: Path, table: dict[str, Any], expected: str, version: int) -> None:
+    """Raise InputError for a file of another format or version."""
+    if table.get("format") != expected:
+        raise InputError(f"{path}: format", table.get("format"), f"'{expected}'")
+    if table.get("version") != version:
+        raise InputError(f"{path}: version", table.get("version"), f"{version}, the one this release reads")
+
+
+def build_input_error(error: ValidationError, where: str, model: type[BaseModel] | None = None) -> InputError:
+    """Convert pydantic's first complaint to one line; suggest the nearest known key for an unknown one."""
+    complaints = error.errors(include_url=False)
+    first = next((item for item in complaints if item["type"] == "extra_forbidden"), complaints[0])
+    place = ".".join(str(part) for part in first["loc"])
+    label = f"{where}: {place}" if place else where
+    if first["type"] == "extra_forbidden":
+        known = _list_known_keys(model, first["loc"][:-1]) if model else []
+        expected = f"a known key, {suggest_nearest(str(first['loc'][-1]), known)}" if known else "no such key"
+        return InputError(label, str(first["loc"][-1]), expected, code="unknown_key")
+    message = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+    if first["type"] == "missing":
+        return InputError(label, None, "this key")
+    if first["type"] == "value_error":
+        return InputError(label, "inconsistent values", message)
+    return InputError(label, first["input"], message)
+
+
+def _list_known_keys(model: type[BaseModel], path: tuple[str | int, ...]) -> list[str]:
+    for part in path:
+        item = model.model_fields.get(str(part))
+        if item is None or not (isinstance(item.annotation, type) and issubclass(item.annotation, BaseModel)):
+            return []
+        model = item.annotation
+    return list(model.model_fields)

@@ -1,0 +1,95 @@
+"""Configuration files: shipped ones, loading, and the measured servo that a configuration may name."""
+
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, ValidationError
+
+from optodrive.core.errors import InputError
+from optodrive.core.files import read_toml
+from optodrive.core.toml_model import Section, build_input_error, check_format
+from optodrive.device.config import FORMAT, VERSION, Config, ServoSection
+
+RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
+"""Keys that version 4 renamed, with their new names."""
+MIRRORS_FORMAT = "optodrive-mirrors"
+MIRRORS_VERSION = 1
+DEFAULT_CONFIG = "display-437"
+
+
+def locate_shipped(*parts: str) -> Path:
+    """Return the path of a file that ships with the package, in the wheel or in the source tree."""
+    package = Path(str(files("optodrive")))
+    installed = package / "_shipped" / "configs"
+    return (installed if installed.is_dir() else package.parent / "configs").joinpath(*parts)
+
+
+def list_shipped_configs() -> list[str]:
+    """Return the names of the shipped configurations."""
+    return sorted(path.stem for path in locate_shipped().glob("display-*.toml"))
+
+
+def load_config(source: str | Path | None = None, measured_servo: bool = True) -> Config:
+    """Read a configuration file, or a shipped one by its name. Raise InputError with one line.
+
+    measured_servo: apply the file of measured servos that the configuration names
+    """
+    source = DEFAULT_CONFIG if source is None else source
+    path = Path(source)
+    if not path.exists():
+        if str(source) not in list_shipped_configs():
+            raise InputError("--config", str(source), "a file, or " + ", ".join(list_shipped_configs()))
+        path = locate_shipped(f"{source}.toml")
+    table = read_toml(path)
+    if table.get("format") == FORMAT and table.get("version") == 3:
+        renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
+        raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
+    check_format(path, table, FORMAT, VERSION)
+    _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
+    _resolve_paths(path, table.get("display"), ("pixel_map",))
+    try:
+        config = Config.model_validate(table)
+    except ValidationError as error:
+        raise build_input_error(error, str(path), Config) from None
+    mirrors = config.scanner.mirrors
+    return apply_measured_servo(config, Path(mirrors)) if measured_servo and mirrors is not None else config
+
+
+def _resolve_paths(path: Path, section: object, keys: tuple[str, ...]) -> None:
+    """Resolve the files that a table names relative to the configuration's folder."""
+    for key in keys:
+        if isinstance(section, dict) and isinstance(section.get(key), str) and section[key]:
+            section[key] = str(path.parent / section[key])
+
+
+class GalvoSection(Section):
+    """Correction of the galvo cap for mirrors that accelerate more than the common servo."""
+
+    share: Annotated[float, Field(gt=0, le=1)] = 1.0
+    """Remaining fraction of the cap."""
+
+
+class MirrorsFile(Section):
+    """mirrors.toml as `optodrive calibrate servo` writes it; about and axes are informative."""
+
+    format: Literal["optodrive-mirrors"]
+    version: Literal[1]
+    scanner: ServoSection
+    galvo: GalvoSection = GalvoSection()
+    about: dict[str, Any] = Field(default_factory=dict)
+    axes: dict[str, Any] = Field(default_factory=dict)
+
+
+def apply_measured_servo(config: Config, path: Path) -> Config:
+    """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
+    table = read_toml(path)
+    check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
+    try:
+        measured = MirrorsFile.model_validate(table)
+    except ValidationError as error:
+        raise build_input_error(error, str(path), MirrorsFile) from None
+    scanner = config.scanner.model_copy(update={**measured.scanner.model_dump(), "mirrors": str(path)})
+    stated = config.limits.galvo_acceleration_rms_max_rad_per_s2
+    cap = {"galvo_acceleration_rms_max_rad_per_s2": stated * measured.galvo.share}
+    return config.model_copy(update={"scanner": scanner, "limits": config.limits.model_copy(update=cap)})
