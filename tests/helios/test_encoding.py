@@ -170,7 +170,7 @@ def test_a_plan_without_pulses_emits_nothing():
     frames = encode(plan, PointScale.from_config(display.config))
     assert len(decode([frame.data for frame in frames], PointScale.from_config(display.config))) == 0
     frame = HeliosFrame.from_bytes(EMITTING * 2 + BLANK + GOOD)
-    with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
+    with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
         verify_frames(
             [frame.data], plan, PointScale.from_config(display.config), display.build_cold_state()[1], display.budget
         )
@@ -246,7 +246,7 @@ def test_mutants_of_the_bytes_fail_verification(mutant):
     points = parse_points(frames[number])[0].copy()
     mutant(points)
     frames[number] = points.tobytes() + frames[number][-5:]
-    with pytest.raises(LocalProtocolError, match=r"beyond the plan's pulses|last point"):
+    with pytest.raises(LocalProtocolError, match=r"exceeds the plan's pulses|last point"):
         verify_frames(frames, plan, scale, budget, display.budget)
 
 
@@ -266,5 +266,5 @@ def test_a_wrong_rate_fails_verification():
     scale, budget = PointScale.from_config(display.config), display.build_cold_state()[1]
     plan, verified = build_verified(display, build_frame(display))
     frames = [frame.data[:-5] + struct.pack("<H", 50_000) + frame.data[-3:] for frame in verified.frames]
-    with pytest.raises(LocalProtocolError, match="beyond the plan's pulses"):
+    with pytest.raises(LocalProtocolError, match="exceeds the plan's pulses"):
         verify_frames(frames, plan, scale, budget, display.budget)

@@ -128,7 +128,7 @@ class Planner:
                 self._pending_count -= 1
             self._record_progress(1.0)
 
-    def _record_progress(self, _share: float) -> None:
+    def _record_progress(self, _fraction: float) -> None:
         self._progress_at_s = self._clock.now_s()
 
     def _plan_once(

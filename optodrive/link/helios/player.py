@@ -14,8 +14,6 @@ POLL_INTERVAL_S = 0.001
 READY_TIMEOUT_S = 0.5
 """Maximum time for the DAC to become ready, 20 times the longest frame."""
 
-ProgressCallback = Callable[[float], None]
-
 
 @dataclass(frozen=True)
 class PlaybackReport:
@@ -31,7 +29,10 @@ class PlaybackReport:
 
 
 def play(
-    helios: Helios, verified: VerifiedFrames, clock: Clock, on_progress: ProgressCallback = lambda _share: None
+    helios: Helios,
+    verified: VerifiedFrames,
+    clock: Clock,
+    on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> PlaybackReport:
     """Play frames on a display in the thermal state that the plan assumes. Block until emission has ended.
 
@@ -53,12 +54,12 @@ def play(
 
 
 def _send_frames(
-    helios: Helios, frames: tuple[HeliosFrame, ...], clock: Clock, on_progress: ProgressCallback
+    helios: Helios, frames: tuple[HeliosFrame, ...], clock: Clock, on_progress: Callable[[float], None]
 ) -> PlaybackReport:
     underruns, underrun_s, end_s = 0, 0.0, clock.now_s()
     for number, frame in enumerate(frames):
-        share = number / len(frames)
-        _wait_until_ready(helios, clock, lambda share=share: on_progress(share))  # type: ignore[misc]
+        fraction = number / len(frames)
+        _wait_until_ready(helios, clock, lambda fraction=fraction: on_progress(fraction))  # type: ignore[misc]
         helios.send(frame)
         now_s = clock.now_s()
         if number and now_s > end_s:

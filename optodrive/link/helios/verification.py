@@ -69,6 +69,6 @@ def verify_frames(
         violating |= pulses.power_w > plan.power_w[row] * (1 + POWER_TOLERANCE)
     if violating.any():
         first = int(np.flatnonzero(violating)[0])
-        raise LocalProtocolError(f"encoded light at {pulses.start_s[first]:.6f} s lies beyond the plan's pulses")
+        raise LocalProtocolError(f"encoded emission at {pulses.start_s[first]:.6f} s exceeds the plan's pulses")
     verify(plan, row, pulses, state, budget)
     return pulses, row

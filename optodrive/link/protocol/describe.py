@@ -43,7 +43,7 @@ def _describe_field(message: m.Message, name: str) -> dict[str, Any]:
     if name in NONCE_FIELDS:
         return {name: f"{value:08x}"}
     if name in DUTY_FIELDS:
-        return {name.replace("duty", "duty_share"): value / DUTY_MAX}
+        return {name.replace("duty", "duty_fraction"): value / DUTY_MAX}
     if name == "inputs":
         return {name: [input_name for bit, input_name in enumerate(m.INPUTS) if value >> bit & 1]}
     if name == "temperature_dc":
@@ -57,12 +57,21 @@ def _describe_field(message: m.Message, name: str) -> dict[str, Any]:
 
 def _describe_points(message: m.Data) -> dict[str, Any]:
     x, y, dark_us, on_us, duty = zip(*m.POINT.iter_unpack(message.points), strict=True)
-    duty_share = [round(value / DUTY_MAX, 6) for value in duty]
+    duty_fraction = [round(value / DUTY_MAX, 6) for value in duty]
     columns = {"x_code": x, "y_code": y, "dark_us": dark_us, "on_us": on_us}
-    return {"points": len(x), **{name: list(values) for name, values in columns.items()}, "duty_share": duty_share}
+    return {
+        "points": len(x),
+        **{name: list(values) for name, values in columns.items()},
+        "duty_fraction": duty_fraction,
+    }
 
 
 def _describe_records(message: m.Executed) -> dict[str, Any]:
     on_tick, on_ticks, duty = zip(*message.records, strict=True)
-    duty_share = [round(value / DUTY_MAX, 6) for value in duty]
-    return {"records": len(on_tick), "on_tick": list(on_tick), "on_ticks": list(on_ticks), "duty_share": duty_share}
+    duty_fraction = [round(value / DUTY_MAX, 6) for value in duty]
+    return {
+        "records": len(on_tick),
+        "on_tick": list(on_tick),
+        "on_ticks": list(on_ticks),
+        "duty_fraction": duty_fraction,
+    }

@@ -54,7 +54,7 @@ def fill(host, count):
 # --- hello ----------------------------------------------------------------------------------------------------------
 
 
-def test_hello_goes_out_without_a_session_and_nothing_sequenced_before_the_reply():
+def test_nothing_sequenced_is_sent_before_hello_reply():
     host = HostConnection()
     host.send_hello(5)
     host.send(data(0))
@@ -66,7 +66,7 @@ def test_hello_goes_out_without_a_session_and_nothing_sequenced_before_the_reply
     assert [frame[:3] for frame in frames(host.bytes_to_send(9.0, PLENTY))] == [(m.Data.TYPE, 0, SESSION)]
 
 
-def test_hello_repeated_with_a_new_nonce_takes_only_the_newest_reply():
+def test_a_repeated_hello_accepts_only_the_newest_reply():
     host = HostConnection()
     host.send_hello(5)
     host.send_hello(6)
@@ -78,7 +78,7 @@ def test_hello_repeated_with_a_new_nonce_takes_only_the_newest_reply():
     assert host.session == 222
 
 
-def test_a_new_hello_forgets_the_window(host):
+def test_a_new_hello_clears_the_window(host):
     fill(host, 3)
     host.bytes_to_send(0.0, PLENTY)
     host.send_hello(78)
@@ -110,7 +110,7 @@ def test_seq_wraps(host):
     assert host.outstanding == 0
 
 
-def test_flight_budget_counts_encoded_bytes_but_always_lets_one_frame_go(host):
+def test_the_limit_of_bytes_in_flight_permits_at_least_one_frame(host):
     size = len(wire(data(0)))
     fill(host, 6)
     assert len(frames(host.bytes_to_send(0.0, 3 * size))) == 3
@@ -131,7 +131,7 @@ def test_unsequenced_messages_pass_a_full_window(host):
 # --- loss -----------------------------------------------------------------------------------------------------------
 
 
-def test_sent_again_after_the_timeout_and_not_before(host):
+def test_retransmission_after_the_timeout_and_not_before(host):
     fill(host, 3)
     first = host.bytes_to_send(0.0, PLENTY)
     assert host.bytes_to_send(RTO_S, PLENTY) == b""
@@ -149,7 +149,7 @@ def test_an_acknowledgement_restarts_the_timeout(host):
     assert seqs(host.bytes_to_send(0.046, PLENTY)) == [1]
 
 
-def test_sequence_nak_goes_back_at_once(host):
+def test_a_sequence_nak_triggers_retransmission_at_once(host):
     fill(host, 6)
     host.bytes_to_send(0.0, PLENTY)
     nak(host, 2, "SEQUENCE")
@@ -157,7 +157,7 @@ def test_sequence_nak_goes_back_at_once(host):
     assert host.counters.naks == 1
 
 
-def test_the_other_naks_of_one_gap_do_not_multiply_it(host):
+def test_a_gap_triggers_one_retransmission(host):
     fill(host, 8)
     host.bytes_to_send(0.0, PLENTY)
     sent = []
@@ -178,7 +178,7 @@ def test_no_room_waits_for_the_timeout(host):
 
 
 @pytest.mark.parametrize("reason", [name for name in m.NAK_REASONS if name not in m.NOT_CONSUMED])
-def test_other_refusals_count_as_taken(host, reason):
+def test_other_refusals_consume_the_frame(host, reason):
     fill(host, 2)
     host.bytes_to_send(0.0, PLENTY)
     assert nak(host, 2, reason) == [m.Nak(2, m.NAK_REASONS.index(reason))]
@@ -186,7 +186,7 @@ def test_other_refusals_count_as_taken(host, reason):
     assert host.bytes_to_send(1.0, PLENTY) == b""
 
 
-def test_old_and_impossible_acknowledgements_change_nothing(host):
+def test_old_and_impossible_acknowledgements_have_no_effect(host):
     fill(host, 5)
     host.bytes_to_send(0.0, PLENTY)
     ack(host, 3)
@@ -196,14 +196,14 @@ def test_old_and_impossible_acknowledgements_change_nothing(host):
     assert seqs(host.bytes_to_send(1.0, PLENTY)) == [3, 4]
 
 
-def test_acknowledgements_of_other_sessions_change_nothing(host):
+def test_acknowledgements_of_other_sessions_have_no_effect(host):
     fill(host, 2)
     host.bytes_to_send(0.0, PLENTY)
     assert host.receive_bytes(wire(m.Ack(2, 100, 0, 3), session=SESSION + 1), 0.0) == []
     assert host.outstanding == 2
 
 
-def test_an_echo_of_our_own_words_is_no_answer(host):
+def test_an_echo_is_a_format_error(host):
     fill(host, 1)
     host.send(m.Get())
     echo = host.bytes_to_send(0.0, PLENTY)
@@ -211,7 +211,7 @@ def test_an_echo_of_our_own_words_is_no_answer(host):
     assert host.counters.format_errors == 2
 
 
-def test_answers_read_byte_by_byte_and_with_junk_behind(host):
+def test_answers_byte_by_byte_and_followed_by_junk(host):
     fill(host, 2)
     host.bytes_to_send(0.0, PLENTY)
     stream = b"\x07junk\0" + wire(m.Ack(1, 5, 0, 3)) + wire(m.Ack(2, 6, 0, 3)) + b"\x02"
@@ -224,7 +224,7 @@ def test_answers_read_byte_by_byte_and_with_junk_behind(host):
 # --- abort ----------------------------------------------------------------------------------------------------------
 
 
-def test_abort_goes_ahead_of_all_and_nothing_else_follows(host):
+def test_abort_precedes_and_clears_everything(host):
     fill(host, 12)
     host.bytes_to_send(0.0, PLENTY)
     host.send(m.Lease(100))
@@ -237,7 +237,7 @@ def test_abort_goes_ahead_of_all_and_nothing_else_follows(host):
     assert host.peer is None
 
 
-def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_begins(host):
+def test_events_of_the_aborted_session_are_returned_until_the_next_one(host):
     event = m.Event(state=m.STATES.index("DISARMED"), reason=m.EVENT_REASONS.index("abort"), fault=0, tick=7)
     host.abort()
     host.send_hello(3)
@@ -250,7 +250,7 @@ def test_events_of_the_session_that_was_aborted_are_given_until_the_next_one_beg
     assert host.receive_bytes(wire(event, session=222), 0.0) == []
 
 
-def test_what_is_queued_for_the_next_session_waits_through_repeated_hellos(host):
+def test_messages_for_the_next_session_survive_repeated_hellos(host):
     host.abort()
     host.send_hello(3)
     host.send(data(0))
@@ -278,7 +278,7 @@ def link():
     return board
 
 
-def test_frames_in_order_are_taken_once(link):
+def test_frames_in_order_are_accepted_once(link):
     for seq in [*range(256), 0, 1]:
         assert link.accept(seq) == (True, None)
         link.mark_consumed(None)
@@ -286,7 +286,7 @@ def test_frames_in_order_are_taken_once(link):
     assert link.seq_errors == 0
 
 
-def test_duplicates_are_answered_as_the_last_frame_was(link):
+def test_duplicates_get_the_answer_of_the_last_frame(link):
     for refusal in (None, m.NAK_REASONS.index("STATE")):
         seq = link.expected_seq
         link.accept(seq)
@@ -303,7 +303,7 @@ def test_gaps_are_refused_and_counted(link):
     assert link.accept(0) == (True, None)
 
 
-def test_what_is_not_consumed_is_awaited_again(link):
+def test_a_frame_that_was_not_consumed_stays_expected(link):
     assert link.accept(0) == (True, None)
     assert link.accept(0) == (True, None)
     assert link.expected_seq == 0

@@ -52,7 +52,7 @@ def test_too_long_to_encode():
 
 
 @pytest.mark.parametrize("encoded", [b"", b"\x00", b"\x02", b"\x03a", b"\xff" + b"a" * 254, b"\x01\x00"], ids=repr)
-def test_what_is_no_cobs(encoded):
+def test_invalid_cobs(encoded):
     assert cobs_decode(encoded) is None
 
 
@@ -71,7 +71,7 @@ def test_decoded_whole_and_byte_by_byte():
     assert read(*one_by_one(STREAM)) == (FRAMES, (0, 0))
 
 
-def test_a_frame_comes_with_its_delimiter_and_not_before():
+def test_a_frame_is_complete_at_its_delimiter():
     assert read(STREAM[:-1])[0] == FRAMES[:-1]
 
 
@@ -80,19 +80,19 @@ def test_decoded_in_two_portions(cut):
     assert read(STREAM[:cut], STREAM[cut:]) == (FRAMES, (0, 0))
 
 
-def test_trailing_junk_is_kept_for_later_and_spoils_only_itself():
+def test_trailing_junk_damages_no_other_frame():
     junk = b"\x05junk"
     assert read(STREAM + junk) == (FRAMES, (0, 0))
     assert read(STREAM + junk + b"\0" + STREAM) == (FRAMES * 2, (0, 1))
 
 
-def test_leading_junk_spoils_one_frame_at_most():
+def test_leading_junk_damages_at_most_one_frame():
     frames, counted = read(b"junk" + STREAM)
     assert frames == FRAMES[1:]
     assert sum(counted) == 1
 
 
-def test_empty_frames_are_nothing_and_count_nothing():
+def test_empty_frames_are_ignored():
     assert read(b"\0\0\0" + STREAM + b"\0\0") == (FRAMES, (0, 0))
 
 
@@ -103,11 +103,11 @@ def test_short_frames_count_as_format_errors():
 
 @pytest.mark.parametrize("portions", [lambda data: [data], one_by_one], ids=["whole", "byte by byte"])
 @pytest.mark.parametrize("length", [ENCODED_MAX + 1, 300, 5000])
-def test_overlong_counts_once_and_ends_at_its_delimiter(portions, length):
+def test_an_overlong_frame_counts_once_and_ends_at_its_delimiter(portions, length):
     assert read(*portions(b"\x07" * length + b"\0" + STREAM)) == (FRAMES, (0, 1))
 
 
-def test_overlong_keeps_no_memory():
+def test_overlong_frames_use_bounded_memory():
     decoder = FrameDecoder()
     for _ in range(100):
         assert list(decoder.feed(b"\x07" * 1000)) == []
@@ -115,16 +115,16 @@ def test_overlong_keeps_no_memory():
     assert decoder.counters.format_errors == 1
 
 
-def test_every_flipped_bit_is_caught():
+def test_every_flipped_bit_is_detected():
     wire = encode_frame(FRAMES[2])
     for at in range(len(wire) - 1):
         for bit in range(8):
-            hurt = bytearray(wire)
-            hurt[at] ^= 1 << bit
-            assert read(bytes(hurt))[0] == []
+            damaged = bytearray(wire)
+            damaged[at] ^= 1 << bit
+            assert read(bytes(damaged))[0] == []
 
 
-def test_a_wrong_crc_counts_as_such():
+def test_a_wrong_crc_is_counted():
     raw = struct.pack("<BBH", 0x18, 0, 1)
     wrong = cobs_encode(raw + struct.pack("<I", crc32(raw) ^ 1)) + b"\0"
     assert read(wrong) == ([], (1, 0))

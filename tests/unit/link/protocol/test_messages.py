@@ -70,7 +70,7 @@ def test_enumerated_fields(name):
     assert stated == KINDS[name].ENUMS
 
 
-def test_limits_field_by_field_wherever_they_stand():
+def test_limits_in_limits_and_hello_reply():
     assert names(STRUCTS["limits"]) == [item.name for item in fields(m.Limits)]
     assert "<" + codes(STATED["LIMITS"]["fields"]) == m.Limits.LAYOUT.format
     hello = STATED["HELLO_REPLY"]["fields"]
@@ -117,7 +117,7 @@ def written(text):
 
 
 @pytest.mark.parametrize("name", STATED)
-def test_the_page_s_table_says_the_same(name):
+def test_the_table_in_the_specification_agrees(name):
     row = re.search(rf"^\| (\w\w) \| {name} \| (S?) ?\| (.*) \|$", PAGE, re.MULTILINE)
     assert row, "no row"
     assert (int(row[1], 16), row[2] == "S") == (STATED[name]["id"], STATED[name]["sequenced"])
@@ -125,13 +125,13 @@ def test_the_page_s_table_says_the_same(name):
 
 
 @pytest.mark.parametrize("name", STRUCTS)
-def test_the_page_s_structs_say_the_same(name):
+def test_the_structs_in_the_specification_agree(name):
     text = re.search(rf"^    {name}:(.*\n(?:     +.*\n)*)", PAGE, re.MULTILINE)
     assert written(re.sub(r"\(.*?\)", "", text[1])) == offsets(STRUCTS[name])
 
 
 @pytest.mark.parametrize("name", ["nak_reason", "fault", "reason"])
-def test_the_page_s_numbers_say_the_same(name):
+def test_the_enumerations_in_the_specification_agree(name):
     for number, word in enumerate(TOML["enumerations"][name]):
         if word:
             assert re.search(rf"\b{number}(?: \|)? {word}\b", PAGE), word

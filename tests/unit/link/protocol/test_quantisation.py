@@ -48,7 +48,7 @@ def random_plan(n=500, seed=3):
     return plan(*zip(start, width, *angles, rng.uniform(1e-3, 2.45, n), strict=True))
 
 
-def test_times_come_back_to_1e_12():
+def test_times_are_recovered_to_1e_12():
     limited = random_plan()
     read = back(limited)
     assert len(read.start_s) == 500
@@ -56,13 +56,13 @@ def test_times_come_back_to_1e_12():
     assert np.abs(read.width_s - limited.width_s).max() < 1e-12
 
 
-def test_rounding_of_starts_never_adds_up():
+def test_rounding_errors_of_starts_do_not_accumulate():
     start = np.arange(2000) * 0.0030003  # 300 ns more off the tick at each pulse
     read = back(plan(*((s, 0.001, 0, 0, 1) for s in start)))
     assert np.abs(read.start_s - start).max() <= 0.5e-6 + 1e-12
 
 
-def test_angles_come_back_to_half_a_code():
+def test_angles_are_recovered_to_half_a_code():
     limited = random_plan()
     read = back(limited)
     for axis in ("x_rad", "y_rad"):
@@ -85,22 +85,22 @@ def test_index_counts_points_and_row_the_pulses():
     assert decode(payload(points), SCALE).index.tolist() == [8, 10]
 
 
-def test_a_long_gap_becomes_dark_points_at_the_next_position():
+def test_a_long_gap_becomes_gate_off_points_at_the_next_position():
     points = quantise(plan((0.0, 0.001, 0.1, 0, 1), (0.301, 0.001, -0.1, 0, 1)), SCALE)
-    first, *dark, last = points.table.tolist()
-    assert dark == [[last[0], last[1], GATE_OFF_STEP_TICKS, 0, 0]] * 4
+    first, *gaps, last = points.table.tolist()
+    assert gaps == [[last[0], last[1], GATE_OFF_STEP_TICKS, 0, 0]] * 4
     assert last[2] == 300_000 - 4 * GATE_OFF_STEP_TICKS
     assert first[0] > CENTRE_CODE > last[0]
 
 
-@pytest.mark.parametrize(("gap_us", "dark_points"), [(65_535, 0), (65_536, 1), (125_535, 1), (125_536, 2)])
-def test_the_edges_of_a_long_gap(gap_us, dark_points):
+@pytest.mark.parametrize(("gap_us", "gate_off_points"), [(65_535, 0), (65_536, 1), (125_535, 1), (125_536, 2)])
+def test_the_edges_of_a_long_gap(gap_us, gate_off_points):
     limited = plan((0.0, 0.001, 0, 0, 1), (0.001 + gap_us * 1e-6, 0.001, 0, 0, 1))
-    assert len(quantise(limited, SCALE)) == 2 + dark_points
+    assert len(quantise(limited, SCALE)) == 2 + gate_off_points
     assert back(limited).start_s[1] == pytest.approx(0.001 + gap_us * 1e-6, abs=1e-12)
 
 
-def test_a_pulse_of_no_power_is_dark_for_as_long():
+def test_a_pulse_without_power_becomes_an_equally_long_gate_off_point():
     limited = plan((0.001, 0.05, 0.1, 0, 0.0), (0.051, 0.05, 0.1, 0, 1e-9), (0.101, 0.05, 0.1, 0, 1.0))
     points = quantise(limited, SCALE)
     assert points.table[:, 3:].tolist() == [[0, 0], [0, 0], [50_000, int(65535 / 2.45)]]
@@ -108,14 +108,14 @@ def test_a_pulse_of_no_power_is_dark_for_as_long():
     assert decode(payload(points), SCALE).start_s == pytest.approx([0.101], abs=1e-12)
 
 
-def test_payloads_hold_whole_points():
+def test_payloads_contain_whole_points():
     points = quantise(random_plan(100), SCALE)
     assert len(points.encode_payload()) == 10 * len(points)
     assert points.encode_payload(3, 4) == points.encode_payload()[30:70]
     assert points.encode_payload()[:10] == points.table[0].astype("<u2").tobytes()
 
 
-def test_points_know_where_they_end_and_where_a_pulse_begins():
+def test_point_ends_and_counts():
     limited = plan((0.001, 0.05, 0.1, 0, 1.0), (0.3, 0.05, 0.1, 0, 0.0), (0.4, 0.05, 0.1, 0, 1.0))
     points = quantise(limited, SCALE)
     assert points.row.tolist() == [0, -1, -1, -1, -1, 1, 2]
@@ -144,7 +144,7 @@ def test_an_empty_plan_has_no_points():
         ([(0, 0.001, 0, 0, -0.1)], "does not fit a point"),
     ],
 )
-def test_what_does_not_fit_the_wire_is_our_own_error(pulses, says):
+def test_a_plan_that_does_not_fit_the_wire_is_a_local_error(pulses, says):
     with pytest.raises(LocalProtocolError, match=says):
         quantise(plan(*pulses), SCALE)
 
@@ -154,7 +154,7 @@ def test_pulses_may_touch():
     assert quantise(limited, SCALE).table[:, 2].tolist() == [0, 0]
 
 
-def test_decoding_sees_a_changed_byte():
+def test_decoding_detects_a_changed_byte():
     limited = plan((0.001, 0.01, 0.05, 0, 1.0))
     wire = bytearray(payload(quantise(limited, SCALE)))
     wire[6] ^= 1
@@ -169,7 +169,7 @@ def test_codes_and_angles_are_inverse():
     assert coarse.to_codes(np.array([0.0, 0.0006])).tolist() == [CENTRE_CODE, CENTRE_CODE + 1]
 
 
-def test_mirrors_do_not_go_to_a_pulse_that_was_trimmed_to_nothing():
+def test_mirrors_skip_pulses_trimmed_to_zero():
     limited = plan((0.001, 0.002, 0.01, 0.0, 1.0), (0.004, 0.002, 0.15, 0.1, 0.0), (0.008, 0.002, 0.02, 0.0, 1.0))
     points = quantise(limited, SCALE)
     x_rad = SCALE.to_angles_rad(points.table[:, 0].astype(np.int64))

@@ -15,7 +15,7 @@ def wire(message, seq=0, session=5):
     return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
 
-def test_messages_in_words_and_units():
+def test_description_of_messages():
     words = describe(STATUS)
     assert words["state"] == "RUNNING"
     assert words["fault"] == "LINK"
@@ -28,19 +28,19 @@ def test_messages_in_words_and_units():
         "y_code": [2, 2],
         "dark_us": [3, 3],
         "on_us": [4, 4],
-        "duty_share": [1.0, 1.0],
+        "duty_fraction": [1.0, 1.0],
     }
     assert describe(m.Executed(4, ((1000, 20, 0),))) == {
         "first_index": 4,
         "records": 1,
         "on_tick": [1000],
         "on_ticks": [20],
-        "duty_share": [0.0],
+        "duty_fraction": [0.0],
     }
     assert describe(m.ArmReq(255)) == {"host_nonce": "000000ff"}
     assert describe(m.Event(1, 0, 2, 5)) == {"state": "DISARMED", "fault": None, "reason": "hello", "tick": 5}
     limits = describe(m.Limits(*range(1, 15)))
-    assert limits["max_duty_share"] == pytest.approx(2 / 65535)
+    assert limits["max_duty_fraction"] == pytest.approx(2 / 65535)
     assert limits["lease_ms"] == 14
     reply = m.HelloReply(1, 0, 1, 2, 0x10000, bytes(12), 0, 1_000_000, 256, 8, 300, 3, m.Limits(*range(1, 15)))
     assert (describe(reply)["reset_cause"], describe(reply)["firmware"]) == ("watchdog", "1.0")
@@ -49,7 +49,7 @@ def test_messages_in_words_and_units():
 
 
 @given(st.lists(st.integers(1, 40), max_size=20))
-def test_lines_do_not_depend_on_how_the_bytes_came(cuts):
+def test_entries_do_not_depend_on_the_portions(cuts):
     stream = wire(m.Get()) + b"\x03xx\0" + wire(DATA, 0) + b"\0" + wire(STATUS)
     transcript, lines, at = Transcript(), [], 0
     for k, cut in enumerate([*cuts, len(stream)]):
@@ -63,7 +63,7 @@ def test_lines_do_not_depend_on_how_the_bytes_came(cuts):
 
 
 @given(st.binary(max_size=2000))
-def test_any_bytes_are_counted_as_the_decoder_counts_them(data):
+def test_counts_agree_with_the_decoder(data):
     transcript, decoder = Transcript(), FrameDecoder()
     lines = transcript.feed(0.0, False, data + b"\0")
     runs = [run for run in data.split(b"\0") if run]
@@ -73,7 +73,7 @@ def test_any_bytes_are_counted_as_the_decoder_counts_them(data):
     assert sum(line.frame is not None for line in lines) == len(list(decoder.feed(data + b"\0")))
 
 
-def test_a_damaged_frame_says_what_is_wrong():
+def test_a_damaged_frame_has_an_error_text():
     good = wire(m.Get())
     transcript = Transcript()
     crc = bytearray(good)
@@ -84,7 +84,7 @@ def test_a_damaged_frame_says_what_is_wrong():
     assert lines[1].error == "unknown message type 0x77"
 
 
-def test_endless_bytes_without_a_delimiter_cost_bounded_memory():
+def test_bytes_without_a_delimiter_use_bounded_memory():
     transcript = Transcript()
     lines = [line for k in range(50) for line in transcript.feed(float(k), False, b"\x07" * 100)]
     assert sum(len(line.raw) for line in lines) >= 5000 - PENDING_MAX
