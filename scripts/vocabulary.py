@@ -109,7 +109,7 @@ def python_names(path: str, source: str) -> Iterator[Name]:
     """Yield what a Python file defines, its keyword arguments and its string keys."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            if not node.name.startswith("test_"):  # a sentence, not a name
+            if not is_sentence(path, node.name):
                 yield Name(node.name, path, node.lineno, is_function=True)
         elif isinstance(node, ast.ClassDef):
             yield Name(node.name, path, node.lineno)
@@ -125,6 +125,11 @@ def python_names(path: str, source: str) -> Iterator[Name]:
             yield from (key_name(key, path) for key in node.keys if is_key(key))
         elif isinstance(node, ast.Subscript) and is_key(node.slice):
             yield key_name(node.slice, path)
+
+
+def is_sentence(path: str, name: str) -> bool:
+    """Return whether a function's name is the sentence that a test or a scenario shows."""
+    return path.startswith("tests/") and (name.startswith("test_") or name.count("_") >= 4)
 
 
 def is_key(node: ast.expr | None) -> bool:

@@ -86,7 +86,7 @@ void limits_tighten(struct board_limits *limits, const struct board_limits *requ
 /* B4, B5, B8: returns the fault that queueing the point causes, FAULT_NONE if it is permitted. */
 enum fault guards_check_point(const struct board_limits *limits, const struct point *point);
 /* B4 to B6: returns the fault that the point's pulse causes now; a permitted pulse is added to the accounts. */
-enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                        const struct point *point, uint64_t now_us);
 
 /* --- states and points --- */

@@ -164,7 +164,7 @@ static enum fault check_pulse(const struct guards *g, const struct board_limits 
     return level + energy_uj(limits, point) > limits->spot_uj ? FAULT_SPOT : FAULT_NONE;
 }
 
-enum fault guards_admit_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
+enum fault guards_accept_pulse(struct guards *g, const struct board_limits *limits, uint16_t cell_codes,
                        const struct point *point, uint64_t now_us) {
     struct cell *cells[GRIDS];
     drop_old_pulses(g, now_us);

@@ -13,8 +13,8 @@ struct layout {
     } names[3];
 };
 
-#define LAYOUT(type, host, sequenced, body, item, most, at0, n0, at1, n1, at2, n2) \
-    {type, host, sequenced, body, item, most, {{at0, n0}, {at1, n1}, {at2, n2}}},
+#define LAYOUT(type, host, sequenced, body, item, max_bytes, at0, n0, at1, n1, at2, n2) \
+    {type, host, sequenced, body, item, max_bytes, {{at0, n0}, {at1, n1}, {at2, n2}}},
 static const struct layout LAYOUTS[] = {MESSAGE_LAYOUTS(LAYOUT)};
 
 /* Decodes the bytes between two zeros; returns false and counts an error if they are not a frame. */

@@ -107,7 +107,7 @@ def run(
             f"optodrive: {config.name} on http://{config.daemon.host}:{port}{socket_text}, token in {path}", flush=True
         )
         if sys.stdout.isatty():  # a secret: only on a terminal, never in a log
-            secret = tokens.most_privileged.secret
+            secret = tokens.highest_role.secret
             print(
                 f"optodrive: personal link to the page: http://{config.daemon.host}:{port}/#token={secret}", flush=True
             )

@@ -308,11 +308,11 @@ class Config(Section):
     @model_validator(mode="after")
     def _check_scan_range(self) -> Self:
         layout = build_pixel_layout(self.display)
-        reach_m = 2.0 * self.scanner.range_rad * self.scanner.focal_length_m
+        half_field_m = 2.0 * self.scanner.range_rad * self.scanner.focal_length_m
         farthest_m = float(max(np.abs(layout.x_m).max(), np.abs(layout.y_m).max()))
-        if farthest_m > reach_m:
+        if farthest_m > half_field_m:
             raise ValueError(
-                f"scanner reaches ±{reach_m:.4f} m (range_rad, focal_length_m), a pixel lies at {farthest_m:.4f} m"
+                f"scanner reaches ±{half_field_m:.4f} m (range_rad, focal_length_m), a pixel lies at {farthest_m:.4f} m"
             )
         return self
 

@@ -40,8 +40,8 @@ def test_the_closed_form_is_what_integration_gives_also_where_steps_overlap(hz, 
     at_s = np.cumsum(random.uniform(1e-4, 4e-3, 8))
     command_rad = random.uniform(-0.1, 0.1, 8)
     t_s = np.linspace(0.0, at_s[-1] + 5e-3, 300)
-    told = step_response_rad(Servo(hz, damping, delay_s, slew), Steps(at_s, command_rad), t_s)
-    assert told == pytest.approx(HiddenServo(hz, damping, delay_s, slew).follow(at_s, command_rad, t_s), abs=1e-7)
+    reported = step_response_rad(Servo(hz, damping, delay_s, slew), Steps(at_s, command_rad), t_s)
+    assert reported == pytest.approx(HiddenServo(hz, damping, delay_s, slew).follow(at_s, command_rad, t_s), abs=1e-7)
 
 
 @pytest.mark.parametrize("seed", [900, *(pytest.param(k, marks=pytest.mark.slow) for k in range(901, 912))])
@@ -51,36 +51,36 @@ def test_hidden_servos_are_found_on_both_axes(seed):
     rate_hz, noise = (float(np.exp(random.uniform(*np.log(ends)))) for ends in ((1e4, 1e5), (1e-3, 1e-2)))
     measurement = recording(servos, random, rate_hz, noise)
     for axis, servo in enumerate(servos):
-        told = found(measurement, axis)
-        assert told.servo.delay == pytest.approx(servo.delay_s, abs=1e-5)
-        assert told.servo.frequency == pytest.approx(servo.hz, rel=0.03)
-        assert told.slew_identified
-        assert told.servo.slew == pytest.approx(servo.slew, rel=0.03)
-        assert 0.7 < told.misfit < 1.4
+        reported = found(measurement, axis)
+        assert reported.servo.delay == pytest.approx(servo.delay_s, abs=1e-5)
+        assert reported.servo.frequency == pytest.approx(servo.hz, rel=0.03)
+        assert reported.slew_identified
+        assert reported.servo.slew == pytest.approx(servo.slew, rel=0.03)
+        assert 0.7 < reported.misfit < 1.4
         for step_rad in SIZES_RAD:
             for tolerance_rad in (CONFIG.tolerance_rad[axis], 0.02 * step_rad):
                 # Where an overshoot just touches the tolerance the time jumps: a hair wider or narrower is as true.
                 ends_s = [servo.settled_s(step_rad, near * tolerance_rad) for near in (0.98, 1.0, 1.02)]
-                told_s = told.settling_s(step_rad, tolerance_rad)[0]
-                assert 0.95 * min(ends_s) < told_s < 1.05 * max(ends_s)
+                reported_s = reported.settling_s(step_rad, tolerance_rad)[0]
+                assert 0.95 * min(ends_s) < reported_s < 1.05 * max(ends_s)
 
 
 @pytest.mark.slow
 def test_intervals_hold_the_truth_about_as_often_as_they_say():
     within = []
     for seed in range(10):
-        told = found(recording((ONE, OTHER), np.random.default_rng(seed), 2e4, 0.01), 0)
-        off = np.abs([np.log(told.servo.frequency / ONE.hz), told.servo.damping - ONE.damping])
-        within += list(off < 1.96 * told.sigma[:2])
+        reported = found(recording((ONE, OTHER), np.random.default_rng(seed), 2e4, 0.01), 0)
+        off = np.abs([np.log(reported.servo.frequency / ONE.hz), reported.servo.damping - ONE.damping])
+        within += list(off < 1.96 * reported.sigma[:2])
     assert sum(within) >= 15  # of 20, nineteen expected
 
 
 def test_without_a_large_step_the_slew_is_kept_as_configured_and_the_rest_is_found():
     random = np.random.default_rng(4)
-    told = found(recording((HiddenServo(1500.0, 0.7, 3e-5, 100.0), OTHER), random, 1e5, 0.01, (2e-4,)), 0)
-    assert not told.slew_identified
-    assert told.servo.slew == pytest.approx(CONFIG.scanner.slew_rad_per_s)
-    assert told.servo.delay == pytest.approx(3e-5, abs=1e-5)
+    reported = found(recording((HiddenServo(1500.0, 0.7, 3e-5, 100.0), OTHER), random, 1e5, 0.01, (2e-4,)), 0)
+    assert not reported.slew_identified
+    assert reported.servo.slew == pytest.approx(CONFIG.scanner.slew_rad_per_s)
+    assert reported.servo.delay == pytest.approx(3e-5, abs=1e-5)
 
 
 def test_missing_samples_and_a_position_output_with_an_offset_do_no_harm(measured):
@@ -90,10 +90,10 @@ def test_missing_samples_and_a_position_output_with_an_offset_do_no_harm(measure
         value[::7] = np.nan
         return replace(run, signals=run.signals | {"mirror_x_rad": Signal(0, signal.t_s.copy(), value)})
 
-    told = found(altered(measured, spoil), 0)
-    assert told.servo.frequency == pytest.approx(ONE.hz, rel=0.01)
-    assert told.gain == pytest.approx(1.02, abs=1e-3)
-    assert told.offset_rad == pytest.approx(0.01, abs=1e-4)
+    reported = found(altered(measured, spoil), 0)
+    assert reported.servo.frequency == pytest.approx(ONE.hz, rel=0.01)
+    assert reported.gain == pytest.approx(1.02, abs=1e-3)
+    assert reported.offset_rad == pytest.approx(0.01, abs=1e-4)
 
 
 def test_no_mirror_signal_is_named(measured):

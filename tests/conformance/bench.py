@@ -105,11 +105,11 @@ class BoardProcess:
         """(state, reason) of every change."""
         return [(entry["state"], entry["reason"]) for entry in self.of("state")]
 
-    def fired(self):
+    def executed(self):
         """Numbers of the pulses."""
         return [entry["index"] for entry in self.of("pulse")]
 
-    def lit(self):
+    def pulsed(self):
         """Whether the gate is on."""
         edges = self.of("gate")
         return bool(edges) and edges[-1]["on"]

@@ -32,8 +32,8 @@ def board_kind(request, ready):
 def outcomes(board_kind, request):
     """Futures by the scenario's name, of those that were asked for in this module."""
     here = [item for item in request.session.items if item.module is request.module and hasattr(item, "callspec")]
-    asked = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
-    futures = run_all(board_kind, [case for case in asked.values() if not board_kind.spares(case.subject)])
+    requested = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
+    futures = run_all(board_kind, [case for case in requested.values() if not board_kind.spares(case.subject)])
     yield futures
     for future in futures.values():
         future.cancel()

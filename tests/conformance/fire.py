@@ -133,9 +133,9 @@ class Witness:
             assert pulse in self._sent, f"never sent: {entry}"
             assert pulse not in self._done, f"twice: {entry}"
             assert entry["index"] > last_index, f"out of order: {entry}"
-            lit_us = entry["off_us"] - entry["on_us"]
+            gate_on_us = entry["off_us"] - entry["on_us"]
             whole = (entry["off_us"], f"point {entry['index']} done") in ended
-            assert lit_us == self._sent[pulse] if whole else lit_us <= self._sent[pulse], f"another width: {entry}"
+            assert gate_on_us == self._sent[pulse] if whole else gate_on_us <= self._sent[pulse], f"another width: {entry}"
             self._done.add(pulse)
             last_index = entry["index"]
             count += 1

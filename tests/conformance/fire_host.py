@@ -1,4 +1,4 @@
-"""The real session as its owner drives it, whatever link is below: connect, arm by hand, stream points."""
+"""The real session as its owner drives it, over any link: connect, arm by hand, stream points."""
 
 import numpy as np
 
@@ -70,7 +70,7 @@ class FireHost:
         return self.session.begin(self.points.make(count, dark_us), self.session.board_s() + 0.05, ahead_s)
 
     def live(self, count, patience_s):
-        """One session from its greeting to its end: arm, stream, and whatever the link makes of it."""
+        """One session from its greeting to its end: arm, stream, and every effect of the link."""
         session = self.session
         try:
             session.connect()

@@ -34,7 +34,7 @@ def a_job_begins_with_its_watermark(bench):
     assert host.status().state == "RUNNING"
     assert host.board.of("gate") == []
     host.order(host.data(here(100, **DIM)))
-    host.wait(lambda: host.board.fired() == [0, 1, 2], "the points")
+    host.wait(lambda: host.board.executed() == [0, 1, 2], "the points")
     until(host, "HOLD", "queue empty")
 
 
@@ -49,7 +49,7 @@ def a_job_begins_when_all_up_to_its_end_is_here(bench):
     assert host.tell("END", job=2, end_index=1) == ["STATE"]
     assert host.tell("END", job=1, end_index=1) == []
     until(host, "ARMED", "job done")
-    assert host.board.fired() == [0]
+    assert host.board.executed() == [0]
 
 
 @scenario("jobs")
@@ -61,14 +61,14 @@ def points_behind_the_end_belong_to_the_next_job(bench):
     assert host.order(host.data(here(200, **DIM), here(300, **DIM))) == []
     until(host, "ARMED", "job done")
     host.pause(0.05)
-    assert host.board.fired() == [0]
+    assert host.board.executed() == [0]
     assert host.status().queued == 2
     assert start(host, first=0) == ["INDEX"]
     assert start(host, first=1) == []
     assert start(host, first=1) == ["STATE"]
     assert host.tell("END", job=1, end_index=3) == []
     until(host, "ARMED", "job done")
-    assert host.board.fired() == [0, 1, 2]
+    assert host.board.executed() == [0, 1, 2]
 
 
 @scenario("jobs")
@@ -93,7 +93,7 @@ def a_hold_ends_with_the_watermark_and_the_next_dark_time_counts_from_then(bench
     host.pause(0.05)
     assert host.status().state == "HOLD"
     host.order(host.data(here(100, dark_us=7000, **DIM)))
-    host.wait(lambda: len(host.board.fired()) == 4, "the points")
+    host.wait(lambda: len(host.board.executed()) == 4, "the points")
     (refilled,) = [entry for entry in host.board.of("state") if entry["reason"] == "refilled"]
     assert 0 <= host.board.of("pulse")[2]["on_us"] - refilled["t_us"] - 7000 <= host.board.late_us
     assert host.board.states()[-1] == ("HOLD", "queue empty")
@@ -116,7 +116,7 @@ def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
     host.play(here(100, **DIM), end=False)
     until(host, "HOLD", "queue empty")
     host.order(host.data(here(100, **DIM)))
-    host.wait(lambda: len(host.board.fired()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
+    host.wait(lambda: len(host.board.executed()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
     host.order(host.data(here(100, **DIM)))
     until(host, "FAULT", "fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["UNDERRUN"]
@@ -135,7 +135,7 @@ def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
 def flush_drops_the_queue_and_stays_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     assert host.tell("FLUSH") == []
     status = host.status()
     assert (status.state, status.queued, status.done_index) == ("ARMED", 0, 24)
@@ -149,7 +149,7 @@ def flush_drops_the_queue_and_stays_armed(bench):
     host.index = 30
     assert host.play(here(100, **DIM)) == []
     until(host, "ARMED", "job done")
-    assert host.board.fired()[-1] == 30
+    assert host.board.executed()[-1] == 30
     assert host.status().done_index == 31
 
 
@@ -157,14 +157,14 @@ def flush_drops_the_queue_and_stays_armed(bench):
 def abort_drops_everything_and_disarms(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     _, status = host.ask(host.frame("ABORT"))
     assert (status.state, status.queued) == ("DISARMED", 0)
     assert host.board.states()[-1] == ("DISARMED", "abort")
-    count = len(host.board.fired())
+    count = len(host.board.executed())
     host.arm()
     assert host.status().queued == 0
-    assert len(host.board.fired()) == count
+    assert len(host.board.executed()) == count
 
 
 @scenario("ABORT")
@@ -191,14 +191,14 @@ def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
     points = [here(100 + k if k % 5 else 0, dark_us=300, duty=1000 + k, x=CENTRE + 40 * k) for k in range(60)]
     assert host.play(*points) == []
     host.wait(lambda: len(reported(host)) == 60, "the reports")
-    told = reported(host)
+    records = reported(host)
     pulses = {entry["index"]: entry for entry in host.board.of("pulse")}
     assert set(pulses) == {k for k in range(60) if k % 5}
-    shift = {pulse["on_us"] - told[k][0] for k, pulse in pulses.items()}
+    shift = {pulse["on_us"] - records[k][0] for k, pulse in pulses.items()}
     assert len(shift) == 1
-    for k, (_, on, duty) in told.items():
+    for k, (_, on, duty) in records.items():
         assert (on, duty) == ((100 + k, 1000 + k) if k % 5 else (0, 0))
-    ticks = [told[k][0] for k in range(60)]
+    ticks = [records[k][0] for k in range(60)]
     assert ticks == sorted(ticks)
     for first in (0, 37, 59):
         said, _ = host.ask(host.frame("GET_EXECUTED", first_index=first))
@@ -213,7 +213,7 @@ def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
 def a_pulse_cut_short_tells_what_it_did_and_one_not_lit_nothing(bench):
     host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     assert host.tell("FLUSH") == []
     cut = host.board.of("pulse")[-1]
     host.wait(lambda: cut["index"] in reported(host), "its report")

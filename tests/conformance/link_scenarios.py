@@ -44,7 +44,7 @@ def the_reply_tells_what_the_board_is(bench):
 def hello_is_taken_whatever_session_stands_there_and_ends_what_goes_on(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     host.raw(frame(HOST["HELLO"][0], 5, host.session ^ 0x5555, body_of("HELLO", major=1, minor=9, host_nonce=7777)))
     host.wait(lambda: host.of("HELLO_REPLY")[-1].host_nonce == 7777, "the reply")
     assert host.of("HELLO_REPLY")[-1].session != host.session
@@ -102,7 +102,7 @@ def another_session_s_frames_and_a_board_s_own_do_nothing(bench):
 def abort_is_taken_in_any_session(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     host.ask(host.frame("ABORT", session=host.session ^ 0x1234))
     assert host.board.states()[-1] == ("DISARMED", "abort")
     status = host.status()
@@ -113,7 +113,7 @@ def abort_is_taken_in_any_session(bench):
 def a_port_that_is_closed_and_opened_again_is_not_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     host.close()
     wait_for(lambda: host.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
     again = bench.host(host.board)
@@ -204,7 +204,7 @@ def each_order_out_of_place_is_refused_by_its_reason(bench):
 @scenario("clock")
 def a_tick_is_a_microsecond_and_questions_come_back_unchanged(bench):
     host = bench.greeted(**PATIENT)
-    asked = []
+    requested = []
     for stamp in (0, 0xFFFF_FFFF, 0x0100_0001):
         sent_s = time.monotonic()
         host.say("CLOCK", host_t=stamp)
@@ -213,9 +213,9 @@ def a_tick_is_a_microsecond_and_questions_come_back_unchanged(bench):
         (reply,) = host.of("CLOCK_REPLY")
         assert reply.host_t == stamp
         host.heard.clear()
-        asked.append((sent_s, reply.tick, heard_s))
+        requested.append((sent_s, reply.tick, heard_s))
         host.pause(0.3, lease=False)
-    (sent_s, first, heard_s), _, (later_sent_s, last, later_heard_s) = asked
+    (sent_s, first, heard_s), _, (later_sent_s, last, later_heard_s) = requested
     passed_s = (last - first) * 1e-6
     assert (later_sent_s - heard_s) * 0.999 - 0.001 <= passed_s <= (later_heard_s - sent_s) * 1.001 + 0.001
 
@@ -232,10 +232,10 @@ def status_and_events_tell_what_the_log_tells(bench):
     assert abs(status.laser_on_us - 15_000) <= 1
     host.say("ABORT")
     host.wait(lambda: host.board.states()[-1][1] == "abort" and host.status().state == "DISARMED", "the abort")
-    told = [(m.state, m.reason, m.tick) for m in host.of("EVENT")]
+    reported = [(m.state, m.reason, m.tick) for m in host.of("EVENT")]
     logged = [(entry["state"], entry["reason"], entry["t_us"]) for entry in host.board.of("state")][1:]
-    assert [event[:2] for event in told] == [event[:2] for event in logged]
-    assert len({logged_us - tick for (*_, tick), (*_, logged_us) in zip(told, logged, strict=True)}) == 1
+    assert [event[:2] for event in reported] == [event[:2] for event in logged]
+    assert len({logged_us - tick for (*_, tick), (*_, logged_us) in zip(reported, logged, strict=True)}) == 1
 
 
 @scenario("credits")

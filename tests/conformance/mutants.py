@@ -194,12 +194,12 @@ def b9_cleared_without_a_look():
 
 
 def b10_takes_what_it_is_told():
-    return machine_module, "tighten", lambda own, asked: asked
+    return machine_module, "tighten", lambda own, requested: requested
 
 
 def b10_against_the_first_only():
     tightened = machine_module.tighten
-    return machine_module, "tighten", lambda own, asked: tightened(DEFAULT_LIMITS, asked)
+    return machine_module, "tighten", lambda own, requested: tightened(DEFAULT_LIMITS, requested)
 
 
 def b11_any_echo():

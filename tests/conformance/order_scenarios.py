@@ -34,7 +34,7 @@ def each_number_once_and_in_order(bench):
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
     assert host.tell("DATA", first_index=0, points=four) == ["INDEX"], "nor when the job is over"
     assert host.tell("DATA", first_index=0xFFFF_FFFD, points=four) == ["INDEX"], "numbers do not wrap"
-    assert host.board.fired() == list(range(8))
+    assert host.board.executed() == list(range(8))
     pulses = host.board.of("pulse")
     assert all(one["off_us"] <= other["on_us"] for one, other in pairwise(pulses))
 
@@ -50,7 +50,7 @@ def a_frame_that_comes_back_256_later_is_caught_by_its_number(bench):
     start = host.frame("START", job=1, first_index=0, start_tick=0, watermark=1)
     assert host.order(start, host.frame("END", job=1, end_index=256)) == []
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert host.board.fired() == [0]
+    assert host.board.executed() == [0]
 
 
 # --- B13 ------------------------------------------------------------------------------------------------------------
@@ -70,7 +70,7 @@ def junk_changes_counters_only(bench):
     board = host.board
     points = [here(20_000, duty=999)] * 250
     host.play(*points)
-    host.wait(board.lit, "light")
+    host.wait(board.pulsed, "light")
     before, log = host.status(), len(board.of("state"))
     answered = len(host.heard)
     junk = [bytes.fromhex(case["wire"]) for case in REFUSED]
@@ -97,7 +97,7 @@ def junk_changes_counters_only(bench):
     assert after.state == "RUNNING"
     assert len(board.of("state")) == log
     host.wait(lambda: board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert board.fired() == list(range(len(points)))
+    assert board.executed() == list(range(len(points)))
     assert {entry["off_us"] - entry["on_us"] for entry in board.of("pulse")} == {20_000}
 
 

@@ -77,7 +77,7 @@ def audit(board):
 
 def audit_log(events, state="BOOT"):
     """What any log must show: light in RUNNING only, each pulse an edge on and one off. state: that before it."""
-    gate, since, lit = False, None, []
+    gate, since, pulsed = False, None, []
     for entry in events:
         if entry["event"] == "state":
             assert entry["before"] in (state, "BOOT"), entry  # a reset goes through BOOT unseen
@@ -91,12 +91,12 @@ def audit_log(events, state="BOOT"):
             if gate:
                 since = entry
             else:
-                lit.append((since["reason"], since["t_us"], entry["t_us"]))
+                pulsed.append((since["reason"], since["t_us"], entry["t_us"]))
     assert not gate, "lit when it ended"
-    told = [entry for entry in events if entry["event"] == "pulse"]
-    pulses = [(f"point {entry['index']}", entry["on_us"], entry["off_us"]) for entry in told]
+    reported = [entry for entry in events if entry["event"] == "pulse"]
+    pulses = [(f"point {entry['index']}", entry["on_us"], entry["off_us"]) for entry in reported]
     shown = set(pulses)
-    assert [edge for edge in lit if edge in shown] == pulses, "pulses that the gate does not show"
+    assert [edge for edge in pulsed if edge in shown] == pulses, "pulses that the gate does not show"
 
 
 def run_all(kind: BoardKind, cases: list[Scenario]):

@@ -14,7 +14,7 @@ def failing(bench, action):
     """A board that lights and darkens when its script lets something in it fail."""
     host = bench.ready(f'[[step]]\nat_s = {FAILS_S}\ndo = "{action}"\n', **BRIGHT)
     assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
-    host.wait(host.board.lit, "light")
+    host.wait(host.board.pulsed, "light")
     return host
 
 
@@ -52,7 +52,7 @@ def a_hung_main_loop_ends_in_a_dark_reset_that_hello_tells(bench):
     host = failing(bench, "stop_loop")
     board = host.board
     host.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")
-    assert not board.lit()
+    assert not board.pulsed()
     host.pause(0.2, lease=False)  # what it said before is still on its way
     host.heard.clear()
     host.say("GET")

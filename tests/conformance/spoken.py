@@ -100,12 +100,12 @@ def understood(raw):
         assert 1 <= len(records) <= 28
         return SimpleNamespace(name="EXECUTED", session=session, first_index=first, records=records)
     name, codes, names = BOARD[raw[0]]
-    told = dict(zip(names, struct.unpack("<" + codes, body), strict=True))
+    reported = dict(zip(names, struct.unpack("<" + codes, body), strict=True))
     for field, words in {**NAMES, "reason": NAKS if name == "NAK" else REASONS}.items():
-        if field in told:
-            told[field] = words[told[field]]
-    told["session"] = told.get("session", session)
-    return SimpleNamespace(name=name, **told)
+        if field in reported:
+            reported[field] = words[reported[field]]
+    reported["session"] = reported.get("session", session)
+    return SimpleNamespace(name=name, **reported)
 
 
 class Ear:

@@ -46,13 +46,13 @@ def caught_by(mutant, ready):
 @pytest.fixture(scope="module")
 def verdicts(request, ready):
     """Futures of `caught_by` for the mutants that were asked for."""
-    asked = [
+    requested = [
         item.callspec.params["mutant"]
         for item in request.session.items
         if item.module is request.module and hasattr(item, "callspec")
     ]
     with ThreadPoolExecutor(AT_ONCE) as pool:
-        yield {mutant: pool.submit(caught_by, mutant, ready) for mutant in asked}
+        yield {mutant: pool.submit(caught_by, mutant, ready) for mutant in requested}
 
 
 FIRST = {mutant.guard: mutant for mutant in reversed(MUTANTS) if mutant.board == "host"}

@@ -102,7 +102,7 @@ def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
     time.sleep(1.3)
     assert states(rig)[-1] == "FAULT"
     assert [entry["fault"] for entry in rig.board.of("fault")] == ["LINK"]
-    assert not rig.board.lit()
+    assert not rig.board.pulsed()
     assert not rig.until(lambda: job.is_finished, 0.5)
     assert states(rig)[-1] == "FAULT"
     assert rig.finish() < 3000
@@ -116,7 +116,7 @@ def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_ri
         rig.until(lambda: False, 5.0)
     rig.session.disconnect()
     wait_for(lambda: rig.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
-    assert not rig.board.lit()
+    assert not rig.board.pulsed()
     wait_for(lambda: Path(rig.session.port).exists(), "the port's return")
     rig.session.connect()
     assert rig.session.board.state == "DISARMED"

@@ -53,14 +53,14 @@ def test_a_board_that_breaks_its_word_is_found_out(monkeypatch, names):
 
 
 def test_a_run_can_be_played_again(monkeypatch):
-    told = []
+    reported = []
     for _ in range(2):
         monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
         rig = FireRig(4, 0.1, extra=0.5, pauses=0.002)
         for _ in range(6):
             rig.live(1000, patience_s=4.0)
-        told.append((rig.log, rig.up.log, rig.down.log))
-    assert told[0] == told[1]
+        reported.append((rig.log, rig.up.log, rig.down.log))
+    assert reported[0] == reported[1]
     assert rig.faults > 500
 
 

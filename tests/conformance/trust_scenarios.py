@@ -103,8 +103,8 @@ def what_was_tightened_once_stays_tight(bench, case):
     tight, points, fault = case
     name = next(key for key, value in BEYOND.items() if value is case)
     host = bench.greeted(**OWN)
-    for asked in (tightened(**{name: tight}), LOOSER, OWN, {**LOOSER, "full_power_uw": 1}):
-        assert host.tell("LIMITS", **asked) == []
+    for requested in (tightened(**{name: tight}), LOOSER, OWN, {**LOOSER, "full_power_uw": 1}):
+        assert host.tell("LIMITS", **requested) == []
     host.arm()
     assert host.tell("LIMITS", **LOOSER) == ["STATE"]
     host.play(*points)
@@ -115,11 +115,11 @@ def what_was_tightened_once_stays_tight(bench, case):
 @scenario("B10")
 def settling_and_lease_stay_tight_too(bench):
     host = bench.greeted(**OWN)
-    for asked in (tightened(settle_us=900, settle_ns_per_code=500, lease_ms=700), LOOSER, OWN):
-        assert host.tell("LIMITS", **asked) == []
+    for requested in (tightened(settle_us=900, settle_ns_per_code=500, lease_ms=700), LOOSER, OWN):
+        assert host.tell("LIMITS", **requested) == []
     host.arm()
     host.play(here(100, **DIM), here(100, x=CENTRE + 1000, **DIM))
-    host.wait(lambda: len(host.board.fired()) == 2, "the pulses")
+    host.wait(lambda: len(host.board.executed()) == 2, "the pulses")
     first, second = host.board.of("pulse")
     assert 0 <= second["on_us"] - first["off_us"] - 1400 <= host.board.late_us
     host.raw(host.frame("LEASE", ms=60_000) + host.frame("CLOCK", host_t=5))
@@ -141,7 +141,7 @@ def a_board_s_own_limits_are_back_with_the_next_session_and_never_more(bench):
     host.arm()
     host.play(here(20_000, x=62_000, **DIM))
     host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
-    assert host.board.fired() == [0]
+    assert host.board.executed() == [0]
     host.order(host.data(here(20_001, **DIM)))
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
 
@@ -178,8 +178,8 @@ def armed_two_seconds_after_the_request_at_the_earliest(bench):
     assert host.tell("ARM_CONFIRM", **confirm) == []
     assert host.tell("ARM_CONFIRM", **confirm) == ["STATE"]
     host.wait(lambda: host.board.states()[-1][0] == "ARMED", "ARMED")
-    asked, armed = host.board.of("state")[-2:]
-    assert 0 <= armed["t_us"] - asked["t_us"] - 2_000_000 <= host.board.late_us
+    requested, armed = host.board.of("state")[-2:]
+    assert 0 <= armed["t_us"] - requested["t_us"] - 2_000_000 <= host.board.late_us
 
 
 @scenario("B11")
@@ -187,8 +187,8 @@ def arming_that_is_not_confirmed_times_out(bench):
     host = bench.greeted(**PATIENT)
     host.challenge()
     host.wait(lambda: host.board.states()[-1][1] == "arming timed out", "the time-out")
-    asked, over = host.board.of("state")[-2:]
-    assert 0 <= over["t_us"] - asked["t_us"] - 10_000_000 <= host.board.late_us
+    requested, over = host.board.of("state")[-2:]
+    assert 0 <= over["t_us"] - requested["t_us"] - 10_000_000 <= host.board.late_us
 
 
 @scenario("B11")
@@ -226,7 +226,7 @@ def a_recorded_session_played_again_never_arms(bench, where):
     script = f'[[step]]\nat_s = {SCRIPTED_S}\ndo = "reset"\n' if where == "reset" else ""
     host = bench.ready(script, **PATIENT)
     host.play(here(1000))
-    host.wait(lambda: host.board.fired() == [0], "the pulse")
+    host.wait(lambda: host.board.executed() == [0], "the pulse")
     recorded = host.written
     host.close()
     if where == "reset":

@@ -27,7 +27,7 @@ class PythonEntropy:
 
 
 class LikePython:
-    """Both boards; whatever is done to them, bytes, log and state are compared at once."""
+    """Both boards; after every action bytes, log and state are compared at once."""
 
     def __init__(self, library, settings=None, entropy=None, seed=1):
         source = random.Random(seed)

@@ -23,11 +23,11 @@ def check_b14(make):
         assert (b.fault, b.core.gate_output) == (fault, not fault)
     assert b.pulses[-1] == (0, b.now_us - 1601, b.now_us), "the record tells how long it really was lit"
 
-    for lit in (False, True):
+    for pulsed in (False, True):
         b = make().ready()
-        b.play(here(40_000, dark_us=0 if lit else 40_000))
+        b.play(here(40_000, dark_us=0 if pulsed else 40_000))
         b.wait(1000)
-        b.core.stick(True, not lit)
+        b.core.stick(True, not pulsed)
         began_us = b.now_us
         b.wait(200)
         assert b.fault == "", "it may differ for 100 µs, seen from the first tick that notices"

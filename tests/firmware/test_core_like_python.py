@@ -1,4 +1,4 @@
-"""Two boards, one protocol: whatever a host does, the C core and the Python board answer, log and light the same."""
+"""The C core and the Python board answer, log and emit identically for every host."""
 
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
@@ -159,7 +159,7 @@ def step(both, what, detail):
 
 @settings(max_examples=200)
 @given(BOARDS, EPISODES, st.integers(0, 2**32))
-def test_whatever_happens_both_do_the_same(library, board, episodes, seed):
+def test_both_boards_behave_identically(library, board, episodes, seed):
     both = LikePython(library, board, seed=seed)
     for limits, steps in episodes:
         arm(both, limits)

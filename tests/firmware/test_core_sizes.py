@@ -41,5 +41,5 @@ def test_reports_come_before_their_records_are_overwritten(small):
     b = small(queue_points=24).ready()
     answers = b.play(*[here(0, dark_us=400, duty=0)] * 24)
     answers += [x for _ in range(40) for x in b.wait(500)]
-    told = [x.first_index + k for x in answers if hasattr(x, "records") for k in range(len(x.records))]
-    assert told == list(range(24))
+    reported = [x.first_index + k for x in answers if hasattr(x, "records") for k in range(len(x.records))]
+    assert reported == list(range(24))

@@ -42,9 +42,9 @@ def folder(tmp_path_factory):
 def test_nothing_is_found(folder):
     fuzzers = [start(build(folder, target), SECONDS) for target in LONGEST]
     for fuzzer in fuzzers:
-        told = fuzzer.communicate()[1]
-        assert fuzzer.returncode == 0, told[-5000:]
-        assert "Done" in told
+        reported = fuzzer.communicate()[1]
+        assert fuzzer.returncode == 0, reported[-5000:]
+        assert "Done" in reported
 
 
 @pytest.mark.parametrize("what", FOUND_BEFORE)
@@ -53,8 +53,8 @@ def test_what_was_found_is_mended(folder, what):
     path = folder / "steps"
     path.write_bytes(bytes.fromhex(steps))
     fuzzer = start(build(folder, target), SECONDS, path)
-    told = fuzzer.communicate()[1]
-    assert fuzzer.returncode == 0, told[-5000:]
+    reported = fuzzer.communicate()[1]
+    assert fuzzer.returncode == 0, reported[-5000:]
 
 
 @pytest.mark.parametrize(
@@ -70,6 +70,6 @@ def test_what_was_found_is_mended(folder, what):
 )
 def test_a_core_without_a_check_is_found_out(folder, target, mutant, says):
     fuzzer = start(build(folder, target, mutant), MUTANT_SECONDS)
-    told = fuzzer.communicate()[1]
+    reported = fuzzer.communicate()[1]
     assert fuzzer.returncode != 0, "the fuzzer does not notice"
-    assert says in told, told[-5000:]
+    assert says in reported, reported[-5000:]

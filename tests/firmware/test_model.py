@@ -18,14 +18,16 @@ def explored(folder, mutant):
         ["gcc", "-O2", "-DSAFETY", "-DNOFAIR", "-o", "pan", "pan.c"],
     ):
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
-    told = subprocess.run(["./pan", "-m2000000", "-w24"], cwd=folder, check=True, capture_output=True, text=True).stdout
-    assert "Search not completed" not in told or mutant, told
-    return int(re.search(r"errors: (\d+)", told)[1]), int(re.search(r"(\d+) states, stored", told)[1]), told
+    reported = subprocess.run(
+        ["./pan", "-m2000000", "-w24"], cwd=folder, check=True, capture_output=True, text=True
+    ).stdout
+    assert "Search not completed" not in reported or mutant, reported
+    return int(re.search(r"errors: (\d+)", reported)[1]), int(re.search(r"(\d+) states, stored", reported)[1]), reported
 
 
 def test_nothing_forbidden_happens_in_any_order(tmp_path):
-    errors, states, told = explored(tmp_path, 0)
-    assert errors == 0, told
+    errors, states, reported = explored(tmp_path, 0)
+    assert errors == 0, reported
     assert states > 3_000_000
 
 
@@ -34,6 +36,6 @@ def test_nothing_forbidden_happens_in_any_order(tmp_path):
     [mutant if k % 2 == 0 else pytest.param(mutant, marks=pytest.mark.slow) for k, mutant in enumerate(MUTANTS)],
 )
 def test_a_rule_taken_away_is_missed(tmp_path, mutant):
-    errors, _, told = explored(tmp_path, mutant)
+    errors, _, reported = explored(tmp_path, mutant)
     assert errors == 1
-    assert "assertion violated" in told
+    assert "assertion violated" in reported

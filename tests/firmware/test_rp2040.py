@@ -108,7 +108,7 @@ def test_a_second_stage_that_is_too_long_is_refused(tmp_path):
     wrong = tmp_path / "wrong.bin"
     wrong.write_bytes(bytes(range(256)))
     command = [sys.executable, PORT / "image.py", wrong, tmp_path / "wrong.uf2"]
-    told = subprocess.run(command, capture_output=True, text=True)
-    assert (told.returncode, told.stderr.count("\n")) == (2, 1)
-    assert "fcfdfeff in its last four bytes, expected zeros" in told.stderr
+    reported = subprocess.run(command, capture_output=True, text=True)
+    assert (reported.returncode, reported.stderr.count("\n")) == (2, 1)
+    assert "fcfdfeff in its last four bytes, expected zeros" in reported.stderr
     assert not (tmp_path / "wrong.uf2").exists()

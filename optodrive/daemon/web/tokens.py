@@ -51,7 +51,7 @@ class Tokens:
         return found
 
     @property
-    def most_privileged(self) -> Token:
+    def highest_role(self) -> Token:
         """The token with the highest role."""
         return max(self.all, key=lambda token: ROLES.index(token.role))
 
@@ -153,6 +153,6 @@ def read_token(port: int | None) -> str:
     candidates = [Path(file_name)] if file_name else [*own_paths, SERVICE_TOKENS]
     for path in candidates:
         if os.access(path, os.R_OK):
-            return read_tokens(path).most_privileged.secret
+            return read_tokens(path).highest_role.secret
     listed = " or ".join(str(path) for path in candidates)
     raise InputError(ENVIRONMENT_VARIABLE, None, f"a token: set it, or make {listed} readable")

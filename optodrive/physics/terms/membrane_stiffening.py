@@ -13,7 +13,7 @@ def membrane_drive(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float
 
 
 class MembraneStiffening(Term):
-    """γ / (1 + (curvature · γ)ᵒ)^(1/o): between a plate and a stretched membrane, of whatever material."""
+    """γ / (1 + (curvature · γ)ᵒ)^(1/o): between a plate and a stretched membrane, for any material."""
 
     key = "membrane_stiffening"
     label = "the membrane stiffens as it rises"

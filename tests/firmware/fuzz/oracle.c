@@ -24,8 +24,8 @@ static uint32_t u32(const uint8_t *at) { return (uint32_t)read_le(at, 4); }
 
 /* --- limits --- */
 
-#define LESS_OF(name, asked) now->name = now->name < (asked) ? now->name : (asked)
-#define MORE_OF(name, asked) now->name = now->name > (asked) ? now->name : (asked)
+#define LESS_OF(name, requested) now->name = now->name < (requested) ? now->name : (requested)
+#define MORE_OF(name, requested) now->name = now->name > (requested) ? now->name : (requested)
 
 static void tighten(struct board_limits *now, const uint8_t *body) {
     LESS_OF(max_on_us, u16(body));
@@ -317,7 +317,7 @@ static void on_state_change(struct oracle *o, uint8_t state) {
     if (o->state == STATE_ARMING && (is_leased(state) && state != STATE_ARMING)) {
         require(o->confirmed && o->now_us >= armed_us, "B11", "armed too soon, or without a confirmation");
     }
-    require(is_leased(o->state) || !is_leased(state) || state == STATE_ARMING, "B11", "armed without having been asked");
+    require(is_leased(o->state) || !is_leased(state) || state == STATE_ARMING, "B11", "armed without having been requested");
     require(o->state != STATE_FAULT || o->cleared, "fault", "left without being cleared");
     if (ends) {
         forget_points(o);

@@ -58,7 +58,7 @@ static double window_duty_us(const struct oracle *o, double end_us) {
 }
 
 static void check_mean_power(const struct oracle *o, const struct observed_pulse *pulse) {
-    double most = SECOND_US * o->limits.mean_duty + (double)o->late_us * FULL + 0.5;
+    double limit = SECOND_US * o->limits.mean_duty + (double)o->late_us * FULL + 0.5;
     double begin_us = (double)pulse->from_us, end_us = begin_us + pulse->on_us, max_duty_us = window_duty_us(o, end_us);
     for (uint32_t k = 0; k < o->pulses_count; k++) { /* the sum peaks only where a pulse begins to leave the second */
         double leaves_us = (double)o->pulses[k].from_us + SECOND_US;
@@ -66,7 +66,7 @@ static void check_mean_power(const struct oracle *o, const struct observed_pulse
             max_duty_us = fmax(max_duty_us, window_duty_us(o, leaves_us));
         }
     }
-    if (max_duty_us > most) {
+    if (max_duty_us > limit) {
         report_violation("B5", "a second holds too much light");
     }
 }

@@ -71,9 +71,9 @@ size_t reference_encode(uint8_t *wire, uint8_t type, uint8_t seq, uint16_t sessi
     return to;
 }
 
-/* From PROTOCOL.md: bytes of the body, bytes per item of 1 to `most` items, enumerated fields. */
+/* From PROTOCOL.md: bytes of the body, bytes per item of 1 to `max_items` items, enumerated fields. */
 static const struct {
-    uint8_t type, size, item, most;
+    uint8_t type, size, item, max_items;
     bool sequenced;
     struct {
         uint8_t at, names;
@@ -112,7 +112,7 @@ bool reference_is_valid(const struct parsed *parsed) {
         }
         size_t rest = parsed->length - MESSAGES[k].size, item = MESSAGES[k].item;
         bool fits = parsed->length >= MESSAGES[k].size &&
-                    (item ? rest >= item && rest <= item * MESSAGES[k].most && rest % item == 0 : rest == 0);
+                    (item ? rest >= item && rest <= item * MESSAGES[k].max_items && rest % item == 0 : rest == 0);
         for (size_t n = 0; fits && n < 3; n++) {
             uint8_t names = MESSAGES[k].named[n].names;
             fits = names == 0 || parsed->body[MESSAGES[k].named[n].at] < names;

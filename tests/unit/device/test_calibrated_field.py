@@ -45,12 +45,12 @@ def test_far_places_are_never_taken_for_others():
     for seed in range(6):
         spots, _ = measure_spots(GroundTruthGeometry.sample(seed, CONFIG), grid_codes(5), np.random.default_rng(0))
         field = fit_field(spots, PRIOR).field
-        for beyond, most_codes in ((False, 0.1), (True, 10.0)):
+        for beyond, max_codes in ((False, 0.1), (True, 10.0)):
             codes = np.array(field.codes(*far_m, extrapolate=beyond))
             kept = np.isfinite(codes[0])
             assert kept.any()
             again = np.array(field.position_m(*codes[:, kept]))
-            assert np.abs(again - far_m[:, kept]).max() < most_codes * CODE_M
+            assert np.abs(again - far_m[:, kept]).max() < max_codes * CODE_M
 
 
 def test_angles_are_codes_in_the_converter_s_scale():

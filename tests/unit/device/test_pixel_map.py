@@ -125,9 +125,10 @@ def test_heights_are_kept_and_heat_is_never_scaled(display):
     assert DEAD_PIXEL not in energy_j
     assert energy_j[LOW] > 1.3 * nominal_j[LOW]
     assert energy_j[HIGH] < 0.8 * nominal_j[HIGH]
-    lit = (plan.plan.pixel, plan.plan.start_s, plan.plan.width_s, plan.plan.power_w)
+    pulsed = (plan.plan.pixel, plan.plan.start_s, plan.plan.width_s, plan.plan.power_w)
     assert np.array_equal(
-        display.build_cold_heat().apply_pulses(*lit).absorber_k, PLAIN.build_cold_heat().apply_pulses(*lit).absorber_k
+        display.build_cold_heat().apply_pulses(*pulsed).absorber_k,
+        PLAIN.build_cold_heat().apply_pulses(*pulsed).absorber_k,
     )
     for name in ("r_k_per_w", "c_j_per_k", "epsilon", "tau_g_s"):
         assert np.array_equal(getattr(display.pixels, name), getattr(PLAIN.pixels, name))
@@ -151,11 +152,9 @@ def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
 
 def test_the_dead_are_left_out_and_named(display):
     prepared, feasibility = check_feasibility(display, frame_of_all(60e-6), *display.build_cold_state())
-    figures = summarize_plan(prepared, feasibility)
+    stats = summarize_plan(prepared, feasibility)
     assert feasibility.fits
-    assert figures.dead == DeadPixelSummary(
-        pixels=[DEAD_PIXEL], count=1, message=f"pixel {DEAD_PIXEL} is dead: omitted"
-    )
+    assert stats.dead == DeadPixelSummary(pixels=[DEAD_PIXEL], count=1, message=f"pixel {DEAD_PIXEL} is dead: omitted")
     alone = np.zeros(COUNT)
     alone[DEAD_PIXEL] = 5e-3  # unreachable for every pixel
     nothing, _ = check_feasibility(

@@ -67,8 +67,8 @@ def test_times_rise_and_no_detour_is_quicker(moves):
         for far in range(2, len(times_us)):
             ways_us = times_us[1:far] + times_us[far - 1 : 0 : -1]
             assert times_us[far] <= ways_us.min()
-    for calm, hasty in zip(moves.after_long_dwell, moves.after_short_dwell, strict=True):
-        assert np.all(np.array(hasty) >= np.array(calm))
+    for long_us, short_us in zip(moves.after_long_dwell, moves.after_short_dwell, strict=True):
+        assert np.all(np.array(short_us) >= np.array(long_us))
     assert moves.lead_in_us >= moves.after_short_dwell[0][-1]
 
 

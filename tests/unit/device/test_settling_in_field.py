@@ -20,8 +20,8 @@ class Askew:
         self.magnification, self.turn_rad, self.bend_per_m = magnification, turn_rad, bend_per_m
 
     def angles_rad(self, x_m, y_m):
-        bent = 1.0 + self.bend_per_m * x_m
-        x_m, y_m = bent * x_m - self.turn_rad * y_m, bent * y_m + self.turn_rad * x_m
+        distorted = 1.0 + self.bend_per_m * x_m
+        x_m, y_m = distorted * x_m - self.turn_rad * y_m, distorted * y_m + self.turn_rad * x_m
         return IdealField(CONFIG.scanner.focal_length_m * self.magnification).angles_rad(x_m, y_m)
 
 

@@ -94,8 +94,8 @@ def test_a_pulse_asked_for_a_height_reaches_it_after_others(key):
         assert 0 < periods <= DRIVE.max_periods
         assert 0 < duty <= 1
         one = (np.array([5]), np.array([at_s]), np.array([periods * DRIVE.period_s]), np.array([duty * FULL_W]))
-        together = tuple(np.concatenate(pair) for pair in zip(before, one, strict=True))
-        t_s, _, displacement_m = simulate_alone(keys, 5, together, at_s + 0.3)
+        combined = tuple(np.concatenate(pair) for pair in zip(before, one, strict=True))
+        t_s, _, displacement_m = simulate_alone(keys, 5, combined, at_s + 0.3)
         assert displacement_m[t_s >= at_s].max() == pytest.approx(target_m, rel=1e-3)
         if periods > 1:
             shorter = extended(*keys)

@@ -40,8 +40,8 @@ def test_pulses_follow_the_closed_form_and_leave_neighbours_alone(pixels):
     heat = NominalThermalState(pixels)
     heat.apply_pulse(0, 0.010, 0.008, 2.45)
     heat.apply_pulse(0, 0.030, 0.004, 1.0)
-    lit = advance(NARROW, 0.0, 0.0, 2.45, 0.008)
-    again = advance(NARROW, *advance(NARROW, *lit, 0.0, 0.012), 1.0, 0.004)
+    pulsed = advance(NARROW, 0.0, 0.0, 2.45, 0.008)
+    again = advance(NARROW, *advance(NARROW, *pulsed, 0.0, 0.012), 1.0, 0.004)
     assert heat.rises_k(0, 0.050) == pytest.approx(advance(NARROW, *again, 0.0, 0.016), rel=1e-12)
     assert heat.rises_k(1, 0.050) == (0.0, 0.0)
 
@@ -136,13 +136,13 @@ def test_trace_is_exact_at_edges_and_between(pixels):
     rows = [(0, 0.001, 0.008, 2.45), (1, 0.010, 0.002, 2.45)]
     t_s = np.array([0.0, 0.001, 0.005, 0.009, 0.030])
     trace = NominalThermalState(pixels).simulate_traces(columns_of(rows), [1, 0], t_s)
-    lit = advance(NARROW, 0.0, 0.0, 2.45, 0.008)
+    pulsed = advance(NARROW, 0.0, 0.0, 2.45, 0.008)
     expected = [
         (0.0, 0.0),
         (0.0, 0.0),
         advance(NARROW, 0.0, 0.0, 2.45, 0.004),
-        lit,
-        advance(NARROW, *lit, 0.0, 0.021),
+        pulsed,
+        advance(NARROW, *pulsed, 0.0, 0.021),
     ]
     got = np.stack([trace.absorber_k[:, 1], trace.gas_k[:, 1]], axis=1)
     assert got == pytest.approx(np.array(expected), rel=1e-9, abs=1e-9)

@@ -227,12 +227,12 @@ def test_what_only_scales_or_shifts():
 
 
 def test_the_power_curve_keeps_full_power():
-    bent = {"power_nonlinearity": {"threshold": 0.245, "curvature": 0.2}}
+    distorted = {"power_nonlinearity": {"threshold": 0.245, "curvature": 0.2}}
     for watts in (2.45, 1.2, 0.2):
         pulses = np.array([[0.0, 0.05, watts, 0.0]])
         scene = PixelExperiment(pulses, 0, AMBIENT_K, (T_S, T_S, T_S))
         rise_k = simulate_signals(scene, PIXEL, ActiveTerms.from_values({}))[0].max()
-        ours_k = simulate_signals(scene, PIXEL, ActiveTerms.from_values(bent))[0].max()
+        ours_k = simulate_signals(scene, PIXEL, ActiveTerms.from_values(distorted))[0].max()
         left = max(0.0, (watts / 2.45 - 0.1) / 0.9)
         assert ours_k == pytest.approx(rise_k * left * (1 + 0.2 * (1 - left)) / (watts / 2.45))
 

@@ -10,10 +10,10 @@ PIXEL = Pixel(184.0, 126e-6, 0.66, 3e-3, 4e-6, 2e-4)
 DRIVE = DriveRange.from_laser(2.45, 5000.0, 0.050)
 
 
-def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, least_periods=1, from_s=0.0):
-    goal_k = target_m / pixel.kappa_m_per_k
-    span = (drive.max_power_w, drive.period_s, min(least_periods, drive.max_periods), drive.max_periods)
-    periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, goal_k, *span, from_s)
+def pulse_for_peak(pixel, theta_k, gamma_k, target_m, drive, min_periods=1, from_s=0.0):
+    target_k = target_m / pixel.kappa_m_per_k
+    span = (drive.max_power_w, drive.period_s, min(min_periods, drive.max_periods), drive.max_periods)
+    periods, duty = find_shortest_pulse(pixel, theta_k, gamma_k, target_k, *span, from_s)
     return (periods, duty) if periods else None
 
 
@@ -64,26 +64,26 @@ def test_a_target_unreachable_gets_the_longest_pulse():
     assert pulse_for_peak(PIXEL, 0.0, 0.0, 2 * max_displacement_m(PIXEL, DRIVE), DRIVE) == (250, 1.0)
 
 
-@given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), least=st.integers(1, 300))
-def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, least):
+@given(share=st.floats(1e-3, 0.9), theta=st.floats(0.0, 20.0), minimum=st.integers(1, 300))
+def test_a_pulse_is_as_wide_as_told_and_its_duty_makes_up_the_rest(share, theta, minimum):
     target = share * max_displacement_m(PIXEL, DRIVE)
-    narrow, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, least_periods=n) for n in (1, least))
+    narrow, wide = (pulse_for_peak(PIXEL, theta, 0.0, target, DRIVE, min_periods=n) for n in (1, minimum))
     if narrow is None:
         assert wide is None
         return
-    assert wide[0] == max(narrow[0], min(least, DRIVE.max_periods))
+    assert wide[0] == max(narrow[0], min(minimum, DRIVE.max_periods))
     peak = pulse_peak(PIXEL, theta, 0.0, wide[1] * 2.45, wide[0] * DRIVE.period_s)[0] * PIXEL.kappa_m_per_k
     assert peak == pytest.approx(target, rel=1e-6)
 
 
-@given(share=st.floats(0.01, 0.5), least=st.integers(1, 40), from_s=st.floats(0.01, 0.04))
-def test_a_peak_may_count_only_from_a_time_on(share, least, from_s):
+@given(share=st.floats(0.01, 0.5), minimum=st.integers(1, 40), from_s=st.floats(0.01, 0.04))
+def test_a_peak_may_count_only_from_a_time_on(share, minimum, from_s):
     target = share * max_displacement_m(PIXEL, DRIVE)
-    periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, target, DRIVE, least, from_s)
+    periods, duty = pulse_for_peak(PIXEL, 0.0, 0.0, target, DRIVE, minimum, from_s)
     width = periods * DRIVE.period_s
-    lit = advance(PIXEL, 0.0, 0.0, duty * 2.45, width)
-    gas = [advance(PIXEL, *lit, 0.0, s)[1] for s in max(0.0, from_s - width) + np.linspace(0, 0.05, 2001)]
-    assert periods >= least
+    pulsed = advance(PIXEL, 0.0, 0.0, duty * 2.45, width)
+    gas = [advance(PIXEL, *pulsed, 0.0, s)[1] for s in max(0.0, from_s - width) + np.linspace(0, 0.05, 2001)]
+    assert periods >= minimum
     assert (duty == 1.0 and periods == DRIVE.max_periods) or max(gas) * PIXEL.kappa_m_per_k == pytest.approx(
         target, rel=1e-4
     )

@@ -7,7 +7,9 @@ from optodrive.daemon.web.static_files import LOGIN_PATHS
 
 def test_each_role_may_do_what_the_lesser_ones_may():
     for index, role in enumerate(ROLES):
-        assert [is_role_sufficient(role, least) for least in ROLES] == [place <= index for place in range(len(ROLES))]
+        assert [is_role_sufficient(role, minimum) for minimum in ROLES] == [
+            place <= index for place in range(len(ROLES))
+        ]
 
 
 @pytest.mark.parametrize(
@@ -43,7 +45,7 @@ def test_what_is_not_in_the_table_is_not_found(method, path):
 def test_stop_asks_for_the_least_role_and_arm_for_the_highest():
     assert ROUTES["POST /v1/stop"] == ROLES[0]
     assert ROUTES["POST /v1/arm"] == ROLES[-1]
-    assert [key for key, least in ROUTES.items() if least is None] == [
+    assert [key for key, minimum in ROUTES.items() if minimum is None] == [
         "GET /v1/health",
         *(f"GET {path}" for path in LOGIN_PATHS),
     ]

@@ -37,18 +37,18 @@ def send_request(path, method="GET", **headers):
         "headers": [(name.encode(), value.encode()) for name, value in request_headers.items()],
     }
     asyncio.run(AccessMiddleware(serve_inner, POLICY)(scope, receive, send))
-    heads = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
-    return sent[0]["status"], heads, sent[1]["body"]
+    lead_periods = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
+    return sent[0]["status"], lead_periods, sent[1]["body"]
 
 
 def test_without_a_token_the_page_asks_for_it_and_the_api_answers_a_problem():
-    status, heads, body = send_request("/")
-    assert (status, heads["content-type"]) == (401, "text/html")
-    assert heads["content-security-policy"] == SECURITY_HEADERS["Content-Security-Policy"]
+    status, lead_periods, body = send_request("/")
+    assert (status, lead_periods["content-type"]) == (401, "text/html")
+    assert lead_periods["content-security-policy"] == SECURITY_HEADERS["Content-Security-Policy"]
     assert b"<form" in body
     assert send_request("/page/main.js")[0] == 401
-    status, heads, _ = send_request("/v1/state")
-    assert (status, heads["content-type"]) == (401, "application/problem+json")
+    status, lead_periods, _ = send_request("/v1/state")
+    assert (status, lead_periods["content-type"]) == (401, "application/problem+json")
 
 
 def test_the_cookie_opens_the_page_for_get_alone():

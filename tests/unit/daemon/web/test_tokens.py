@@ -52,7 +52,7 @@ def test_the_environment_gives_the_armers(monkeypatch):
     monkeypatch.setenv(ENVIRONMENT_VARIABLE, SECRET)
     tokens, path = load_daemon_tokens("", 1)
     assert tokens.find(SECRET).role == "armer"
-    assert read_tokens(path).most_privileged.secret == SECRET
+    assert read_tokens(path).highest_role.secret == SECRET
 
 
 @pytest.mark.parametrize("mode", [0o640, 0o604, 0o660, 0o777])

@@ -1,4 +1,4 @@
-"""The loop's small parts: readings that agree, the session on disk, the process aside."""
+"""The loop's small parts: readings that agree, the session on disk, the process worker."""
 
 import json
 from pathlib import Path
@@ -58,15 +58,15 @@ def test_a_session_of_something_else_is_refused(tmp_path, change, says):
 
 
 def test_work_aside_comes_back_or_says_why():
-    with WorkerProcess() as aside:
-        aside.submit(str.upper, "spot")
-        assert aside.result() == "SPOT"
-        aside.submit(refuse, "a file")
+    with WorkerProcess() as worker:
+        worker.submit(str.upper, "spot")
+        assert worker.result() == "SPOT"
+        worker.submit(refuse, "a file")
         with pytest.raises(RefusedError, match="a file: got 1, expected 2"):
-            aside.result()
-        aside.submit(Path.read_text, Path("/nowhere at all"))
+            worker.result()
+        worker.submit(Path.read_text, Path("/nowhere at all"))
         with pytest.raises(OptodriveError, match="read_text: FileNotFoundError"):
-            aside.result()
-        aside._process.terminate()
+            worker.result()
+        worker._process.terminate()
         with pytest.raises(OptodriveError, match="has ended"):
-            aside.result()
+            worker.result()

@@ -462,8 +462,8 @@ def test_a_report_never_runs_over_a_gap_of_numbers(bench):
     answers = bench.say(m.Flush())
     bench.index = 100
     answers += bench.play(*dim(2)) + bench.wait(50_000)
-    told = executed(bench.say(m.GetExecuted(0)))
-    assert [record[0] for record in told] == [0]
+    reported = executed(bench.say(m.GetExecuted(0)))
+    assert [record[0] for record in reported] == [0]
     assert [record[0] for record in executed(bench.say(m.GetExecuted(1)))] == [100, 101]
 
 

@@ -290,9 +290,9 @@ def b6_one_grid_whose_borders_hide(patch):
 def first_light_after_us(b):
     began_us = b.now_us
     b.wait(20_000)
-    lit = [t_us - began_us for t_us, on in b.edges if on and t_us >= began_us]
-    assert lit
-    return lit[0]
+    pulsed = [t_us - began_us for t_us, on in b.edges if on and t_us >= began_us]
+    assert pulsed
+    return pulsed[0]
 
 
 def check_b7(make):
@@ -429,11 +429,11 @@ def check_b10(make):
     tighter = m.Limits(**{n: v // 2 if n in MORE_IS_LOOSER else v + 50 for n, v in OWN.items()})
     b = make(OWN)
     assert b.hello().limits == own
-    for asked, power in ((looser, 9), (own, 1)):
-        assert naks(b.say(m.Limits(**{**vars(asked), "full_power_uw": power}))) == []
+    for requested, power in ((looser, 9), (own, 1)):
+        assert naks(b.say(m.Limits(**{**vars(requested), "full_power_uw": power}))) == []
         assert b.limits == own
-    for asked in (tighter, looser, own):
-        b.say(asked)
+    for requested in (tighter, looser, own):
+        b.say(requested)
         assert vars(b.limits) == {**vars(tighter), "full_power_uw": OWN["full_power_uw"]}
     b.arm()
     assert naks(b.say(looser)) == ["STATE"]
@@ -444,12 +444,12 @@ def check_b10(make):
 
 
 def b10_takes_what_it_is_told(patch):
-    patch.setattr(machine_module, "tighten", lambda own, asked: asked)
+    patch.setattr(machine_module, "tighten", lambda own, requested: requested)
 
 
 def b10_against_own_only(patch):
     tightened = machine_module.tighten
-    patch.setattr(machine_module, "tighten", lambda own, asked: tightened(m.Limits(**OWN), asked))
+    patch.setattr(machine_module, "tighten", lambda own, requested: tightened(m.Limits(**OWN), requested))
 
 
 # --- B11: arming needs a fresh nonce, and the key's edge where the board wants it -----------------------------------

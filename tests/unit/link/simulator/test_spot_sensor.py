@@ -14,7 +14,7 @@ CODES = (CENTRE_CODE + 9000, CENTRE_CODE - 4000)
 SETTLED_US = 100_000
 
 
-def looking(noise_m=10e-6, outlier_share=0.0, outputs=True):
+def build_sensor(noise_m=10e-6, outlier_share=0.0, outputs=True):
     mirrors = SimulatedGalvos(CONFIG, seed=1)
     mirrors.move_to(*CODES, 0)
     return SimulatedSpotSensor(CONFIG, TRUTH, mirrors, noise_m, outlier_share, outputs, seed=2), mirrors
@@ -32,7 +32,7 @@ def numbers(line):
 
 
 def test_it_sees_where_the_truth_says_with_its_noise():
-    sensor, _ = looking()
+    sensor, _ = build_sensor()
     lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k)) for k in range(400)])
     landed_um = 1e6 * np.array(TRUTH.position_m(*CODES))
     assert lines[:, :2].mean(axis=0) == pytest.approx(landed_um, abs=2.0)
@@ -41,7 +41,7 @@ def test_it_sees_where_the_truth_says_with_its_noise():
 
 
 def test_nothing_in_the_dark_and_nothing_twice():
-    sensor, _ = looking(outlier_share=1.0)
+    sensor, _ = build_sensor(outlier_share=1.0)
     assert sensor.answer("spot", 0) == "spot none"
     assert shine(sensor) != "spot none"
     assert sensor.answer("spot", SETTLED_US + 20_001) == "spot none"
@@ -50,7 +50,7 @@ def test_nothing_in_the_dark_and_nothing_twice():
 
 
 def test_too_little_light_a_cover_and_a_spot_outside_are_none():
-    sensor, mirrors = looking()
+    sensor, mirrors = build_sensor()
     assert shine(sensor, energy_j=1e-6) == "spot none"
     mirrors.move_to(65535, CENTRE_CODE, SETTLED_US)
     assert shine(sensor, 2 * SETTLED_US) == "spot none"
@@ -60,7 +60,7 @@ def test_too_little_light_a_cover_and_a_spot_outside_are_none():
 
 
 def test_false_detections_lie_anywhere_and_are_as_many_as_asked():
-    sensor, _ = looking(outlier_share=0.2)
+    sensor, _ = build_sensor(outlier_share=0.2)
     lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k))[:2] for k in range(1000)])
     away = np.hypot(*(lines - 1e6 * np.array(TRUTH.position_m(*CODES))).T) > 100.0
     assert away.mean() == pytest.approx(0.2, abs=0.04)
@@ -70,9 +70,9 @@ def test_false_detections_lie_anywhere_and_are_as_many_as_asked():
 
 
 def test_mirrors_and_words_it_does_not_know():
-    sensor, _ = looking()
+    sensor, _ = build_sensor()
     word, x_rad, _ = sensor.answer("mirrors", SETTLED_US).split()
     assert word == "mirrors"
     assert float(x_rad) == pytest.approx(9000 * CONFIG.scanner.rad_per_code, abs=1e-4)
-    assert looking(outputs=False)[0].answer("mirrors", 0) == "mirrors none"
+    assert build_sensor(outputs=False)[0].answer("mirrors", 0) == "mirrors none"
     assert sensor.answer("spots", 0).startswith("error")
