@@ -10,10 +10,10 @@ from optodrive.planning.display_model import DisplayModel
 
 HEAD = """# REST API
 
-Generated from the daemon's OpenAPI document, which the daemon serves at `/openapi.json`. Every route except `/v1/health` needs
-`Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are problem documents (RFC 9457) with a stable
-`code`. The WebSocket is described in [streaming](../how-to/stream-frames.md), the Python client in
-[client](../how-to/use-the-python-client.md).
+Generated from the daemon's OpenAPI document, which the daemon serves at `/openapi.json`. Every route except
+`/v1/health` needs `Authorization: Bearer TOKEN`; the role is the lowest that may call the route. Errors are problem
+documents (RFC 9457) with a stable `code`. [Streaming](../how-to/stream-frames.md) describes the WebSocket,
+[the client](../how-to/use-the-python-client.md) its use from Python.
 """
 PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem):
 
@@ -21,8 +21,8 @@ PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem
 |---|---|"""
 MODELS_HEAD = """## Models
 
-The JSON bodies. A type in parentheses may be null. Members of `Problem` and `FrameResult` that do not apply are absent; all other
-models always have all members.
+The JSON bodies. A type in parentheses may be null. Members of `Problem` and `FrameResult` that do not apply are absent;
+all other models always have all members.
 """
 
 

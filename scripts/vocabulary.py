@@ -20,7 +20,7 @@ DOCUMENTS = ("docs", "README.md", "CONTRIBUTING.md", "CHANGELOG.md")
 ENTRY = re.compile(r"`([^`]+)`")
 WORD = re.compile(r"[A-Z]+(?=[A-Z][a-z])|[A-Z]?[a-z]+|[A-Z]+|\d+")
 TEXT = (".py", ".c", ".h", ".js", ".css", ".html", ".md", ".toml", ".pml", ".service")
-VAGUE = re.compile(r";|\b(what|whoever|whatever)\b", re.IGNORECASE)
+VAGUE = re.compile(r";|\b(what|who[e]ver|whate[v]er)\b", re.IGNORECASE)
 C_NOISE = re.compile(
     r'/\*.*?\*/|//[^\n]*|"(?:\\.|[^"\\\n])*"|\'(?:\\.|[^\'\\\n])*\'|^\s*#\s*include[^\n]*', re.S | re.M
 )
@@ -109,7 +109,7 @@ def python_names(path: str, source: str) -> Iterator[Name]:
     """Yield what a Python file defines, its keyword arguments and its string keys."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            if not is_sentence(path, node.name):
+            if not names_scenario(path, node.name):
                 yield Name(node.name, path, node.lineno, is_function=True)
         elif isinstance(node, ast.ClassDef):
             yield Name(node.name, path, node.lineno)
@@ -127,7 +127,7 @@ def python_names(path: str, source: str) -> Iterator[Name]:
             yield key_name(node.slice, path)
 
 
-def is_sentence(path: str, name: str) -> bool:
+def names_scenario(path: str, name: str) -> bool:
     """Return whether a function's name is the sentence that a test or a scenario shows."""
     return path.startswith("tests/") and (name.startswith("test_") or name.count("_") >= 4)
 

@@ -1,4 +1,4 @@
-"""What both streams share: the address, the buffer of results, and the errors of refused frames."""
+"""Common parts of both streams: the address, the buffer of results, and the errors of refused frames."""
 
 from collections import deque
 

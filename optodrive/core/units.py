@@ -1,4 +1,4 @@
-"""Unit conversions for interfaces; internally all quantities are SI, with the unit as suffix of the name."""
+"""Unit conversions for interfaces, because internally all quantities are in SI units."""
 
 from typing import TypeVar
 

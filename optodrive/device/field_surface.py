@@ -1,4 +1,4 @@
-"""Smooth correction of a scan field per axis, for what the physical geometry does not explain.
+"""Smooth correction of a scan field per axis, for errors that the physical geometry does not explain.
 
 It is a sum of products of Legendre polynomials of both axes, of total degree 2 to ORDER; the physical geometry covers
 the lower degrees. Outside the extent it keeps its value at the edge.

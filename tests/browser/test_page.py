@@ -358,11 +358,11 @@ def test_axe_finds_nothing_serious_where_the_token_is_asked_for(visit, daemon, a
 
 def test_reduced_motion_asks_for_fewer_pictures(visit, daemon):
     page = visit(daemon, reduced_motion="reduce").page
-    asked = []
-    page.on("request", lambda request: asked.append(request.url))
+    requested = []
+    page.on("request", lambda request: requested.append(request.url))
     page.goto(f"{daemon.url}/#token={TOKEN}")
     page.get_by_text("live", exact=True).wait_for()
-    assert any("rate_hz=5" in url for url in asked)
+    assert any("rate_hz=5" in url for url in requested)
     assert not page.locator("#beam").is_checked()
 
 

@@ -1,4 +1,4 @@
-"""The table of docs/reference/board-conformance.md: for each guard what looks at it, counted from the suite. Run, it prints it."""
+"""Print the table of docs/reference/board-conformance.md: the scenarios and mutants of each guard."""
 
 from collections import Counter
 

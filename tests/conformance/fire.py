@@ -135,7 +135,9 @@ class Witness:
             assert entry["index"] > last_index, f"out of order: {entry}"
             gate_on_us = entry["off_us"] - entry["on_us"]
             whole = (entry["off_us"], f"point {entry['index']} done") in ended
-            assert gate_on_us == self._sent[pulse] if whole else gate_on_us <= self._sent[pulse], f"another width: {entry}"
+            assert gate_on_us == self._sent[pulse] if whole else gate_on_us <= self._sent[pulse], (
+                f"another width: {entry}"
+            )
             self._done.add(pulse)
             last_index = entry["index"]
             count += 1

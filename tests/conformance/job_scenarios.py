@@ -205,7 +205,7 @@ def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
         (again,) = said
         assert again.first_index == first
         assert len(again.records) == min(28, 60 - first)
-        assert again.records == [told[first + k] for k in range(len(again.records))]
+        assert again.records == [records[first + k] for k in range(len(again.records))]
     assert host.ask(host.frame("GET_EXECUTED", first_index=60))[0] == []
 
 

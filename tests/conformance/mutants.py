@@ -164,7 +164,7 @@ def b8_no_field():
     return BoardMachine, "_check_point", lambda self, point: ""
 
 
-def b8_lit_points_only():
+def b8_gate_on_points_only():
     static = BoardMachine._check_point
     return BoardMachine, "_check_point", lambda self, point: static(self, point) if point.on_us else ""
 

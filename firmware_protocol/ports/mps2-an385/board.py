@@ -2,8 +2,9 @@
 
 python firmware_protocol/ports/mps2-an385/board.py [--image FILE] --pty LINK [--log FILE] [--limits FILE] …
 
-Requires qemu-system-arm, the image (make) and the package optodrive, whose board process it uses. QEMU's own pty does not
-report to the guest that a host has closed it; the bytes therefore pass through sockets, and this process owns the pty.
+Requires qemu-system-arm, the image (make) and the package optodrive, whose board process it uses. QEMU's own pty does
+not report to the guest that a host has closed it; the bytes therefore pass through sockets, and this process owns the
+pty.
 """
 
 import atexit

@@ -1,4 +1,4 @@
-"""The events of GET /v1/telemetry; the event `state` is a StateReport."""
+"""The events of GET /v1/telemetry, except `state`, which is a StateReport."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""The table of all routes with the role that each requires; the daemon rejects a route that is not in it."""
+"""The table of all routes with the role that each requires."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The simulated board's execution records: what became of each point, and the reports made of them."""
+"""The simulated board's execution records of points, and the reports made of them."""
 
 from collections import deque
 from collections.abc import Sequence

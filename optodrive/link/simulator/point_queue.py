@@ -85,5 +85,5 @@ class PointQueue:
         self.done_index = self.next_index
 
     def reset_indices(self) -> None:
-        """Number points from 0 again; the queue must be empty."""
+        """Restart the numbering of points at 0. The queue must be empty."""
         self.next_index = self.done_index = 0

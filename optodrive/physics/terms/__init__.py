@@ -1,4 +1,4 @@
-"""Physical effects beyond the nominal pixel, one module per term; a new module is a new term without other edits."""
+"""Physical effects beyond the nominal pixel, one module per term."""
 
 from collections.abc import Collection
 from functools import cache

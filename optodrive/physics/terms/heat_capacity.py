@@ -1,4 +1,4 @@
-"""Heat capacity: graphite stores more heat when hot; its c_p rises 0.71 to 1.12 J/(g K) from 300 to 450 K."""
+"""Heat capacity of graphite that increases from 0.71 to 1.12 J/(g K) between 300 and 450 K."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray

@@ -1,4 +1,4 @@
-"""Wall heating: the wall at the bridge's far end is no heat sink; it warms and cools slowly to its surroundings."""
+"""Heating of the wall at the bridge's far end, which cools slowly to its surroundings."""
 
 from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray
