@@ -80,7 +80,7 @@ def test_an_unusable_file_is_rejected_by_name(memory):
         memory.load(DAY_S - 5.0, build_cold_budget_state(16))
     with memory.path.open("wb") as file:
         np.savez(file, format="optodrive-helios-memory", version=0)
-    with pytest.raises(InputError, match="expected optodrive-helios-memory 1"):
+    with pytest.raises(InputError, match="expected optodrive-helios-memory 2"):
         memory.load(DAY_S, build_cold_budget_state(16))
     memory.path.write_bytes(memory.path.read_bytes()[:100])
     with pytest.raises(InputError, match="a file that can be read; remove it once the display has cooled"):

@@ -69,7 +69,7 @@ class PlanQueue:
     def make_snapshot(self, streamed: bool, planning_time_s: float) -> PlanningSnapshot:
         """Build the snapshot for the next plan.
 
-        A streamed plan truncates the running stream at the first pulse that is not yet sent after planning_time_s.
+        A streamed plan truncates the running stream at the first pulse that is still unsent after planning_time_s.
         """
         with self.lock:
             thermal = self._thermal
@@ -103,7 +103,7 @@ class PlanQueue:
     # --- accepting plans ----------------------------------------------------------------------------------------
 
     def commit(self, record: PlanRecord, snapshot: PlanningSnapshot) -> bool:
-        """Accept a plan into the queue. Return False if its snapshot is stale."""
+        """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late."""
         with self.lock:
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self._thermal is not snapshot.thermal:
