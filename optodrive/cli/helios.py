@@ -114,13 +114,15 @@ def play(
                 _combine_progress(raise_if_signalled, on_progress),
                 fit,
             )
-        proven = encode_verified(planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget)
+        verified = encode_verified(
+            planned_sequence.plan, PointScale.from_config(display.config), budget, display.budget
+        )
         with show_progress("playing") as on_progress:
             playback = _play_and_store_heat(
-                helios, memory, planned_sequence, proven, clock, _combine_progress(raise_if_signalled, on_progress)
+                helios, memory, planned_sequence, verified, clock, _combine_progress(raise_if_signalled, on_progress)
             )
     summary = summarize_plan(planned_sequence, feasibility)
-    playback_summary = _summarise_playback(display, planned_sequence, proven, playback)
+    playback_summary = _summarize_playback(display, planned_sequence, verified, playback)
     if json:
         print_json({**summary.model_dump(mode="json"), "helios": playback_summary})
         return
@@ -148,11 +150,11 @@ def _defer_signals() -> Iterator[Callable[[], None]]:
 
 
 def _combine_progress(
-    raise_if_signalled: Callable[[], None], show_share: Callable[[float], None]
+    raise_if_signalled: Callable[[], None], show_fraction: Callable[[float], None]
 ) -> Callable[[float], None]:
-    def on_progress(share: float) -> None:
+    def on_progress(fraction: float) -> None:
         raise_if_signalled()
-        show_share(share)
+        show_fraction(fraction)
 
     return on_progress
 
@@ -173,7 +175,7 @@ def _play_and_store_heat(
     helios: "Helios",
     memory: "HeatMemory",
     planned_sequence: "PlannedSequence",
-    proven: "VerifiedFrames",
+    verified: "VerifiedFrames",
     clock: "Clock",
     on_progress: Callable[[float], None],
 ) -> "PlaybackReport":
@@ -183,25 +185,25 @@ def _play_and_store_heat(
 
     memory.save(planned_sequence.budget, time_of_day() + ZERO_OFFSET_S)
     try:
-        return play(helios, proven, clock, on_progress)
+        return play(helios, verified, clock, on_progress)
     finally:
-        memory.save(planned_sequence.budget, time_of_day() - min(proven.duration_s, planned_sequence.budget.at_s))
+        memory.save(planned_sequence.budget, time_of_day() - min(verified.duration_s, planned_sequence.budget.at_s))
 
 
-def _summarise_playback(
-    display: "DisplayModel", planned_sequence: "PlannedSequence", proven: "VerifiedFrames", playback: "PlaybackReport"
+def _summarize_playback(
+    display: "DisplayModel", planned_sequence: "PlannedSequence", verified: "VerifiedFrames", playback: "PlaybackReport"
 ) -> dict[str, Any]:
     from optodrive.core.units import m_to_um
     from optodrive.link.helios.encoding import PointScale
 
-    pulses, plan = proven.pulses, planned_sequence.plan
+    pulses, plan = verified.pulses, planned_sequence.plan
     response = display.build_cold_heat().apply_pulses(
-        plan.pixel[proven.row], pulses.start_s, pulses.width_s, pulses.power_w
+        plan.pixel[verified.row], pulses.start_s, pulses.width_s, pulses.power_w
     )
     return {
         "points_per_s": 1.0 / PointScale.from_config(display.config).point_s,
         "frames": playback.frames,
-        "energy_j": proven.energy_j,
+        "energy_j": verified.energy_j,
         "energy_planned_j": float(plan.energy_j.sum()),
         "predicted_max_um": m_to_um(float(response.displacement_m.max())) if len(pulses) else 0.0,
         "underruns": playback.underruns,
