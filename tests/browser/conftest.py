@@ -6,7 +6,7 @@ from board_fixtures import board_disarmed, daemon_disarmed, disarmed, kept, make
 from window import TIMEOUT_MS, PageVisit, launch_chromium
 
 
-@pytest.fixture(scope="module")  # its loop runs in this process meanwhile: tests with loops of their own come after
+@pytest.fixture(scope="module")  # its event loop runs in this process: tests with their own loops run afterwards
 def browser():
     with launch_chromium() as browser:
         from playwright.sync_api import expect

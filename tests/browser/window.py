@@ -22,7 +22,7 @@ WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
 
 @contextmanager
 def launch_chromium():
-    """A browser without windows, with a new profile: what one run leaves, no other finds."""
+    """Launch a headless browser with a new profile, so that runs do not affect each other."""
     assert CHROMIUM, "the page is tested in Chromium, which is missing: apt-get install chromium"
     from playwright.sync_api import sync_playwright
 
@@ -35,7 +35,7 @@ def launch_chromium():
 
 
 class PageVisit:
-    """A window on a daemon's page, which notes what the page complains of."""
+    """A window on a daemon's page that records the page's console errors."""
 
     def __init__(self, browser, url, viewport=WIDE, **options):
         self.context = browser.new_context(viewport=viewport, **options)
@@ -49,7 +49,7 @@ class PageVisit:
         self.url = url
 
     def open(self, token=TOKEN):
-        """Log in by the address that a terminal shows; the page, once it is live."""
+        """Log in with the address that a terminal shows; return the page once it is live."""
         self.page.goto(f"{self.url}/#token={token}")
         try:
             self.page.get_by_text("live", exact=True).wait_for()
@@ -60,6 +60,6 @@ class PageVisit:
         return self.page
 
     def unexpected_errors(self, *expected):
-        """What the page complained of, less what was meant to go wrong; the 401 that asks for the token is one."""
+        """Return the console errors except the expected ones; the 401 of the login is always expected."""
         expected = ("401", *expected)
         return [line for line in self.console_errors if not any(part in line for part in expected)]

@@ -71,7 +71,7 @@ class Telemetry:
         self._readers = 0
         self._closed = False
         self._latest: dict[str, tuple[int, str]] = {}
-        self._due_s: dict[str, float] = {}
+        self._next_s: dict[str, float] = {}
         self._batches: deque[_Batch] = deque(maxlen=BATCHES_MAX)
         self._batch_number = 0
         self._announced_rows: dict[str, int] = {}
@@ -107,7 +107,7 @@ class Telemetry:
     async def stream_events(self, rate_hz: float = DEFAULT_RATE_HZ) -> AsyncIterator[bytes]:
         """Yield the new events for one reader every 1 / rate_hz seconds, until it disconnects."""
         sent_numbers, batch = dict[str, int](), 0
-        due_s, pulses_s = self._clock.now_s(), 0.0
+        next_s, pulses_s = self._clock.now_s(), 0.0
         self._readers += 1
         try:
             while not self._closed:
@@ -123,8 +123,8 @@ class Telemetry:
                 if text:
                     yield text.encode()
                 busy = self._is_warm or self._has_upcoming or self._batch_number > batch
-                due_s = max(due_s + 1.0 / (rate_hz if busy else min(rate_hz, IDLE_RATE_HZ)), self._clock.now_s())
-                await asyncio.sleep(due_s - self._clock.now_s())
+                next_s = max(next_s + 1.0 / (rate_hz if busy else min(rate_hz, IDLE_RATE_HZ)), self._clock.now_s())
+                await asyncio.sleep(next_s - self._clock.now_s())
         finally:
             self._readers -= 1
 
@@ -158,9 +158,9 @@ class Telemetry:
         return self._board_clock_reference[1] + now_s - self._board_clock_reference[0]
 
     def _is_due(self, kind: str, now_s: float, period_s: float) -> bool:
-        due = now_s >= self._due_s.get(kind, now_s)
+        due = now_s >= self._next_s.get(kind, now_s)
         if due:
-            self._due_s[kind] = now_s + period_s
+            self._next_s[kind] = now_s + period_s
         return due
 
     def _publish(self, kind: str, event: JsonModel) -> None:

@@ -16,14 +16,14 @@ from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 LAYOUT = DISPLAYS["display-437"].layout
 
 
-def test_the_layout_comes_out_of_the_daemons_configuration(any_display):
+def test_the_layout_follows_from_the_daemons_configuration(any_display):
     sent = build_effective_config(any_display).model_dump_json()
     layout = build_pixel_layout(EffectiveConfig.model_validate_json(sent).display)
     for name in ("x_m", "y_m", "row", "column"):
         np.testing.assert_array_equal(getattr(layout, name), getattr(any_display.layout, name))
 
 
-def test_a_pixel_an_array_and_a_picture_ask_for_the_same():
+def test_mapping_array_and_grid_are_equivalent():
     by_place = np.full((21, 21), np.nan)
     by_place[LAYOUT.row[17], LAYOUT.column[17]] = 120.0
     by_index = np.zeros(437)
@@ -47,25 +47,25 @@ def test_a_pixel_an_array_and_a_picture_ask_for_the_same():
         ([[1.0], [2.0, 3.0]], "heights_um"),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(heights_um, where):
+def test_invalid_heights_are_refused_in_one_line(heights_um, where):
     with pytest.raises(InputError, match=where) as refused:
         convert_to_pixels(heights_um, LAYOUT)
     assert "\n" not in str(refused.value)
 
 
 @given(st.integers(0, 2**33), st.lists(st.floats(0, 6553.5), min_size=437, max_size=437))
-def test_the_daemon_reads_a_streams_bytes_back(number, heights_um):
+def test_the_daemon_decodes_encoded_frames(number, heights_um):
     read, sequence = parse_live_frame(encode_frame(number, np.array(heights_um)), 0, 437)
     assert read == number % 2**32
     np.testing.assert_allclose(1e6 * sequence.frames[0].target_m, heights_um, atol=0.0501)
 
 
-def test_a_height_beyond_a_streams_bits_is_refused():
+def test_a_height_that_exceeds_16_bits_is_refused():
     with pytest.raises(InputError, match=r"6553\.5"):
         encode_frame(0, convert_to_pixels({3: 6553.6}, LAYOUT))
 
 
-def test_the_picture_has_its_size_and_its_colours_only_grow_lighter(any_display):
+def test_the_picture_has_its_size_and_its_lightness_increases(any_display):
     layout = any_display.layout
     written = render_png(layout, np.linspace(0.0, 50.0, len(layout)))
     width, height = struct.unpack(">II", written[16:24])

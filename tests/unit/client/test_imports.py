@@ -1,4 +1,4 @@
-"""What the client's import loads."""
+"""Modules that importing the client loads."""
 
 import subprocess
 import sys

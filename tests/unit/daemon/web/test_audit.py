@@ -28,7 +28,7 @@ def read_entries(folder):
     return [json.loads(line) for line in (folder / "audit.jsonl").read_text().splitlines() if line.endswith("}")]
 
 
-def test_lines_are_added_in_order_to_a_private_file(audit, tmp_path, reports):
+def test_entries_are_appended_in_order(audit, tmp_path, reports):
     (tmp_path / "audit.jsonl").write_text('{"event": "older"}\n')
     for number in range(5):
         audit.record({"event": "push", "number": number})
@@ -38,12 +38,12 @@ def test_lines_are_added_in_order_to_a_private_file(audit, tmp_path, reports):
     assert reports == []
 
 
-def test_a_new_file_is_its_owners_alone(audit, tmp_path):
+def test_a_new_file_is_private_to_its_owner(audit, tmp_path):
     asyncio.run(audit.record_durably({"event": "requested"}))
     assert (tmp_path / "audit.jsonl").stat().st_mode & 0o777 == 0o600
 
 
-def test_one_event_is_one_line_whatever_it_holds(audit, tmp_path):
+def test_one_entry_is_one_line_whatever_it_contains(audit, tmp_path):
     asyncio.run(audit.record_durably({"call": 'POST /v1/patterns/a\n{"event": "armed"}\r\u2028'}))
     assert len((tmp_path / "audit.jsonl").read_text().splitlines()) == 1
 
@@ -60,12 +60,12 @@ def test_a_disk_that_is_full_is_said_once_and_again_when_it_is_not(audit, tmp_pa
     assert len(reports) == 1
     assert "arming is refused" in reports[0]
     assert asyncio.run(audit.record_durably({"event": "after"})) is None
-    # The torn line stays by itself: what comes after it can be read.
+    # The incomplete line stays on a line of its own, so that later entries are readable.
     assert [line["event"] for line in read_entries(tmp_path)] == ["requested", "after"]
     assert "again" in reports[1]
 
 
-def test_a_disk_that_stands_still_holds_nothing_up(audit, reports, monkeypatch):
+def test_a_blocked_disk_delays_nothing(audit, reports, monkeypatch):
     go_on = threading.Event()
     monkeypatch.setattr(audit_module, "WRITE_TIMEOUT_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
@@ -75,7 +75,7 @@ def test_a_disk_that_stands_still_holds_nothing_up(audit, reports, monkeypatch):
     go_on.set()
 
 
-def test_arming_does_not_wait_for_ever(audit, monkeypatch):
+def test_a_durable_entry_has_a_timeout(audit, monkeypatch):
     go_on = threading.Event()
     monkeypatch.setattr(audit_module, "WRITE_TIMEOUT_S", 0.05)
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())

@@ -12,13 +12,13 @@ def test_a_socket_is_for_owner_and_group(tmp_path):
         assert stat.S_IMODE((tmp_path / "s").stat().st_mode) == 0o660
 
 
-def test_one_that_a_dead_daemon_left_is_taken_over(tmp_path):
+def test_the_socket_of_a_dead_daemon_is_replaced(tmp_path):
     open_unix_listener(tmp_path / "s").close()
     with open_unix_listener(tmp_path / "s"), socket.socket(socket.AF_UNIX) as caller:
         caller.connect(str(tmp_path / "s"))
 
 
-def test_one_that_is_answered_and_any_other_file_stay(tmp_path):
+def test_a_live_socket_and_any_other_file_are_kept(tmp_path):
     with open_unix_listener(tmp_path / "s"), pytest.raises(InputError, match=r"daemon\.socket"):
         open_unix_listener(tmp_path / "s")
     (tmp_path / "file").write_text("kept")

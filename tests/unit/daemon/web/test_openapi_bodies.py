@@ -12,14 +12,14 @@ SCHEMA = jsonschema_rs.validator_for(SEQUENCE_SCHEMA)
 
 
 @pytest.mark.parametrize("name", ["showcase", "experiment-1", "experiment-6", "text", "vibration"])
-def test_what_is_played_is_what_the_document_describes(name):
+def test_patterns_match_the_schema_of_sequences(name):
     config = DISPLAYS["display-437"].config
     given = {"text": "hello"} if name == "text" else {}
     SCHEMA.validate(sequence_to_json(build_pattern(name, given, config)))
 
 
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
-def test_the_example_is_right_on_every_display(name):
+def test_the_example_is_valid_on_every_display(name):
     SCHEMA.validate(SEQUENCE_EXAMPLE)
     parse_sequence(copy.deepcopy(SEQUENCE_EXAMPLE), DISPLAYS[name].config, "body")
 
@@ -37,7 +37,7 @@ def test_the_example_is_right_on_every_display(name):
         {"trains": [{**SEQUENCE_EXAMPLE["trains"][0], "pixel": 1.5}]},
     ],
 )
-def test_what_the_document_refuses_is_refused(wrong):
+def test_the_parser_refuses_what_the_schema_refuses(wrong):
     assert not SCHEMA.is_valid(wrong)
     with pytest.raises(Exception, match="body"):
         parse_sequence(wrong, DISPLAYS["display-437"].config, "body")

@@ -14,7 +14,7 @@ def test_a_burst_then_the_rate():
 
 
 @given(st.lists(st.floats(0.0, 0.3), min_size=1, max_size=200), st.floats(1.0, 50.0), st.integers(1, 20))
-def test_never_more_than_burst_and_rate_allow(gaps, per_s, burst):
+def test_accepted_requests_never_exceed_burst_and_rate(gaps, per_s, burst):
     rates, now_s, answered = RateLimiter(per_s, burst), 0.0, 0
     for gap in gaps:
         now_s += gap
@@ -23,7 +23,7 @@ def test_never_more_than_burst_and_rate_allow(gaps, per_s, burst):
 
 
 @given(st.floats(1.0, 100.0), st.integers(1, 10))
-def test_who_waits_as_told_is_answered(per_s, burst):
+def test_a_request_after_the_returned_wait_is_accepted(per_s, burst):
     rates, now_s = RateLimiter(per_s, burst), 0.0
     for _ in range(burst + 20):
         wait_s = rates.acquire("a", now_s)
@@ -32,7 +32,7 @@ def test_who_waits_as_told_is_answered(per_s, burst):
             assert rates.acquire("a", now_s) == 0.0
 
 
-def test_callers_do_not_pile_up():
+def test_the_number_of_buckets_is_bounded():
     rates = RateLimiter(1.0, 1)
     for caller in range(3 * CALLERS_MAX):
         rates.acquire(caller, 0.0)

@@ -44,7 +44,7 @@ def test_a_response_has_its_status_and_its_type():
 
 
 def collect_start_order(middleware, paths):
-    """In which order requests begin that arrived in this order at one time."""
+    """Return the order in which requests start that arrive at the same time in the given order."""
     order = []
 
     async def app(scope, receive, send):
@@ -58,13 +58,13 @@ def collect_start_order(middleware, paths):
     return order
 
 
-def test_stop_begins_before_all_that_wait_and_these_in_order():
+def test_stop_starts_first_and_the_others_in_order():
     paths = [*(f"/v1/plans/{k}" for k in range(50)), "/v1/stop"]
     assert collect_start_order(StopPriorityMiddleware, paths) == ["/v1/stop", *paths[:50]]
-    assert collect_start_order(lambda app: app, paths)[-1] == "/v1/stop"  # as it was without
+    assert collect_start_order(lambda app: app, paths)[-1] == "/v1/stop"  # without the middleware
 
 
-def test_one_that_takes_long_holds_no_other_up():
+def test_a_slow_request_delays_no_other():
     async def run():
         done = asyncio.Event()
 
@@ -82,7 +82,7 @@ def test_one_that_takes_long_holds_no_other_up():
 
 
 async def collect_order_during_stop(stop):
-    """In which order requests begin, and STOP ends, that arrived in this order at one time."""
+    """Return the order in which requests start and STOP ends, all of which arrive at the same time."""
     order = []
 
     async def app(scope, receive, send):
@@ -96,7 +96,7 @@ async def collect_order_during_stop(stop):
     return order
 
 
-def test_none_begins_while_stop_is_answered():
+def test_no_request_starts_while_stop_is_being_answered():
     async def stop(order):
         for _ in range(100):
             await asyncio.sleep(0)
@@ -104,7 +104,7 @@ def test_none_begins_while_stop_is_answered():
     assert asyncio.run(collect_order_during_stop(stop))[0] == "/v1/stop"
 
 
-def test_a_stop_that_is_not_answered_holds_others_up_for_a_moment_only():
+def test_an_unanswered_stop_delays_others_only_briefly():
     async def stop(order):
         while len(order) < 20:
             await asyncio.sleep(0.01)
