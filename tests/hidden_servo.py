@@ -1,4 +1,4 @@
-"""Servos that identification does not know, integrated by Runge and Kutta, and recordings of their steps."""
+"""Ground-truth servos, integrated by a Runge-Kutta method, and recordings of their steps."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -16,7 +16,7 @@ SETTLING_S = np.linspace(0.0, 0.03, 60_001)
 
 @dataclass(frozen=True)
 class HiddenServo:
-    """bandwidth in Hz, damping of critical, delay in s, slew in rad/s."""
+    """A servo: bandwidth in Hz, damping ratio, delay in s, slew limit in rad/s."""
 
     hz: float
     damping: float
@@ -29,7 +29,7 @@ class HiddenServo:
         return cls(hz, random.uniform(0.3, 1.0), random.uniform(0.0, 1e-4), slew)
 
     def knots(self, at_s, command_rad):
-        """Where the servo's own target bends: times and places."""
+        """Return the breakpoints of the slew-limited target: times and positions."""
         times, places, place = [at_s[0]], [command_rad[0]], command_rad[0]
         for row in range(1, len(at_s)):
             begin_s = at_s[row] + self.delay_s
@@ -47,7 +47,7 @@ class HiddenServo:
         return np.array(times), np.array(places)
 
     def follow(self, at_s, command_rad, t_s):
-        """Angles at t_s, integrated from bend to bend."""
+        """Return the angles at t_s, integrated between breakpoints."""
         times, places = self.knots(at_s, command_rad)
         omega = 2.0 * np.pi * self.hz
 
@@ -69,17 +69,17 @@ class HiddenServo:
 
     @cache  # noqa: B019
     def _off_rad(self, step_rad):
-        """How far from its end a mirror is while it makes a step, at SETTLING_S."""
+        """Return the distance from the end of a step at SETTLING_S."""
         return np.abs(self.follow(np.array([-1.0, 0.0]), np.array([0.0, step_rad]), SETTLING_S) - step_rad)
 
     def settled_s(self, step_rad, tolerance_rad):
-        """From a step's command until it is near for good and its ramp is over, from a dense trace."""
+        """Return the settling time from a dense trace: within the tolerance for good, and after the ramp."""
         last_s = SETTLING_S[np.flatnonzero(self._off_rad(step_rad) > tolerance_rad)[-1]]
         return max(last_s, self.delay_s + step_rad / self.slew)
 
 
 def commands(random, size_rad, count=16):
-    """Steps there and back, x every time and y every other time: t_s, x_rad, y_rad."""
+    """Return commands of steps there and back, x each time and y every other time: t_s, x_rad, y_rad."""
     at_s = np.concatenate([[0.0], 0.002 + 0.015 * np.arange(count) + random.uniform(0.0, 1e-3, count)])
     number = np.arange(count)
     x_rad, y_rad = np.where(number % 2 == 0, size_rad, 0.0), np.where(number // 2 % 2 == 0, size_rad, 0.0)
@@ -87,7 +87,7 @@ def commands(random, size_rad, count=16):
 
 
 def recording(servos, random, rate_hz=5e4, noise=0.003, sizes_rad=SIZES_RAD):
-    """A run for each size; noise: of the step. servos: of x and y."""
+    """Build a recording with one run per step size. noise: relative to the step; servos: of x and y."""
     runs = []
     for number, size_rad in enumerate(sizes_rad):
         table = commands(random, size_rad)

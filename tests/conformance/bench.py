@@ -1,4 +1,4 @@
-"""A board as a process, its log as witness, and a host of a few lines on its port: what the scenarios work with."""
+"""Test bench of the scenarios: a board process with its log, and a minimal host on its port."""
 
 import json
 import subprocess
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import serial
-from spoken import DATA_POINTS_MAX, HOST, SEQUENCED, Ear, body_of, frame
+from wire_format import DATA_POINTS_MAX, HOST, SEQUENCED, MessageReader, body_of, frame
 
 from firmware_ports import build_board
 from rig import SIMULATED
@@ -17,23 +17,22 @@ START_S = 60.0
 CENTRE = 32768
 WINDOW = 8
 WITH_THE_END = 65_535
-"""A watermark that no queue reaches: the job begins when its END has come, however slow line and board are."""
+"""A watermark that no queue reaches, so that the job begins at its END independently of the speed of line and board."""
 LEASE_EVERY_S = 0.02
 BRIGHT = dict(max_on_us=65_000, spot_uj=4_000_000_000, spot_leak_uw=4_000_000_000, rest_us=0, lease_ms=5000)
-"""Limits of a board that stays lit as long as a scenario needs it, and forgives a host that is scheduled late."""
+"""Limits that permit long pulses and tolerate a host that is scheduled late."""
 PATIENT = dict(lease_ms=5000)
 
 
 class TooLateError(Exception):
-    """This host was scheduled too late for what it wanted to see: it says nothing about the board."""
+    """The host was scheduled too late for a conclusion about the board."""
 
 
 class BoardKind(NamedTuple):
-    """A board to be judged.
+    """A board implementation under test.
 
-    command: how it starts; port: the firmware's port that is built for it instead; spared: why it is not asked for
-    a guard, or another subject, by name; at_once: how many of it run side by side; late_us: how late its logged edges
-    may be.
+    command: of its process; port: firmware port to build instead; spared: reasons for exempting it from subjects, by
+    name; at_once: number of concurrent instances; late_us: permitted lateness of its logged edges
     """
 
     name: str
@@ -44,27 +43,27 @@ class BoardKind(NamedTuple):
     late_us: int = 0
 
     def ready(self, folder, mutant=0):
-        """The same kind with its port built in a folder. mutant: the guard it lacks."""
+        """Return this kind with its port built in a folder. mutant: number of the disabled guard."""
         return self._replace(command=build_board(folder, mutant, self.port)) if self.port else self
 
     def spares(self, subject):
-        """Why it is not asked for a subject, '' where it is."""
+        """Return the reason for exempting it from a subject, '' if it is tested."""
         return self.spared.get(subject, "")
 
 
 ABOUT_ITSELF = "the simulated board does B1 to B13: it has no tick, readback or watchdog of its own"
-UNDER_FIRE = "link under fire"
+LINK_FAULTS = "link faults"
 TOO_FAST = "its witness leaves the emulator byte by byte, some 2 ms a pulse: too slow for a point every 1.2 ms"
 BOARD_KINDS = [
     BoardKind("python", SIMULATED, at_once=8, spared=dict.fromkeys(("B14", "B15"), ABOUT_ITSELF)),
     BoardKind("host", port="host"),
-    BoardKind("qemu", port="mps2-an385", spared={UNDER_FIRE: TOO_FAST}, at_once=6),
+    BoardKind("qemu", port="mps2-an385", spared={LINK_FAULTS: TOO_FAST}, at_once=6),
 ]
-"""One line for each implementation."""
+"""All board implementations."""
 
 
 class BoardProcess:
-    """A board that runs; limits: its file's keys; script: its file's text."""
+    """A running board process. limits: keys of its limits file; script: text of its script file."""
 
     def __init__(self, kind, folder, limits, script):
         self.port, self.late_us = folder / "tty", kind.late_us
@@ -87,7 +86,7 @@ class BoardProcess:
             raise
 
     def events(self):
-        """The log so far."""
+        """Return all log entries so far."""
         if self._log.exists():
             with self._log.open("rb") as log:
                 log.seek(self._read)
@@ -98,40 +97,40 @@ class BoardProcess:
         return list(self._events)
 
     def of(self, kind):
-        """The log's entries of a kind."""
+        """Return the log entries of a kind."""
         return [entry for entry in self.events() if entry["event"] == kind]
 
     def states(self):
-        """(state, reason) of every change."""
+        """Return (state, reason) of each state change."""
         return [(entry["state"], entry["reason"]) for entry in self.of("state")]
 
-    def executed(self):
-        """Numbers of the pulses."""
+    def pulse_numbers(self):
+        """Return the numbers of all pulses."""
         return [entry["index"] for entry in self.of("pulse")]
 
-    def pulsed(self):
-        """Whether the gate is on."""
+    def is_gate_on(self):
+        """Return whether the gate is on."""
         edges = self.of("gate")
         return bool(edges) and edges[-1]["on"]
 
     def kept(self):
-        """Whether its log says that this machine was too busy: a late tick nobody ordered, a HOLD of a whole second."""
+        """Return whether the log shows an overloaded machine: an unscripted late tick, or a HOLD of a whole second."""
         ticked_late = "TICK" in [entry["fault"] for entry in self.of("fault")] and "late_tick" not in self._script
         return ticked_late or ("DISARMED", "hold too long") in self.states()
 
     def end(self):
-        """Stop it."""
+        """Stop the process."""
         self.process.terminate()
         self.process.wait(timeout=10)
 
 
 def toml(limits):
-    """Keys and numbers, flags or words as TOML."""
+    """Format keys with numbers, booleans or strings as TOML."""
     return "".join(f"{name} = {json.dumps(value)}\n" for name, value in limits.items())
 
 
 def wait_for(condition, what, patience_s=PATIENCE_S):
-    """Poll until condition() is true."""
+    """Poll until condition() is true; fail after patience_s."""
     until = time.monotonic() + patience_s
     while not condition():
         assert time.monotonic() < until, f"waited in vain for {what}"
@@ -139,7 +138,7 @@ def wait_for(condition, what, patience_s=PATIENCE_S):
 
 
 class Host:
-    """A host on a real serial port; it renews the lease whenever it waits, unless told not to."""
+    """A host on a real serial port that renews the lease while it waits, unless disabled."""
 
     def __init__(self, board, record=None):
         self.board = board
@@ -147,10 +146,10 @@ class Host:
         self.written = [] if record is None else record
         self.session = self.seq = self.index = 0
         self.heard = []
-        self._ear = Ear()
+        self._reader = MessageReader()
         self._leased_s = 0.0
 
-    # --- saying and hearing ---
+    # --- messages ---
 
     def raw(self, data):
         """Write bytes."""
@@ -158,7 +157,7 @@ class Host:
         self.port.write(data)
 
     def frame(self, name, seq=None, session=None, **fields):
-        """A message as bytes; the next sequence number is its own where it takes one."""
+        """Encode a message; a sequenced one gets the next sequence number."""
         if seq is None:
             seq = self.seq if name in SEQUENCED else 0
             self.seq = (self.seq + (name in SEQUENCED)) % 256
@@ -166,19 +165,19 @@ class Host:
         return frame(HOST[name][0], seq, session, body_of(name, **fields))
 
     def say(self, name, **fields):
-        """Say a message, wait for nothing."""
+        """Send a message without waiting."""
         self.raw(self.frame(name, **fields))
 
     def hear(self):
-        """Take in what has arrived."""
-        self.heard += self._ear.take(self.port.read(max(1, self.port.in_waiting)))
+        """Read the messages that have arrived."""
+        self.heard += self._reader.take(self.port.read(max(1, self.port.in_waiting)))
 
     def of(self, name):
-        """What was heard of a kind."""
+        """Return the received messages of a kind."""
         return [message for message in self.heard if message.name == name]
 
     def wait(self, condition, what, lease=True, patience_s=PATIENCE_S):
-        """Hear until condition() is true."""
+        """Read messages until condition() is true."""
         until = time.monotonic() + patience_s
         while not condition():
             assert time.monotonic() < until, f"waited in vain for {what}; log {self.board.events()[-8:]}"
@@ -187,21 +186,21 @@ class Host:
             self.hear()
 
     def lease(self):
-        """Renew it, not too often."""
+        """Renew the lease, at a limited rate."""
         if self.session and time.monotonic() - self._leased_s > LEASE_EVERY_S:
             self._leased_s = time.monotonic()
             self.say("LEASE", ms=60_000)
 
     def pause(self, duration_s, lease=True):
-        """Let time pass."""
+        """Wait for a time."""
         until = time.monotonic() + duration_s
         self.wait(lambda: time.monotonic() >= until, "the time", lease)
 
     def ask(self, data=b""):
-        """Send bytes; what the board said to them, and its status after that."""
+        """Send bytes; return the board's answers and its status after them."""
         before = len(self.heard)
         self.raw(data)
-        for _ in range(2):  # an ACK may follow the batch it answers: only what comes before the second status is all
+        for _ in range(2):  # an ACK may follow its batch, so the answers are complete only at the second status
             count = len(self.of("STATUS"))
             self.say("GET")
             self.wait(lambda count=count: len(self.of("STATUS")) > count, "a status", lease=False)
@@ -209,25 +208,25 @@ class Host:
         return [m for m in self.heard[before:] if m.name != "STATUS"], status
 
     def order(self, *frames):
-        """Send frames, as many together as may be unanswered; the reasons of the NAKs they met."""
+        """Send frames in batches of the window size; return the reasons of all NAKs."""
         said = []
         for at in range(0, len(frames), WINDOW):
-            self.lease()  # hundreds of frames may take longer than one lasts
+            self.lease()  # hundreds of frames may take longer than one lease
             said.append(self.ask(b"".join(frames[at : at + WINDOW]))[0])
         return [message.reason for messages in said for message in messages if message.name == "NAK"]
 
     def tell(self, name, **fields):
-        """Send one message; the reasons of the NAKs it met."""
+        """Send one message; return the reasons of its NAKs."""
         return self.order(self.frame(name, **fields))
 
     def status(self):
-        """The board's status now."""
+        """Request the board's status."""
         return self.ask()[1]
 
-    # --- the way to light ---
+    # --- session, arming, jobs ---
 
     def hello(self, major=1):
-        """A new session, and the board's reply; repeated, as a board may notice late that its port is open."""
+        """Begin a session and return the board's reply; repeat HELLO, as a board may detect the open port late."""
         nonce = 0
         until = time.monotonic() + PATIENCE_S
         while time.monotonic() < until:
@@ -245,13 +244,13 @@ class Host:
         raise AssertionError("no answer to HELLO")
 
     def challenge(self, host_nonce=99):
-        """ARM_REQ, and the challenge."""
+        """Send ARM_REQ and return the challenge."""
         said, _ = self.ask(self.frame("ARM_REQ", host_nonce=host_nonce))
         (challenge,) = [message for message in said if message.name == "ARM_CHALLENGE"]
         return challenge
 
     def arm(self):
-        """Arm by the book."""
+        """Arm the board by the regular sequence."""
         count = self.board.states().count(("ARMED", "armed"))
         challenge = self.challenge()
         self.say("ARM_CONFIRM", host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
@@ -259,12 +258,12 @@ class Host:
         return self
 
     def data(self, *points):
-        """DATA for (x, y, dark_us, on_us, duty), counting on from the last."""
+        """Build a DATA frame of points (x, y, dark_us, on_us, duty), numbered after the last one."""
         first, self.index = self.index, self.index + len(points)
         return self.frame("DATA", first_index=first, points=points)
 
     def play(self, *points, end=True, start_tick=0, watermark=1):
-        """Points, START and END at once; the NAKs."""
+        """Send points, START and END at once; return the reasons of the NAKs."""
         first = self.index
         pieces = [points[at : at + DATA_POINTS_MAX] for at in range(0, len(points), DATA_POINTS_MAX)]
         frames = [self.data(*piece) for piece in pieces]
@@ -279,7 +278,7 @@ class Host:
 
 
 class Bench:
-    """Makes boards and hosts for one scenario, and ends them."""
+    """Creates and stops the boards and hosts of one scenario."""
 
     def __init__(self, kind, folder):
         self.kind = kind
@@ -287,33 +286,33 @@ class Bench:
         self._boards, self._hosts = [], []
 
     def board(self, script="", **limits):
-        """A board that has just been powered up."""
+        """Start a board."""
         folder = self._folder / f"board{len(self._boards)}"
         folder.mkdir()
         self._boards.append(BoardProcess(self.kind, folder, limits, script))
         return self._boards[-1]
 
     def host(self, board):
-        """A host with the board's port open."""
+        """Open a host on the board's port."""
         self._hosts.append(Host(board))
         return self._hosts[-1]
 
     def greeted(self, script="", **limits):
-        """A host in session with a new board."""
+        """Return a host in session with a new board."""
         host = self.host(self.board(script, **limits))
         host.hello()
         return host
 
     def ready(self, script="", **limits):
-        """A host that has armed a new board."""
+        """Return a host that has armed a new board."""
         return self.greeted(script, **limits).arm()
 
     def kept(self):
-        """Whether a board of it was kept from the processor, or from its host, too long to be judged."""
+        """Return whether a board was suspended by the operating system for too long for a conclusion."""
         return any(board.kept() for board in self._boards)
 
     def finish(self, audit):
-        """Close everything; audit gets each board's whole log."""
+        """Close all hosts and boards; pass each board to audit."""
         try:
             for host in self._hosts:
                 host.close()
@@ -325,5 +324,5 @@ class Bench:
 
 
 def here(on_us, dark_us=0, duty=65535, x=CENTRE, y=CENTRE):
-    """A point at the centre, or near it."""
+    """Return a point, by default at the centre."""
     return x, y, dark_us, on_us, duty

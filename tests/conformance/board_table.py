@@ -1,4 +1,4 @@
-"""Print the table of docs/reference/board-conformance.md: the scenarios and mutants of each guard."""
+"""The table of docs/reference/board-conformance.md, counted from the suite. Run as a script, it prints the table."""
 
 from collections import Counter
 
@@ -26,13 +26,13 @@ ENFORCED = {
 
 
 def scenarios_of(guard):
-    """Names of its scenarios in code; × how many cases where there are several."""
+    """Return the names of a guard's scenarios, with the number of cases."""
     counts = Counter(case.name.partition("-")[0] for case in SCENARIOS if case.subject == guard)
     return ", ".join(f"`{name}`" + (f" ×{count}" if count > 1 else "") for name, count in counts.items())
 
 
 def row(guard):
-    """A line of the table."""
+    """Return a row of the table."""
     boards = [kind.name for kind in BOARD_KINDS if not kind.spares(guard)]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
     killed = ", ".join(f"{board} {count}" for board, count in broken.items())
@@ -40,7 +40,7 @@ def row(guard):
 
 
 def table():
-    """All of it, as Markdown."""
+    """Return the table as Markdown."""
     head = ["| | enforced | scenarios | on | mutants killed |", "|---|---|---|---|---|"]
     return "\n".join([*head, *map(row, GUARDS)]) + "\n"
 

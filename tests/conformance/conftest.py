@@ -1,4 +1,4 @@
-"""Each kind of board in turn, and a module's scenarios played at once."""
+"""Fixtures of board kinds; the scenarios of a module run concurrently."""
 
 from functools import cache
 
@@ -12,7 +12,7 @@ from scenario import run_all  # noqa: E402
 
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory):
-    """A kind with its program built, of a mutant where one is named; each once, whichever thread asks."""
+    """Return a function that builds a kind's program, or a mutant of it, once for all threads."""
     boards = tmp_path_factory.mktemp("boards")
 
     @cache
@@ -30,7 +30,7 @@ def board_kind(request, ready):
 
 @pytest.fixture(scope="module")
 def outcomes(board_kind, request):
-    """Futures by the scenario's name, of those that were asked for in this module."""
+    """Return the futures of this module's selected scenarios, by name."""
     here = [item for item in request.session.items if item.module is request.module and hasattr(item, "callspec")]
     requested = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
     futures = run_all(board_kind, [case for case in requested.values() if not board_kind.spares(case.subject)])
@@ -41,7 +41,7 @@ def outcomes(board_kind, request):
 
 @pytest.fixture
 def conforms(board_kind, outcomes):
-    """Raises what a scenario found; skips one that this kind of board cannot be asked for."""
+    """Return a function that raises a scenario's error, or skips it for an exempted kind of board."""
 
     def look(case):
         if why := board_kind.spares(case.subject):

@@ -1,26 +1,26 @@
-"""B1 to B8: light only when, where, as long and as bright as it may be."""
+"""Scenarios of B1 to B8: time, position, duration and power of emission."""
 
 import time
 
 from bench import BRIGHT, CENTRE, PATIENT, TooLateError, here
 from scenario import scenario
-from spoken import HOST, body_of, frame
+from wire_format import HOST, body_of, frame
 
 OTHER_CELL = CENTRE + 2000
 INSTANT = dict(settle_us=0, settle_ns_per_code=0)
 SCRIPTED_S = 8.0
-"""When scripts act: a host has armed and lit by then."""
+"""Time of scripted events, after the host has armed and started a job."""
 
 
 def shine(host, seconds=9.0):
-    """A job that is lit all the time, running; no end is named."""
+    """Run a job with the gate on continuously, without END."""
     points = [here(60_000, duty=2000)] * int(seconds / 0.06)
     assert host.play(*points, end=False) == []
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
 
 
 def sees(host, condition, what):
-    """Wait for the board's log without saying anything but leases."""
+    """Wait for the board's log; send only leases."""
     host.wait(lambda: condition(host.board), what)
 
 
@@ -38,7 +38,7 @@ def dark_until_a_job_s_first_point_is_due(bench):
     host.pause(0.1)
     assert host.status().state == "RUNNING"
     assert host.board.of("gate") == [], "lit before its tick"
-    sees(host, lambda board: board.executed(), "the pulse")
+    sees(host, lambda board: board.pulse_numbers(), "the pulse")
     (pulse,) = host.board.of("pulse")
     (event,) = [m for m in host.of("EVENT") if m.reason == "start"]
     (started,) = [entry for entry in host.board.of("state") if entry["reason"] == "start"]
@@ -81,7 +81,7 @@ def what_comes_from_outside_is_dark_at_once(bench, case):
 
 
 def dark_by(board, change):
-    """Whether the last edge is off, and no later than a state's change."""
+    """Return whether the last edge is off and not after a change of state."""
     edge = board.of("gate")[-1]
     events = board.events()
     return not edge["on"] and edge["t_us"] <= change["t_us"] and events.index(edge) < events.index(change)
@@ -122,9 +122,9 @@ def silence_is_a_fault_and_nothing_but_a_lease_of_this_session_renews(bench, sta
         host.play(*[here(50_000, duty=2000)] * WAYS[state], end=False)
         host.wait(lambda: ("HOLD", "queue empty") in host.board.states() or state == "RUNNING", state)
         if host.board.states()[-1][0] != state:
-            raise TooLateError  # a hold lasts a second, and ours was over before we saw it
+            raise TooLateError  # the hold of one second was over before the host saw it
     requested = host.frame("CLOCK", host_t=1), host.frame("CLOCK", host_t=2)
-    # Both clocks bracket the lease; the board's cap holds, and a shorter lease takes nothing back.
+    # Both clocks bracket the lease; the board's maximum applies, and a shorter lease does not shorten it.
     host.raw(requested[0] + host.frame("LEASE", ms=60_000) + host.frame("LEASE", ms=1) + requested[1])
     useless = b"".join(
         [
@@ -148,7 +148,7 @@ def silence_is_a_fault_and_nothing_but_a_lease_of_this_session_renews(bench, sta
     assert before + LEASE_MS * 1000 <= fault.tick <= after + LEASE_MS * 1000 + host.board.late_us
     host.say("LEASE", ms=600)
     assert host.status().state == "FAULT"
-    assert not host.board.pulsed()
+    assert not host.board.is_gate_on()
 
 
 # --- B4 -------------------------------------------------------------------------------------------------------------
@@ -172,9 +172,9 @@ def a_point_longer_than_allowed_is_refused_when_queued(bench):
 def a_cell_s_light_in_pieces_counts_as_one(bench, points):
     host = bench.ready(**PATIENT)
     host.play(*points)
-    sees(host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.executed()) >= 1, "the end")
+    sees(host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.pulse_numbers()) >= 1, "the end")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
-    assert host.board.executed() == [0]
+    assert host.board.pulse_numbers() == [0]
 
 
 @scenario("B4")
@@ -184,18 +184,18 @@ def a_glance_elsewhere_is_no_rest_and_a_rest_is(bench):
     rest = here(0, dark_us=500)
     host.play(here(30_000, **dim), here(20_000, **dim), rest, here(50_000, **dim))
     sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert len(host.board.executed()) == 3, "50 ms in two pieces, and again after 500 µs of rest"
+    assert len(host.board.pulse_numbers()) == 3, "50 ms in two pieces, and again after 500 µs of rest"
     host.play(here(0, dark_us=600), here(30_000, **dim), here(100, x=OTHER_CELL), here(30_000, **dim))
-    sees(host, lambda board: board.of("fault") or len(board.executed()) == 6, "the fault")
+    sees(host, lambda board: board.of("fault") or len(board.pulse_numbers()) == 6, "the fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
-    assert len(host.board.executed()) == 5
+    assert len(host.board.pulse_numbers()) == 5
 
 
 # --- B5 -------------------------------------------------------------------------------------------------------------
 
 
 def sweep(count, on_us=20_000):
-    """Pulses, each in a cell of its own."""
+    """Return pulses in separate cells."""
     return [here(on_us, x=1000 + 2000 * k) for k in range(count)]
 
 
@@ -215,8 +215,8 @@ def mean_power_over_any_second(bench, case):
     host.play(*sweep(5), *more)
     sees(host, lambda board: board.of("fault"), "the fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["MEAN_POWER"]
-    # 20 ms of full power five times are 6554 in a second; what is older than one no longer counts.
-    assert len(host.board.executed()) == (10 if allowed == 5 else 4)
+    # Five pulses of 20 ms at full power are 6554 in a second; pulses older than a second do not count.
+    assert len(host.board.pulse_numbers()) == (10 if allowed == 5 else 4)
 
 
 # --- B6 -------------------------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def energy_of_a_cell(bench, case):
     host.play(*points)
     sees(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
     assert [entry["fault"] for entry in host.board.of("fault")] == [fault] * bool(fault)
-    assert len(host.board.executed()) == count
+    assert len(host.board.pulse_numbers()) == count
 
 
 # --- B7 -------------------------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ def no_gate_before_the_move_and_the_dark_time_are_over(bench):
         (here(100, x=CENTRE + 10_022, y=CENTRE + 3000), 202),
     ]
     host.play(*[point for point, _ in walk])
-    sees(host, lambda board: len(board.executed()) == len(walk), "all pulses")
+    sees(host, lambda board: len(board.pulse_numbers()) == len(walk), "all pulses")
     before_us = next(entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start")
     for pulse, (_, dark_us) in zip(host.board.of("pulse"), walk, strict=True):
         assert 0 <= pulse["on_us"] - before_us - dark_us <= host.board.late_us, pulse
@@ -275,7 +275,7 @@ def a_move_that_was_broken_off_is_still_under_way(bench):
     host.pause(0.05)
     assert host.tell("FLUSH") == []
     host.play(here(100, x=CENTRE + 20_000), here(100, x=CENTRE + 20_000, dark_us=10))
-    sees(host, lambda board: len(board.executed()) == 2, "the pulses")
+    sees(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
     started = [entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start"]
     assert len(started) == 2
     if started[1] > started[0] + move_us:
@@ -292,7 +292,7 @@ def settling_that_a_host_asked_for(bench):
     assert host.tell("LIMITS", **{**limits, "settle_us": 3000, "settle_ns_per_code": 100}) == []
     host.arm()
     host.play(here(100), here(100, x=CENTRE + 10))
-    sees(host, lambda board: len(board.executed()) == 2, "the pulses")
+    sees(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
     first, second = host.board.of("pulse")
     assert 0 <= second["on_us"] - first["off_us"] - 3001 <= host.board.late_us
 

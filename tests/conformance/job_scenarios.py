@@ -1,4 +1,4 @@
-"""Jobs, HOLD and refill, FLUSH, faults cleared, reports: what becomes of points."""
+"""Scenarios of jobs: HOLD and refill, FLUSH, cleared faults, reports."""
 
 from bench import BRIGHT, CENTRE, here
 from scenario import scenario
@@ -7,18 +7,18 @@ DIM = dict(duty=999)
 
 
 def until(host, state, reason):
-    """Wait for a change of state in the log; its entry."""
+    """Wait for a change of state; return its log entry."""
     host.wait(lambda: host.board.states()[-1] == (state, reason), f"{state} {reason}")
     return host.board.of("state")[-1]
 
 
 def start(host, first=0, watermark=1, job=1, start_tick=0):
-    """START; its NAKs."""
+    """Send START; return the reasons of its NAKs."""
     return host.tell("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
 
 
 def reported(host):
-    """Records by number, as EXECUTED told them."""
+    """Return the records of all EXECUTED messages, by number."""
     return {m.first_index + k: record for m in host.of("EXECUTED") for k, record in enumerate(m.records)}
 
 
@@ -34,7 +34,7 @@ def a_job_begins_with_its_watermark(bench):
     assert host.status().state == "RUNNING"
     assert host.board.of("gate") == []
     host.order(host.data(here(100, **DIM)))
-    host.wait(lambda: host.board.executed() == [0, 1, 2], "the points")
+    host.wait(lambda: host.board.pulse_numbers() == [0, 1, 2], "the points")
     until(host, "HOLD", "queue empty")
 
 
@@ -49,7 +49,7 @@ def a_job_begins_when_all_up_to_its_end_is_here(bench):
     assert host.tell("END", job=2, end_index=1) == ["STATE"]
     assert host.tell("END", job=1, end_index=1) == []
     until(host, "ARMED", "job done")
-    assert host.board.executed() == [0]
+    assert host.board.pulse_numbers() == [0]
 
 
 @scenario("jobs")
@@ -61,14 +61,14 @@ def points_behind_the_end_belong_to_the_next_job(bench):
     assert host.order(host.data(here(200, **DIM), here(300, **DIM))) == []
     until(host, "ARMED", "job done")
     host.pause(0.05)
-    assert host.board.executed() == [0]
+    assert host.board.pulse_numbers() == [0]
     assert host.status().queued == 2
     assert start(host, first=0) == ["INDEX"]
     assert start(host, first=1) == []
     assert start(host, first=1) == ["STATE"]
     assert host.tell("END", job=1, end_index=3) == []
     until(host, "ARMED", "job done")
-    assert host.board.executed() == [0, 1, 2]
+    assert host.board.pulse_numbers() == [0, 1, 2]
 
 
 @scenario("jobs")
@@ -93,7 +93,7 @@ def a_hold_ends_with_the_watermark_and_the_next_dark_time_counts_from_then(bench
     host.pause(0.05)
     assert host.status().state == "HOLD"
     host.order(host.data(here(100, dark_us=7000, **DIM)))
-    host.wait(lambda: len(host.board.executed()) == 4, "the points")
+    host.wait(lambda: len(host.board.pulse_numbers()) == 4, "the points")
     (refilled,) = [entry for entry in host.board.of("state") if entry["reason"] == "refilled"]
     assert 0 <= host.board.of("pulse")[2]["on_us"] - refilled["t_us"] - 7000 <= host.board.late_us
     assert host.board.states()[-1] == ("HOLD", "queue empty")
@@ -116,7 +116,7 @@ def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
     host.play(here(100, **DIM), end=False)
     until(host, "HOLD", "queue empty")
     host.order(host.data(here(100, **DIM)))
-    host.wait(lambda: len(host.board.executed()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
+    host.wait(lambda: len(host.board.pulse_numbers()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
     host.order(host.data(here(100, **DIM)))
     until(host, "FAULT", "fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["UNDERRUN"]
@@ -135,7 +135,7 @@ def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
 def flush_drops_the_queue_and_stays_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     assert host.tell("FLUSH") == []
     status = host.status()
     assert (status.state, status.queued, status.done_index) == ("ARMED", 0, 24)
@@ -144,12 +144,12 @@ def flush_drops_the_queue_and_stays_armed(bench):
     assert (flushed["state"], flushed["reason"]) == ("ARMED", "flush")
     assert cut["off_us"] == flushed["t_us"]
     assert cut["off_us"] - cut["on_us"] <= 60_000
-    # A host that dropped points goes on with its own count, never a smaller one.
+    # A host that dropped points continues its own count, never a smaller one.
     assert host.tell("DATA", first_index=23, points=[here(100)]) == ["INDEX"]
     host.index = 30
     assert host.play(here(100, **DIM)) == []
     until(host, "ARMED", "job done")
-    assert host.board.executed()[-1] == 30
+    assert host.board.pulse_numbers()[-1] == 30
     assert host.status().done_index == 31
 
 
@@ -157,14 +157,14 @@ def flush_drops_the_queue_and_stays_armed(bench):
 def abort_drops_everything_and_disarms(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     _, status = host.ask(host.frame("ABORT"))
     assert (status.state, status.queued) == ("DISARMED", 0)
     assert host.board.states()[-1] == ("DISARMED", "abort")
-    count = len(host.board.executed())
+    count = len(host.board.pulse_numbers())
     host.arm()
     assert host.status().queued == 0
-    assert len(host.board.executed()) == count
+    assert len(host.board.pulse_numbers()) == count
 
 
 @scenario("ABORT")
@@ -213,7 +213,7 @@ def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
 def a_pulse_cut_short_tells_what_it_did_and_one_not_lit_nothing(bench):
     host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     assert host.tell("FLUSH") == []
     cut = host.board.of("pulse")[-1]
     host.wait(lambda: cut["index"] in reported(host), "its report")

@@ -1,10 +1,10 @@
-"""Handshake, versions, sessions, go-back-N, NAKs, clock, status: what passes between host and board."""
+"""Scenarios of the link: handshake, versions, sessions, go-back-N, NAKs, clock, status."""
 
 import time
 
 from bench import BRIGHT, PATIENT, WITH_THE_END, TooLateError, here, wait_for
 from scenario import scenario
-from spoken import HOST, body_of, frame
+from wire_format import HOST, body_of, frame
 
 UID = "00112233445566778899aabb"
 
@@ -44,7 +44,7 @@ def the_reply_tells_what_the_board_is(bench):
 def hello_is_taken_whatever_session_stands_there_and_ends_what_goes_on(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     host.raw(frame(HOST["HELLO"][0], 5, host.session ^ 0x5555, body_of("HELLO", major=1, minor=9, host_nonce=7777)))
     host.wait(lambda: host.of("HELLO_REPLY")[-1].host_nonce == 7777, "the reply")
     assert host.of("HELLO_REPLY")[-1].session != host.session
@@ -73,7 +73,7 @@ def after_a_reset_all_is_forgotten_and_hello_tells(bench):
     if len(host.board.of("state")) > 1:
         raise TooLateError("greeted after the reset")
     wait_for(lambda: len(host.board.of("state")) == 2, "the reset")
-    host.pause(0.2, lease=False)  # what it said before is still on its way
+    host.pause(0.2, lease=False)  # earlier answers may still be in transit
     host.heard.clear()
     host.say("GET")
     host.pause(0.2, lease=False)
@@ -102,7 +102,7 @@ def another_session_s_frames_and_a_board_s_own_do_nothing(bench):
 def abort_is_taken_in_any_session(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     host.ask(host.frame("ABORT", session=host.session ^ 0x1234))
     assert host.board.states()[-1] == ("DISARMED", "abort")
     status = host.status()
@@ -113,7 +113,7 @@ def abort_is_taken_in_any_session(bench):
 def a_port_that_is_closed_and_opened_again_is_not_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     host.close()
     wait_for(lambda: host.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
     again = bench.host(host.board)
@@ -247,7 +247,7 @@ def points_that_do_not_fit_are_refused_whole_and_may_come_again(bench):
     said, status = host.ask(over)
     assert [(m.name, m.reason, m.next_seq) for m in said] == [("NAK", "NO_ROOM", (host.seq - 1) % 256)]
     assert status.queued == 24
-    host.seq, host.index = (host.seq - 1) % 256, 24  # it was not consumed
+    host.seq, host.index = (host.seq - 1) % 256, 24  # the frame was not consumed
     assert host.tell("START", job=1, first_index=0, start_tick=0, watermark=1) == []
     host.wait(lambda: host.status().queued <= 20, "room")
     assert host.order(host.data(*[here(0, dark_us=100)] * 7)) == []

@@ -1,4 +1,4 @@
-"""Python boards that break one rule each: python mutants.py NAME --pty LINK ..., as the board's own process."""
+"""Simulated boards that violate one guard each: python mutants.py NAME --pty LINK ..., as the board process."""
 
 import sys
 from types import SimpleNamespace
@@ -16,7 +16,7 @@ from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 from optodrive.link.simulator.board_machine import BoardMachine
 from optodrive.link.simulator.guards import EmissionGuards
 
-# Each function gives what is patched: (owner, name, what takes its place).
+# Each function returns a patch: (owner, attribute, replacement).
 
 
 def b1_states_do_not_darken():
@@ -283,7 +283,7 @@ MUTANTS = {
     for name, mutant in list(globals().items())
     if name.startswith("b") and name.partition("_")[0][1:].isdigit() and callable(mutant)
 }
-"""By name; what stands before the first underscore is the guard that it breaks."""
+"""Mutants by name; the part before the first underscore is the violated guard."""
 
 if __name__ == "__main__":
     setattr(*MUTANTS[sys.argv[1]]())

@@ -1,4 +1,4 @@
-"""B12 and B13: each point once and in order; junk changes counters only."""
+"""Scenarios of B12 and B13: each point once and in order; invalid frames change only counters."""
 
 import tomllib
 from itertools import pairwise
@@ -6,7 +6,7 @@ from pathlib import Path
 
 from bench import BRIGHT, PATIENT, here
 from scenario import scenario
-from spoken import HOST, body_of, frame
+from wire_format import HOST, body_of, frame
 
 REFUSED = tomllib.loads((Path(__file__).parents[2] / "firmware_protocol" / "refused.toml").read_text())["case"]
 
@@ -34,7 +34,7 @@ def each_number_once_and_in_order(bench):
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
     assert host.tell("DATA", first_index=0, points=four) == ["INDEX"], "nor when the job is over"
     assert host.tell("DATA", first_index=0xFFFF_FFFD, points=four) == ["INDEX"], "numbers do not wrap"
-    assert host.board.executed() == list(range(8))
+    assert host.board.pulse_numbers() == list(range(8))
     pulses = host.board.of("pulse")
     assert all(one["off_us"] <= other["on_us"] for one, other in pairwise(pulses))
 
@@ -45,19 +45,19 @@ def a_frame_that_comes_back_256_later_is_caught_by_its_number(bench):
     old = host.data(here(100, duty=999))
     assert host.order(old, *[host.data(here(0)) for _ in range(255)]) == []
     assert host.order(old) == ["INDEX"]
-    host.seq = (host.seq + 1) % 256  # it had the number that was expected
+    host.seq = (host.seq + 1) % 256  # the frame had the expected number
     assert host.status().queued == 256
     start = host.frame("START", job=1, first_index=0, start_tick=0, watermark=1)
     assert host.order(start, host.frame("END", job=1, end_index=256)) == []
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert host.board.executed() == [0]
+    assert host.board.pulse_numbers() == [0]
 
 
 # --- B13 ------------------------------------------------------------------------------------------------------------
 
 
 def damaged(whole):
-    """A frame cut short anywhere, and with any one bit wrong, each with its zero."""
+    """Return a frame truncated at each position and with each single bit flipped."""
     cut = [whole[:at] + b"\0" for at in range(1, len(whole) - 1)]
     at_bits = [(at, bit) for at in range(len(whole) - 1) for bit in range(8)]
     flipped = [bytes((*whole[:at], whole[at] ^ 1 << bit, *whole[at + 1 :])) for at, bit in at_bits]
@@ -70,16 +70,14 @@ def junk_changes_counters_only(bench):
     board = host.board
     points = [here(20_000, duty=999)] * 250
     host.play(*points)
-    host.wait(board.pulsed, "light")
+    host.wait(board.is_gate_on, "light")
     before, log = host.status(), len(board.of("state"))
     answered = len(host.heard)
     junk = [bytes.fromhex(case["wire"]) for case in REFUSED]
     for name in ("ABORT", "FLUSH", "DISARM", "GET"):
         junk += damaged(host.frame(name, seq=host.seq))
     junk += damaged(host.frame("END", seq=host.seq, job=1, end_index=1))[::3]
-    junk += [
-        frame(kind, host.seq, host.session, b"") for kind in (0x00, 0x05, 0x1B, 0x7F, 0xFF)
-    ]  # types without a name
+    junk += [frame(kind, host.seq, host.session, b"") for kind in (0x00, 0x05, 0x1B, 0x7F, 0xFF)]  # undefined types
     junk += [frame(HOST[name][0], host.seq, host.session, bytes(3)) for name in ("ABORT", "GET", "FLUSH", "DISARM")]
     junk += [frame(HOST["HELLO"][0], 0, 0, body_of("HELLO", major=1, minor=0, host_nonce=1) + b"\1")]
     junk += [frame(HOST["DATA"][0], host.seq, host.session, bytes(4) + bytes(n)) for n in (0, 9, 11)]
@@ -97,7 +95,7 @@ def junk_changes_counters_only(bench):
     assert after.state == "RUNNING"
     assert len(board.of("state")) == log
     host.wait(lambda: board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert board.executed() == list(range(len(points)))
+    assert board.pulse_numbers() == list(range(len(points)))
     assert {entry["off_us"] - entry["on_us"] for entry in board.of("pulse")} == {20_000}
 
 

@@ -1,4 +1,4 @@
-"""The scenarios by subject, played many at once: most of their time is the two seconds of arming."""
+"""Registry and concurrent execution of scenarios, which mostly wait for the two seconds of arming."""
 
 import tempfile
 import tomllib
@@ -17,7 +17,7 @@ GUARDS = [f"B{k}" for k in range(1, 16)]
 
 
 class Scenario(NamedTuple):
-    """One thing that must hold. subject: B1 to B15, or a section of PROTOCOL.md."""
+    """One requirement. subject: B1 to B15, or a section of PROTOCOL.md."""
 
     subject: str
     name: str
@@ -29,7 +29,7 @@ SCENARIOS: list[Scenario] = []
 
 
 def scenario(subject, cases=None):
-    """Register a function of a bench; with cases (a dict by name), once for each, as its second argument."""
+    """Register a function of a bench; with cases (a dict by name), once per case as its second argument."""
 
     def register(function):
         name, module = function.__name__, function.__module__
@@ -44,9 +44,9 @@ def scenario(subject, cases=None):
 
 
 def judge(kind: BoardKind, case: Scenario, excused=Bench.kept):
-    """Play it against a board of a kind; AssertionError where the board does not conform.
+    """Run a scenario against a board of a kind; raise AssertionError if the board does not conform.
 
-    Played again where this machine was too busy to tell: a fault of the board fails every time.
+    It is repeated if the machine was overloaded; a fault of the board fails every time.
     """
     for attempt in range(ATTEMPTS):
         with tempfile.TemporaryDirectory(prefix="conform-") as folder:
@@ -67,20 +67,20 @@ def judge(kind: BoardKind, case: Scenario, excused=Bench.kept):
 
 
 def unseen(board):
-    """A board that has failed already."""
+    """Ignore the log of a board that has already failed."""
 
 
 def audit(board):
-    """A board that has ended: its whole log is sound."""
+    """Check the log of a stopped board."""
     audit_log(board.events())
 
 
 def audit_log(events, state="BOOT"):
-    """What any log must show: light in RUNNING only, each pulse an edge on and one off. state: that before it."""
+    """Check transitions, gate on only in RUNNING, and two edges per pulse. state: before the log."""
     gate, since, pulsed = False, None, []
     for entry in events:
         if entry["event"] == "state":
-            assert entry["before"] in (state, "BOOT"), entry  # a reset goes through BOOT unseen
+            assert entry["before"] in (state, "BOOT"), entry  # a reset passes BOOT without an entry
             assert (entry["before"], entry["reason"], entry["state"]) in TRANSITIONS, f"no transition: {entry}"
             state = entry["state"]
             assert not gate or state == "RUNNING", f"lit in {entry}"
@@ -100,7 +100,7 @@ def audit_log(events, state="BOOT"):
 
 
 def run_all(kind: BoardKind, cases: list[Scenario]):
-    """Start all of them, as many at a time as run side by side; a future for each, by name."""
+    """Start all scenarios with limited concurrency; return their futures by name."""
     pool = ThreadPoolExecutor(kind.at_once)
     futures = {case.name: pool.submit(judge, kind, case) for case in cases}
     pool.shutdown(wait=False)

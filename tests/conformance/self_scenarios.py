@@ -1,20 +1,20 @@
-"""B14 and B15: a board that fails by itself goes dark, and says so."""
+"""Scenarios of B14 and B15: a board with an internal fault turns the gate off and reports it."""
 
 from bench import BRIGHT, here
 from guard_scenarios import dark_by
 from scenario import scenario
 
 FAILS_S = 6.0
-"""A host has armed and lit by then; an emulated watchdog may take as long again."""
+"""Time of scripted faults, after the host has armed; an emulated watchdog may take as long again."""
 WATCHDOG = 3
-"""The reset's cause in HELLO_REPLY."""
+"""Reset cause in HELLO_REPLY."""
 
 
 def failing(bench, action):
-    """A board that lights and darkens when its script lets something in it fail."""
+    """Run a job until a scripted internal fault turns the gate off."""
     host = bench.ready(f'[[step]]\nat_s = {FAILS_S}\ndo = "{action}"\n', **BRIGHT)
     assert host.play(*[here(10_000, dark_us=10_000, duty=2000)] * 450, end=False) == []
-    host.wait(host.board.pulsed, "light")
+    host.wait(host.board.is_gate_on, "light")
     return host
 
 
@@ -52,8 +52,8 @@ def a_hung_main_loop_ends_in_a_dark_reset_that_hello_tells(bench):
     host = failing(bench, "stop_loop")
     board = host.board
     host.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")
-    assert not board.pulsed()
-    host.pause(0.2, lease=False)  # what it said before is still on its way
+    assert not board.is_gate_on()
+    host.pause(0.2, lease=False)  # earlier answers may still be in transit
     host.heard.clear()
     host.say("GET")
     host.pause(0.2, lease=False)

@@ -1,4 +1,4 @@
-"""docs/reference/board-conformance.md says of the suite what the suite is."""
+"""docs/reference/board-conformance.md is current with the suite."""
 
 from board_table import table
 

@@ -1,4 +1,4 @@
-"""A suite that lets a broken board pass is none: for each guard, boards that break it fail its scenarios."""
+"""Mutation test of the suite: for each guard, boards that violate it fail its scenarios."""
 
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -18,7 +18,7 @@ MODULES = [module.__name__ for module in (guard_scenarios, trust_scenarios, orde
 
 
 class Mutant(NamedTuple):
-    """A board of a kind that breaks a guard; name: of the Python mutant, or the C core's MUTANT."""
+    """A board of a kind that violates a guard; name: of the Python mutant, or the C core's MUTANT."""
 
     board: str
     guard: str
@@ -30,7 +30,7 @@ MUTANTS += [Mutant("host", guard, guard.removeprefix("B")) for guard in GUARDS]
 
 
 def caught_by(mutant, ready):
-    """The first scenario of its guard that a mutant fails, '' where it passes them all."""
+    """Return the first scenario of its guard that a mutant fails, '' if it passes all."""
     kind = BoardKind(mutant.name, (sys.executable, str(Path(mutants.__file__)), mutant.name))
     if mutant.board != "python":
         kind = ready(mutant.board, int(mutant.name))
@@ -45,7 +45,7 @@ def caught_by(mutant, ready):
 
 @pytest.fixture(scope="module")
 def verdicts(request, ready):
-    """Futures of `caught_by` for the mutants that were asked for."""
+    """Return the futures of `caught_by` for the selected mutants."""
     requested = [
         item.callspec.params["mutant"]
         for item in request.session.items
@@ -56,7 +56,7 @@ def verdicts(request, ready):
 
 
 FIRST = {mutant.guard: mutant for mutant in reversed(MUTANTS) if mutant.board == "host"}
-"""The C core's, one of each guard; the others are looked for by scripts/test --slow."""
+"""The C core's mutant of each guard; scripts/test --slow runs the others."""
 CASES = [mutant if mutant in FIRST.values() else pytest.param(mutant, marks=pytest.mark.slow) for mutant in MUTANTS]
 
 

@@ -1,4 +1,4 @@
-"""PROTOCOL.md from outside: every scenario, against each kind of board.
+"""Black-box conformance with PROTOCOL.md: each scenario against each kind of board.
 
 One file, for one worker: scenarios played beside others would wait for the processor rather than for time.
 """

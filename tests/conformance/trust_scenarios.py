@@ -1,4 +1,4 @@
-"""B9 to B11: inputs, limits, arming."""
+"""Scenarios of B9 to B11: inputs, limits, arming."""
 
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ OPPOSITE = {"true": "false", "false": "true"}
 
 
 def step(at_s, name, value):
-    """One step of a script."""
+    """Return one step of a script."""
     return f'[[step]]\nat_s = {at_s}\nset = "{name}"\nvalue = {value}\n'
 
 
@@ -94,7 +94,7 @@ BEYOND = {
 
 
 def tightened(**values):
-    """The board's own limits, some of them tighter."""
+    """Return the board's own limits with some tighter values."""
     return {**OWN, **values}
 
 
@@ -119,7 +119,7 @@ def settling_and_lease_stay_tight_too(bench):
         assert host.tell("LIMITS", **requested) == []
     host.arm()
     host.play(here(100, **DIM), here(100, x=CENTRE + 1000, **DIM))
-    host.wait(lambda: len(host.board.executed()) == 2, "the pulses")
+    host.wait(lambda: len(host.board.pulse_numbers()) == 2, "the pulses")
     first, second = host.board.of("pulse")
     assert 0 <= second["on_us"] - first["off_us"] - 1400 <= host.board.late_us
     host.raw(host.frame("LEASE", ms=60_000) + host.frame("CLOCK", host_t=5))
@@ -141,7 +141,7 @@ def a_board_s_own_limits_are_back_with_the_next_session_and_never_more(bench):
     host.arm()
     host.play(here(20_000, x=62_000, **DIM))
     host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
-    assert host.board.executed() == [0]
+    assert host.board.pulse_numbers() == [0]
     host.order(host.data(here(20_001, **DIM)))
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
 
@@ -226,7 +226,7 @@ def a_recorded_session_played_again_never_arms(bench, where):
     script = f'[[step]]\nat_s = {SCRIPTED_S}\ndo = "reset"\n' if where == "reset" else ""
     host = bench.ready(script, **PATIENT)
     host.play(here(1000))
-    host.wait(lambda: host.board.executed() == [0], "the pulse")
+    host.wait(lambda: host.board.pulse_numbers() == [0], "the pulse")
     recorded = host.written
     host.close()
     if where == "reset":
@@ -240,7 +240,7 @@ def a_recorded_session_played_again_never_arms(bench, where):
     for _, data in recorded:
         again.raw(data)
         again.pause(0.01, lease=False)
-    for at in range(120):  # and its leases go on, as a recording's would
+    for at in range(120):  # leases continue, as in a recording
         again.raw(recorded[at % len(recorded)][1])
         again.pause(0.02, lease=False)
     states = {entry["state"] for entry in board.events()[before:] if entry["event"] == "state"}

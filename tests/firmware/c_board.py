@@ -1,4 +1,4 @@
-"""The C core behind the face of `BoardCore`, so that one bench and one set of checks serve both."""
+"""The C core with the interface of `BoardCore`, for the same bench and checks."""
 
 import ctypes
 import random
@@ -50,7 +50,7 @@ class Trace(ctypes.Structure):
     )
 
     def entry(self):
-        """As the Python board logs it."""
+        """Return the entry in the format of the simulated board's log."""
         kind = TRACE_KINDS[self.kind]
         done = "" if self.on else " done"
         why = f"point {self.index}{done}" if self.is_point else m.EVENT_REASONS[self.reason]
@@ -73,7 +73,7 @@ class Edge(ctypes.Structure):
 
 
 def build_library(folder, mutant=0, *defines):
-    """The core and the shim as a shared library in a folder outside the source tree; defines: sizes that differ."""
+    """Build the core and the shim as a shared library outside the source tree; defines: non-default sizes."""
     require("gcc")
     library = folder / f"core-{mutant}{''.join(defines)}.so"
     sources = [*sorted((FIRMWARE / "core").glob("*.c")), Path(__file__).with_name("shim.c")]
@@ -124,7 +124,7 @@ def load(path):
 
 
 class CBoard:
-    """A C core with ticks on time; sink: gets every log event, as from the Python board."""
+    """A C core with punctual ticks; sink: receives each log event, as from the simulated board."""
 
     def __init__(self, library, settings=None, sink=None, entropy=None):
         settings = settings or BoardSettings()
@@ -182,14 +182,14 @@ class CBoard:
         return [(edges[k].at_us, bool(edges[k].on)) for k in range(count.value)]
 
     def advance(self, now_us, loop=True):
-        """Ticks every 100 µs up to now_us; loop: whether the main loop turns then."""
+        """Run ticks every 100 µs up to now_us; loop: whether the main loop runs then."""
         self._library.shim_run(self._handle, now_us)
         if loop:
             self._library.shim_receive(self._handle, b"", 0)
         self._drain()
 
     def tick(self, now_us):
-        """One tick, however late."""
+        """Run one tick, possibly late."""
         self._library.shim_tick(self._handle, now_us)
         self._drain()
 
@@ -212,7 +212,7 @@ class CBoard:
         self._drain()
 
     def stick(self, stuck, on=False):
-        """The gate's readback stays at `on`, or follows the gate again."""
+        """Freeze the gate's readback at `on`, or release it."""
         self._library.shim_stick(self._handle, stuck, on)
 
     def on_link_lost(self, now_us):
@@ -230,7 +230,7 @@ class CBoard:
 
 
 class CBench(Bench):
-    """The bench of the Python board with a C core on it."""
+    """The bench of the simulated board with a C core."""
 
     def __init__(self, library, limits=None, **settings):
         super().__init__(limits, **settings)

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-for folder in ("simulator", "protocol"):  # the Python side's bench, checks and vectors
+for folder in ("simulator", "protocol"):  # bench, checks and vectors of the Python tests
     sys.path.append(str(Path(__file__).parents[1] / "unit" / "link" / folder))
 
 from c_board import CBench, build_library  # noqa: E402 - it stands on the bench
@@ -12,7 +12,7 @@ from c_board import CBench, build_library  # noqa: E402 - it stands on the bench
 
 @pytest.fixture(scope="session")
 def libraries(tmp_path_factory):
-    """The library of a mutant, 0 for the true core; each built once."""
+    """Return a function for the library of a mutant, 0 for the unmodified core; each is built once."""
     return cache(partial(build_library, tmp_path_factory.mktemp("core")))
 
 

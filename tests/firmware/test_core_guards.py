@@ -1,4 +1,4 @@
-"""B1 to B15 on the C core: the Python board's checks for B1 to B13, and for each guard a core without it, caught."""
+"""B1 to B15 of the C core: the checks of the simulated board for B1 to B13, and detection of each disabled guard."""
 
 from functools import partial
 from itertools import pairwise
@@ -102,7 +102,7 @@ def test_an_input_is_dark_within_1_ms(make, name, unsafe):
     b.core.inputs[name] = unsafe
     bits = sum(1 << k for k, known in enumerate(m.INPUTS) if b.core.inputs[known])
     opened_us = b.now_us
-    b.core._library.shim_set_inputs(b.core._handle, bits)  # and no tick told: the next one finds it
+    b.core._library.shim_set_inputs(b.core._handle, bits)  # without a tick: the next one detects it
     b.wait(1000)
     assert dark_us(b) - opened_us <= 1000
     assert b.fault == name.upper()

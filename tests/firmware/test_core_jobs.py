@@ -1,4 +1,4 @@
-"""The Python board's tests of arming, jobs, holds, reports and faults, with the C core on the bench."""
+"""The simulated board's tests of arming, jobs, holds, reports and faults, run on the C core."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import test_board_core as python_board
 from c_board import CBench
 from test_board_core import *  # noqa: F403
 
-# The Python board's own parts, or its inside. Inputs at power-up and 32 bits of time are tested elsewhere here.
+# Tests of the simulated board's internals. Inputs at power-up and 32 bits of time have other tests here.
 del test_the_timing_of_the_contract  # noqa: F821
 del test_no_arming_with_an_input_that_is_not_safe  # noqa: F821
 del test_a_report_never_runs_over_more_than_32_bits_of_time  # noqa: F821

@@ -1,4 +1,4 @@
-"""A core with little memory: what it cannot account for stays dark."""
+"""A core with small tables: pulses that it cannot account for are not emitted."""
 
 from functools import partial
 

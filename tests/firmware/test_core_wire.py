@@ -1,11 +1,11 @@
-"""The wire of the C core: every vector encodes and decodes, refused frames only count, junk in any portions."""
+"""The wire format of the C core: vectors encode and decode; refused frames and random bytes change only counters."""
 
 import ctypes
 
 import pytest
 import test_messages as wire
 from c_board import CBench, CBoard
-from same import LikePython
+from lockstep import Lockstep
 
 from optodrive.link.protocol import messages as m
 
@@ -13,7 +13,7 @@ SESSION = 0xBEEF
 
 
 def bench_in_session(library):
-    """A core that gives the vectors' session."""
+    """Return a core with the session of the vectors."""
     b = CBench(library)
     b.core = CBoard(library, sink=b.log.append, entropy=[SESSION, 0x1234_5678])
     b.hello()
@@ -34,7 +34,7 @@ def test_vector_encodes(library, stem):
 @pytest.mark.parametrize("stem", wire.VECTORS)
 def test_vector_is_answered_as_the_python_board_answers(library, stem, portion):
     vector = wire.VECTORS[stem]
-    both = LikePython(library, entropy=[SESSION, 7])
+    both = Lockstep(library, entropy=[SESSION, 7])
     both.say(m.Hello(1, 0, 42))
     both.say(*[m.Disarm()] * vector["seq"])
     data = bytes.fromhex(vector["wire"])

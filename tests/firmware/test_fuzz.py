@@ -1,4 +1,4 @@
-"""libFuzzer on the C core: in half a minute it does nothing it must not, and cores without a guard are found out."""
+"""libFuzzer on the C core: half a minute without a violation, and detection of each disabled guard."""
 
 import shutil
 import subprocess
@@ -11,13 +11,13 @@ SECONDS = 30
 MUTANT_SECONDS = 60
 LONGEST = {"decoder": 1024, "board": 512}
 FOUND_BEFORE = {
-    # A reset far from the centre, then a point there: the core took the mirrors to stand where it had not sent them.
+    # A reset far from the centre, then a point there: the core assumed a mirror position that it had not commanded.
     "mirrors after a reset": ("board", "01 03 00 06 00 78 17 cd 03 04 00 00 02"),
 }
 
 
 def build(folder, target, mutant=0):
-    """The program of a fuzz target, built outside the source tree."""
+    """Build a fuzz target outside the source tree."""
     missing = [tool for tool in ("clang", "make") if shutil.which(tool) is None]
     assert not missing, f"the fuzzers need {' and '.join(missing)}: apt-get install clang libclang-rt-dev make"
     program = folder / (f"{target}-{mutant}" if mutant else target)
@@ -28,7 +28,7 @@ def build(folder, target, mutant=0):
 
 
 def start(program, seconds, *inputs):
-    """The fuzzer for so long, from an empty corpus."""
+    """Run the fuzzer for some seconds from an empty corpus."""
     longest = LONGEST[program.name.partition("-")[0]]
     options = [f"-max_total_time={seconds}", f"-max_len={longest}", "-seed=1", f"-artifact_prefix={program}-found-"]
     return subprocess.Popen([program, *options, *inputs], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)

@@ -1,4 +1,4 @@
-"""The model of link, gate and dying host, explored whole; each rule taken away is missed."""
+"""Exhaustive search of the SPIN model of link, gate and failing host; each removed rule is detected."""
 
 import re
 import subprocess
@@ -12,7 +12,7 @@ MUTANTS = range(1, 7)
 
 
 def explored(folder, mutant):
-    """What pan says of the model: errors, and states."""
+    """Run pan; return the numbers of errors and of states, and its output."""
     for command in (
         ["spin", f"-DMUTANT={mutant}", "-a", MODEL],
         ["gcc", "-O2", "-DSAFETY", "-DNOFAIR", "-o", "pan", "pan.c"],

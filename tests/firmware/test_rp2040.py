@@ -1,4 +1,4 @@
-"""The port to the Raspberry Pi Pico, as far as can be seen without one: it builds, and its ROM would take the image."""
+"""The port to the Raspberry Pi Pico without hardware: it builds, and the ROM accepts the image."""
 
 import re
 import shutil
@@ -48,7 +48,7 @@ def symbols(build):
 
 
 def rom_crc(data):
-    """CRC-32 most significant bit first, by way of zlib's, which takes the least significant first."""
+    """Compute CRC-32 MSB first with zlib's LSB-first function."""
     turned = bytes(int(f"{byte:08b}"[::-1], 2) for byte in data)
     return int(f"{~zlib.crc32(turned) & 0xFFFFFFFF:032b}"[::-1], 2)
 
@@ -59,7 +59,7 @@ def test_rom_takes_the_second_stage(image):
 
 
 def test_second_stage_may_stand_anywhere(build):
-    """The ROM runs a copy of it: nothing in it may be called or looked up elsewhere in the flash, but the vectors."""
+    """The ROM runs a copy of the boot loader, which must not refer to other flash contents than the vectors."""
     listed = run("arm-none-eabi-objdump", "-d", "-j", ".boot2", build / "board.elf")
     code = listed[listed.index("<boot2>:") :]
     assert "\tbl\t" not in code

@@ -1,4 +1,4 @@
-"""A held board in virtual time: what it lets through, and how it ends."""
+"""Exclusive board access in virtual time: permitted points, and the end of access."""
 
 import numpy as np
 import pytest
@@ -88,7 +88,7 @@ def test_no_spot_far_outside_the_display(rig, codes):
 
 
 def test_what_the_limiter_refuses_never_reaches_the_board(display):
-    """20 ms of 50 mW are 1 mJ; the cap here is half of that."""
+    """A pulse of 20 ms and 50 mW has 1 mJ, twice the cap."""
     rig = Rig(limited(display, pulse_energy_max_j=0.5e-3))
     with rig.armed() as held, pytest.raises(RefusedError, match="pulse energy cap"):
         held.fire_spot(*CENTRE, 0.05)
@@ -98,7 +98,7 @@ def test_what_the_limiter_refuses_never_reaches_the_board(display):
 
 
 def test_spots_anywhere_count_on_one_pixel(display):
-    """A beam that nobody has measured may land on a neighbour: so a pixel's mean power binds wherever it is sent."""
+    """An uncalibrated beam may hit a neighbour, so a pixel's mean-power cap applies at each position."""
     rig = Rig(limited(display, pixel_mean_power_max_w=5e-3, pixel_mean_window_s=1.0))
     places = [(CENTRE_CODE + 3000 * column, CENTRE_CODE + 3000 * row) for row in (-4, 0, 4) for column in (-4, 0, 4)]
     with rig.armed() as held:
@@ -166,7 +166,7 @@ def test_indicator_takes_two_seconds(rig):
 
 
 def test_late_points_count_as_late(rig):
-    """The limiter's time line follows the board's: spots of a minute do not pile up, and mirrors cool."""
+    """The limiter's timeline follows the board's: many spots do not accumulate, and the galvos cool."""
     with rig.armed() as held:
         for _ in range(30):
             for sign in (1, -1):

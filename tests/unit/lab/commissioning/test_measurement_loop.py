@@ -1,4 +1,4 @@
-"""The loop's small parts: readings that agree, the session on disk, the process worker."""
+"""Parts of the measurement loop: robust mean, session file, worker process."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The host's side of the sensor's lines."""
+"""The client of the spot sensor."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from optodrive.lab.commissioning.spot_sensor_client import LINE_MAX, SpotSensorC
 
 
 class Wire:
-    """A transport that says what a test lets it say, in pieces."""
+    """A transport with scripted input in pieces."""
 
     name = "a wire"
 

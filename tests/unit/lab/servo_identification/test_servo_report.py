@@ -1,4 +1,4 @@
-"""What is remarked of mirrors that a configuration cannot state, or that are no such servo."""
+"""Remarks on mirrors outside the configuration's range or the servo model."""
 
 from dataclasses import replace
 

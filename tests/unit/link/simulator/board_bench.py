@@ -1,4 +1,4 @@
-"""A simulated board on the bench: frames put together by hand, time moved by hand, everything seen."""
+"""Test bench of a simulated board: explicit frames and time, and access to its log."""
 
 from dataclasses import replace
 
@@ -12,7 +12,7 @@ LEASE_STEP_US = 20_000
 
 
 class Bench:
-    """limits: fields of the board's own that differ; settings: of the board."""
+    """A board with its host side. limits: fields that differ from the defaults; settings: of the board."""
 
     def __init__(self, limits=None, **settings):
         self.log = []
@@ -28,7 +28,7 @@ class Bench:
     # --- bytes ---
 
     def raw(self, data):
-        """Bytes arrive; the messages the board answers with."""
+        """Pass bytes to the board and return its answers."""
         self.host_bytes.append(data)
         self.core.receive(data, self.now_us)
         return self.take()
@@ -44,13 +44,13 @@ class Bench:
         return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
     def say(self, *messages):
-        """Messages arrive together."""
+        """Pass messages in one batch and return the answers."""
         return self.raw(b"".join([self.frame(message) for message in messages]))
 
     # --- time ---
 
     def wait(self, duration_us, lease=True):
-        """Let time pass, renewing the lease meanwhile."""
+        """Advance the time and renew the lease."""
         until_us, answers = self.now_us + duration_us, []
         while self.now_us < until_us:
             self.now_us = min(until_us, self.now_us + LEASE_STEP_US)
@@ -60,10 +60,10 @@ class Bench:
                 answers += self.say(m.Lease(100))
         return answers
 
-    # --- orders ---
+    # --- session, arming, jobs ---
 
     def hello(self, nonce=42, major=m.MAJOR):
-        """A new session; the board's reply."""
+        """Begin a session and return the board's reply."""
         self.seq = self.index = 0
         (reply,) = [x for x in self.say(m.Hello(major, 0, nonce)) if isinstance(x, m.HelloReply)]
         self.session = reply.session
@@ -84,17 +84,17 @@ class Bench:
         return self.arm()
 
     def data(self, *points):
-        """A DATA message for (x, y, dark_us, on_us, duty), counting on from the last."""
+        """Build a DATA message of points (x, y, dark_us, on_us, duty), numbered after the last one."""
         first, self.index = self.index, self.index + len(points)
         return m.Data(first, b"".join(m.POINT.pack(*point) for point in points))
 
     def play(self, *points, end=True):
-        """Points, START at once, and END."""
+        """Send points, an immediate START, and END."""
         first = self.index
         pieces = [self.data(*points[at : at + m.POINTS_MAX]) for at in range(0, len(points), m.POINTS_MAX)]
         return self.say(*pieces, m.Start(1, first, 0, 1), *([m.End(1, self.index)] if end else []))
 
-    # --- what is seen ---
+    # --- observations ---
 
     @property
     def state(self):
@@ -109,16 +109,16 @@ class Bench:
 
     @property
     def edges(self):
-        """(time, on) of every gate edge."""
+        """(time, on) of each gate edge."""
         return [(entry["t_us"], entry["on"]) for entry in self.of("gate")]
 
     @property
     def pulses(self):
-        """(index, gate on, gate off) of every pulse, from the log."""
+        """(index, gate on, gate off) of each pulse, from the log."""
         return [(entry["index"], entry["on_us"], entry["off_us"]) for entry in self.of("pulse")]
 
     def condition(self):
-        """All that junk on the line must leave as it is."""
+        """Return the state that invalid frames must not change."""
         machine = self.core.machine
         queue = machine.queue
         return (
@@ -138,7 +138,7 @@ class Bench:
         return self.core.machine.limits
 
     def bad_frames(self):
-        """Frames counted as no frames: CRC, form."""
+        """Return the counts of CRC and format errors."""
         counted = self.core._link.decoder.counters
         return [counted.crc_errors, counted.format_errors]
 
@@ -148,7 +148,7 @@ class Bench:
 
 
 def here(on_us, dark_us=0, duty=65535, x=CENTRE, y=CENTRE):
-    """A point at the centre, or near it."""
+    """Return a point, by default at the centre."""
     return x, y, dark_us, on_us, duty
 
 

@@ -1,4 +1,4 @@
-"""The board's states, jobs and reports, with the clock moved by hand."""
+"""States, jobs and reports of the simulated board, with explicit time."""
 
 import random
 import tomllib
@@ -23,7 +23,7 @@ def bench():
 
 
 def executed(answers):
-    """(index, gate-on tick, ticks, duty) of every EXECUTED record."""
+    """Return (index, gate-on tick, ticks, duty) of each EXECUTED record."""
     return [
         (message.first_index + k, *record)
         for message in answers
@@ -37,7 +37,7 @@ def dim(count, on_us=1000, dark_us=9000):
 
 
 def walk(b):
-    """States entered, with their reasons."""
+    """Return the entered states with their reasons."""
     return [(entry["state"], entry["reason"]) for entry in b.of("state")]
 
 
@@ -97,7 +97,7 @@ def test_another_major_version_may_talk_but_not_arm():
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])
 def test_no_arming_with_an_input_that_is_not_safe(name, value):
     b = Bench()
-    b.core.machine.inputs[name] = value  # at power-up already, so no fault came of it
+    b.core.machine.inputs[name] = value  # as at power-up, so it is no fault
     b.hello()
     assert naks(b.say(m.ArmReq(1))) == ["INPUT"]
 
@@ -471,7 +471,7 @@ def test_a_report_never_runs_over_more_than_32_bits_of_time(bench):
     bench.play(*dim(1))
     bench.wait(20_000)
     bench.say(m.Start(2, 1, bench.now_us + (1 << 32), 1), bench.data(*dim(1)), m.End(2, 2))
-    bench.core.machine.lease_until_us = bench.now_us + (1 << 33)  # an hour and more in one step
+    bench.core.machine.lease_until_us = bench.now_us + (1 << 33)  # more than an hour in one step
     bench.now_us += (1 << 32) + 20_000
     bench.core.advance(bench.now_us)
     assert [record[0] for record in executed(bench.take())] == [1]
@@ -498,7 +498,7 @@ def test_events_tell_every_change(bench):
 
 
 def in_second_before(end_us, pulses):
-    """Gate-on time × duty in the second before end_us."""
+    """Return gate-on time × duty in the second before end_us."""
     return sum(max(0, min(t + on, end_us) - max(t, end_us - WINDOW_US)) * duty for t, on, duty in pulses)
 
 

@@ -1,4 +1,4 @@
-"""The simulated board's files (limits, script) and its link that breaks down."""
+"""The simulated board's limits file, script file and faulty link."""
 
 import pytest
 

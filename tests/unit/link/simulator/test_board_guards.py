@@ -1,4 +1,4 @@
-"""B1 to B13 of PROTOCOL.md: what the board enforces against its host; and for each, boards that do not, caught."""
+"""B1 to B13 of PROTOCOL.md on the simulated board, and detection of boards that violate them."""
 
 import tomllib
 from itertools import pairwise

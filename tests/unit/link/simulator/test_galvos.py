@@ -1,4 +1,4 @@
-"""The simulated mirrors against the servo that the physics integrates, step by step."""
+"""The simulated galvos against a numerical integration of the servo."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ CONFIG = DISPLAYS["display-437"].config
 def test_a_move_follows_the_servo():
     mirrors = SimulatedGalvos(CONFIG, seed=0)
     mirrors.move_to(CENTRE_CODE + 12_000, CENTRE_CODE - 500, 1000)
-    # The integration moves the servo's target on by whole steps; the closed form does not.
+    # The integration advances the servo's target in whole steps; the closed form is continuous.
     scanner = CONFIG.scanner
     step_rad = scanner.slew_rad_per_s * 2.0 / (STEPS_PER_TIME_CONSTANT * 2.0 * np.pi * scanner.bandwidth_hz)
     t_us = np.arange(900, 12_000, 37)

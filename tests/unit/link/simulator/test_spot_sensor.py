@@ -1,4 +1,4 @@
-"""The simulated sensor: what it sees, when, how well, and what it never sees."""
+"""The simulated spot sensor: detection, timing, noise and outliers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The real session and the C core, a link under fire between them, in virtual time: what the Python board bears."""
+"""A real session and the C core over a faulty link in virtual time, with the tests of the simulated board."""
 
 import sys
 from functools import partial
@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 from c_board import CBoard
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))  # before a folder with a bench of its own
+sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))  # before a folder with its own bench module
 
-import test_fire_virtual as python_board
-from fire_virtual import FireRig
-from test_fire_virtual import *  # noqa: F403
+import test_link_faults_virtual as python_board
+from test_link_faults_virtual import *  # noqa: F403
+from virtual_rig import VirtualRig
 
 # Of the fire or of the host alone; and mutants of the Python board, in whose place a core without a guard stands below.
 del test_a_board_that_breaks_its_word_is_found_out  # noqa: F821
@@ -21,7 +21,7 @@ del test_goodput_of_a_job_at_one_percent_loss  # noqa: F821
 
 
 class SeededCBoard(CBoard):
-    """A C core that is made, and changed by its bench, as the Python board is."""
+    """A C core with the constructor of the simulated board."""
 
     def __init__(self, library, settings, sink, seed):
         entropy = python_board.random.Random(seed)
@@ -30,11 +30,11 @@ class SeededCBoard(CBoard):
 
 @pytest.fixture(autouse=True)
 def _c_core_in_every_rig(monkeypatch, library):
-    monkeypatch.setattr(python_board, "FireRig", partial(FireRig, make_core=partial(SeededCBoard, library)))
+    monkeypatch.setattr(python_board, "VirtualRig", partial(VirtualRig, make_core=partial(SeededCBoard, library)))
 
 
 @pytest.mark.parametrize("guard", [1, 12, 13])
 def test_a_core_without_a_guard_is_found_out(libraries, guard):
-    rig = FireRig(5, 0.15, extra=0.6, pauses=0.001, make_core=partial(SeededCBoard, libraries(guard)))
+    rig = VirtualRig(5, 0.15, extra=0.6, pauses=0.001, make_core=partial(SeededCBoard, libraries(guard)))
     with pytest.raises(AssertionError):
         python_board.storm(rig)

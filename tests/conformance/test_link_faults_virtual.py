@@ -1,14 +1,14 @@
-"""The real session and a board, a link under fire between them, in virtual time: 200,000 faults."""
+"""A real session and a board over a faulty link in virtual time: 200,000 faults."""
 
 import random
 from dataclasses import replace
 from math import inf
 
 import pytest
-from fire_host import configured
-from fire_virtual import FireRig
 from mutants import MUTANTS
-from spoken import HOST
+from session_rig import configured
+from virtual_rig import VirtualRig
+from wire_format import HOST
 
 from optodrive.link.session import board_requirements
 from optodrive.link.session import session as session_module
@@ -21,7 +21,7 @@ ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
 def storm(rig):
-    """Sessions until enough has gone wrong; how many, and their pulses."""
+    """Run sessions until enough faults are injected; return the number of sessions and pulses."""
     sessions = pulses = 0
     while rig.faults < FAULTS_EACH:
         rig.live(3000, patience_s=4.0)
@@ -32,7 +32,7 @@ def storm(rig):
 
 @pytest.mark.parametrize(("seed", "loss"), STORMS)
 def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_is_dark(seed, loss):
-    rig = FireRig(seed, loss, extra=0.6, pauses=0.001)
+    rig = VirtualRig(seed, loss, extra=0.6, pauses=0.001)
     rig.up.never_again = ENDING if seed == 2 else ()
     sessions, pulses = storm(rig)
     kinds = rig.up.counts + rig.down.counts
@@ -49,14 +49,14 @@ def test_a_board_that_breaks_its_word_is_found_out(monkeypatch, names):
     for name in names:
         monkeypatch.setattr(*MUTANTS[name]())
     with pytest.raises(AssertionError):
-        storm(FireRig(5, 0.15, extra=0.6, pauses=0.001))
+        storm(VirtualRig(5, 0.15, extra=0.6, pauses=0.001))
 
 
 def test_a_run_can_be_played_again(monkeypatch):
     reported = []
     for _ in range(2):
         monkeypatch.setattr(session_module.secrets, "randbits", random.Random(4).getrandbits)
-        rig = FireRig(4, 0.1, extra=0.5, pauses=0.002)
+        rig = VirtualRig(4, 0.1, extra=0.5, pauses=0.002)
         for _ in range(6):
             rig.live(1000, patience_s=4.0)
         reported.append((rig.log, rig.up.log, rig.down.log))
@@ -65,7 +65,7 @@ def test_a_run_can_be_played_again(monkeypatch):
 
 
 def test_equal_seeds_give_equal_faults():
-    one, other = (FireRig(3, 0.1, 0.5, 0.01).up for _ in range(2))
+    one, other = (VirtualRig(3, 0.1, 0.5, 0.01).up for _ in range(2))
     stream = bytes(range(256)) * 40
     assert [one.carry(stream, k) for k in range(9)] == [other.carry(stream, k) for k in range(9)]
     assert one.log == other.log
@@ -77,7 +77,7 @@ def test_equal_seeds_give_equal_faults():
 
 @pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(2, 6))])
 def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(seed):
-    rig = FireRig(seed, paced=True)
+    rig = VirtualRig(seed, paced=True)
     rig.session.connect()
     assert rig.armed()
     rig.up.loss = rig.down.loss = 0.05
@@ -91,8 +91,8 @@ def test_no_underrun_at_five_percent_loss_with_a_queue_of_a_quarter_second(seed)
 
 
 def played_in_s(loss, seed):
-    """How long 2,000 points take on the board, one every 0.55 ms."""
-    rig = FireRig(seed, paced=True)
+    """Return the duration of 2,000 points on the board, one every 0.55 ms."""
+    rig = VirtualRig(seed, paced=True)
     rig.session.connect()
     assert rig.armed()
     rig.up.loss = rig.down.loss = loss
@@ -112,16 +112,16 @@ def test_goodput_of_a_job_at_one_percent_loss():
 
 
 LINES = {115_200: 6000, 1_000_000: 20_000}
-"""Baud, and the points that keep a line busy for a while."""
+"""Baud rates, and numbers of points that saturate the line for some time."""
 
 
 def filled_in_s(baud, loss, seed):
-    """How long a full line takes to bring points to a board that has room for them, all of them acknowledged.
+    """Return the time in which a saturated line delivers points to a board with a large queue, all acknowledged.
 
     With a lease of half a second: of 100 ms, 115,200 baud lose one after the other too often.
     """
     config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
-    rig = FireRig(seed, paced=True, config=config, queue_points=30_000, limits=limits)
+    rig = VirtualRig(seed, paced=True, config=config, queue_points=30_000, limits=limits)
     rig.session.connect()
     assert rig.armed()
     rig.up.loss = rig.down.loss = loss
@@ -136,7 +136,7 @@ def filled_in_s(baud, loss, seed):
 
 @pytest.mark.parametrize("baud", LINES)
 def test_goodput_of_a_full_line_at_one_percent_loss(baud):
-    """Points delivered in a time, over what the same line delivers without loss; each lost frame costs those behind."""
+    """The throughput relative to a line without loss; each lost frame costs those behind it."""
     clean_s = filled_in_s(baud, 0.0, 0)
     assert clean_s < 1.1 * LINES[baud] * (FRAME_BYTES / 24) * BITS_PER_BYTE / baud, "the line was not full"
     lossy_s = [filled_in_s(baud, 0.01, seed) for seed in range(1, 11)]
@@ -149,16 +149,18 @@ def test_goodput_of_a_full_line_at_one_percent_loss(baud):
 
 
 def dark_after_abort_s(baud):
-    """How long after a host aborts in the middle of a full line the gate is off, s; the longest of some moments."""
+    """Return the maximum time from an abort on a saturated line to gate off, s."""
     return max(dark_after_abort_at_s(baud, executed) for executed in range(3, 35, 4))
 
 
 def dark_after_abort_at_s(baud, executed):
     config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
-    rig = FireRig(1, paced=True, config=config, limits=limits)
+    rig = VirtualRig(1, paced=True, config=config, limits=limits)
     rig.session.connect()
     assert rig.armed()
-    job = rig.begin(4000, dark_us=4500, ahead_s=inf)  # as slow as pulses are: the line is full until all are there
+    job = rig.begin(
+        4000, dark_us=4500, ahead_s=inf
+    )  # slow pulses, so that the line is saturated until all points have arrived
     assert rig.until(lambda: job.executed_count > executed and rig.core.gate, 10.0)
     assert not job.is_fully_sent
     aborted_s = rig.clock.now_s()
@@ -169,7 +171,7 @@ def dark_after_abort_at_s(baud, executed):
 
 
 def abort_bound_s(baud):
-    """What PROTOCOL.md lets be in flight, and 5 ms."""
+    """Return the transmission time of the permitted data in flight, plus 5 ms."""
     return max(2 * FRAME_BYTES * BITS_PER_BYTE / baud, 0.02) + 0.005
 
 
@@ -189,8 +191,8 @@ def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
 
 
 def stalled(for_s, ahead_s):
-    """A host with a lease of half a second does nothing for a while in mid-job; the rig and the job, then."""
-    rig = FireRig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
+    """Stall a host with a lease of half a second during a job; return the rig and the job."""
+    rig = VirtualRig(1, config=configured(lease_s=0.5), limits=replace(DEFAULT_LIMITS, lease_ms=500))
     rig.session.connect()
     assert rig.armed()
     job = rig.begin(2000, dark_us=900, ahead_s=ahead_s)

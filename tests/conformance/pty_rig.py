@@ -1,4 +1,4 @@
-"""The real session on a real serial port, a board's process on another, and a proxy with fire between the two."""
+"""A real session on a serial port, a board process on another, and a proxy with fault injection between them."""
 
 import os
 import select
@@ -9,9 +9,9 @@ from contextlib import suppress
 
 import serial
 from bench import Bench
-from fire import Fire, Witness
-from fire_host import FireHost, configured
+from link_faults import LinkFaults, Witness
 from scenario import audit_log
+from session_rig import SessionRig, configured
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.link.session.board_requirements import BoardRequirements
@@ -23,7 +23,7 @@ READ_MAX = 4096
 
 
 class Proxy(threading.Thread):
-    """A pty for the host, passed on to the board's; the board's port is open for as long as the host's is."""
+    """Connects a pty for the host with the board's port, which is open as long as the host's is."""
 
     def __init__(self, board_port, link, up, down):
         super().__init__(daemon=True)
@@ -41,16 +41,16 @@ class Proxy(threading.Thread):
         os.close(slave)
 
     def cut(self):
-        """The host's port vanishes and comes back, as if unplugged."""
+        """Remove and restore the host's port, as if unplugged."""
         self._cutting.set()
 
     @property
     def cutting(self):
-        """Whether the port has still to come back."""
+        """Whether the port is not restored yet."""
         return self._cutting.is_set()
 
     def end(self):
-        """Stop, and wait for it."""
+        """Stop the thread and wait for it."""
         self._ending.set()
         self.join()
         os.close(self._master)
@@ -76,7 +76,7 @@ class Proxy(threading.Thread):
         while self._host_there() and not self._ending.is_set() and not self._cutting.is_set():
             select.select([self._master, board.fileno()], [], [], TURN_S)
             now_s = time.monotonic()
-            with suppress(OSError):  # nothing there, or the host has just closed
+            with suppress(OSError):  # empty, or the host has just closed
                 board.write(self._up.carry(self._from_host(), now_s))
                 os.write(self._master, self._down.carry(board.read(READ_MAX), now_s))
 
@@ -87,7 +87,7 @@ class Proxy(threading.Thread):
 
 
 class WitnessedPort(SerialPort):
-    """A serial port that notes what is written before it leaves."""
+    """A serial port that records all written bytes."""
 
     def __init__(self, port, witness):
         super().__init__(port, 1_000_000)
@@ -98,11 +98,11 @@ class WitnessedPort(SerialPort):
         super().write(data)
 
 
-class PtyRig(FireHost):
-    """A board of a kind behind a proxy; its lease, and the configuration's, are a second."""
+class PtyRig(SessionRig):
+    """A board of a kind behind a proxy, with leases of one second."""
 
     def __init__(self, kind, folder, seed, loss=0.0, extra=0.0, pauses=0.0):
-        up, down = (Fire(2 * seed + way, loss, extra, pauses) for way in (0, 1))
+        up, down = (LinkFaults(2 * seed + way, loss, extra, pauses) for way in (0, 1))
         self._bench = Bench(kind, folder)
         self.board = self._bench.board(lease_ms=1000)
         self.witness = Witness()
@@ -115,7 +115,7 @@ class PtyRig(FireHost):
         )
 
     def finish(self):
-        """End host, proxy and board; the number of pulses in its log, which keeps its word."""
+        """Stop host, proxy and board; check the log and return the number of pulses."""
         self.session.close()
         self.proxy.end()
         self._bench.finish(lambda board: None)

@@ -1,23 +1,23 @@
-"""A link under fire: seeded faults on one direction of it, each one logged; and a witness of what pulses may be."""
+"""Seeded, logged fault injection for one direction of a link, and a check of the pulses that a board may emit."""
 
 import random
 from collections import Counter, deque
 from typing import NamedTuple
 
-from spoken import HOST, POINT, uncobs
+from wire_format import HOST, POINT, uncobs
 
 DAMAGE = ("drop", "flip", "truncate", "lose a byte", "insert a byte")
 OLD_FRAMES = 600
-"""More than the 256 after which sequence numbers come back."""
+"""More than the 256 after which sequence numbers repeat."""
 PAUSE_MAX_S = 0.3
 
 
-class Fire:
-    """Damages frames on their way; equal seeds, bytes and times give equal faults.
+class LinkFaults:
+    """Injects faults into transmitted frames, reproducible for equal seeds, bytes and times.
 
-    loss: part of the frames that is lost or spoilt; extra: chance that something comes before a frame that nobody
-    sent now, again and again; pauses: chance that after a frame nothing passes for a while, held or lost.
-    never_again: types of frames that are not played again: an old ABORT ends every session, as it must.
+    loss: share of lost or damaged frames; extra: probability of additional data before a frame, repeatedly;
+    pauses: probability of an interruption after a frame, with delay or loss
+    never_again: frame types that are not replayed: an old ABORT correctly ends any session
     """
 
     def __init__(self, seed, loss=0.0, extra=0.0, pauses=0.0):
@@ -35,7 +35,7 @@ class Fire:
         self._lossy_pause = False
 
     def carry(self, data, now_s):
-        """What arrives now of what is sent now, or was held back."""
+        """Return the bytes that arrive now, of those sent now or delayed."""
         *pieces, self._rest = (self._rest + data).split(b"\0")
         out = b"".join(self._fate(piece + b"\0", now_s) for piece in pieces if piece)
         if now_s < self._until_s:
@@ -45,7 +45,7 @@ class Fire:
         return out
 
     def calm(self):
-        """No more faults from now on."""
+        """Stop injecting faults."""
         self.loss = self.extra = self.pauses = 0.0
         self._until_s = 0.0
 
@@ -89,7 +89,7 @@ class Fire:
 
 
 class Pulse(NamedTuple):
-    """A lit point as the host sent it."""
+    """An emitting point as the host sent it."""
 
     index: int
     x: int
@@ -99,9 +99,9 @@ class Pulse(NamedTuple):
 
 
 class Witness:
-    """Holds what a host wrote, before any damage, against what a board's log says it did.
+    """Compares the host's output, before any fault, with the board's log.
 
-    No two points of a run may be alike, so that a pulse tells by itself where it comes from.
+    All points of a run must differ, so that a pulse identifies its point.
     """
 
     def __init__(self):
@@ -110,7 +110,7 @@ class Witness:
         self._done = set()
 
     def wrote(self, data):
-        """Note the host's bytes."""
+        """Record the host's bytes."""
         *pieces, self._rest = (self._rest + data).split(b"\0")
         for piece in filter(None, pieces):
             raw = uncobs(piece)
@@ -121,7 +121,7 @@ class Witness:
                         self._sent[first + k, x, y, duty] = on_us
 
     def check(self, events):
-        """All pulses of a log, or of its next part: sent, as sent, once, in order; the number of them."""
+        """Check that each pulse of the log was sent, is unchanged, once and in order; return the number of pulses."""
         last_index, count = -1, 0
         ended = {(entry["t_us"], entry["reason"]) for entry in events if entry["event"] == "gate" and not entry["on"]}
         for entry in events:

@@ -1,4 +1,4 @@
-"""The real session over real ports, a board's process, and a proxy with fire between them: thousands of faults."""
+"""A real session over serial ports, a board process, and a proxy that injects thousands of faults."""
 
 import random
 import time
@@ -8,16 +8,16 @@ from pathlib import Path
 from threading import Timer
 
 import pytest
-from bench import UNDER_FIRE, wait_for
-from fire_pty import PtyRig
-from spoken import HOST
+from bench import LINK_FAULTS, wait_for
+from pty_rig import PtyRig
+from wire_format import HOST
 
 from optodrive.core.errors import LinkError
 
 STORMS = [(1, 0.01), (2, 0.03), (3, 0.08), (4, 0.2)]
 SESSIONS = 3
 KINDS = 11
-"""Kinds of faults; a port that closes is another."""
+"""Number of fault kinds; the close of a port is another one."""
 
 
 @pytest.fixture(scope="module", params=[pytest.param("python", marks=pytest.mark.slow), "host", "qemu"])
@@ -27,14 +27,14 @@ def board_kind(request, ready):
 
 @pytest.fixture
 def make_rig(board_kind, tmp_path):
-    if why := board_kind.spares(UNDER_FIRE):
+    if why := board_kind.spares(LINK_FAULTS):
         pytest.skip(f"{board_kind.name}: {why}")
     rigs = []
 
-    def make(*fire, **more):
+    def make(*faults, **more):
         folder = tmp_path / f"rig{len(rigs)}"
         folder.mkdir()
-        rigs.append(PtyRig(board_kind, folder, *fire, **more))
+        rigs.append(PtyRig(board_kind, folder, *faults, **more))
         return rigs[-1]
 
     yield make
@@ -89,7 +89,7 @@ def in_mid_job(rig):
 def test_a_host_that_stalls_for_a_quarter_second_harms_nothing(make_rig):
     rig = make_rig(8)
     job = in_mid_job(rig)
-    time.sleep(0.25)  # the stall itself
+    time.sleep(0.25)  # the host stalls
     assert rig.until(lambda: job.is_finished, 15.0)
     assert "HOLD" not in states(rig)
     assert "FAULT" not in states(rig)
@@ -102,7 +102,7 @@ def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
     time.sleep(1.3)
     assert states(rig)[-1] == "FAULT"
     assert [entry["fault"] for entry in rig.board.of("fault")] == ["LINK"]
-    assert not rig.board.pulsed()
+    assert not rig.board.is_gate_on()
     assert not rig.until(lambda: job.is_finished, 0.5)
     assert states(rig)[-1] == "FAULT"
     assert rig.finish() < 3000
@@ -116,7 +116,7 @@ def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_ri
         rig.until(lambda: False, 5.0)
     rig.session.disconnect()
     wait_for(lambda: rig.board.states()[-1] == ("DISARMED", "link lost"), "the loss")
-    assert not rig.board.pulsed()
+    assert not rig.board.is_gate_on()
     wait_for(lambda: Path(rig.session.port).exists(), "the port's return")
     rig.session.connect()
     assert rig.session.board.state == "DISARMED"

@@ -1,8 +1,8 @@
-"""The real session and the board's core in virtual time, with fire on both directions of the link between them."""
+"""A real session and a board core in virtual time, with fault injection in both directions of the link."""
 
-from fire import Fire, Witness
-from fire_host import FireHost, configured
+from link_faults import LinkFaults, Witness
 from scenario import audit_log
+from session_rig import SessionRig, configured
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import LinkError
@@ -14,7 +14,7 @@ from optodrive.link.simulator.memory_link import EXCHANGE_MIN_S, MemoryLink
 
 
 class Line:
-    """One direction of a serial line: bytes come out at its pace, or at once for a rate of 0."""
+    """One direction of a serial line with a byte rate; 0 for no limit."""
 
     def __init__(self, bytes_per_s):
         self._bytes_per_s = bytes_per_s
@@ -22,7 +22,7 @@ class Line:
         self._passed_s = 0.0
 
     def carry(self, data, now_s):
-        """What comes out now."""
+        """Return the bytes that have passed."""
         if not self._bytes_per_s:
             return data
         if not self._waiting:
@@ -34,8 +34,8 @@ class Line:
         return out
 
 
-class FireLink(MemoryLink):
-    """The link in memory under fire; up: to the board."""
+class FaultyMemoryLink(MemoryLink):
+    """A memory link with fault injection; up: direction to the board."""
 
     def __init__(self, core, clock, up, down, bytes_per_s=0):
         super().__init__(core, clock)
@@ -45,12 +45,12 @@ class FireLink(MemoryLink):
         self.open()
 
     def open(self):
-        """Nothing of what was on the line before is there."""
+        """Open the link with an empty line."""
         self._up_line, self._down_line = Line(self._bytes_per_s), Line(self._bytes_per_s)
         self._broken = False
 
     def write(self, data):
-        """Towards the board."""
+        """Send bytes to the board."""
         if self._broken:
             raise LinkError("the link is broken")
         self.witness.wrote(data)
@@ -63,7 +63,7 @@ class FireLink(MemoryLink):
             super().write(arrived)
 
     def read(self, timeout_s):
-        """What has come through, as soon as something has; time passes."""
+        """Return received bytes as soon as there are any; advance the clock."""
         until_s, wait_s = self._clock.now_s() + timeout_s, EXCHANGE_MIN_S
         while not self._broken:
             sent = super().read(wait_s)
@@ -76,31 +76,32 @@ class FireLink(MemoryLink):
         raise LinkError("the link is broken")
 
     def break_down(self):
-        """The port is gone: both ends notice."""
+        """Remove the port; both ends detect it."""
         self._broken = True
         self.close()
 
 
-class FireRig(FireHost):
-    """loss, extra, pauses: of the fire in both directions; paced: at the configuration's baud; settings: the board's.
+class VirtualRig(SessionRig):
+    """A session and a board core in virtual time.
 
-    make_core: (settings, sink, seed) → the board, of which the simulated one is not the only one.
+    loss, extra, pauses: of the faults in both directions; paced: limit the line to the configured baud rate
+    make_core: (settings, sink, seed) → board core; settings: of the board
     """
 
     def __init__(
         self, seed, loss=0.0, extra=0.0, pauses=0.0, config=None, paced=False, make_core=BoardCore, **settings
     ):
-        up, down = (Fire(2 * seed + way, loss, extra, pauses) for way in (0, 1))
+        up, down = (LinkFaults(2 * seed + way, loss, extra, pauses) for way in (0, 1))
         clock = ManualClock(5.0)
         self.log = []
         self._state = "BOOT"
         config = config or configured()
         self.core = make_core(BoardSettings(**settings), self.log.append, seed=seed)
-        self.link = FireLink(self.core, clock, up, down, config.board.baud / BITS_PER_BYTE if paced else 0)
+        self.link = FaultyMemoryLink(self.core, clock, up, down, config.board.baud / BITS_PER_BYTE if paced else 0)
         super().__init__(BoardSession(self.link, clock, BoardRequirements.from_config(config)), clock, up, down)
 
     def check(self):
-        """The log so far keeps its word; forget it. The number of pulses."""
+        """Check and clear the log; return the number of pulses."""
         assert not self.core.gate
         audit_log(self.log, self._state)
         self._state = self.core.state

@@ -1,8 +1,8 @@
-"""The C core and the Python board answer, log and emit identically for every host."""
+"""For any host, the C core and the simulated board give equal answers, logs and gate edges."""
 
 from hypothesis import event, given, settings
 from hypothesis import strategies as st
-from same import LikePython
+from lockstep import Lockstep
 
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
@@ -75,11 +75,11 @@ STEPS = st.integers(0, 5).flatmap(lambda n: UNUSUAL if n == 5 else USUAL)
 EPISODES = st.lists(
     st.tuples(st.one_of(st.none(), st.none(), LIMITS), st.lists(STEPS, min_size=3, max_size=20)), min_size=1, max_size=4
 )
-"""Each begins with HELLO, LIMITS perhaps, and arming."""
+"""Each episode begins with HELLO, optional LIMITS, and arming."""
 
 
 def messages(core, what, detail):
-    """What a host would say for a step, mostly such as the board may take in its state."""
+    """Return the host's messages of a step, mostly valid in the board's state."""
     first = core.machine.queue.first_index
     if what in ("play", "queue"):
         data = m.Data(core.machine.queue.next_index, b"".join(m.POINT.pack(*point) for point in detail))
@@ -104,7 +104,7 @@ def messages(core, what, detail):
 
 
 def arm(both, limits=None):
-    """All that leads to ARMED from here, unless limits or a lost lease stand in the way."""
+    """Arm both boards from any state, unless limits or a lost lease prevent it."""
     core = both.python
     for name, safe in (("interlock", True), ("key", True), ("estop", False)):
         if core.machine.inputs[name] != safe:
@@ -160,7 +160,7 @@ def step(both, what, detail):
 @settings(max_examples=200)
 @given(BOARDS, EPISODES, st.integers(0, 2**32))
 def test_both_boards_behave_identically(library, board, episodes, seed):
-    both = LikePython(library, board, seed=seed)
+    both = Lockstep(library, board, seed=seed)
     for limits, steps in episodes:
         arm(both, limits)
         for what, detail in steps:
@@ -175,7 +175,7 @@ def test_both_boards_behave_identically(library, board, episodes, seed):
 
 
 def test_more_records_than_are_kept(library):
-    both = LikePython(library)
+    both = Lockstep(library)
     arm(both)
     point = m.POINT.pack(CENTRE, CENTRE, 2, 0, 0)
     for k in range(400):
@@ -190,7 +190,7 @@ def test_more_records_than_are_kept(library):
 
 
 def test_a_report_over_more_than_32_bits_of_time_is_two(library):
-    both = LikePython(library, BoardSettings(m.Limits(**{**vars(DEFAULT_LIMITS), **PATIENT})))
+    both = Lockstep(library, BoardSettings(m.Limits(**{**vars(DEFAULT_LIMITS), **PATIENT})))
     arm(both)
     point = m.POINT.pack(CENTRE, CENTRE, 0, 100, 999)
     both.say(m.Data(0, point), m.Start(1, 0, 0, 1), m.End(1, 1))

@@ -1,4 +1,4 @@
-"""A Python board and a C core that get the same bytes, inputs and time, and must do the same."""
+"""Lockstep comparison of the simulated board and the C core under equal bytes, inputs and times."""
 
 import random
 
@@ -10,7 +10,7 @@ from optodrive.link.simulator.board_core import BoardCore
 
 
 class PythonEntropy:
-    """The numbers that the C core's source gives, for the Python board's two questions."""
+    """The entropy of the C core for the simulated board's random numbers."""
 
     def __init__(self, values):
         self._values, self._at = values, 0
@@ -26,8 +26,8 @@ class PythonEntropy:
         return value
 
 
-class LikePython:
-    """Both boards; after every action bytes, log and state are compared at once."""
+class Lockstep:
+    """Both boards; bytes, log and state are compared after each action."""
 
     def __init__(self, library, settings=None, entropy=None, seed=1):
         source = random.Random(seed)
@@ -43,7 +43,7 @@ class LikePython:
         self.compare()
 
     def both(self, do):
-        """Do the same to both."""
+        """Apply an action to both boards."""
         for board in (self.python, self.c):
             do(board)
         self.compare()
@@ -60,7 +60,7 @@ class LikePython:
         self.both(lambda board: board.receive(data, self.now_us))
 
     def frame(self, message, ahead=0, session=None):
-        """A frame with the number that is expected, or one ahead of it."""
+        """Encode a frame with the expected sequence number, or a later one."""
         link = self.python._link
         seq = (link.expected_seq + ahead) % 256 if message.SEQUENCED else 0
         return encode_frame(

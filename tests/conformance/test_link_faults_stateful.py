@@ -1,9 +1,8 @@
-"""A session and its owner do anything in any order over a hostile link: never armed by itself, dark, in order."""
+"""Stateful test of a session over a faulty link: it never arms by itself, and pulses stay permitted and in order."""
 
 from contextlib import suppress
 
 import pytest
-from fire_virtual import FireRig
 from hypothesis import Phase, event, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import (
@@ -14,7 +13,8 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
-from spoken import HOST
+from virtual_rig import VirtualRig
+from wire_format import HOST
 
 from optodrive.core.errors import LinkError
 from optodrive.link.session.session import BoardSession
@@ -24,11 +24,11 @@ ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
 class Owner(RuleBasedStateMachine):
-    """The owner of a session; `allowed` is how often the board may have become ARMED by now."""
+    """An application that owns a session; `allowed`: how often the board may have become ARMED."""
 
     @initialize(seed=st.integers(0, 2**16), endings_come_again=st.booleans())
     def power_up(self, seed, endings_come_again):
-        self.rig = FireRig(seed)
+        self.rig = VirtualRig(seed)
         self.rig.up.never_again = () if endings_come_again else ENDING
         self.allowed = self.jobs = 0
 
@@ -49,7 +49,7 @@ class Owner(RuleBasedStateMachine):
         return round(self.rig.clock.now_s() * 1e6)
 
     def pass_time(self, condition, duration_s, lease=True):
-        """The owner's loop, which gives the link up when the session says so."""
+        """Run the application's loop, which disconnects when the session fails."""
         until_s = self.rig.clock.now_s() + duration_s
         try:
             while self.rig.clock.now_s() < until_s and not condition():
@@ -58,7 +58,7 @@ class Owner(RuleBasedStateMachine):
             self.session.disconnect()
             self.allowed = self.times("armed")
 
-    # --- what the owner does ---
+    # --- application ---
 
     def connect(self):
         if not self.connected():
@@ -72,7 +72,7 @@ class Owner(RuleBasedStateMachine):
 
     @rule(wait_s=st.sampled_from([0.0, 1.0, 2.5, 2.5, 2.5]))
     def arm(self, wait_s):
-        """The owner acknowledges what there is to acknowledge, then presses the button once."""
+        """Acknowledge a fault, then arm once."""
         self.connect()
         if self.is_in("FAULT"):
             self.inputs_are_safe_again()
@@ -115,14 +115,14 @@ class Owner(RuleBasedStateMachine):
         assert not self.connected()
         assert self.rig.core.state in ("DISARMED", "FAULT")
 
-    # --- what befalls it ---
+    # --- environment ---
 
     @rule(
         loss=st.sampled_from([0.0, 0.02, 0.05]),
         extra=st.sampled_from([0.0, 0.1, 0.4]),
         pauses=st.sampled_from([0.0, 0.01]),
     )
-    def fire(self, loss, extra, pauses):
+    def faults(self, loss, extra, pauses):
         for way in (self.rig.up, self.rig.down):
             way.loss, way.extra, way.pauses = loss, extra, pauses
 
@@ -147,7 +147,7 @@ class Owner(RuleBasedStateMachine):
         self.rig.clock.sleep(duration_s)
         self.rig.core.advance(self.now_us())
 
-    # --- what always holds ---
+    # --- invariants ---
 
     @invariant()
     def dark_unless_running(self):

@@ -1,4 +1,4 @@
-"""The real session as its owner drives it, over any link: connect, arm by hand, stream points."""
+"""A real session over any link, driven as by its application: connect, arm manually, stream points."""
 
 import numpy as np
 
@@ -12,20 +12,20 @@ PLACES = ((30_500, 32_000), (34_000, 32_000), (30_500, 33_500), (34_000, 33_500)
 
 
 def configured(lease_s=0.1, baud=1_000_000):
-    """The smallest display, with a lease and a line."""
+    """Return the configuration of the smallest display with a lease and a baud rate."""
     table = DISPLAYS["display-16"].config.model_dump()
     table["board"] |= {"lease_s": lease_s, "baud": baud}
     return Config.model_validate(table)
 
 
 class Points:
-    """Makes points no two of which are alike."""
+    """Generates distinct points."""
 
     def __init__(self):
         self._serial = 0
 
     def make(self, count, dark_us=200):
-        """[count] lit points at four places in turn, eight at each; about half a millisecond each."""
+        """Return [count] points with pulses at four positions in turn, eight at each; about half a millisecond each."""
         serial = self._serial + np.arange(count)
         self._serial += count
         places = np.array(PLACES)[serial // 8 % 4]
@@ -34,8 +34,8 @@ class Points:
         return WirePoints(np.column_stack(columns).astype(np.uint16), np.arange(count))
 
 
-class FireHost:
-    """Has a session, a clock, points, and fire on both ways."""
+class SessionRig:
+    """A session with a clock, points, and fault injection in both directions."""
 
     def __init__(self, session, clock, up, down):
         self.session, self.clock, self.up, self.down = session, clock, up, down
@@ -43,11 +43,11 @@ class FireHost:
 
     @property
     def faults(self):
-        """Faults injected so far."""
+        """Return the number of injected faults."""
         return sum(self.up.counts.values()) + sum(self.down.counts.values())
 
     def until(self, condition, patience_s):
-        """Step until condition() or too late; whether it came true. LinkError where the session gives up."""
+        """Step until condition() is true or patience_s has passed; return whether it is true."""
         give_up_s = self.clock.now_s() + patience_s
         while not condition():
             if self.clock.now_s() > give_up_s:
@@ -56,7 +56,7 @@ class FireHost:
         return True
 
     def armed(self, patience_s=4.0):
-        """Arm once, as a person would press the button; whether it came to that."""
+        """Arm once, as a user does; return whether the board is armed."""
         if self.session.board.state == "FAULT":
             self.session.disarm()
             self.until(lambda: self.session.board.state == "DISARMED", 1.0)
@@ -66,11 +66,11 @@ class FireHost:
         return self.until(lambda: self.session.is_ready, patience_s)
 
     def begin(self, count, dark_us=200, ahead_s=0.25):
-        """Stream points, from a little later on."""
+        """Stream points from a short lead time on."""
         return self.session.begin(self.points.make(count, dark_us), self.session.board_s() + 0.05, ahead_s)
 
     def live(self, count, patience_s):
-        """One session from its greeting to its end: arm, stream, and every effect of the link."""
+        """Run one session from HELLO to its end: arm and stream under faults."""
         session = self.session
         try:
             session.connect()

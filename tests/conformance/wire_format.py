@@ -1,4 +1,4 @@
-"""What host and board say, as bytes: written by hand from PROTOCOL.md and nothing else of this project."""
+"""Independent implementation of the wire format, written from PROTOCOL.md only."""
 
 import struct
 import zlib
@@ -53,7 +53,7 @@ NAMES = {"state": STATES, "fault": FAULTS}
 
 
 def cobs(raw):
-    """COBS of at most 252 bytes, without the zero behind it."""
+    """Encode at most 252 bytes as COBS, without the delimiter."""
     out = bytearray()
     run = bytearray()
     for byte in raw:
@@ -66,7 +66,7 @@ def cobs(raw):
 
 
 def uncobs(coded):
-    """What was encoded."""
+    """Decode COBS."""
     raw, at = bytearray(), 0
     while at < len(coded):
         code = coded[at]
@@ -77,20 +77,20 @@ def uncobs(coded):
 
 
 def frame(kind, seq=0, session=0, body=b""):
-    """A frame as it goes over the wire."""
+    """Encode a frame with its delimiter."""
     raw = struct.pack("<BBH", kind, seq, session) + body
     return cobs(raw + struct.pack("<I", zlib.crc32(raw))) + b"\0"
 
 
 def body_of(name, **fields):
-    """A host message's body; DATA takes points as tuples of five."""
+    """Encode the body of a host's message; DATA takes points as tuples of five."""
     _, codes, names = HOST[name]
     points = b"".join(POINT.pack(*point) for point in fields.pop("points", ()))
     return struct.pack("<" + codes, *(fields.pop(field) for field in names)) + points
 
 
 def understood(raw):
-    """A board's frame as a namespace: name, session and its fields, numbers with names as those names."""
+    """Decode a board's frame as a namespace: name, session and fields; enumerations by name."""
     *_, session = struct.unpack_from("<BBH", raw)
     content, body = raw[:-4], raw[4:-4]
     assert struct.unpack("<I", raw[-4:])[0] == zlib.crc32(content), "a board's frame with a wrong CRC"
@@ -108,13 +108,13 @@ def understood(raw):
     return SimpleNamespace(name=name, **reported)
 
 
-class Ear:
-    """Cuts a board's bytes into what it says."""
+class MessageReader:
+    """Splits a board's bytes into messages."""
 
     def __init__(self):
         self._rest = b""
 
     def take(self, data):
-        """Messages that are complete now."""
+        """Return the messages completed by data."""
         *pieces, self._rest = (self._rest + data).split(b"\0")
         return [understood(uncobs(piece)) for piece in pieces if piece]
