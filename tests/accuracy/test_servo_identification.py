@@ -59,7 +59,7 @@ def test_hidden_servos_are_found_on_both_axes(seed):
         assert 0.7 < reported.misfit < 1.4
         for step_rad in SIZES_RAD:
             for tolerance_rad in (CONFIG.tolerance_rad[axis], 0.02 * step_rad):
-                # The time is discontinuous where an overshoot touches the tolerance; nearby tolerances are equally valid.
+                # The time is discontinuous where an overshoot touches the tolerance; neighbours are equally valid.
                 ends_s = [servo.settled_s(step_rad, near * tolerance_rad) for near in (0.98, 1.0, 1.02)]
                 reported_s = reported.settling_s(step_rad, tolerance_rad)[0]
                 assert 0.95 * min(ends_s) < reported_s < 1.05 * max(ends_s)
