@@ -16,18 +16,10 @@ from optodrive.planning.limiter.caps import CapValues
 from optodrive.planning.limiter.worst_case import NominalThermalModel, NominalTouch, NominalWalls, Uncertainty
 
 NO_CAPS = CapValues(
-    absorber_k=1e6,
-    wall_k=1e6,
-    touch_k=1e6,
-    galvo_rad2_per_s4=inf,
-    pulse_energy_j=1e3,
-    pulse_width_s=0.050,
-    pulse_gap_s=5e-4,
-    pixel_mean_w=1e3,
-    pixel_window_s=1.0,
-    display_mean_w=1e3,
-    display_window_s=2.0,
-    min_power_w=0.0,
+    **dict.fromkeys(CapValues._fields, inf)
+    | {"absorber_k": 1e6, "wall_k": 1e6, "touch_k": 1e6, "pulse_energy_j": 1e3, "pulse_width_s": 0.050}
+    | {"pulse_gap_s": 5e-4, "pixel_mean_w": 1e3, "pixel_window_s": 1.0, "display_mean_w": 1e3, "display_window_s": 2.0}
+    | {"min_power_w": 0.0}
 )
 """Caps that do not bind."""
 

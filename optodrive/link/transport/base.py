@@ -1,6 +1,9 @@
 """Interface of all transports, to real and simulated boards alike."""
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from optodrive.device.config import BoardSection
 
 
 class Transport(Protocol):
@@ -22,3 +25,10 @@ class Transport(Protocol):
 
     def release(self) -> None:
         """Close permanently and stop everything that open() has started."""
+
+
+class TransportKind(NamedTuple):
+    """Kind of transport. name: its value of `board.transport`; create: from a configuration, without opening it."""
+
+    name: str
+    create: Callable[[BoardSection], Transport]

@@ -1,20 +1,23 @@
 """Transports by their name in the configuration."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
+from importlib import import_module
+from pkgutil import iter_modules
 
 from optodrive.core.errors import InputError
 from optodrive.device.config import BoardSection
-from optodrive.link.transport.base import Transport
-from optodrive.link.transport.serial_port import SerialPort
+from optodrive.link import transport
+from optodrive.link.transport.base import Transport, TransportKind
 from optodrive.link.transport.simulated import SimulatedBoard
-from optodrive.link.transport.usb_bulk import UsbBulk
 
-TRANSPORTS: dict[str, Callable[[BoardSection], Transport]] = {
-    "serial": lambda board: SerialPort(board.port, board.baud),
-    "simulated": lambda board: SimulatedBoard(board.port, board.baud),
-    "usb": UsbBulk.from_config,
-}
+
+@cache
+def discover_transports() -> dict[str, Callable[[BoardSection], Transport]]:
+    """Return the factory of every module in this package that has a TRANSPORT, by its name."""
+    modules = [import_module(f"{transport.__name__}.{item.name}") for item in iter_modules(transport.__path__)]
+    kinds: list[TransportKind] = [module.TRANSPORT for module in modules if hasattr(module, "TRANSPORT")]
+    return {kind.name: kind.create for kind in kinds}
 
 
 def find_transport_factory(board: BoardSection) -> Callable[[], Transport]:
@@ -22,13 +25,14 @@ def find_transport_factory(board: BoardSection) -> Callable[[], Transport]:
 
     Raise InputError for a Helios, which does not use the board's protocol.
     """
-    if board.transport not in TRANSPORTS:
+    factories = discover_transports()
+    if board.transport not in factories:
         raise InputError(
             "board.transport",
             board.transport,
-            f"one of {', '.join(TRANSPORTS)}: the daemon cannot use a Helios, see `optodrive helios play`",
+            f"one of {', '.join(sorted(factories))}: the daemon cannot use a Helios, see `optodrive helios play`",
         )
-    return partial(TRANSPORTS[board.transport], board)
+    return partial(factories[board.transport], board)
 
 
 def build_bench_transport(board: BoardSection, display: str) -> tuple[Transport, str]:

@@ -7,6 +7,7 @@ import serial
 from serial.tools import list_ports
 
 from optodrive.core.errors import InputError, LinkError
+from optodrive.link.transport.base import TransportKind
 
 WRITE_TIMEOUT_S = 0.5
 
@@ -77,3 +78,6 @@ class SerialPort:
     def release(self) -> None:
         """Close the port."""
         self.close()
+
+
+TRANSPORT = TransportKind("serial", lambda board: SerialPort(board.port, board.baud))

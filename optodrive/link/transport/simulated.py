@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 from optodrive.core.errors import LinkError
+from optodrive.link.transport.base import TransportKind
 from optodrive.link.transport.serial_port import SerialPort
 
 START_TIMEOUT_S = 15.0
@@ -69,3 +70,6 @@ class SimulatedBoard(SerialPort):
             if time.monotonic() > deadline_s:
                 raise LinkError(f"the simulated board created no port within {START_TIMEOUT_S:.0f} s")
             time.sleep(0.01)
+
+
+TRANSPORT = TransportKind("simulated", lambda board: SimulatedBoard(board.port, board.baud))

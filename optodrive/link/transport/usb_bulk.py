@@ -8,6 +8,7 @@ import usb.util
 
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import BoardSection
+from optodrive.link.transport.base import TransportKind
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 
 WRITE_TIMEOUT_S = 0.5
@@ -108,3 +109,6 @@ class UsbBulk:
     def release(self) -> None:
         """Release the device."""
         self.close()
+
+
+TRANSPORT = TransportKind("usb", UsbBulk.from_config)

@@ -1,6 +1,7 @@
 """Session over USB: the real pyusb with bulk endpoints of a simulated board core."""
 
 import errno
+from typing import get_args
 
 import pytest
 import usb.core
@@ -14,7 +15,7 @@ from optodrive.link.protocol.quantisation import quantise
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.transport.registry import TRANSPORTS, find_transport_factory
+from optodrive.link.transport.registry import discover_transports, find_transport_factory
 from optodrive.link.transport.usb_bulk import UsbBulk
 from optodrive.planning.pipeline import plan_sequence
 
@@ -156,6 +157,7 @@ def test_the_registry_builds_the_configured_transport():
     board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
     assert find_transport_factory(board)().name == "usb 1209:0001 A1"
     assert find_transport_factory(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
-    assert set(TRANSPORTS) == {"serial", "simulated", "usb"}
+    stated = get_args(BoardSection.model_fields["transport"].annotation)
+    assert {*discover_transports(), "helios"} == set(stated)
     with pytest.raises(InputError, match="the daemon cannot use a Helios"):
         find_transport_factory(BoardSection(transport="helios"))
