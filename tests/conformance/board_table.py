@@ -7,21 +7,21 @@ from scenario import GUARDS, SCENARIOS
 from test_conform_mutants import MUTANTS
 
 ENFORCED = {
-    "B1": "dark unless running",
-    "B2": "an empty queue is dark",
-    "B3": "silence of the host is dark: the lease",
+    "B1": "gate off unless running",
+    "B2": "gate off when the queue is empty",
+    "B3": "lease: gate off when the host is silent",
     "B4": "gate-on time, of a point and of a cell",
     "B5": "power, of a point and over any second",
     "B6": "energy of a cell",
-    "B7": "no light before the mirrors have settled",
+    "B7": "gate off until the mirrors have settled",
     "B8": "the field",
     "B9": "interlock, key, emergency stop",
     "B10": "limits only tighten",
-    "B11": "arming is fresh",
+    "B11": "fresh arming",
     "B12": "each point once, in order",
-    "B13": "junk changes counters only",
-    "B14": "tick and gate watched by the board itself",
-    "B15": "a watchdog whose reset is dark",
+    "B13": "invalid frames change only counters",
+    "B14": "self-monitoring of tick and gate",
+    "B15": "watchdog whose reset turns the gate off",
 }
 
 

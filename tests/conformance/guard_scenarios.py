@@ -28,7 +28,7 @@ def sees(host, condition, what):
 
 
 @scenario("B1")
-def dark_until_a_job_s_first_point_is_due(bench):
+def gate_is_off_until_the_first_point_is_due(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(1000)))
     host.pause(0.05)
@@ -56,7 +56,7 @@ ENDS = {
 
 
 @scenario("B1", ENDS)
-def leaving_running_is_dark_before_anything_else(bench, end):
+def leaving_running_turns_the_gate_off_first(bench, end):
     reason, act = end
     host = bench.ready(**BRIGHT)
     board = host.board
@@ -70,7 +70,7 @@ def leaving_running_is_dark_before_anything_else(bench, end):
 
 
 @scenario("B1", {"an input": ("interlock", "fault"), "a reset": ("reset", "boot")})
-def what_comes_from_outside_is_dark_at_once(bench, case):
+def external_event_turns_the_gate_off_at_once(bench, case):
     what, reason = case
     verb = 'set = "interlock"\nvalue = false' if what == "interlock" else 'do = "reset"'
     host = bench.ready(f"[[step]]\nat_s = {SCRIPTED_S}\n{verb}\n", **BRIGHT)
@@ -91,7 +91,7 @@ def dark_by(board, change):
 
 
 @scenario("B2")
-def the_light_goes_off_in_time_whether_or_not_more_is_queued(bench):
+def gate_turns_off_in_time_with_and_without_more_points(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(10_000), here(500, dark_us=20_000), end=False)
     sees(host, lambda board: board.states()[-1][0] == "HOLD", "HOLD")
@@ -112,7 +112,7 @@ WAYS = {"ARMING": None, "ARMED": None, "RUNNING": 40, "HOLD": 1}
 
 
 @scenario("B3", {state: state for state in WAYS})
-def silence_is_a_fault_and_nothing_but_a_lease_of_this_session_renews(bench, state):
+def only_a_lease_of_this_session_prevents_fault_link(bench, state):
     host = bench.greeted(**{**BRIGHT, "lease_ms": LEASE_MS})
     if state == "ARMING":
         host.challenge()
@@ -162,14 +162,14 @@ SPLITS = {
 
 
 @scenario("B4")
-def a_point_longer_than_allowed_is_refused_when_queued(bench):
+def point_above_max_on_us_is_refused_when_queued(bench):
     host = bench.ready(**PATIENT)
     assert host.order(host.data(here(50_000)), host.data(here(50_001, duty=0))) == ["STATE"]
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
 
 
 @scenario("B4", SPLITS)
-def a_cell_s_light_in_pieces_counts_as_one(bench, points):
+def split_pulses_in_a_cell_add_up(bench, points):
     host = bench.ready(**PATIENT)
     host.play(*points)
     sees(host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.pulse_numbers()) >= 1, "the end")
@@ -178,7 +178,7 @@ def a_cell_s_light_in_pieces_counts_as_one(bench, points):
 
 
 @scenario("B4")
-def a_glance_elsewhere_is_no_rest_and_a_rest_is(bench):
+def only_a_full_rest_clears_the_on_time(bench):
     host = bench.ready(settle_us=100, settle_ns_per_code=0, **PATIENT)
     dim = dict(duty=999)
     rest = here(0, dark_us=500)
@@ -200,7 +200,7 @@ def sweep(count, on_us=20_000):
 
 
 @scenario("B5")
-def a_brighter_point_than_allowed_is_refused_when_queued(bench):
+def point_above_max_duty_is_refused_when_queued(bench):
     host = bench.ready(max_duty=40_000, **PATIENT)
     assert host.order(host.data(here(0, duty=40_000)), host.data(here(0, duty=40_001))) == ["STATE"]
     assert [entry["fault"] for entry in host.board.of("fault")] == ["DUTY"]
@@ -248,7 +248,7 @@ def energy_of_a_cell(bench, case):
 
 
 @scenario("B7")
-def no_gate_before_the_move_and_the_dark_time_are_over(bench):
+def gate_waits_for_settling_and_dark_us(bench):
     host = bench.ready(**BRIGHT)
     walk = [
         (here(100), 0),
@@ -268,7 +268,7 @@ def no_gate_before_the_move_and_the_dark_time_are_over(bench):
 
 
 @scenario("B7")
-def a_move_that_was_broken_off_is_still_under_way(bench):
+def interrupted_move_still_has_to_settle(bench):
     host = bench.ready(settle_ns_per_code=40_000, **{**BRIGHT, "settle_us": 1000})
     move_us = 1000 + 20_000 * 40
     host.play(here(100, x=CENTRE + 20_000))
@@ -285,7 +285,7 @@ def a_move_that_was_broken_off_is_still_under_way(bench):
 
 
 @scenario("B7")
-def settling_that_a_host_asked_for(bench):
+def requested_settling_applies(bench):
     host = bench.host(bench.board(**BRIGHT))
     own = host.hello()
     limits = {name: getattr(own, name) for name in own.__dict__ if name in LIMIT_NAMES}
@@ -311,7 +311,7 @@ OUTSIDE = {
 
 
 @scenario("B8", OUTSIDE)
-def outside_the_field_is_a_fault_when_queued(bench, point):
+def point_outside_the_field_is_a_fault_when_queued(bench, point):
     host = bench.ready(**FIELD, **PATIENT)
     host.play(here(1000), here(1000), point)
     assert [entry["fault"] for entry in host.board.of("fault")] == ["RANGE"]
@@ -320,7 +320,7 @@ def outside_the_field_is_a_fault_when_queued(bench, point):
 
 
 @scenario("B8")
-def the_field_s_corners_are_inside(bench):
+def corners_of_the_field_are_permitted(bench):
     host = bench.ready(**FIELD, **PATIENT)
     host.play(here(1000, x=1000, y=2000), here(1000, x=64_000, y=63_000))
     sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")

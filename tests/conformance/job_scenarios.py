@@ -26,7 +26,7 @@ def reported(host):
 
 
 @scenario("jobs")
-def a_job_begins_with_its_watermark(bench):
+def job_begins_at_its_watermark(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, **DIM), here(100, **DIM)))
     assert start(host, watermark=3) == []
@@ -39,7 +39,7 @@ def a_job_begins_with_its_watermark(bench):
 
 
 @scenario("jobs")
-def a_job_begins_when_all_up_to_its_end_is_here(bench):
+def job_begins_when_all_its_points_are_queued(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, **DIM)))
     assert start(host, watermark=48) == []
@@ -53,7 +53,7 @@ def a_job_begins_when_all_up_to_its_end_is_here(bench):
 
 
 @scenario("jobs")
-def points_behind_the_end_belong_to_the_next_job(bench):
+def points_after_end_belong_to_the_next_job(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, dark_us=60_000, **DIM)))
     assert start(host) == []
@@ -72,7 +72,7 @@ def points_behind_the_end_belong_to_the_next_job(bench):
 
 
 @scenario("jobs")
-def points_that_never_come_disarm_a_second_after_the_start(bench):
+def missing_points_disarm_a_second_after_the_start(bench):
     host = bench.ready(**BRIGHT)
     assert start(host) == []
     began = host.board.of("state")[-1]
@@ -84,7 +84,7 @@ def points_that_never_come_disarm_a_second_after_the_start(bench):
 
 
 @scenario("HOLD")
-def a_hold_ends_with_the_watermark_and_the_next_dark_time_counts_from_then(bench):
+def hold_ends_at_the_watermark_and_dark_us_counts_from_then(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, **DIM), here(100, **DIM)))
     assert start(host, watermark=2) == []
@@ -102,7 +102,7 @@ def a_hold_ends_with_the_watermark_and_the_next_dark_time_counts_from_then(bench
 
 
 @scenario("HOLD")
-def a_hold_of_a_second_disarms(bench):
+def hold_of_a_second_disarms(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(100, **DIM), end=False)
     hold = until(host, "HOLD", "queue empty")
@@ -111,7 +111,7 @@ def a_hold_of_a_second_disarms(bench):
 
 
 @scenario("HOLD")
-def the_third_underrun_is_a_fault_and_clearing_forgets_them(bench):
+def third_underrun_is_a_fault_and_clearing_resets_the_count(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(100, **DIM), end=False)
     until(host, "HOLD", "queue empty")
@@ -168,7 +168,7 @@ def abort_drops_everything_and_disarms(bench):
 
 
 @scenario("ABORT")
-def a_fault_outlives_abort_disarm_and_hello(bench):
+def fault_persists_over_abort_disarm_and_hello(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(65_001)))
     assert host.board.states()[-1] == ("FAULT", "fault")
@@ -186,7 +186,7 @@ def a_fault_outlives_abort_disarm_and_hello(bench):
 
 
 @scenario("reports")
-def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
+def each_point_is_reported_and_can_be_requested_again(bench):
     host = bench.ready(**BRIGHT)
     points = [here(100 + k if k % 5 else 0, dark_us=300, duty=1000 + k, x=CENTRE + 40 * k) for k in range(60)]
     assert host.play(*points) == []
@@ -210,7 +210,7 @@ def every_point_is_reported_as_it_was_and_may_be_asked_again(bench):
 
 
 @scenario("reports")
-def a_pulse_cut_short_tells_what_it_did_and_one_not_lit_nothing(bench):
+def interrupted_pulse_is_reported_with_its_actual_width(bench):
     host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
     host.wait(host.board.is_gate_on, "light")

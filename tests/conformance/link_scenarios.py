@@ -13,7 +13,7 @@ UID = "00112233445566778899aabb"
 
 
 @scenario("handshake")
-def a_board_without_a_session_answers_nothing_but_hello(bench):
+def board_without_a_session_answers_only_hello(bench):
     host = bench.host(bench.board(**PATIENT))
     wait_for(lambda: host.board.of("port"), "the port to be seen")
     for name, fields in (("GET", {}), ("CLOCK", {"host_t": 1}), ("ARM_REQ", {"host_nonce": 1}), ("ABORT", {})):
@@ -31,7 +31,7 @@ def _any_limits():
 
 
 @scenario("handshake")
-def the_reply_tells_what_the_board_is(bench):
+def hello_reply_describes_the_board(bench):
     host = bench.host(bench.board(uid=UID, cell_codes=900, queue_points=100, key_edge=True, max_on_us=1234, y_min=77))
     reply = host.hello()
     assert (reply.major, reply.tick_hz) == (1, 1_000_000)
@@ -41,7 +41,7 @@ def the_reply_tells_what_the_board_is(bench):
 
 
 @scenario("handshake")
-def hello_is_taken_whatever_session_stands_there_and_ends_what_goes_on(bench):
+def hello_is_accepted_in_any_session_and_ends_the_job(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
     host.wait(host.board.is_gate_on, "light")
@@ -57,7 +57,7 @@ def hello_is_taken_whatever_session_stands_there_and_ends_what_goes_on(bench):
 
 
 @scenario("versions")
-def another_major_is_greeted_and_never_armed(bench):
+def other_major_version_gets_a_reply_but_cannot_arm(bench):
     host = bench.host(bench.board(key_edge=True, **PATIENT))
     reply = host.hello(major=2)
     assert reply.major == 1
@@ -68,7 +68,7 @@ def another_major_is_greeted_and_never_armed(bench):
 
 
 @scenario("handshake")
-def after_a_reset_all_is_forgotten_and_hello_tells(bench):
+def reset_clears_all_state_and_hello_reports_it(bench):
     host = bench.greeted('[[step]]\nat_s = 3.0\ndo = "reset"\n', **PATIENT)
     if len(host.board.of("state")) > 1:
         raise TooLateError("greeted after the reset")
@@ -86,7 +86,7 @@ def after_a_reset_all_is_forgotten_and_hello_tells(bench):
 
 
 @scenario("sessions")
-def another_session_s_frames_and_a_board_s_own_do_nothing(bench):
+def frames_of_other_sessions_or_from_a_board_have_no_effect(bench):
     host = bench.ready(**PATIENT)
     before = host.status()
     foreign = [host.frame(name, seq=host.seq, session=host.session ^ 1) for name in ("DISARM", "FLUSH", "GET")]
@@ -99,7 +99,7 @@ def another_session_s_frames_and_a_board_s_own_do_nothing(bench):
 
 
 @scenario("sessions")
-def abort_is_taken_in_any_session(bench):
+def abort_is_accepted_in_any_session(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
     host.wait(host.board.is_gate_on, "light")
@@ -110,7 +110,7 @@ def abort_is_taken_in_any_session(bench):
 
 
 @scenario("sessions")
-def a_port_that_is_closed_and_opened_again_is_not_armed(bench):
+def reopened_port_is_not_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
     host.wait(host.board.is_gate_on, "light")
@@ -128,7 +128,7 @@ def a_port_that_is_closed_and_opened_again_is_not_armed(bench):
 
 
 @scenario("go-back-N")
-def a_gap_is_told_at_once_and_filled_in_order(bench):
+def gap_is_refused_at_once_and_filled_in_order(bench):
     host = bench.ready(**PATIENT)
     first, second, third = (host.data(here(0, dark_us=k)) for k in range(3))
     before = host.status().seq_errors
@@ -142,7 +142,7 @@ def a_gap_is_told_at_once_and_filled_in_order(bench):
 
 
 @scenario("go-back-N")
-def a_frame_that_comes_again_is_answered_again_and_not_carried_out(bench):
+def duplicate_frame_is_answered_but_not_executed(bench):
     host = bench.ready(**PATIENT)
     taken = host.data(here(0))
     assert host.order(taken) == []
@@ -157,7 +157,7 @@ def a_frame_that_comes_again_is_answered_again_and_not_carried_out(bench):
 
 
 @scenario("go-back-N")
-def ahead_and_behind_meet_halfway(bench):
+def sequence_numbers_ahead_and_behind_divide_at_half(bench):
     host = bench.greeted(**PATIENT)
     assert host.tell("DISARM") == []
     before = host.status().seq_errors
@@ -169,7 +169,7 @@ def ahead_and_behind_meet_halfway(bench):
 
 
 @scenario("go-back-N")
-def numbers_wrap_at_256_and_begin_again_with_hello(bench):
+def sequence_numbers_wrap_at_256_and_restart_at_hello(bench):
     host = bench.greeted(**PATIENT)
     assert host.order(*[host.frame("DISARM") for _ in range(270)]) == []
     said, _ = host.ask(host.frame("DISARM"))
@@ -180,7 +180,7 @@ def numbers_wrap_at_256_and_begin_again_with_hello(bench):
 
 
 @scenario("NAK")
-def each_order_out_of_place_is_refused_by_its_reason(bench):
+def message_in_a_wrong_state_is_refused_with_its_reason(bench):
     host = bench.greeted(**PATIENT)
     start = dict(job=1, first_index=0, start_tick=0, watermark=1)
     assert host.order(host.frame("DATA", first_index=0, points=[here(0)])) == ["STATE"]
@@ -202,7 +202,7 @@ def each_order_out_of_place_is_refused_by_its_reason(bench):
 
 
 @scenario("clock")
-def a_tick_is_a_microsecond_and_questions_come_back_unchanged(bench):
+def tick_is_a_microsecond_and_host_t_is_returned(bench):
     host = bench.greeted(**PATIENT)
     requested = []
     for stamp in (0, 0xFFFF_FFFF, 0x0100_0001):
@@ -221,7 +221,7 @@ def a_tick_is_a_microsecond_and_questions_come_back_unchanged(bench):
 
 
 @scenario("status")
-def status_and_events_tell_what_the_log_tells(bench):
+def status_and_events_agree_with_the_log(bench):
     host = bench.ready(**BRIGHT)
     points = here(10_000, duty=65535), here(10_000, dark_us=50, duty=32768), here(0, dark_us=100, duty=0)
     host.play(*points, watermark=WITH_THE_END)
@@ -239,7 +239,7 @@ def status_and_events_tell_what_the_log_tells(bench):
 
 
 @scenario("credits")
-def points_that_do_not_fit_are_refused_whole_and_may_come_again(bench):
+def points_without_room_are_refused_and_can_be_resent(bench):
     host = bench.ready(queue_points=30, **BRIGHT)
     assert host.order(host.data(*[here(0, dark_us=20_000)] * 24)) == []
     assert host.of("ACK")[-1].free_points == 6

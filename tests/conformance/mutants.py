@@ -19,16 +19,16 @@ from optodrive.link.simulator.guards import EmissionGuards
 # Each function returns a patch: (owner, attribute, replacement).
 
 
-def b1_states_do_not_darken():
+def b1_gate_stays_on_after_running():
     return BoardMachine, "_close_gate", lambda self, reason: setattr(self, "_current_point", None)
 
 
-def b1_start_tick_is_not_awaited():
+def b1_start_tick_is_ignored():
     start = BoardMachine.start_job
     return BoardMachine, "start_job", lambda self, message: start(self, m.Start(message.job, message.first_index, 0, 1))
 
 
-def b2_lit_until_more_comes():
+def b2_gate_stays_on_until_more_points():
     finish = BoardMachine._finish_point
 
     def burn_on(self, point):
@@ -59,7 +59,7 @@ def b3_anything_renews():
     return BoardCore, "_handle_unsequenced", renew
 
 
-def b3_host_says_how_long():
+def b3_host_sets_the_duration():
     obey = BoardCore._handle_unsequenced
 
     def believe(self, message):
@@ -71,7 +71,7 @@ def b3_host_says_how_long():
     return BoardCore, "_handle_unsequenced", believe
 
 
-def b3_a_short_lease_takes_time_back():
+def b3_a_short_lease_shortens():
     obey = BoardCore._handle_unsequenced
 
     def shorten(self, message):
@@ -83,7 +83,7 @@ def b3_a_short_lease_takes_time_back():
     return BoardCore, "_handle_unsequenced", shorten
 
 
-def b4_points_are_not_looked_at():
+def b4_points_are_not_checked():
     static = BoardMachine._check_point
     return BoardMachine, "_check_point", lambda self, point: static(self, point._replace(on_us=0))
 
@@ -96,12 +96,12 @@ def b4_by_position_and_not_by_cell():
     return EmissionGuards, "find_cells", lambda self, x, y: [(0, x, y)]
 
 
-def b4_one_grid_whose_borders_hide():
+def b4_a_single_grid():
     cells = EmissionGuards.find_cells
     return EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1]
 
 
-def b4_light_elsewhere_is_rest():
+def b4_pulse_elsewhere_is_rest():
     fire = EmissionGuards.record_pulse
 
     def forget(self, limits, x, y, start_us, on_us, duty):
@@ -133,7 +133,7 @@ def b6_one_bucket_for_all():
     return EmissionGuards, "find_cells", lambda self, x, y: [(0, 0, 0)]
 
 
-def b6_one_grid_whose_borders_hide():
+def b6_a_single_grid():
     cells = EmissionGuards.find_cells
     return EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1]
 
@@ -148,15 +148,15 @@ def _begin(due):
     return BoardMachine, "_begin_point", begin
 
 
-def b7_dark_time_alone():
+def b7_only_dark_us():
     return _begin(lambda dark_us, settle_us: dark_us)
 
 
-def b7_settling_alone():
+def b7_only_settling():
     return _begin(lambda dark_us, settle_us: settle_us)
 
 
-def b7_forgets_a_move_that_was_broken_off():
+def b7_interrupted_move_is_ignored():
     return _begin(max)
 
 
@@ -184,7 +184,7 @@ def b9_not_latched():
     return BoardMachine, "set_input", forgive
 
 
-def b9_cleared_without_a_look():
+def b9_cleared_without_a_check():
     def clear(self):
         self.fault = ""
         self._change_state(EventReason.FAULT_CLEARED)
@@ -193,16 +193,16 @@ def b9_cleared_without_a_look():
     return BoardMachine, "clear_fault", clear
 
 
-def b10_takes_what_it_is_told():
+def b10_applies_any_limits():
     return machine_module, "tighten", lambda own, requested: requested
 
 
-def b10_against_the_first_only():
+def b10_compares_only_with_the_defaults():
     tightened = machine_module.tighten
     return machine_module, "tighten", lambda own, requested: tightened(DEFAULT_LIMITS, requested)
 
 
-def b11_any_echo():
+def b11_any_confirmation():
     def confirm(self, host_nonce, board_nonce):
         self._confirmed, self._key_turned = True, False
         return ""
@@ -225,7 +225,7 @@ def b11_predictable():
     return core_module, "random", SimpleNamespace(Random=Counting)
 
 
-def b11_key_may_stay():
+def b11_key_edge_is_not_consumed():
     confirm = BoardMachine.confirm_arming
 
     def keep(self, host_nonce, board_nonce):
@@ -236,11 +236,11 @@ def b11_key_may_stay():
     return BoardMachine, "confirm_arming", keep
 
 
-def b11_at_once():
+def b11_without_the_indicator_time():
     return machine_module, "INDICATOR_US", 1000
 
 
-def b12_duplicates_are_taken():
+def b12_duplicates_are_accepted():
     def accept(self, seq):
         self._expected_seq = seq
         return True, None
@@ -248,7 +248,7 @@ def b12_duplicates_are_taken():
     return BoardLink, "accept", accept
 
 
-def b12_number_is_not_looked_at():
+def b12_index_is_not_checked():
     queue_points = BoardMachine.queue_points
     return BoardMachine, "queue_points", lambda self, first, points: queue_points(self, self.queue.next_index, points)
 
@@ -264,7 +264,7 @@ def b13_no_crc():
     return FrameDecoder, "_decode_frame", frame
 
 
-def b13_lengths_do_not_matter():
+def b13_lengths_are_not_checked():
     parse = m.parse_message
 
     def lenient(kind, body):

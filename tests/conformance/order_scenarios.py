@@ -14,7 +14,7 @@ REFUSED = tomllib.loads((Path(__file__).parents[2] / "firmware_protocol" / "refu
 
 
 @scenario("B12")
-def each_number_once_and_in_order(bench):
+def each_point_executes_once_and_in_order(bench):
     host = bench.ready(**BRIGHT)
     four = [here(100, dark_us=900, duty=999)] * 4
     first = host.data(*four)
@@ -40,7 +40,7 @@ def each_number_once_and_in_order(bench):
 
 
 @scenario("B12")
-def a_frame_that_comes_back_256_later_is_caught_by_its_number(bench):
+def frame_repeated_256_later_is_detected_by_its_index(bench):
     host = bench.ready(**BRIGHT)
     old = host.data(here(100, duty=999))
     assert host.order(old, *[host.data(here(0)) for _ in range(255)]) == []
@@ -65,7 +65,7 @@ def damaged(whole):
 
 
 @scenario("B13")
-def junk_changes_counters_only(bench):
+def invalid_frames_change_only_counters(bench):
     host = bench.ready(**BRIGHT)
     board = host.board
     points = [here(20_000, duty=999)] * 250
@@ -100,7 +100,7 @@ def junk_changes_counters_only(bench):
 
 
 @scenario("B13")
-def each_frame_to_be_refused_is_counted_as_said(bench):
+def refused_frames_count_as_specified(bench):
     host = bench.greeted(**PATIENT)
     for case in REFUSED:
         before = host.status()
@@ -114,7 +114,7 @@ def each_frame_to_be_refused_is_counted_as_said(bench):
 
 
 @scenario("B13")
-def empty_frames_count_nothing_and_a_long_one_counts_once(bench):
+def empty_pieces_count_nothing_and_a_long_one_once(bench):
     host = bench.greeted(**PATIENT)
     before = host.status()
     said, after = host.ask(bytes(500))

@@ -22,7 +22,7 @@ def failing(bench, action):
 
 
 @scenario("B14", {"a late tick": ("late_tick", "TICK"), "a gate that sticks": ("stick_gate", "READBACK")})
-def what_fails_in_the_board_is_a_fault_at_once_and_latched(bench, case):
+def internal_fault_is_immediate_and_latched(bench, case):
     action, fault = case
     host = failing(bench, action)
     board = host.board
@@ -35,7 +35,7 @@ def what_fails_in_the_board_is_a_fault_at_once_and_latched(bench, case):
 
 
 @scenario("B14")
-def a_gate_that_sticks_dark_is_a_fault_when_it_is_told_to_shine(bench):
+def gate_stuck_off_is_a_fault_at_the_next_pulse(bench):
     host = bench.ready('[[step]]\nat_s = 0.5\ndo = "stick_gate"\n', **BRIGHT)
     assert host.board.of("fault") == [], "it reads as it was told, until now"
     host.play(here(60_000, duty=2000), end=False)
@@ -48,7 +48,7 @@ def a_gate_that_sticks_dark_is_a_fault_when_it_is_told_to_shine(bench):
 
 
 @scenario("B15")
-def a_hung_main_loop_ends_in_a_dark_reset_that_hello_tells(bench):
+def stopped_main_loop_ends_in_a_reset_that_hello_reports(bench):
     host = failing(bench, "stop_loop")
     board = host.board
     host.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")

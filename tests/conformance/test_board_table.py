@@ -8,4 +8,4 @@ PAGE = locate_shipped().parent / "docs" / "reference" / "board-conformance.md"
 
 
 def test_the_page_has_the_table_of_this_suite():
-    assert table() in PAGE.read_text(), "python tests/conformance/board_table.py prints what belongs there"
+    assert table() in PAGE.read_text(), "PYTHONPATH=tests:tests/system python tests/conformance/board_table.py"

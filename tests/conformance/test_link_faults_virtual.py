@@ -41,7 +41,11 @@ def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_
     assert len(kinds) == 11, "a kind of fault that never came"
 
 
-BROKEN = [["b1_states_do_not_darken"], ["b12_duplicates_are_taken", "b12_number_is_not_looked_at"], ["b13_no_crc"]]
+BROKEN = [
+    ["b1_gate_stays_on_after_running"],
+    ["b12_duplicates_are_accepted", "b12_index_is_not_checked"],
+    ["b13_no_crc"],
+]
 
 
 @pytest.mark.parametrize("names", BROKEN, ids=lambda names: names[0])

@@ -19,7 +19,7 @@ def step(at_s, name, value):
 
 
 @scenario("B9", {name: name for name in INPUTS})
-def an_input_is_a_fault_latched_until_cleared(bench, name):
+def unsafe_input_is_latched_until_cleared(bench, name):
     unsafe = INPUTS[name]
     script = step(SCRIPTED_S, name, unsafe) + step(SCRIPTED_S + 1, name, OPPOSITE[unsafe])
     host = bench.ready(script, **BRIGHT)
@@ -42,7 +42,7 @@ def an_input_is_a_fault_latched_until_cleared(bench, name):
 
 
 @scenario("B9", {name: name for name in INPUTS})
-def an_input_is_a_fault_in_disarmed_too_and_nothing_but_clear_fault_ends_it(bench, name):
+def unsafe_input_in_disarmed_is_ended_only_by_clear_fault(bench, name):
     host = bench.greeted(step(0.5, name, INPUTS[name]), **PATIENT)
     wait_for(lambda: host.board.of("fault"), "the fault")
     host.say("ABORT")
@@ -55,7 +55,7 @@ def an_input_is_a_fault_in_disarmed_too_and_nothing_but_clear_fault_ends_it(benc
 
 
 @scenario("B9")
-def what_is_unsafe_at_power_up_is_no_fault_and_keeps_from_arming(bench):
+def input_unsafe_at_power_up_prevents_arming_without_a_fault(bench):
     reset = '[[step]]\nat_s = 0.8\ndo = "reset"\n'
     host = bench.greeted(step(0.4, "interlock", "false") + reset + step(SCRIPTED_S / 2, "interlock", "true"), **PATIENT)
     board = host.board
@@ -99,7 +99,7 @@ def tightened(**values):
 
 
 @scenario("B10", BEYOND)
-def what_was_tightened_once_stays_tight(bench, case):
+def tightened_limits_cannot_be_loosened(bench, case):
     tight, points, fault = case
     name = next(key for key, value in BEYOND.items() if value is case)
     host = bench.greeted(**OWN)
@@ -113,7 +113,7 @@ def what_was_tightened_once_stays_tight(bench, case):
 
 
 @scenario("B10")
-def settling_and_lease_stay_tight_too(bench):
+def tightened_settling_and_lease_cannot_be_loosened(bench):
     host = bench.greeted(**OWN)
     for requested in (tightened(settle_us=900, settle_ns_per_code=500, lease_ms=700), LOOSER, OWN):
         assert host.tell("LIMITS", **requested) == []
@@ -130,7 +130,7 @@ def settling_and_lease_stay_tight_too(bench):
 
 
 @scenario("B10")
-def a_board_s_own_limits_are_back_with_the_next_session_and_never_more(bench):
+def next_session_restores_the_own_limits(bench):
     host = bench.host(bench.board(**OWN))
     reply = host.hello()
     assert {name: getattr(reply, name) for name in LIMIT_NAMES} == OWN
@@ -155,7 +155,7 @@ WRONG = {
 
 
 @scenario("B11", WRONG)
-def a_wrong_echo_disarms_and_the_challenge_is_spent(bench, wrong):
+def wrong_confirmation_disarms_and_consumes_the_challenge(bench, wrong):
     host = bench.greeted(**PATIENT)
     challenge = host.challenge()
     host_nonce, board_nonce = wrong(challenge)
@@ -171,7 +171,7 @@ def a_wrong_echo_disarms_and_the_challenge_is_spent(bench, wrong):
 
 
 @scenario("B11")
-def armed_two_seconds_after_the_request_at_the_earliest(bench):
+def arming_takes_at_least_two_seconds(bench):
     host = bench.greeted(**PATIENT)
     challenge = host.challenge()
     confirm = dict(host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
@@ -183,7 +183,7 @@ def armed_two_seconds_after_the_request_at_the_earliest(bench):
 
 
 @scenario("B11")
-def arming_that_is_not_confirmed_times_out(bench):
+def unconfirmed_arming_times_out(bench):
     host = bench.greeted(**PATIENT)
     host.challenge()
     host.wait(lambda: host.board.states()[-1][1] == "arming timed out", "the time-out")
@@ -192,7 +192,7 @@ def arming_that_is_not_confirmed_times_out(bench):
 
 
 @scenario("B11")
-def the_key_is_turned_before_each_arming(bench):
+def key_edge_is_required_before_each_arming(bench):
     script = step(2.0, "key", "false") + step(2.3, "key", "true")
     host = bench.greeted(script, key_edge=True, **PATIENT)
     assert host.of("HELLO_REPLY")[-1].capabilities & 1
@@ -205,7 +205,7 @@ def the_key_is_turned_before_each_arming(bench):
 
 
 @scenario("B11")
-def what_a_board_chooses_is_never_the_same_again(bench):
+def sessions_and_nonces_do_not_repeat(bench):
     nonces, sessions = [], []
     for _ in range(2):
         host = bench.host(bench.board(**PATIENT))
@@ -222,7 +222,7 @@ def what_a_board_chooses_is_never_the_same_again(bench):
 
 
 @scenario("B11", {"the same board": "same", "a new one": "new", "after a reset": "reset"})
-def a_recorded_session_played_again_never_arms(bench, where):
+def replayed_session_does_not_arm(bench, where):
     script = f'[[step]]\nat_s = {SCRIPTED_S}\ndo = "reset"\n' if where == "reset" else ""
     host = bench.ready(script, **PATIENT)
     host.play(here(1000))

@@ -52,7 +52,7 @@ def check_b1(make):
     assert b.edges[0][0] >= began_us + 200 + 500, "lit while settling"
 
 
-def b1_states_do_not_darken(patch):
+def b1_gate_stays_on_after_running(patch):
     patch.setattr(BoardMachine, "_close_gate", lambda self, reason: setattr(self, "_current_point", None))
 
 
@@ -69,7 +69,7 @@ def check_b2(make):
     assert b.state == "HOLD"
 
 
-def b2_goes_on_until_more_comes(patch):
+def b2_gate_stays_on_until_more_points(patch):
     finish = BoardMachine._finish_point
 
     def burn_on(self, point):
@@ -141,7 +141,7 @@ def b3_anything_renews(patch):
     patch.setattr(BoardCore, "_handle_unsequenced", renew)
 
 
-def b3_host_says_how_long(patch):
+def b3_host_sets_the_duration(patch):
     def obey(self, message):
         if isinstance(message, m.Lease):
             self.machine.lease_until_us = self.machine.now_us + 1000 * message.ms
@@ -183,7 +183,7 @@ def check_b4(make):
     assert (b.fault, len(b.pulses)) == ("ON_TIME", 2), "a glance at another cell is no rest"
 
 
-def b4_no_look_at_points(patch):
+def b4_points_are_not_checked(patch):
     static = BoardMachine._check_point
     patch.setattr(BoardMachine, "_check_point", lambda self, point: static(self, point._replace(on_us=0)))
 
@@ -196,7 +196,7 @@ def b4_by_position_and_not_by_cell(patch):
     patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: [(0, x, y)])
 
 
-def b4_one_grid_whose_borders_hide(patch):
+def b4_a_single_grid(patch):
     cells = EmissionGuards.find_cells
     patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1])
 
@@ -279,7 +279,7 @@ def b6_one_bucket_for_all(patch):
     patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: [(0, 0, 0)])
 
 
-def b6_one_grid_whose_borders_hide(patch):
+def b6_a_single_grid(patch):
     cells = EmissionGuards.find_cells
     patch.setattr(EmissionGuards, "find_cells", lambda self, x, y: cells(self, x, y)[:1])
 
@@ -332,15 +332,15 @@ def _begin(due):
     return begin
 
 
-def b7_host_alone(patch):
+def b7_only_dark_us(patch):
     patch.setattr(BoardMachine, "_begin_point", _begin(lambda dark_us, settle_us: dark_us))
 
 
-def b7_board_alone(patch):
+def b7_only_settling(patch):
     patch.setattr(BoardMachine, "_begin_point", _begin(lambda dark_us, settle_us: settle_us))
 
 
-def b7_forgets_a_move_that_was_broken_off(patch):
+def b7_interrupted_move_is_ignored(patch):
     patch.setattr(BoardMachine, "_begin_point", _begin(max))
 
 
@@ -406,7 +406,7 @@ def b9_not_latched(patch):
     patch.setattr(BoardMachine, "set_input", forgive)
 
 
-def b9_cleared_without_a_look(patch):
+def b9_cleared_without_a_check(patch):
     def clear(self):
         self.fault = ""
         self._change_state(EventReason.FAULT_CLEARED)
@@ -443,11 +443,11 @@ def check_b10(make):
     assert b.limits == own
 
 
-def b10_takes_what_it_is_told(patch):
+def b10_applies_any_limits(patch):
     patch.setattr(machine_module, "tighten", lambda own, requested: requested)
 
 
-def b10_against_own_only(patch):
+def b10_compares_only_with_the_own_limits(patch):
     tightened = machine_module.tighten
     patch.setattr(machine_module, "tighten", lambda own, requested: tightened(m.Limits(**OWN), requested))
 
@@ -502,7 +502,7 @@ def turn_key(b):
     b.say(m.ClearFault())
 
 
-def b11_any_nonce(patch):
+def b11_any_confirmation(patch):
     def confirm(self, host_nonce, board_nonce):
         self._confirmed = True
         self._key_turned = False
@@ -526,7 +526,7 @@ def b11_predictable(patch):
     patch.setattr(core_module, "random", SimpleNamespace(Random=Constant))
 
 
-def b11_key_may_stay(patch):
+def b11_key_edge_is_not_consumed(patch):
     confirm = BoardMachine.confirm_arming
 
     def keep(self, host_nonce, board_nonce):
@@ -564,7 +564,7 @@ def check_b12(make):
     assert b.state == "ARMED"
 
 
-def b12_duplicates_are_taken(patch):
+def b12_duplicates_are_accepted(patch):
     def accept(self, seq):
         self._expected_seq = seq
         return True, None
@@ -572,7 +572,7 @@ def b12_duplicates_are_taken(patch):
     patch.setattr(BoardLink, "accept", accept)
 
 
-def b12_index_is_not_looked_at(patch):
+def b12_index_is_not_checked(patch):
     queue_points = BoardMachine.queue_points
     patch.setattr(
         BoardMachine, "queue_points", lambda self, first, points: queue_points(self, self.queue.next_index, points)
@@ -618,7 +618,7 @@ def b13_no_crc(patch):
     patch.setattr(FrameDecoder, "_decode_frame", frame)
 
 
-def b13_lengths_do_not_matter(patch):
+def b13_lengths_are_not_checked(patch):
     parse = m.parse_message
 
     def lenient(kind, body):
