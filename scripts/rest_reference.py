@@ -1,11 +1,14 @@
 """The REST reference, generated from the application's own OpenAPI document; run as a script, it prints the page."""
 
 from optodrive.core.clock import MonotonicClock
+from optodrive.core.toml_model import Section
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
+from optodrive.device import config
 from optodrive.device.config_file import load_config
 from optodrive.link.transport.registry import find_transport_factory
+from optodrive.planning import effective_config
 from optodrive.planning.display_model import DisplayModel
 
 HEAD = """# REST API
@@ -44,8 +47,23 @@ def build_rest_reference():
         for method, route in methods.items():
             sections.append(format_route(f"{method.upper()} {path}", route))
     sections.append(MODELS_HEAD)
-    sections += [format_model(name, schema) for name, schema in sorted(document["components"]["schemas"].items())]
+    schemas = document["components"]["schemas"]
+    configured = {name for name in schemas if is_section(getattr(config, name, None))}
+    sections += [
+        format_model(name, schema, configured) for name, schema in sorted(schemas.items()) if name not in configured
+    ]
     return "\n".join(sections)
+
+
+def is_section(kind):
+    """Return whether a class is a table of the configuration, which has a page of its own."""
+    return isinstance(kind, type) and issubclass(kind, Section)
+
+
+def list_configured_members(name):
+    """List the members that a model of the effective configuration inherits from the configuration."""
+    bases = getattr(effective_config, name, object).__mro__[1:]
+    return {member for base in bases if is_section(base) for member in base.model_fields}
 
 
 def format_route(title, route):
@@ -76,14 +94,21 @@ def format_content(response):
     return format_type(content["schema"]) if "$ref" in content["schema"] else media_type
 
 
-def format_model(name, schema):
-    """Format one model: its description and members."""
+def format_model(name, schema, configured):
+    """Format one model: its description and members; the page on the configuration has those of `configured`."""
     lines = [f"### {name}", ""]
     if schema.get("description"):
         lines += [schema["description"].strip(), ""]
     if "properties" not in schema:
         return "\n".join([*lines, format_type(schema), ""])
-    rows = [f"| `{member}` | {format_type(item)} |" for member, item in schema["properties"].items()]
+    inherited = list_configured_members(name)
+    if inherited:
+        lines += ["Members as [configured](configuration.md), and:", ""]
+    rows = [
+        f"| `{member}` | {format_type(item, configured)} |"
+        for member, item in schema["properties"].items()
+        if member not in inherited or "Effective" in str(item)
+    ]
     return "\n".join([*lines, "| member | type |", "|---|---|", *rows, ""])
 
 
@@ -93,13 +118,13 @@ def format_parameter(schema):
     return escape_cell(text + (f", default {schema['default']}" if "default" in schema else ""))
 
 
-def format_type(schema):
+def format_type(schema, configured=frozenset()):
     """Format the type of a schema; a model is linked."""
     if "$ref" in schema:
         name = schema["$ref"].rpartition("/")[2]
-        return f"[{name}](#{name.lower()})"
+        return f"[{name}](configuration.md)" if name in configured else f"[{name}](#{name.lower()})"
     if "anyOf" in schema:
-        kinds = [format_type(item) for item in schema["anyOf"] if item.get("type") != "null"]
+        kinds = [format_type(item, configured) for item in schema["anyOf"] if item.get("type") != "null"]
         text = " or ".join(kinds)
         return f"({text})" if len(kinds) < len(schema["anyOf"]) else text
     if "enum" in schema or "const" in schema:
