@@ -24,7 +24,7 @@ def _start_the_firmware(monkeypatch, program):
     def start(*arguments, **options):
         return subprocess.Popen([*program, *map(str, arguments)], stderr=subprocess.PIPE, text=True, **options)
 
-    monkeypatch.setattr(simulated, "initial_places", start)
+    monkeypatch.setattr(simulated, "start", start)
 
 
 @pytest.fixture
