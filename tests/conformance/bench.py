@@ -133,7 +133,7 @@ def wait_for(condition, what, patience_s=PATIENCE_S):
     """Poll until condition() is true; fail after patience_s."""
     until = time.monotonic() + patience_s
     while not condition():
-        assert time.monotonic() < until, f"waited in vain for {what}"
+        assert time.monotonic() < until, f"timed out waiting for {what}"
         time.sleep(0.005)
 
 
@@ -145,7 +145,7 @@ class Host:
         self.port = serial.Serial(str(board.port), 1_000_000, timeout=0.005, exclusive=True)
         self.written = [] if record is None else record
         self.session = self.seq = self.index = 0
-        self.heard = []
+        self.received = []
         self._reader = MessageReader()
         self._leased_s = 0.0
 
@@ -164,64 +164,64 @@ class Host:
         session = self.session if session is None else session
         return frame(HOST[name][0], seq, session, body_of(name, **fields))
 
-    def say(self, name, **fields):
+    def send(self, name, **fields):
         """Send a message without waiting."""
         self.raw(self.frame(name, **fields))
 
-    def hear(self):
+    def receive(self):
         """Read the messages that have arrived."""
-        self.heard += self._reader.take(self.port.read(max(1, self.port.in_waiting)))
+        self.received += self._reader.take(self.port.read(max(1, self.port.in_waiting)))
 
     def of(self, name):
         """Return the received messages of a kind."""
-        return [message for message in self.heard if message.name == name]
+        return [message for message in self.received if message.name == name]
 
     def wait(self, condition, what, lease=True, patience_s=PATIENCE_S):
         """Read messages until condition() is true."""
         until = time.monotonic() + patience_s
         while not condition():
-            assert time.monotonic() < until, f"waited in vain for {what}; log {self.board.events()[-8:]}"
+            assert time.monotonic() < until, f"timed out waiting for {what}; log {self.board.events()[-8:]}"
             if lease:
                 self.lease()
-            self.hear()
+            self.receive()
 
     def lease(self):
         """Renew the lease, at a limited rate."""
         if self.session and time.monotonic() - self._leased_s > LEASE_EVERY_S:
             self._leased_s = time.monotonic()
-            self.say("LEASE", ms=60_000)
+            self.send("LEASE", ms=60_000)
 
     def pause(self, duration_s, lease=True):
         """Wait for a time."""
         until = time.monotonic() + duration_s
         self.wait(lambda: time.monotonic() >= until, "the time", lease)
 
-    def ask(self, data=b""):
+    def request(self, data=b""):
         """Send bytes; return the board's answers and its status after them."""
-        before = len(self.heard)
+        before = len(self.received)
         self.raw(data)
         for _ in range(2):  # an ACK may follow its batch, so the answers are complete only at the second status
             count = len(self.of("STATUS"))
-            self.say("GET")
+            self.send("GET")
             self.wait(lambda count=count: len(self.of("STATUS")) > count, "a status", lease=False)
         status = self.of("STATUS")[-1]
-        return [m for m in self.heard[before:] if m.name != "STATUS"], status
+        return [m for m in self.received[before:] if m.name != "STATUS"], status
 
     def order(self, *frames):
         """Send frames in batches of the window size; return the reasons of all NAKs."""
-        said = []
+        answers = []
         for at in range(0, len(frames), WINDOW):
             self.lease()  # hundreds of frames may take longer than one lease
-            said.append(self.ask(b"".join(frames[at : at + WINDOW]))[0])
-        return [message.reason for messages in said for message in messages if message.name == "NAK"]
+            answers.append(self.request(b"".join(frames[at : at + WINDOW]))[0])
+        return [message.reason for messages in answers for message in messages if message.name == "NAK"]
 
-    def tell(self, name, **fields):
+    def send_checked(self, name, **fields):
         """Send one message; return the reasons of its NAKs."""
         return self.order(self.frame(name, **fields))
 
     def status(self):
         """Request the board's status."""
-        return self.ask()[1]
+        return self.request()[1]
 
     # --- session, arming, jobs ---
 
@@ -232,12 +232,12 @@ class Host:
         while time.monotonic() < until:
             self.session = self.seq = self.index = 0
             nonce += 1
-            before = len(self.heard)
-            self.say("HELLO", major=major, minor=0, host_nonce=nonce)
+            before = len(self.received)
+            self.send("HELLO", major=major, minor=0, host_nonce=nonce)
             soon = time.monotonic() + 0.5
             while time.monotonic() < soon:
-                self.hear()
-                for message in self.heard[before:]:
+                self.receive()
+                for message in self.received[before:]:
                     if message.name == "HELLO_REPLY" and message.host_nonce == nonce:
                         self.session = message.session
                         return message
@@ -245,15 +245,15 @@ class Host:
 
     def challenge(self, host_nonce=99):
         """Send ARM_REQ and return the challenge."""
-        said, _ = self.ask(self.frame("ARM_REQ", host_nonce=host_nonce))
-        (challenge,) = [message for message in said if message.name == "ARM_CHALLENGE"]
+        answers, _ = self.request(self.frame("ARM_REQ", host_nonce=host_nonce))
+        (challenge,) = [message for message in answers if message.name == "ARM_CHALLENGE"]
         return challenge
 
     def arm(self):
         """Arm the board by the regular sequence."""
         count = self.board.states().count(("ARMED", "armed"))
         challenge = self.challenge()
-        self.say("ARM_CONFIRM", host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
+        self.send("ARM_CONFIRM", host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
         self.wait(lambda: self.board.states().count(("ARMED", "armed")) > count, "ARMED")
         return self
 

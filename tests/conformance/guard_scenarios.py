@@ -12,14 +12,14 @@ SCRIPTED_S = 8.0
 """Time of scripted events, after the host has armed and started a job."""
 
 
-def shine(host, seconds=9.0):
+def run_bright_job(host, seconds=9.0):
     """Run a job with the gate on continuously, without END."""
     points = [here(60_000, duty=2000)] * int(seconds / 0.06)
     assert host.play(*points, end=False) == []
     host.wait(host.board.is_gate_on, "light")
 
 
-def sees(host, condition, what):
+def wait_for_log(host, condition, what):
     """Wait for the board's log; send only leases."""
     host.wait(lambda: condition(host.board), what)
 
@@ -38,7 +38,7 @@ def gate_is_off_until_the_first_point_is_due(bench):
     host.pause(0.1)
     assert host.status().state == "RUNNING"
     assert host.board.of("gate") == [], "lit before its tick"
-    sees(host, lambda board: board.pulse_numbers(), "the pulse")
+    wait_for_log(host, lambda board: board.pulse_numbers(), "the pulse")
     (pulse,) = host.board.of("pulse")
     (event,) = [m for m in host.of("EVENT") if m.reason == "start"]
     (started,) = [entry for entry in host.board.of("state") if entry["reason"] == "start"]
@@ -47,10 +47,10 @@ def gate_is_off_until_the_first_point_is_due(bench):
 
 
 ENDS = {
-    "flush": ("flush", lambda host: host.say("FLUSH")),
-    "disarm": ("disarm", lambda host: host.say("DISARM")),
-    "abort": ("abort", lambda host: host.say("ABORT")),
-    "hello": ("hello", lambda host: host.say("HELLO", major=1, minor=0, host_nonce=77)),
+    "flush": ("flush", lambda host: host.send("FLUSH")),
+    "disarm": ("disarm", lambda host: host.send("DISARM")),
+    "abort": ("abort", lambda host: host.send("ABORT")),
+    "hello": ("hello", lambda host: host.send("HELLO", major=1, minor=0, host_nonce=77)),
     "closed port": ("link lost", lambda host: host.close()),
 }
 
@@ -60,13 +60,13 @@ def leaving_running_turns_the_gate_off_first(bench, end):
     reason, act = end
     host = bench.ready(**BRIGHT)
     board = host.board
-    shine(host)
+    run_bright_job(host)
     act(host)
     until = time.monotonic() + 5
     while board.states()[-1][1] != reason:
         assert time.monotonic() < until, f"{board.states()} does not end with {reason}"
         time.sleep(0.005)
-    assert dark_by(board, board.of("state")[-1])
+    assert is_off_by(board, board.of("state")[-1])
 
 
 @scenario("B1", {"an input": ("interlock", "fault"), "a reset": ("reset", "boot")})
@@ -74,13 +74,13 @@ def external_event_turns_the_gate_off_at_once(bench, case):
     what, reason = case
     verb = 'set = "interlock"\nvalue = false' if what == "interlock" else 'do = "reset"'
     host = bench.ready(f"[[step]]\nat_s = {SCRIPTED_S}\n{verb}\n", **BRIGHT)
-    shine(host)
-    sees(host, lambda board: len(board.states()) > 4, "the end")
+    run_bright_job(host)
+    wait_for_log(host, lambda board: len(board.states()) > 4, "the end")
     assert host.board.states()[-1][1] == reason
-    assert dark_by(host.board, host.board.of("state")[-1])
+    assert is_off_by(host.board, host.board.of("state")[-1])
 
 
-def dark_by(board, change):
+def is_off_by(board, change):
     """Return whether the last edge is off and not after a change of state."""
     edge = board.of("gate")[-1]
     events = board.events()
@@ -94,7 +94,7 @@ def dark_by(board, change):
 def gate_turns_off_in_time_with_and_without_more_points(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(10_000), here(500, dark_us=20_000), end=False)
-    sees(host, lambda board: board.states()[-1][0] == "HOLD", "HOLD")
+    wait_for_log(host, lambda board: board.states()[-1][0] == "HOLD", "HOLD")
     edges = [(entry["t_us"], entry["on"]) for entry in host.board.of("gate")]
     assert [on for _, on in edges] == [True, False, True, False]
     for (on_us, _), (off_us, _), width_us in zip(edges[::2], edges[1::2], (10_000, 500), strict=True):
@@ -146,7 +146,7 @@ def only_a_lease_of_this_session_prevents_fault_link(bench, state):
     (fault,) = [m for m in host.of("EVENT") if m.state == "FAULT"]
     assert fault.fault == "LINK"
     assert before + LEASE_MS * 1000 <= fault.tick <= after + LEASE_MS * 1000 + host.board.late_us
-    host.say("LEASE", ms=600)
+    host.send("LEASE", ms=600)
     assert host.status().state == "FAULT"
     assert not host.board.is_gate_on()
 
@@ -172,7 +172,9 @@ def point_above_max_on_us_is_refused_when_queued(bench):
 def split_pulses_in_a_cell_add_up(bench, points):
     host = bench.ready(**PATIENT)
     host.play(*points)
-    sees(host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.pulse_numbers()) >= 1, "the end")
+    wait_for_log(
+        host, lambda board: board.states()[-1][0] in ("FAULT", "ARMED") and len(board.pulse_numbers()) >= 1, "the end"
+    )
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
     assert host.board.pulse_numbers() == [0]
 
@@ -183,10 +185,10 @@ def only_a_full_rest_clears_the_on_time(bench):
     dim = dict(duty=999)
     rest = here(0, dark_us=500)
     host.play(here(30_000, **dim), here(20_000, **dim), rest, here(50_000, **dim))
-    sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
+    wait_for_log(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
     assert len(host.board.pulse_numbers()) == 3, "50 ms in two pieces, and again after 500 µs of rest"
     host.play(here(0, dark_us=600), here(30_000, **dim), here(100, x=OTHER_CELL), here(30_000, **dim))
-    sees(host, lambda board: board.of("fault") or len(board.pulse_numbers()) == 6, "the fault")
+    wait_for_log(host, lambda board: board.of("fault") or len(board.pulse_numbers()) == 6, "the fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["ON_TIME"]
     assert len(host.board.pulse_numbers()) == 5
 
@@ -213,7 +215,7 @@ def mean_power_over_any_second(bench, case):
     old = [here(0, dark_us=60_000, duty=0)] * 15
     more = [*old, *sweep(5), here(100, dark_us=60_000)] if allowed == 5 else []
     host.play(*sweep(5), *more)
-    sees(host, lambda board: board.of("fault"), "the fault")
+    wait_for_log(host, lambda board: board.of("fault"), "the fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["MEAN_POWER"]
     # Five pulses of 20 ms at full power are 6554 in a second; pulses older than a second do not count.
     assert len(host.board.pulse_numbers()) == (10 if allowed == 5 else 4)
@@ -239,7 +241,7 @@ def energy_of_a_cell(bench, case):
     points, fault, count = case
     host = bench.ready(**PATIENT)
     host.play(*points)
-    sees(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
+    wait_for_log(host, lambda board: board.states()[-1][1] in ("fault", "job done"), "the end")
     assert [entry["fault"] for entry in host.board.of("fault")] == [fault] * bool(fault)
     assert len(host.board.pulse_numbers()) == count
 
@@ -260,7 +262,7 @@ def gate_waits_for_settling_and_dark_us(bench):
         (here(100, x=CENTRE + 10_022, y=CENTRE + 3000), 202),
     ]
     host.play(*[point for point, _ in walk])
-    sees(host, lambda board: len(board.pulse_numbers()) == len(walk), "all pulses")
+    wait_for_log(host, lambda board: len(board.pulse_numbers()) == len(walk), "all pulses")
     before_us = next(entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start")
     for pulse, (_, dark_us) in zip(host.board.of("pulse"), walk, strict=True):
         assert 0 <= pulse["on_us"] - before_us - dark_us <= host.board.late_us, pulse
@@ -273,9 +275,9 @@ def interrupted_move_still_has_to_settle(bench):
     move_us = 1000 + 20_000 * 40
     host.play(here(100, x=CENTRE + 20_000))
     host.pause(0.05)
-    assert host.tell("FLUSH") == []
+    assert host.send_checked("FLUSH") == []
     host.play(here(100, x=CENTRE + 20_000), here(100, x=CENTRE + 20_000, dark_us=10))
-    sees(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
+    wait_for_log(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
     started = [entry["t_us"] for entry in host.board.of("state") if entry["reason"] == "start"]
     assert len(started) == 2
     if started[1] > started[0] + move_us:
@@ -289,10 +291,10 @@ def requested_settling_applies(bench):
     host = bench.host(bench.board(**BRIGHT))
     own = host.hello()
     limits = {name: getattr(own, name) for name in own.__dict__ if name in LIMIT_NAMES}
-    assert host.tell("LIMITS", **{**limits, "settle_us": 3000, "settle_ns_per_code": 100}) == []
+    assert host.send_checked("LIMITS", **{**limits, "settle_us": 3000, "settle_ns_per_code": 100}) == []
     host.arm()
     host.play(here(100), here(100, x=CENTRE + 10))
-    sees(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
+    wait_for_log(host, lambda board: len(board.pulse_numbers()) == 2, "the pulses")
     first, second = host.board.of("pulse")
     assert 0 <= second["on_us"] - first["off_us"] - 3001 <= host.board.late_us
 
@@ -323,5 +325,5 @@ def point_outside_the_field_is_a_fault_when_queued(bench, point):
 def corners_of_the_field_are_permitted(bench):
     host = bench.ready(**FIELD, **PATIENT)
     host.play(here(1000, x=1000, y=2000), here(1000, x=64_000, y=63_000))
-    sees(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
+    wait_for_log(host, lambda board: board.states()[-1] == ("ARMED", "job done"), "the job")
     assert [(entry["x"], entry["y"]) for entry in host.board.of("pulse")] == [(1000, 2000), (64_000, 63_000)]

@@ -14,7 +14,7 @@ def until(host, state, reason):
 
 def start(host, first=0, watermark=1, job=1, start_tick=0):
     """Send START; return the reasons of its NAKs."""
-    return host.tell("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
+    return host.send_checked("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
 
 
 def reported(host):
@@ -45,9 +45,9 @@ def job_begins_when_all_its_points_are_queued(bench):
     assert start(host, watermark=48) == []
     host.pause(0.05)
     assert host.board.of("gate") == []
-    assert host.tell("END", job=1, end_index=2) == ["INDEX"]
-    assert host.tell("END", job=2, end_index=1) == ["STATE"]
-    assert host.tell("END", job=1, end_index=1) == []
+    assert host.send_checked("END", job=1, end_index=2) == ["INDEX"]
+    assert host.send_checked("END", job=2, end_index=1) == ["STATE"]
+    assert host.send_checked("END", job=1, end_index=1) == []
     until(host, "ARMED", "job done")
     assert host.board.pulse_numbers() == [0]
 
@@ -57,7 +57,7 @@ def points_after_end_belong_to_the_next_job(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, dark_us=60_000, **DIM)))
     assert start(host) == []
-    assert host.tell("END", job=1, end_index=1) == []
+    assert host.send_checked("END", job=1, end_index=1) == []
     assert host.order(host.data(here(200, **DIM), here(300, **DIM))) == []
     until(host, "ARMED", "job done")
     host.pause(0.05)
@@ -66,7 +66,7 @@ def points_after_end_belong_to_the_next_job(bench):
     assert start(host, first=0) == ["INDEX"]
     assert start(host, first=1) == []
     assert start(host, first=1) == ["STATE"]
-    assert host.tell("END", job=1, end_index=3) == []
+    assert host.send_checked("END", job=1, end_index=3) == []
     until(host, "ARMED", "job done")
     assert host.board.pulse_numbers() == [0, 1, 2]
 
@@ -97,7 +97,7 @@ def hold_ends_at_the_watermark_and_dark_us_counts_from_then(bench):
     (refilled,) = [entry for entry in host.board.of("state") if entry["reason"] == "refilled"]
     assert 0 <= host.board.of("pulse")[2]["on_us"] - refilled["t_us"] - 7000 <= host.board.late_us
     assert host.board.states()[-1] == ("HOLD", "queue empty")
-    assert host.tell("END", job=1, end_index=4) == []
+    assert host.send_checked("END", job=1, end_index=4) == []
     assert host.board.states()[-1] == ("ARMED", "job done")
 
 
@@ -121,7 +121,7 @@ def third_underrun_is_a_fault_and_clearing_resets_the_count(bench):
     until(host, "FAULT", "fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["UNDERRUN"]
     assert host.status().underruns == 3
-    assert host.tell("CLEAR_FAULT") == []
+    assert host.send_checked("CLEAR_FAULT") == []
     host.arm()
     host.play(here(100, **DIM), end=False)
     until(host, "HOLD", "queue empty")
@@ -136,7 +136,7 @@ def flush_drops_the_queue_and_stays_armed(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
     host.wait(host.board.is_gate_on, "light")
-    assert host.tell("FLUSH") == []
+    assert host.send_checked("FLUSH") == []
     status = host.status()
     assert (status.state, status.queued, status.done_index) == ("ARMED", 0, 24)
     cut = host.board.of("pulse")[-1]
@@ -145,7 +145,7 @@ def flush_drops_the_queue_and_stays_armed(bench):
     assert cut["off_us"] == flushed["t_us"]
     assert cut["off_us"] - cut["on_us"] <= 60_000
     # A host that dropped points continues its own count, never a smaller one.
-    assert host.tell("DATA", first_index=23, points=[here(100)]) == ["INDEX"]
+    assert host.send_checked("DATA", first_index=23, points=[here(100)]) == ["INDEX"]
     host.index = 30
     assert host.play(here(100, **DIM)) == []
     until(host, "ARMED", "job done")
@@ -158,7 +158,7 @@ def abort_drops_everything_and_disarms(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
     host.wait(host.board.is_gate_on, "light")
-    _, status = host.ask(host.frame("ABORT"))
+    _, status = host.request(host.frame("ABORT"))
     assert (status.state, status.queued) == ("DISARMED", 0)
     assert host.board.states()[-1] == ("DISARMED", "abort")
     count = len(host.board.pulse_numbers())
@@ -172,12 +172,12 @@ def fault_persists_over_abort_disarm_and_hello(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(65_001)))
     assert host.board.states()[-1] == ("FAULT", "fault")
-    host.say("ABORT")
-    assert host.tell("DISARM") == []
+    host.send("ABORT")
+    assert host.send_checked("DISARM") == []
     host.hello()
     status = host.status()
     assert (status.state, status.fault) == ("FAULT", "ON_TIME")
-    assert host.tell("CLEAR_FAULT") == []
+    assert host.send_checked("CLEAR_FAULT") == []
     assert host.board.states()[1:][-1] == ("DISARMED", "fault cleared")
     assert host.status().fault == ""
 
@@ -201,12 +201,12 @@ def each_point_is_reported_and_can_be_requested_again(bench):
     ticks = [records[k][0] for k in range(60)]
     assert ticks == sorted(ticks)
     for first in (0, 37, 59):
-        said, _ = host.ask(host.frame("GET_EXECUTED", first_index=first))
-        (again,) = said
+        answers, _ = host.request(host.frame("GET_EXECUTED", first_index=first))
+        (again,) = answers
         assert again.first_index == first
         assert len(again.records) == min(28, 60 - first)
         assert again.records == [records[first + k] for k in range(len(again.records))]
-    assert host.ask(host.frame("GET_EXECUTED", first_index=60))[0] == []
+    assert host.request(host.frame("GET_EXECUTED", first_index=60))[0] == []
 
 
 @scenario("reports")
@@ -214,22 +214,22 @@ def interrupted_pulse_is_reported_with_its_actual_width(bench):
     host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
     host.play(*[here(60_000, **DIM)] * 24, end=False)
     host.wait(host.board.is_gate_on, "light")
-    assert host.tell("FLUSH") == []
+    assert host.send_checked("FLUSH") == []
     cut = host.board.of("pulse")[-1]
     host.wait(lambda: cut["index"] in reported(host), "its report")
     assert reported(host)[cut["index"]][1:] == (cut["off_us"] - cut["on_us"], 999)
     assert cut["index"] + 1 not in reported(host)
     host.index = 24
     host.play(here(100, x=CENTRE + 20_000, **DIM), here(100, **DIM), end=False)
-    assert host.tell("FLUSH") == []
+    assert host.send_checked("FLUSH") == []
     host.index = 40
     host.play(*[here(100, x=CENTRE + 20_000, **DIM)] * 2)
     until(host, "ARMED", "job done")
     host.wait(lambda: 41 in reported(host), "the reports")
     assert 24 not in reported(host)
-    (report,) = host.ask(host.frame("GET_EXECUTED", first_index=cut["index"]))[0]
+    (report,) = host.request(host.frame("GET_EXECUTED", first_index=cut["index"]))[0]
     assert (report.first_index, len(report.records)) == (cut["index"], 1), "a gap in the numbers ends a report"
-    (report,) = host.ask(host.frame("GET_EXECUTED", first_index=cut["index"] + 1))[0]
+    (report,) = host.request(host.frame("GET_EXECUTED", first_index=cut["index"] + 1))[0]
     assert (report.first_index, len(report.records)) == (40, 2)
     host.hello()
-    assert host.ask(host.frame("GET_EXECUTED", first_index=0))[0] == [], "records are the session's"
+    assert host.request(host.frame("GET_EXECUTED", first_index=0))[0] == [], "records are the session's"

@@ -17,11 +17,11 @@ def board_without_a_session_answers_only_hello(bench):
     host = bench.host(bench.board(**PATIENT))
     wait_for(lambda: host.board.of("port"), "the port to be seen")
     for name, fields in (("GET", {}), ("CLOCK", {"host_t": 1}), ("ARM_REQ", {"host_nonce": 1}), ("ABORT", {})):
-        host.say(name, **fields)
+        host.send(name, **fields)
     until = time.monotonic() + 0.3
     while time.monotonic() < until:
-        host.hear()
-    assert host.heard == []
+        host.receive()
+    assert host.received == []
     assert [entry["state"] for entry in host.board.of("state")] == ["DISARMED"]
     assert host.hello().reset_cause == 0
 
@@ -61,10 +61,10 @@ def other_major_version_gets_a_reply_but_cannot_arm(bench):
     host = bench.host(bench.board(key_edge=True, **PATIENT))
     reply = host.hello(major=2)
     assert reply.major == 1
-    assert host.tell("ARM_REQ", host_nonce=1) == ["VERSION"]
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["VERSION"]
     assert host.status().state == "DISARMED"
     host.hello()
-    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"]
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"]
 
 
 @scenario("handshake")
@@ -74,12 +74,12 @@ def reset_clears_all_state_and_hello_reports_it(bench):
         raise TooLateError("greeted after the reset")
     wait_for(lambda: len(host.board.of("state")) == 2, "the reset")
     host.pause(0.2, lease=False)  # earlier answers may still be in transit
-    host.heard.clear()
-    host.say("GET")
+    host.received.clear()
+    host.send("GET")
     host.pause(0.2, lease=False)
-    assert host.heard == []
+    assert host.received == []
     assert host.hello().reset_cause == 1
-    assert host.tell("ARM_REQ", host_nonce=1) == []
+    assert host.send_checked("ARM_REQ", host_nonce=1) == []
 
 
 # --- sessions -------------------------------------------------------------------------------------------------------
@@ -92,8 +92,8 @@ def frames_of_other_sessions_or_from_a_board_have_no_effect(bench):
     foreign = [host.frame(name, seq=host.seq, session=host.session ^ 1) for name in ("DISARM", "FLUSH", "GET")]
     foreign += [host.frame("DISARM", seq=host.seq, session=0)]
     ack = frame(0x90, 0, host.session, bytes(8))
-    said, after = host.ask(b"".join(foreign) + ack)
-    assert said == []
+    answers, after = host.request(b"".join(foreign) + ack)
+    assert answers == []
     assert after.seq_errors == before.seq_errors + 5
     assert (after.state, after.crc_errors, after.format_errors) == ("ARMED", before.crc_errors, before.format_errors)
 
@@ -103,7 +103,7 @@ def abort_is_accepted_in_any_session(bench):
     host = bench.ready(**BRIGHT)
     host.play(*[here(60_000, duty=999)] * 40, end=False)
     host.wait(host.board.is_gate_on, "light")
-    host.ask(host.frame("ABORT", session=host.session ^ 0x1234))
+    host.request(host.frame("ABORT", session=host.session ^ 0x1234))
     assert host.board.states()[-1] == ("DISARMED", "abort")
     status = host.status()
     assert (status.state, status.queued) == ("DISARMED", 0)
@@ -132,12 +132,12 @@ def gap_is_refused_at_once_and_filled_in_order(bench):
     host = bench.ready(**PATIENT)
     first, second, third = (host.data(here(0, dark_us=k)) for k in range(3))
     before = host.status().seq_errors
-    said, status = host.ask(second + third)
-    assert {(m.name, m.reason, m.next_seq) for m in said} == {("NAK", "SEQUENCE", (host.seq - 3) % 256)}
+    answers, status = host.request(second + third)
+    assert {(m.name, m.reason, m.next_seq) for m in answers} == {("NAK", "SEQUENCE", (host.seq - 3) % 256)}
     assert (status.queued, status.seq_errors) == (0, before + 2)
-    said, status = host.ask(first + second + third)
-    assert {m.name for m in said} == {"ACK"}
-    assert said[-1].next_seq == host.seq
+    answers, status = host.request(first + second + third)
+    assert {m.name for m in answers} == {"ACK"}
+    assert answers[-1].next_seq == host.seq
     assert status.queued == 3
 
 
@@ -146,24 +146,24 @@ def duplicate_frame_is_answered_but_not_executed(bench):
     host = bench.ready(**PATIENT)
     taken = host.data(here(0))
     assert host.order(taken) == []
-    said, status = host.ask(taken)
-    assert [(m.name, m.next_seq, m.free_points) for m in said] == [("ACK", host.seq, 4096 - 1)]
+    answers, status = host.request(taken)
+    assert [(m.name, m.next_seq, m.free_points) for m in answers] == [("ACK", host.seq, 4096 - 1)]
     assert status.queued == 1
     refused = host.frame("START", job=1, first_index=9, start_tick=0, watermark=1)
     for _ in range(3):
-        said, status = host.ask(refused)
-        assert [(m.name, m.reason, m.next_seq) for m in said] == [("NAK", "INDEX", host.seq)]
+        answers, status = host.request(refused)
+        assert [(m.name, m.reason, m.next_seq) for m in answers] == [("NAK", "INDEX", host.seq)]
     assert status.state == "ARMED"
 
 
 @scenario("go-back-N")
 def sequence_numbers_ahead_and_behind_divide_at_half(bench):
     host = bench.greeted(**PATIENT)
-    assert host.tell("DISARM") == []
+    assert host.send_checked("DISARM") == []
     before = host.status().seq_errors
     for distance, name in ((1, "NAK"), (127, "NAK"), (128, "ACK"), (255, "ACK")):
-        said, status = host.ask(host.frame("CLEAR_FAULT", seq=(host.seq + distance) % 256))
-        assert [(m.name, m.next_seq) for m in said] == [(name, host.seq)], distance
+        answers, status = host.request(host.frame("CLEAR_FAULT", seq=(host.seq + distance) % 256))
+        assert [(m.name, m.next_seq) for m in answers] == [(name, host.seq)], distance
     assert status.seq_errors == before + 2
     assert status.state == "DISARMED"
 
@@ -172,11 +172,11 @@ def sequence_numbers_ahead_and_behind_divide_at_half(bench):
 def sequence_numbers_wrap_at_256_and_restart_at_hello(bench):
     host = bench.greeted(**PATIENT)
     assert host.order(*[host.frame("DISARM") for _ in range(270)]) == []
-    said, _ = host.ask(host.frame("DISARM"))
-    assert said[-1].next_seq == 271 % 256
+    answers, _ = host.request(host.frame("DISARM"))
+    assert answers[-1].next_seq == 271 % 256
     host.hello()
-    said, _ = host.ask(host.frame("DISARM"))
-    assert said[-1].next_seq == 1
+    answers, _ = host.request(host.frame("DISARM"))
+    assert answers[-1].next_seq == 1
 
 
 @scenario("NAK")
@@ -184,17 +184,17 @@ def message_in_a_wrong_state_is_refused_with_its_reason(bench):
     host = bench.greeted(**PATIENT)
     start = dict(job=1, first_index=0, start_tick=0, watermark=1)
     assert host.order(host.frame("DATA", first_index=0, points=[here(0)])) == ["STATE"]
-    assert host.tell("START", **start) == ["STATE"]
-    assert host.tell("END", job=1, end_index=0) == ["STATE"]
-    assert host.tell("FLUSH") == ["STATE"]
-    assert host.tell("CLEAR_FAULT") == ["STATE"]
-    assert host.tell("ARM_CONFIRM", host_nonce=1, board_nonce=1) == ["STATE"]
-    assert host.tell("DISARM") == []
+    assert host.send_checked("START", **start) == ["STATE"]
+    assert host.send_checked("END", job=1, end_index=0) == ["STATE"]
+    assert host.send_checked("FLUSH") == ["STATE"]
+    assert host.send_checked("CLEAR_FAULT") == ["STATE"]
+    assert host.send_checked("ARM_CONFIRM", host_nonce=1, board_nonce=1) == ["STATE"]
+    assert host.send_checked("DISARM") == []
     host.arm()
-    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
-    assert host.tell("LIMITS", **_any_limits()) == ["STATE"]
-    assert host.tell("START", **{**start, "first_index": 1}) == ["INDEX"]
-    assert host.tell("END", job=1, end_index=0) == ["STATE"]
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.send_checked("LIMITS", **_any_limits()) == ["STATE"]
+    assert host.send_checked("START", **{**start, "first_index": 1}) == ["INDEX"]
+    assert host.send_checked("END", job=1, end_index=0) == ["STATE"]
     assert host.status().state == "ARMED"
 
 
@@ -207,12 +207,12 @@ def tick_is_a_microsecond_and_host_t_is_returned(bench):
     requested = []
     for stamp in (0, 0xFFFF_FFFF, 0x0100_0001):
         sent_s = time.monotonic()
-        host.say("CLOCK", host_t=stamp)
+        host.send("CLOCK", host_t=stamp)
         host.wait(lambda: host.of("CLOCK_REPLY"), "the clock", lease=False)
         heard_s = time.monotonic()
         (reply,) = host.of("CLOCK_REPLY")
         assert reply.host_t == stamp
-        host.heard.clear()
+        host.received.clear()
         requested.append((sent_s, reply.tick, heard_s))
         host.pause(0.3, lease=False)
     (sent_s, first, heard_s), _, (later_sent_s, last, later_heard_s) = requested
@@ -230,7 +230,7 @@ def status_and_events_agree_with_the_log(bench):
     assert (status.state, status.fault, status.inputs, status.queued, status.underruns) == ("ARMED", "", 0b011, 0, 0)
     assert status.done_index == 3
     assert abs(status.laser_on_us - 15_000) <= 1
-    host.say("ABORT")
+    host.send("ABORT")
     host.wait(lambda: host.board.states()[-1][1] == "abort" and host.status().state == "DISARMED", "the abort")
     reported = [(m.state, m.reason, m.tick) for m in host.of("EVENT")]
     logged = [(entry["state"], entry["reason"], entry["t_us"]) for entry in host.board.of("state")][1:]
@@ -244,13 +244,13 @@ def points_without_room_are_refused_and_can_be_resent(bench):
     assert host.order(host.data(*[here(0, dark_us=20_000)] * 24)) == []
     assert host.of("ACK")[-1].free_points == 6
     over = host.data(*[here(0, dark_us=100)] * 7)
-    said, status = host.ask(over)
-    assert [(m.name, m.reason, m.next_seq) for m in said] == [("NAK", "NO_ROOM", (host.seq - 1) % 256)]
+    answers, status = host.request(over)
+    assert [(m.name, m.reason, m.next_seq) for m in answers] == [("NAK", "NO_ROOM", (host.seq - 1) % 256)]
     assert status.queued == 24
     host.seq, host.index = (host.seq - 1) % 256, 24  # the frame was not consumed
-    assert host.tell("START", job=1, first_index=0, start_tick=0, watermark=1) == []
+    assert host.send_checked("START", job=1, first_index=0, start_tick=0, watermark=1) == []
     host.wait(lambda: host.status().queued <= 20, "room")
     assert host.order(host.data(*[here(0, dark_us=100)] * 7)) == []
-    assert host.tell("END", job=1, end_index=31) == []
+    assert host.send_checked("END", job=1, end_index=31) == []
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
     assert host.status().done_index == 31

@@ -23,17 +23,17 @@ def each_point_executes_once_and_in_order(bench):
     assert host.status().queued == 4, "duplicates are answered, no more"
     ahead = host.frame("DATA", seq=(host.seq + 1) % 256, first_index=4, points=four)
     assert host.order(ahead) == ["SEQUENCE"]
-    assert host.tell("START", job=1, first_index=0, start_tick=0, watermark=1) == []
+    assert host.send_checked("START", job=1, first_index=0, start_tick=0, watermark=1) == []
     for index in (0, 2, 5, 0xFFFF_FFFD):
-        assert host.tell("DATA", first_index=index, points=four) == ["INDEX"], index
+        assert host.send_checked("DATA", first_index=index, points=four) == ["INDEX"], index
     assert host.order(first) == ["INDEX"], "behind: as the last one was answered"
     host.index = 4
     assert host.order(host.data(*four)) == []
-    assert host.tell("DATA", first_index=4, points=four) == ["INDEX"]
-    assert host.tell("END", job=1, end_index=8) == []
+    assert host.send_checked("DATA", first_index=4, points=four) == ["INDEX"]
+    assert host.send_checked("END", job=1, end_index=8) == []
     host.wait(lambda: host.board.states()[-1] == ("ARMED", "job done"), "the job")
-    assert host.tell("DATA", first_index=0, points=four) == ["INDEX"], "nor when the job is over"
-    assert host.tell("DATA", first_index=0xFFFF_FFFD, points=four) == ["INDEX"], "numbers do not wrap"
+    assert host.send_checked("DATA", first_index=0, points=four) == ["INDEX"], "nor when the job is over"
+    assert host.send_checked("DATA", first_index=0xFFFF_FFFD, points=four) == ["INDEX"], "numbers do not wrap"
     assert host.board.pulse_numbers() == list(range(8))
     pulses = host.board.of("pulse")
     assert all(one["off_us"] <= other["on_us"] for one, other in pairwise(pulses))
@@ -72,7 +72,7 @@ def invalid_frames_change_only_counters(bench):
     host.play(*points)
     host.wait(board.is_gate_on, "light")
     before, log = host.status(), len(board.of("state"))
-    answered = len(host.heard)
+    answered = len(host.received)
     junk = [bytes.fromhex(case["wire"]) for case in REFUSED]
     for name in ("ABORT", "FLUSH", "DISARM", "GET"):
         junk += damaged(host.frame(name, seq=host.seq))
@@ -85,13 +85,13 @@ def invalid_frames_change_only_counters(bench):
     for at in range(0, len(junk), 40):
         host.raw(b"".join(junk[at : at + 40]))
         host.lease()
-        host.hear()
+        host.receive()
     after = host.status()
     counted = [getattr(after, name) - getattr(before, name) for name in ("crc_errors", "format_errors")]
     assert sum(counted) >= len(junk)
     assert after.seq_errors == before.seq_errors
-    said = [m for m in host.heard[answered:] if m.name not in ("STATUS", "EXECUTED")]
-    assert said == [], "junk was answered"
+    answers = [m for m in host.received[answered:] if m.name not in ("STATUS", "EXECUTED")]
+    assert answers == [], "junk was answered"
     assert after.state == "RUNNING"
     assert len(board.of("state")) == log
     host.wait(lambda: board.states()[-1] == ("ARMED", "job done"), "the job")
@@ -104,8 +104,8 @@ def refused_frames_count_as_specified(bench):
     host = bench.greeted(**PATIENT)
     for case in REFUSED:
         before = host.status()
-        said, after = host.ask(bytes.fromhex(case["wire"]))
-        assert said == [], case["what"]
+        answers, after = host.request(bytes.fromhex(case["wire"]))
+        assert answers == [], case["what"]
         names = ("crc_errors", "format_errors", "seq_errors")
         grown = {name for name in names if getattr(after, name) != getattr(before, name)}
         assert grown == {case["counter"]}, case["what"]
@@ -117,9 +117,9 @@ def refused_frames_count_as_specified(bench):
 def empty_pieces_count_nothing_and_a_long_one_once(bench):
     host = bench.greeted(**PATIENT)
     before = host.status()
-    said, after = host.ask(bytes(500))
-    assert said == []
+    answers, after = host.request(bytes(500))
+    assert answers == []
     assert after.format_errors == before.format_errors
-    said, after = host.ask(b"\x01" * 254 * 20 + b"\0")
-    assert said == []
+    answers, after = host.request(b"\x01" * 254 * 20 + b"\0")
+    assert answers == []
     assert after.format_errors == before.format_errors + 1

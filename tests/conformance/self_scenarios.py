@@ -1,7 +1,7 @@
 """Scenarios of B14 and B15: a board with an internal fault turns the gate off and reports it."""
 
 from bench import BRIGHT, here
-from guard_scenarios import dark_by
+from guard_scenarios import is_off_by
 from scenario import scenario
 
 FAILS_S = 6.0
@@ -29,8 +29,8 @@ def internal_fault_is_immediate_and_latched(bench, case):
     host.wait(lambda: board.states()[-1][0] != "RUNNING" and board.of("fault"), "the fault")
     assert board.states()[-1] == ("FAULT", "fault")
     assert [entry["fault"] for entry in board.of("fault")] == [fault]
-    assert dark_by(board, board.of("state")[-1])
-    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert is_off_by(board, board.of("state")[-1])
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
     assert (host.status().state, host.status().fault) == ("FAULT", fault)
 
 
@@ -41,7 +41,7 @@ def gate_stuck_off_is_a_fault_at_the_next_pulse(bench):
     host.play(here(60_000, duty=2000), end=False)
     host.wait(lambda: host.board.of("fault") and host.board.states()[-1][0] == "FAULT", "the fault")
     assert [entry["fault"] for entry in host.board.of("fault")] == ["READBACK"]
-    assert dark_by(host.board, host.board.of("state")[-1])
+    assert is_off_by(host.board, host.board.of("state")[-1])
 
 
 # --- B15 ------------------------------------------------------------------------------------------------------------
@@ -54,10 +54,10 @@ def stopped_main_loop_ends_in_a_reset_that_hello_reports(bench):
     host.wait(lambda: board.states()[-1] == ("DISARMED", "boot"), "the reset")
     assert not board.is_gate_on()
     host.pause(0.2, lease=False)  # earlier answers may still be in transit
-    host.heard.clear()
-    host.say("GET")
+    host.received.clear()
+    host.send("GET")
     host.pause(0.2, lease=False)
-    assert host.heard == [], "a session that outlived the reset"
+    assert host.received == [], "a session that outlived the reset"
     assert host.hello().reset_cause == WATCHDOG
     assert host.status().state == "DISARMED"
     assert host.arm().status().state == "ARMED"

@@ -14,7 +14,7 @@ from wire_format import HOST
 
 from optodrive.core.errors import LinkError
 
-STORMS = [(1, 0.01), (2, 0.03), (3, 0.08), (4, 0.2)]
+FAULT_RATES = [(1, 0.01), (2, 0.03), (3, 0.08), (4, 0.2)]
 SESSIONS = 3
 KINDS = 11
 """Number of fault kinds; the close of a port is another one."""
@@ -47,16 +47,16 @@ def states(rig):
     return [state for state, _ in rig.board.states()]
 
 
-def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_is_dark(make_rig):
-    def storm(rig):
+def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(make_rig):
+    def run_fault_sessions(rig):
         rig.up.never_again = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
         for _ in range(SESSIONS):
             rig.live(1500, patience_s=3.0)
         return rig.finish()
 
-    rigs = [make_rig(seed, loss, extra=0.6, pauses=0.002) for seed, loss in STORMS]
+    rigs = [make_rig(seed, loss, extra=0.6, pauses=0.002) for seed, loss in FAULT_RATES]
     with ThreadPoolExecutor(len(rigs)) as pool:
-        pulses = list(pool.map(storm, rigs))
+        pulses = list(pool.map(run_fault_sessions, rigs))
     faults = sum(rig.faults for rig in rigs)
     assert len(sum((rig.up.counts + rig.down.counts for rig in rigs), Counter())) == KINDS
     print(f"{faults} faults over ptys, {len(rigs) * SESSIONS} sessions, pulses {pulses}")
@@ -86,7 +86,7 @@ def in_mid_job(rig):
     return job
 
 
-def test_a_host_that_stalls_for_a_quarter_second_harms_nothing(make_rig):
+def test_a_host_that_stalls_for_a_quarter_second_finishes_its_job(make_rig):
     rig = make_rig(8)
     job = in_mid_job(rig)
     time.sleep(0.25)  # the host stalls
@@ -96,7 +96,7 @@ def test_a_host_that_stalls_for_a_quarter_second_harms_nothing(make_rig):
     assert rig.finish() == 3000
 
 
-def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
+def test_a_host_that_stalls_for_longer_finds_a_fault(make_rig):
     rig = make_rig(9)
     job = in_mid_job(rig)
     time.sleep(1.3)
@@ -108,7 +108,7 @@ def test_a_host_that_stalls_for_longer_finds_a_dark_fault(make_rig):
     assert rig.finish() < 3000
 
 
-def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_rig):
+def test_a_port_removed_in_mid_job_turns_the_gate_off_and_returns_disarmed(make_rig):
     rig = make_rig(10)
     in_mid_job(rig)
     rig.proxy.cut()
@@ -125,8 +125,8 @@ def test_a_port_that_vanishes_in_mid_job_is_dark_and_comes_back_disarmed(make_ri
     assert 0 < rig.finish() < 3000
 
 
-def test_a_port_that_closes_at_any_moment_under_fire(make_rig):
-    def storm(rig, seed):
+def test_a_port_that_closes_at_any_moment_under_link_faults(make_rig):
+    def run_fault_sessions(rig, seed):
         moments = random.Random(seed)
         for _ in range(SESSIONS):
             closing = Timer(moments.choice([moments.uniform(0.0, 2.0), moments.uniform(2.2, 3.0)]), rig.proxy.cut)
@@ -138,7 +138,7 @@ def test_a_port_that_closes_at_any_moment_under_fire(make_rig):
 
     rigs = [make_rig(seed, 0.03, extra=0.3, pauses=0.001) for seed in (11, 12)]
     with ThreadPoolExecutor(len(rigs)) as pool:
-        pulses = list(pool.map(storm, rigs, (11, 12)))
+        pulses = list(pool.map(run_fault_sessions, rigs, (11, 12)))
     lost = [rig.board.states().count(("DISARMED", "link lost")) for rig in rigs]
     print(f"links lost {lost}, pulses {pulses}")
     assert sum(lost) > 0

@@ -150,7 +150,7 @@ class Owner(RuleBasedStateMachine):
     # --- invariants ---
 
     @invariant()
-    def dark_unless_running(self):
+    def gate_is_off_unless_running(self):
         assert not self.rig.core.gate or self.rig.core.state == "RUNNING"
 
     @invariant()
@@ -168,7 +168,7 @@ TestOwner = Owner.TestCase
 TestOwner.settings = settings(max_examples=60, stateful_step_count=30)
 
 
-def test_a_session_that_arms_again_by_itself_is_found_out(monkeypatch):
+def test_a_session_that_rearms_by_itself_is_detected(monkeypatch):
     connect = BoardSession.connect
 
     def eager(self):

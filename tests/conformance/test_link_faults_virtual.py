@@ -15,12 +15,12 @@ from optodrive.link.session import session as session_module
 from optodrive.link.session.board_requirements import BITS_PER_BYTE, FRAME_BYTES
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 
-STORMS = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
+FAULT_RATES = [(seed, loss) for seed in (1, 2) for loss in (0.01, 0.05, 0.15, 0.3)]
 FAULTS_EACH = 25_000
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
-def storm(rig):
+def run_fault_sessions(rig):
     """Run sessions until enough faults are injected; return the number of sessions and pulses."""
     sessions = pulses = 0
     while rig.faults < FAULTS_EACH:
@@ -30,11 +30,11 @@ def storm(rig):
     return sessions, pulses
 
 
-@pytest.mark.parametrize(("seed", "loss"), STORMS)
-def test_whatever_the_link_does_each_pulse_is_as_sent_once_in_order_and_the_end_is_dark(seed, loss):
+@pytest.mark.parametrize(("seed", "loss"), FAULT_RATES)
+def test_under_link_faults_each_pulse_is_as_sent_once_and_in_order(seed, loss):
     rig = VirtualRig(seed, loss, extra=0.6, pauses=0.001)
     rig.up.never_again = ENDING if seed == 2 else ()
-    sessions, pulses = storm(rig)
+    sessions, pulses = run_fault_sessions(rig)
     kinds = rig.up.counts + rig.down.counts
     print(f"loss {loss:.0%}: {rig.faults} faults, {sessions} sessions, {pulses} pulses; {dict(kinds)}")
     assert pulses > 0
@@ -49,11 +49,11 @@ BROKEN = [
 
 
 @pytest.mark.parametrize("names", BROKEN, ids=lambda names: names[0])
-def test_a_board_that_breaks_its_word_is_found_out(monkeypatch, names):
+def test_a_board_that_violates_a_guard_is_detected(monkeypatch, names):
     for name in names:
         monkeypatch.setattr(*MUTANTS[name]())
     with pytest.raises(AssertionError):
-        storm(VirtualRig(5, 0.15, extra=0.6, pauses=0.001))
+        run_fault_sessions(VirtualRig(5, 0.15, extra=0.6, pauses=0.001))
 
 
 def test_a_run_can_be_played_again(monkeypatch):
@@ -152,12 +152,12 @@ def test_goodput_of_a_full_line_at_one_percent_loss(baud):
 # --- ABORT behind what is in flight ---------------------------------------------------------------------------------
 
 
-def dark_after_abort_s(baud):
+def off_after_abort_s(baud):
     """Return the maximum time from an abort on a saturated line to gate off, s."""
-    return max(dark_after_abort_at_s(baud, executed) for executed in range(3, 35, 4))
+    return max(off_after_abort_at_s(baud, executed) for executed in range(3, 35, 4))
 
 
-def dark_after_abort_at_s(baud, executed):
+def off_after_abort_at_s(baud, executed):
     config, limits = configured(0.5, baud), replace(DEFAULT_LIMITS, lease_ms=500)
     rig = VirtualRig(1, paced=True, config=config, limits=limits)
     rig.session.connect()
@@ -180,15 +180,15 @@ def abort_bound_s(baud):
 
 
 @pytest.mark.parametrize("baud", LINES)
-def test_an_abort_is_heard_5_ms_after_what_is_in_flight(baud):
-    dark_s = dark_after_abort_s(baud)
+def test_an_abort_takes_effect_5_ms_after_the_data_in_flight(baud):
+    dark_s = off_after_abort_s(baud)
     print(f"{baud} baud: dark {dark_s * 1e3:.1f} ms after an abort, of {abort_bound_s(baud) * 1e3:.1f}")
     assert dark_s <= abort_bound_s(baud)
 
 
-def test_a_host_that_keeps_more_in_flight_is_caught(monkeypatch):
+def test_a_host_that_keeps_more_in_flight_is_detected(monkeypatch):
     monkeypatch.setattr(board_requirements, "MAX_IN_FLIGHT_S", 0.1)
-    assert dark_after_abort_s(115_200) > abort_bound_s(115_200)
+    assert off_after_abort_s(115_200) > abort_bound_s(115_200)
 
 
 # --- a host that stalls ---------------------------------------------------------------------------------------------
@@ -206,7 +206,7 @@ def stalled(for_s, ahead_s):
     return rig, job
 
 
-def test_a_stall_of_a_quarter_second_harms_nothing():
+def test_a_stall_of_a_quarter_second_has_no_effect():
     rig, job = stalled(0.25, ahead_s=0.5)
     assert rig.core.state == "RUNNING"
     assert rig.until(lambda: job.is_finished, 10.0)
@@ -215,7 +215,7 @@ def test_a_stall_of_a_quarter_second_harms_nothing():
     assert rig.check() == 2000
 
 
-def test_a_stall_longer_than_the_queue_is_a_dark_hold_from_which_it_goes_on():
+def test_a_stall_longer_than_the_queue_is_a_hold_that_resumes():
     rig, job = stalled(0.4, ahead_s=0.25)
     assert rig.core.state == "HOLD"
     assert not rig.core.gate
@@ -224,7 +224,7 @@ def test_a_stall_longer_than_the_queue_is_a_dark_hold_from_which_it_goes_on():
     assert rig.check() == 2000
 
 
-def test_a_stall_longer_than_the_lease_is_a_dark_fault_and_nothing_goes_on_by_itself():
+def test_a_stall_longer_than_the_lease_is_a_fault_that_does_not_resume():
     rig, job = stalled(0.7, ahead_s=inf)
     assert (rig.core.state, rig.core.fault) == ("FAULT", "LINK")
     assert not rig.core.gate

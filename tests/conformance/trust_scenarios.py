@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 from bench import BRIGHT, CENTRE, PATIENT, here, wait_for
-from guard_scenarios import LIMIT_NAMES, SCRIPTED_S, dark_by, shine
+from guard_scenarios import LIMIT_NAMES, SCRIPTED_S, is_off_by, run_bright_job
 from scenario import scenario
 
 INPUTS = {"interlock": "false", "key": "false", "estop": "true"}
@@ -24,31 +24,31 @@ def unsafe_input_is_latched_until_cleared(bench, name):
     script = step(SCRIPTED_S, name, unsafe) + step(SCRIPTED_S + 1, name, OPPOSITE[unsafe])
     host = bench.ready(script, **BRIGHT)
     board = host.board
-    shine(host)
+    run_bright_job(host)
     host.wait(lambda: board.of("fault") and board.states()[-1][0] == "FAULT", "the fault")
     (change,), (fault,) = board.of("input"), board.of("fault")
     assert fault["fault"] == name.upper()
     assert 0 <= fault["t_us"] - change["t_us"] <= 1000
     assert board.of("gate")[-1]["t_us"] <= change["t_us"] + 1000
-    assert dark_by(board, board.of("state")[-1])
-    assert host.tell("CLEAR_FAULT") == ["INPUT"], "cleared while the cause is there"
+    assert is_off_by(board, board.of("state")[-1])
+    assert host.send_checked("CLEAR_FAULT") == ["INPUT"], "cleared while the cause is there"
     host.wait(lambda: len(board.of("input")) == 2, "the input's return")
     host.pause(0.05)
     assert host.status().state == "FAULT", "not latched"
-    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
-    assert host.tell("CLEAR_FAULT") == []
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.send_checked("CLEAR_FAULT") == []
     assert board.states()[-1] == ("DISARMED", "fault cleared")
-    assert host.tell("CLEAR_FAULT") == ["STATE"]
+    assert host.send_checked("CLEAR_FAULT") == ["STATE"]
 
 
 @scenario("B9", {name: name for name in INPUTS})
 def unsafe_input_in_disarmed_is_ended_only_by_clear_fault(bench, name):
     host = bench.greeted(step(0.5, name, INPUTS[name]), **PATIENT)
     wait_for(lambda: host.board.of("fault"), "the fault")
-    host.say("ABORT")
+    host.send("ABORT")
     host.hello()
     assert host.order(host.frame("DISARM"), host.frame("CLEAR_FAULT")) == ["INPUT"]
-    assert host.tell("ARM_REQ", host_nonce=1) == ["STATE"]
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["STATE"]
     status = host.status()
     assert (status.state, status.fault) == ("FAULT", name.upper())
     assert status.inputs == {"interlock": 0b010, "key": 0b001, "estop": 0b111}[name]
@@ -61,7 +61,7 @@ def input_unsafe_at_power_up_prevents_arming_without_a_fault(bench):
     board = host.board
     host.wait(lambda: [state for state, _ in board.states()] == ["DISARMED", "FAULT", "DISARMED"], "the reset")
     host.hello()
-    assert host.tell("ARM_REQ", host_nonce=1) == ["INPUT"]
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["INPUT"]
     assert (host.status().state, host.status().inputs) == ("DISARMED", 0b010)
     host.wait(lambda: len(board.of("input")) == 2, "the interlock")
     assert host.arm().status().state == "ARMED"
@@ -104,9 +104,9 @@ def tightened_limits_cannot_be_loosened(bench, case):
     name = next(key for key, value in BEYOND.items() if value is case)
     host = bench.greeted(**OWN)
     for requested in (tightened(**{name: tight}), LOOSER, OWN, {**LOOSER, "full_power_uw": 1}):
-        assert host.tell("LIMITS", **requested) == []
+        assert host.send_checked("LIMITS", **requested) == []
     host.arm()
-    assert host.tell("LIMITS", **LOOSER) == ["STATE"]
+    assert host.send_checked("LIMITS", **LOOSER) == ["STATE"]
     host.play(*points)
     host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
     assert [entry["fault"] for entry in host.board.of("fault")] == [fault]
@@ -116,7 +116,7 @@ def tightened_limits_cannot_be_loosened(bench, case):
 def tightened_settling_and_lease_cannot_be_loosened(bench):
     host = bench.greeted(**OWN)
     for requested in (tightened(settle_us=900, settle_ns_per_code=500, lease_ms=700), LOOSER, OWN):
-        assert host.tell("LIMITS", **requested) == []
+        assert host.send_checked("LIMITS", **requested) == []
     host.arm()
     host.play(here(100, **DIM), here(100, x=CENTRE + 1000, **DIM))
     host.wait(lambda: len(host.board.pulse_numbers()) == 2, "the pulses")
@@ -124,7 +124,7 @@ def tightened_settling_and_lease_cannot_be_loosened(bench):
     assert 0 <= second["on_us"] - first["off_us"] - 1400 <= host.board.late_us
     host.raw(host.frame("LEASE", ms=60_000) + host.frame("CLOCK", host_t=5))
     host.wait(lambda: host.board.of("fault"), "the fault", lease=False)
-    (fault,) = [m for m in host.of("EVENT") if m.state == "FAULT"] or [host.ask() and host.of("EVENT")[-1]]
+    (fault,) = [m for m in host.of("EVENT") if m.state == "FAULT"] or [host.request() and host.of("EVENT")[-1]]
     assert fault.fault == "LINK"
     assert fault.tick <= host.of("CLOCK_REPLY")[-1].tick + 700_000 + host.board.late_us
 
@@ -134,10 +134,10 @@ def next_session_restores_the_own_limits(bench):
     host = bench.host(bench.board(**OWN))
     reply = host.hello()
     assert {name: getattr(reply, name) for name in LIMIT_NAMES} == OWN
-    assert host.tell("LIMITS", **tightened(max_on_us=100, x_max=40_000)) == []
+    assert host.send_checked("LIMITS", **tightened(max_on_us=100, x_max=40_000)) == []
     reply = host.hello()
     assert {name: getattr(reply, name) for name in LIMIT_NAMES} == OWN
-    assert host.tell("LIMITS", **LOOSER) == []
+    assert host.send_checked("LIMITS", **LOOSER) == []
     host.arm()
     host.play(here(20_000, x=62_000, **DIM))
     host.wait(lambda: host.board.states()[-1][1] in ("fault", "job done"), "the end")
@@ -159,13 +159,13 @@ def wrong_confirmation_disarms_and_consumes_the_challenge(bench, wrong):
     host = bench.greeted(**PATIENT)
     challenge = host.challenge()
     host_nonce, board_nonce = wrong(challenge)
-    assert host.tell("ARM_CONFIRM", host_nonce=host_nonce, board_nonce=board_nonce) == ["NONCE"]
+    assert host.send_checked("ARM_CONFIRM", host_nonce=host_nonce, board_nonce=board_nonce) == ["NONCE"]
     assert host.board.states()[-1] == ("DISARMED", "disarm")
     right = dict(host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
-    assert host.tell("ARM_CONFIRM", **right) == ["STATE"]
+    assert host.send_checked("ARM_CONFIRM", **right) == ["STATE"]
     again = host.challenge()
     assert again.board_nonce != challenge.board_nonce
-    assert host.tell("ARM_CONFIRM", **right) == ["NONCE"], "an old challenge"
+    assert host.send_checked("ARM_CONFIRM", **right) == ["NONCE"], "an old challenge"
     host.pause(2.1)
     assert "ARMED" not in [state for state, _ in host.board.states()]
 
@@ -175,8 +175,8 @@ def arming_takes_at_least_two_seconds(bench):
     host = bench.greeted(**PATIENT)
     challenge = host.challenge()
     confirm = dict(host_nonce=challenge.host_nonce, board_nonce=challenge.board_nonce)
-    assert host.tell("ARM_CONFIRM", **confirm) == []
-    assert host.tell("ARM_CONFIRM", **confirm) == ["STATE"]
+    assert host.send_checked("ARM_CONFIRM", **confirm) == []
+    assert host.send_checked("ARM_CONFIRM", **confirm) == ["STATE"]
     host.wait(lambda: host.board.states()[-1][0] == "ARMED", "ARMED")
     requested, armed = host.board.of("state")[-2:]
     assert 0 <= armed["t_us"] - requested["t_us"] - 2_000_000 <= host.board.late_us
@@ -196,12 +196,12 @@ def key_edge_is_required_before_each_arming(bench):
     script = step(2.0, "key", "false") + step(2.3, "key", "true")
     host = bench.greeted(script, key_edge=True, **PATIENT)
     assert host.of("HELLO_REPLY")[-1].capabilities & 1
-    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
     host.wait(lambda: len(host.board.of("input")) == 2, "the key")
-    assert host.tell("CLEAR_FAULT") == []
+    assert host.send_checked("CLEAR_FAULT") == []
     host.arm()
-    assert host.tell("DISARM") == []
-    assert host.tell("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "one turn arms once"
+    assert host.send_checked("DISARM") == []
+    assert host.send_checked("ARM_REQ", host_nonce=1) == ["KEY_EDGE"], "one turn arms once"
 
 
 @scenario("B11")

@@ -37,7 +37,7 @@ class Lockstep:
         self.python._random = self.python.machine._random = PythonEntropy(values)
         self.c = CBoard(library, settings, self.c_log.append, values)
         self.now_us = 0
-        self.heard = []
+        self.received = []
         self.wire = []
         self._decoder = FrameDecoder()
         self.compare()
@@ -53,7 +53,7 @@ class Lockstep:
         assert self.c.bytes_to_send() == answer
         assert self.c_log == self.log
         assert (self.c.state, self.c.fault, self.c.gate) == (self.python.state, self.python.fault, self.python.gate)
-        self.heard += [m.parse_message(frame.type, frame.body) for frame in self._decoder.feed(answer)]
+        self.received += [m.parse_message(frame.type, frame.body) for frame in self._decoder.feed(answer)]
 
     def raw(self, data):
         self.wire.append(data)
@@ -67,7 +67,7 @@ class Lockstep:
             Frame(message.TYPE, seq, link.session if session is None else session, message.encode_body())
         )
 
-    def say(self, *messages):
+    def send(self, *messages):
         for message in messages:
             self.raw(self.frame(message))
 

@@ -67,13 +67,13 @@ def test_the_core_keeps(make, n):
 
 
 @pytest.mark.parametrize("n", CHECKS)
-def test_a_core_without_it_is_caught(libraries, n):
+def test_a_core_without_the_guard_is_detected(libraries, n):
     without = partial(CBench, libraries(n))
     with pytest.raises(AssertionError):
         CHECKS[n](without)
 
 
-# --- how soon it is dark, by the clock at which the HAL is really told ----------------------------------------------
+# --- latency of gate off, by the time of the HAL's call --------------------------------------------------------------
 
 
 def running(make, on_us=40_000, end=True, **limits):
@@ -84,63 +84,63 @@ def running(make, on_us=40_000, end=True, **limits):
     return b
 
 
-def dark_us(b):
+def gate_off_us(b):
     assert not b.core.gate_output
     return b.core.gate_edges[-1][0]
 
 
-def test_an_underrun_is_dark_within_100_us(make):
+def test_an_underrun_turns_the_gate_off_within_100_us(make):
     b = running(make, on_us=12_345, end=False)
     b.wait(20_000)
     assert b.state == "HOLD"
-    assert 0 <= dark_us(b) - (b.core.gate_edges[0][0] + 12_345) <= 100
+    assert 0 <= gate_off_us(b) - (b.core.gate_edges[0][0] + 12_345) <= 100
 
 
 @pytest.mark.parametrize(("name", "unsafe"), [("interlock", False), ("key", False), ("estop", True)])
-def test_an_input_is_dark_within_1_ms(make, name, unsafe):
+def test_an_input_turns_the_gate_off_within_1_ms(make, name, unsafe):
     b = running(make)
     b.core.inputs[name] = unsafe
     bits = sum(1 << k for k, known in enumerate(m.INPUTS) if b.core.inputs[known])
     opened_us = b.now_us
     b.core._library.shim_set_inputs(b.core._handle, bits)  # without a tick: the next one detects it
     b.wait(1000)
-    assert dark_us(b) - opened_us <= 1000
+    assert gate_off_us(b) - opened_us <= 1000
     assert b.fault == name.upper()
 
 
-def test_no_lease_is_dark_within_101_ms(make):
+def test_a_missing_lease_turns_the_gate_off_within_101_ms(make):
     b = make({"max_on_us": 65_535, "lease_ms": 100, "spot_uj": 2**32 - 1}).ready()
     b.play(*[here(60_000, x=1000 + 2000 * k) for k in range(20)])
-    b.say(m.Lease(100))
+    b.send(m.Lease(100))
     last_us = b.now_us
     b.wait(150_000, lease=False)
-    assert 100_000 <= dark_us(b) - last_us <= 101_000
+    assert 100_000 <= gate_off_us(b) - last_us <= 101_000
     assert b.fault == "LINK"
 
 
 @pytest.mark.parametrize("what", ["abort", "link lost"])
-def test_abort_and_a_lost_link_are_dark_at_once(make, what):
+def test_abort_and_a_lost_link_turn_the_gate_off_at_once(make, what):
     b = running(make)
     if what == "abort":
         b.raw(b.frame(m.Abort(), session=0))
     else:
         b.core.on_link_lost(b.now_us)
-    assert dark_us(b) == b.now_us
+    assert gate_off_us(b) == b.now_us
     assert b.state == "DISARMED"
 
 
-DARK_IN_TIME = {
-    1: partial(test_abort_and_a_lost_link_are_dark_at_once, what="abort"),
-    2: test_an_underrun_is_dark_within_100_us,
-    3: test_no_lease_is_dark_within_101_ms,
-    9: partial(test_an_input_is_dark_within_1_ms, name="interlock", unsafe=False),
+OFF_IN_TIME = {
+    1: partial(test_abort_and_a_lost_link_turn_the_gate_off_at_once, what="abort"),
+    2: test_an_underrun_turns_the_gate_off_within_100_us,
+    3: test_a_missing_lease_turns_the_gate_off_within_101_ms,
+    9: partial(test_an_input_turns_the_gate_off_within_1_ms, name="interlock", unsafe=False),
 }
 
 
-@pytest.mark.parametrize("n", DARK_IN_TIME)
-def test_a_core_that_is_not_dark_in_time_is_caught(libraries, n):
+@pytest.mark.parametrize("n", OFF_IN_TIME)
+def test_a_core_that_turns_the_gate_off_late_is_detected(libraries, n):
     with pytest.raises(AssertionError):
-        DARK_IN_TIME[n](partial(CBench, libraries(n)))
+        OFF_IN_TIME[n](partial(CBench, libraries(n)))
 
 
 # --- what ports rely on ---------------------------------------------------------------------------------------------
@@ -152,7 +152,7 @@ def test_indicator_relay_and_mirrors(make):
     assert not b.core.indicator
     challenge = b.challenge()
     assert b.core.indicator
-    b.say(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
+    b.send(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
     b.wait(2_000_000)
     assert (b.core.indicator, b.core.relay) == (True, True)
     b.play(here(1000, x=CENTRE + 700, y=CENTRE - 900))
@@ -170,7 +170,7 @@ def test_an_input_unsafe_at_power_up_does_not_let_arm(make, name, unsafe):
     b.core.set_input(name, unsafe, b.now_us)
     b.core.reset(b.now_us)
     b.hello()
-    assert (b.state, naks(b.say(m.ArmReq(1)))) == ("DISARMED", ["INPUT"])
+    assert (b.state, naks(b.send(m.ArmReq(1)))) == ("DISARMED", ["INPUT"])
     b.core.set_input(name, not unsafe, b.now_us)
     b.arm()
 

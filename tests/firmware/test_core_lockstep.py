@@ -112,11 +112,11 @@ def arm(both, limits=None):
     if both.python._settings.key_edge:
         both.both(lambda board: board.set_input("key", False, both.now_us))
         both.both(lambda board: board.set_input("key", True, both.now_us))
-    both.say(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
-    both.say(m.ArmConfirm(6, core.machine._board_nonce or 0), m.Lease(60_000))
+    both.send(m.Hello(1, 0, 5), m.ClearFault(), *([limits] if limits else []), m.ArmReq(6))
+    both.send(m.ArmConfirm(6, core.machine._board_nonce or 0), m.Lease(60_000))
     for _ in range(30):
         both.wait(70_000)
-        both.say(m.Lease(60_000))
+        both.send(m.Lease(60_000))
 
 
 def damaged(data, how, where):
@@ -166,7 +166,7 @@ def test_both_boards_behave_identically(library, board, episodes, seed):
         for what, detail in steps:
             step(both, what, detail)
     both.wait(1_000_000)
-    both.say(m.Get(), m.GetExecuted(0))
+    both.send(m.Get(), m.GetExecuted(0))
     pulses = sum(entry["event"] == "pulse" for entry in both.log)
     event(f"{min(pulses, 5)} pulses, 5 meaning more")
     for entry in both.log:
@@ -179,26 +179,26 @@ def test_more_records_than_are_kept(library):
     arm(both)
     point = m.POINT.pack(CENTRE, CENTRE, 2, 0, 0)
     for k in range(400):
-        both.say(m.Data(24 * k, point * 24))
+        both.send(m.Data(24 * k, point * 24))
         if k == 0:
-            both.say(m.Start(1, 0, 0, 1))
+            both.send(m.Start(1, 0, 0, 1))
         both.wait(40)
     both.wait(10_000)
     for first in (0, 1000, 24 * 400 - 8192 - 1, 24 * 400 - 8192, 24 * 400 - 8192 + 1, 24 * 400 - 3, 24 * 400):
-        both.say(m.GetExecuted(first))
-    assert both.heard[-1].first_index == 24 * 400 - 3
+        both.send(m.GetExecuted(first))
+    assert both.received[-1].first_index == 24 * 400 - 3
 
 
 def test_a_report_over_more_than_32_bits_of_time_is_two(library):
     both = Lockstep(library, BoardSettings(m.Limits(**{**vars(DEFAULT_LIMITS), **PATIENT})))
     arm(both)
     point = m.POINT.pack(CENTRE, CENTRE, 0, 100, 999)
-    both.say(m.Data(0, point), m.Start(1, 0, 0, 1), m.End(1, 1))
+    both.send(m.Data(0, point), m.Start(1, 0, 0, 1), m.End(1, 1))
     both.wait(1000)
     later_us = both.now_us + (1 << 32)
-    both.say(m.Data(1, point), m.Start(2, 1, later_us, 1), m.End(2, 2), m.Lease(60_000))
+    both.send(m.Data(1, point), m.Start(2, 1, later_us, 1), m.End(2, 2), m.Lease(60_000))
     while both.now_us < later_us + 1000:
         both.wait(59_000_000)
-        both.say(m.Lease(60_000))
-    both.say(m.GetExecuted(0), m.GetExecuted(1))
-    assert [(x.first_index, len(x.records)) for x in both.heard[-2:]] == [(0, 1), (1, 1)]
+        both.send(m.Lease(60_000))
+    both.send(m.GetExecuted(0), m.GetExecuted(1))
+    assert [(x.first_index, len(x.records)) for x in both.received[-2:]] == [(0, 1), (1, 1)]

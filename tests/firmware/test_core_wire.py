@@ -35,13 +35,13 @@ def test_vector_encodes(library, stem):
 def test_vector_is_answered_as_the_python_board_answers(library, stem, portion):
     vector = wire.VECTORS[stem]
     both = Lockstep(library, entropy=[SESSION, 7])
-    both.say(m.Hello(1, 0, 42))
-    both.say(*[m.Disarm()] * vector["seq"])
+    both.send(m.Hello(1, 0, 42))
+    both.send(*[m.Disarm()] * vector["seq"])
     data = bytes.fromhex(vector["wire"])
     for at in range(0, len(data), portion):
         both.raw(data[at : at + portion])
-    both.say(m.Get())
-    status = both.heard[-1]
+    both.send(m.Get())
+    status = both.received[-1]
     assert (status.crc_errors, status.format_errors) == (0, 0)
     assert status.seq_errors == (wire.STATED[vector["message"]]["from"] == "board")
 

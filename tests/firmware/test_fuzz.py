@@ -68,7 +68,7 @@ def test_what_was_found_is_mended(folder, what):
         pytest.param(*("decoder", 102, "out of bounds for type 'uint8_t[253]'"), marks=pytest.mark.slow),
     ],
 )
-def test_a_core_without_a_check_is_found_out(folder, target, mutant, says):
+def test_a_core_without_a_check_is_detected(folder, target, mutant, says):
     fuzzer = start(build(folder, target, mutant), MUTANT_SECONDS)
     reported = fuzzer.communicate()[1]
     assert fuzzer.returncode != 0, "the fuzzer does not notice"

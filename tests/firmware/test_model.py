@@ -25,7 +25,7 @@ def explored(folder, mutant):
     return int(re.search(r"errors: (\d+)", reported)[1]), int(re.search(r"(\d+) states, stored", reported)[1]), reported
 
 
-def test_nothing_forbidden_happens_in_any_order(tmp_path):
+def test_no_interleaving_violates_a_rule(tmp_path):
     errors, states, reported = explored(tmp_path, 0)
     assert errors == 0, reported
     assert states > 3_000_000
@@ -35,7 +35,7 @@ def test_nothing_forbidden_happens_in_any_order(tmp_path):
     "mutant",
     [mutant if k % 2 == 0 else pytest.param(mutant, marks=pytest.mark.slow) for k, mutant in enumerate(MUTANTS)],
 )
-def test_a_rule_taken_away_is_missed(tmp_path, mutant):
+def test_a_removed_rule_is_detected(tmp_path, mutant):
     errors, _, reported = explored(tmp_path, mutant)
     assert errors == 1
     assert "assertion violated" in reported

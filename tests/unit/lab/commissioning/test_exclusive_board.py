@@ -59,7 +59,7 @@ def test_a_spot_is_one_pulse_with_mirrors_at_rest(rig):
     assert rig.core.state == "DISARMED"
 
 
-def test_going_somewhere_is_dark(rig):
+def test_a_move_keeps_the_gate_off(rig):
     with rig.armed() as held:
         for sign in (1, -1, 1):
             held.move_to(CENTRE_CODE + sign * 15_000, CENTRE_CODE)
@@ -130,7 +130,7 @@ def test_widths_and_waits_are_whole_and_long_enough(any_display):
 
 
 @pytest.mark.parametrize(("name", "value"), [("interlock", False), ("key", False), ("estop", True)])
-def test_an_input_that_opens_is_named_and_dark(rig, name, value):
+def test_an_unsafe_input_is_named_and_turns_the_gate_off(rig, name, value):
     with rig.armed() as held:
         held.fire_spot(*CENTRE, 5e-3)
         rig.core.set_input(name, value, held_us(rig))
@@ -140,7 +140,7 @@ def test_an_input_that_opens_is_named_and_dark(rig, name, value):
     assert not rig.core.gate
 
 
-def test_whoever_leaves_disarms(rig):
+def test_leaving_the_context_disarms(rig):
     def leave():
         with rig.armed():
             assert rig.core.state == "ARMED"
@@ -152,7 +152,7 @@ def test_whoever_leaves_disarms(rig):
     assert rig.of("state")[-1]["reason"] == "abort"
 
 
-def test_nothing_shines_unarmed(rig):
+def test_an_unarmed_board_emits_nothing(rig):
     rig.held.connect()
     with rig.held as held, pytest.raises(NotReadyError, match="not armed"):
         held.fire_spot(*CENTRE, 5e-3)

@@ -43,7 +43,7 @@ class Bench:
         session = self.session if session is None else session
         return encode_frame(Frame(message.TYPE, seq, session, message.encode_body()))
 
-    def say(self, *messages):
+    def send(self, *messages):
         """Pass messages in one batch and return the answers."""
         return self.raw(b"".join([self.frame(message) for message in messages]))
 
@@ -57,7 +57,7 @@ class Bench:
             self.core.advance(self.now_us)
             answers += self.take()
             if lease:
-                answers += self.say(m.Lease(100))
+                answers += self.send(m.Lease(100))
         return answers
 
     # --- session, arming, jobs ---
@@ -65,16 +65,16 @@ class Bench:
     def hello(self, nonce=42, major=m.MAJOR):
         """Begin a session and return the board's reply."""
         self.seq = self.index = 0
-        (reply,) = [x for x in self.say(m.Hello(major, 0, nonce)) if isinstance(x, m.HelloReply)]
+        (reply,) = [x for x in self.send(m.Hello(major, 0, nonce)) if isinstance(x, m.HelloReply)]
         self.session = reply.session
         return reply
 
     def challenge(self):
-        return next(x for x in self.say(m.ArmReq(99)) if isinstance(x, m.ArmChallenge))
+        return next(x for x in self.send(m.ArmReq(99)) if isinstance(x, m.ArmChallenge))
 
     def arm(self):
         challenge = self.challenge()
-        self.say(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
+        self.send(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))
         self.wait(2_000_000)
         assert self.state == "ARMED", self.state
         return self
@@ -92,7 +92,7 @@ class Bench:
         """Send points, an immediate START, and END."""
         first = self.index
         pieces = [self.data(*points[at : at + m.POINTS_MAX]) for at in range(0, len(points), m.POINTS_MAX)]
-        return self.say(*pieces, m.Start(1, first, 0, 1), *([m.End(1, self.index)] if end else []))
+        return self.send(*pieces, m.Start(1, first, 0, 1), *([m.End(1, self.index)] if end else []))
 
     # --- observations ---
 
@@ -143,7 +143,7 @@ class Bench:
         return [counted.crc_errors, counted.format_errors]
 
     def status(self):
-        (status,) = [x for x in self.say(m.Get()) if isinstance(x, m.Status)]
+        (status,) = [x for x in self.send(m.Get()) if isinstance(x, m.Status)]
         return status
 
 

@@ -28,9 +28,9 @@ OTHER_CELL = CENTRE + 2000
 
 def check_b1(make):
     ends = {
-        "flush": lambda b: b.say(m.Flush()),
-        "disarm": lambda b: b.say(m.Disarm()),
-        "abort": lambda b: b.say(m.Abort()),
+        "flush": lambda b: b.send(m.Flush()),
+        "disarm": lambda b: b.send(m.Disarm()),
+        "abort": lambda b: b.send(m.Abort()),
         "hello": lambda b: b.hello(),
         "input": lambda b: b.core.set_input("interlock", False, b.now_us),
         "link lost": lambda b: b.core.on_link_lost(b.now_us),
@@ -96,7 +96,7 @@ def check_b3(make):
             b.play(*[here(20_000, x=CENTRE + 2000 * k) for k in range(10 if state == "RUNNING" else 1)], end=False)
             b.wait(21_000)
         assert b.state == state
-        b.say(m.Lease(100))
+        b.send(m.Lease(100))
         last_us = b.now_us
         useless = [
             b.frame(m.Lease(100), session=b.session ^ 1),
@@ -112,10 +112,10 @@ def check_b3(make):
         assert (b.state, b.fault) == ("FAULT", "LINK"), state
         assert b.of("fault")[-1]["t_us"] == last_us + 100_000
         assert not b.core.gate
-        b.say(m.Lease(100))
+        b.send(m.Lease(100))
         assert b.state == "FAULT"
     b = make().ready()
-    b.say(m.Lease(60_000))
+    b.send(m.Lease(60_000))
     b.wait(101_000, lease=False)
     assert b.fault == "LINK", "a host's lease may not be longer than the board's"
 
@@ -210,7 +210,7 @@ def sweep(count, on_us=20_000, **point):
 
 def check_b5(make):
     b = make({"max_duty": 40_000}).ready()
-    assert naks(b.say(b.data(here(1000, duty=40_001)))) == ["STATE"]
+    assert naks(b.send(b.data(here(1000, duty=40_001)))) == ["STATE"]
     assert (b.fault, b.edges) == ("DUTY", [])
 
     b = make({"mean_duty": 6553, "settle_us": 0, "settle_ns_per_code": 0}).ready()
@@ -311,12 +311,12 @@ def check_b7(make):
     b = make().ready()
     b.play(here(100, x=CENTRE + 20_000))  # 1200 µs away
     b.wait(50)
-    b.say(m.Flush())
+    b.send(m.Flush())
     b.play(here(100, x=CENTRE + 20_000))
     assert first_light_after_us(b) == 1150, "a move that was broken off is still under way"
 
     b = make().ready()
-    b.say(m.Disarm(), m.Limits(**{**vars(b.limits), "settle_us": 3000}))
+    b.send(m.Disarm(), m.Limits(**{**vars(b.limits), "settle_us": 3000}))
     b.arm()
     b.play(here(100, x=CENTRE + 1))
     assert first_light_after_us(b) == 3001
@@ -378,17 +378,17 @@ def check_b9(make):
         assert not b.core.gate
         assert b.edges[-1][0] <= opened_us + 1000
         assert (b.state, b.fault) == ("FAULT", name.upper())
-        assert naks(b.say(m.ClearFault())) == ["INPUT"], "cleared while the cause is there"
+        assert naks(b.send(m.ClearFault())) == ["INPUT"], "cleared while the cause is there"
         b.core.set_input(name, not unsafe, b.now_us)
         b.wait(50_000)
         assert b.state == "FAULT", "not latched"
-        assert naks(b.say(m.ArmReq(1))) == ["STATE"]
-        assert naks(b.say(m.ClearFault())) == []
+        assert naks(b.send(m.ArmReq(1))) == ["STATE"]
+        assert naks(b.send(m.ClearFault())) == []
         assert (b.state, b.fault) == ("DISARMED", "")
         b.core.set_input(name, unsafe, b.now_us)
-        b.say(m.ClearFault())
+        b.send(m.ClearFault())
         b.hello()
-        assert naks(b.say(m.ArmReq(1))) == ["STATE"]
+        assert naks(b.send(m.ArmReq(1))) == ["STATE"]
 
 
 def b9_inputs_are_only_reported(patch):
@@ -430,14 +430,14 @@ def check_b10(make):
     b = make(OWN)
     assert b.hello().limits == own
     for requested, power in ((looser, 9), (own, 1)):
-        assert naks(b.say(m.Limits(**{**vars(requested), "full_power_uw": power}))) == []
+        assert naks(b.send(m.Limits(**{**vars(requested), "full_power_uw": power}))) == []
         assert b.limits == own
     for requested in (tighter, looser, own):
-        b.say(requested)
+        b.send(requested)
         assert vars(b.limits) == {**vars(tighter), "full_power_uw": OWN["full_power_uw"]}
     b.arm()
-    assert naks(b.say(looser)) == ["STATE"]
-    b.say(b.data(here(OWN["max_on_us"] // 2 + 1, x=10_000, y=10_000)))
+    assert naks(b.send(looser)) == ["STATE"]
+    b.send(b.data(here(OWN["max_on_us"] // 2 + 1, x=10_000, y=10_000)))
     assert b.fault == "ON_TIME"
     assert b.hello().limits == own, "a new session begins with the board's own"
     assert b.limits == own
@@ -464,15 +464,15 @@ def check_b11(make):
         b = make()
         b.hello()
         challenge = b.challenge()
-        assert naks(b.say(m.ArmConfirm(*wrong(challenge)))) == ["NONCE"]
-        assert naks(b.say(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))) == ["STATE"], "used twice"
+        assert naks(b.send(m.ArmConfirm(*wrong(challenge)))) == ["NONCE"]
+        assert naks(b.send(m.ArmConfirm(challenge.host_nonce, challenge.board_nonce))) == ["STATE"], "used twice"
         b.wait(2_100_000)
         assert "ARMED" not in states_of(b)
 
     b = make().ready()
     b.play(here(1000))
     b.wait(10_000)
-    b.say(m.Disarm())
+    b.send(m.Disarm())
     recorded = list(b.host_bytes)
     for again in ("as it is", "after a reset"):
         b.log.clear()
@@ -487,11 +487,11 @@ def check_b11(make):
 
     b = make(key_edge=True)
     b.hello()
-    assert naks(b.say(m.ArmReq(1))) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
+    assert naks(b.send(m.ArmReq(1))) == ["KEY_EDGE"], "a key that was on at power-up was not turned"
     turn_key(b)
     b.arm()
-    b.say(m.Disarm())
-    assert naks(b.say(m.ArmReq(1))) == ["KEY_EDGE"], "one turn arms once"
+    b.send(m.Disarm())
+    assert naks(b.send(m.ArmReq(1))) == ["KEY_EDGE"], "one turn arms once"
     turn_key(b)
     b.arm()
 
@@ -499,7 +499,7 @@ def check_b11(make):
 def turn_key(b):
     for value in (False, True):
         b.core.set_input("key", value, b.now_us)
-    b.say(m.ClearFault())
+    b.send(m.ClearFault())
 
 
 def b11_any_confirmation(patch):
@@ -547,20 +547,20 @@ def check_b12(make):
     assert naks(b.raw(first)) == []
     assert naks(b.raw(first + first)) == [], "duplicates are acknowledged, no more"
     assert naks(b.raw(b.frame(second, seq=b.seq + 1))) == ["SEQUENCE"], "one is missing before it"
-    b.say(m.Start(1, 0, 0, 1))
+    b.send(m.Start(1, 0, 0, 1))
     b.wait(1000)
     assert naks(b.raw(first)) == []
-    assert naks(b.say(m.Data(0, second.points))) == ["INDEX"], "old indices under a new seq"
-    assert naks(b.say(m.Data(2, second.points))) == ["INDEX"]
-    assert naks(b.say(m.Data(5, second.points))) == ["INDEX"], "a gap"
-    assert naks(b.say(second)) == []
-    assert naks(b.say(second)) == ["INDEX"]
-    b.say(m.End(1, 8))
+    assert naks(b.send(m.Data(0, second.points))) == ["INDEX"], "old indices under a new seq"
+    assert naks(b.send(m.Data(2, second.points))) == ["INDEX"]
+    assert naks(b.send(m.Data(5, second.points))) == ["INDEX"], "a gap"
+    assert naks(b.send(second)) == []
+    assert naks(b.send(second)) == ["INDEX"]
+    b.send(m.End(1, 8))
     b.wait(50_000)
     assert [index for index, _, _ in b.pulses] == list(range(8))
     assert all(off <= on for (_, _, off), (_, on, _) in pairwise(b.pulses))
-    assert naks(b.say(m.Data(0, second.points))) == ["INDEX"], "nor when the job is over"
-    assert naks(b.say(m.Data(0xFFFF_FFFF, second.points))) == ["INDEX"], "indices do not wrap"
+    assert naks(b.send(m.Data(0, second.points))) == ["INDEX"], "nor when the job is over"
+    assert naks(b.send(m.Data(0xFFFF_FFFF, second.points))) == ["INDEX"], "indices do not wrap"
     assert b.state == "ARMED"
 
 
@@ -653,7 +653,7 @@ def test_holds(name):
 
 
 @pytest.mark.parametrize("name", MUTANTS)
-def test_mutant_is_caught(name, monkeypatch):
+def test_mutant_is_detected(name, monkeypatch):
     MUTANTS[name](monkeypatch)
     with pytest.raises(AssertionError):
         CHECKS[f"check_{name.partition('_')[0]}"](Bench)

@@ -20,7 +20,7 @@ def build_sensor(noise_m=10e-6, outlier_share=0.0, outputs=True):
     return SimulatedSpotSensor(CONFIG, TRUTH, mirrors, noise_m, outlier_share, outputs, seed=2), mirrors
 
 
-def shine(sensor, at_us=SETTLED_US, energy_j=1e-4):
+def emit_pulse(sensor, at_us=SETTLED_US, energy_j=1e-4):
     sensor.record_pulse(at_us, at_us + 20_000, energy_j)
     return sensor.answer("spot", at_us + 20_000)
 
@@ -33,17 +33,17 @@ def numbers(line):
 
 def test_it_sees_where_the_truth_says_with_its_noise():
     sensor, _ = build_sensor()
-    lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k)) for k in range(400)])
+    lines = np.array([numbers(emit_pulse(sensor, SETTLED_US + 30_000 * k)) for k in range(400)])
     landed_um = 1e6 * np.array(TRUTH.position_m(*CODES))
     assert lines[:, :2].mean(axis=0) == pytest.approx(landed_um, abs=2.0)
     assert lines[:, :2].std(axis=0) == pytest.approx([10.0, 10.0], rel=0.15)
     assert np.all(lines[:, 2] == 10.0)
 
 
-def test_nothing_in_the_dark_and_nothing_twice():
+def test_no_spot_without_light_and_none_twice():
     sensor, _ = build_sensor(outlier_share=1.0)
     assert sensor.answer("spot", 0) == "spot none"
-    assert shine(sensor) != "spot none"
+    assert emit_pulse(sensor) != "spot none"
     assert sensor.answer("spot", SETTLED_US + 20_001) == "spot none"
     sensor.record_pulse(SETTLED_US, SETTLED_US + 1000, 1e-4)
     assert sensor.answer("spot", SETTLED_US + 1000 + PULSE_MEMORY_US + 1) == "spot none"
@@ -51,17 +51,17 @@ def test_nothing_in_the_dark_and_nothing_twice():
 
 def test_too_little_light_a_cover_and_a_spot_outside_are_none():
     sensor, mirrors = build_sensor()
-    assert shine(sensor, energy_j=1e-6) == "spot none"
+    assert emit_pulse(sensor, energy_j=1e-6) == "spot none"
     mirrors.move_to(65535, CENTRE_CODE, SETTLED_US)
-    assert shine(sensor, 2 * SETTLED_US) == "spot none"
+    assert emit_pulse(sensor, 2 * SETTLED_US) == "spot none"
     mirrors.move_to(*CODES, 3 * SETTLED_US)
     sensor.blind = True
-    assert shine(sensor, 4 * SETTLED_US) == "spot none"
+    assert emit_pulse(sensor, 4 * SETTLED_US) == "spot none"
 
 
 def test_false_detections_lie_anywhere_and_are_as_many_as_asked():
     sensor, _ = build_sensor(outlier_share=0.2)
-    lines = np.array([numbers(shine(sensor, SETTLED_US + 30_000 * k))[:2] for k in range(1000)])
+    lines = np.array([numbers(emit_pulse(sensor, SETTLED_US + 30_000 * k))[:2] for k in range(1000)])
     away = np.hypot(*(lines - 1e6 * np.array(TRUTH.position_m(*CODES))).T) > 100.0
     assert away.mean() == pytest.approx(0.2, abs=0.04)
     half_um = 1e6 * (36e-3 + FIELD_MARGIN_M)
