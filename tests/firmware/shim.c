@@ -84,8 +84,9 @@ struct shim *shim_new(const uint8_t *limits, const uint8_t *uid, uint32_t cell_c
                       uint32_t key_edge) {
     struct shim *s = calloc(1, sizeof *s);
     s->inputs = INPUT_INTERLOCK | INPUT_KEY;
-    s->hal = (struct board_hal){s,           set_gate,     read_gate,              move_mirrors, read_inputs,    set_indicator, set_relay,
-                                read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog, trace};
+    s->hal = (struct board_hal){s,         set_gate,     read_gate,           move_mirrors, read_inputs,    set_indicator,
+                                set_relay, read_entropy, read_temperature_dc, send,         discard_output, feed_watchdog,
+                                trace};
     limits_decode(&s->config.limits, limits);
     memcpy(s->config.uid, uid, sizeof s->config.uid);
     s->config.firmware = 0x00010000u;

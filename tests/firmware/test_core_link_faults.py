@@ -13,7 +13,7 @@ import test_link_faults_virtual as python_board
 from test_link_faults_virtual import *  # noqa: F403
 from virtual_rig import VirtualRig
 
-# Of the fire or of the host alone; and mutants of the Python board, in whose place a core without a guard stands below.
+# Tests of the fault injection or of the host alone, and mutants of the simulated board, replaced below.
 del test_a_board_that_violates_a_guard_is_detected  # noqa: F821
 del test_equal_seeds_give_equal_faults  # noqa: F821
 del test_goodput_of_a_full_line_at_one_percent_loss  # noqa: F821
@@ -37,4 +37,4 @@ def _c_core_in_every_rig(monkeypatch, library):
 def test_a_core_without_a_guard_is_detected(libraries, guard):
     rig = VirtualRig(5, 0.15, extra=0.6, pauses=0.001, make_core=partial(SeededCBoard, libraries(guard)))
     with pytest.raises(AssertionError):
-        python_board.storm(rig)
+        python_board.run_fault_sessions(rig)

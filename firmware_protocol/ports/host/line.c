@@ -57,7 +57,7 @@ static size_t available_bytes(struct line_rate *line_rate, uint64_t now_us) {
 }
 
 /* An idle line does not accumulate credit beyond a burst. */
-static void cap_credit(struct line_rate *line_rate) { line_rate->tokens = line_rate->tokens > BURST_BYTES ? BURST_BYTES : line_rate->tokens; }
+static void cap_credit(struct line_rate *rate) { rate->tokens = rate->tokens > BURST_BYTES ? BURST_BYTES : rate->tokens; }
 
 bool line_can_read(struct line *line, uint64_t now_us) { return available_bytes(&line->in, now_us) > 0; }
 

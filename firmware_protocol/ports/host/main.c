@@ -107,13 +107,14 @@ int main(int argc, char **argv) {
     signal(SIGXFSZ, SIG_IGN); /* a full disk is reported as a write error of the log */
     port->line.path = options.pty;
     port->line.in.bytes_per_s = port->line.out.bytes_per_s = options.baud / BITS_PER_BYTE;
-    port->exit_when_closed_us = options.exit_when_closed_s < 0 ? UINT64_MAX : (uint64_t)(options.exit_when_closed_s * 1e6);
+    port->exit_when_closed_us =
+        options.exit_when_closed_s < 0 ? UINT64_MAX : (uint64_t)(options.exit_when_closed_s * 1e6);
     if (!line_open(&port->line)) {
         fprintf(stderr, PROGRAM ": no pty: %s\n", strerror(errno));
         return 1;
     }
     struct sched_param first = {.sched_priority = 1};
-    (void)sched_setscheduler(0, SCHED_RR, &first); /* real-time priority, if permitted: a chip does not wait for other programs */
+    (void)sched_setscheduler(0, SCHED_RR, &first); /* if permitted: a chip does not wait for other programs */
     port_run(port);
     if (port->log.failed) {
         fprintf(stderr, PROGRAM ": the log cannot be written (%s); the board stops with the gate off\n",

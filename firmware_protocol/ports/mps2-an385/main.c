@@ -145,7 +145,8 @@ static void configure(void) {
     config.key_edge = bytes[24] != 0;
     inputs = bytes[25];
     const uint8_t *at = bytes + 26;
-#define DECODE(name, bits, offset, way) config.limits.name = (uint##bits##_t)(bits == 16 ? get_u16(at + (offset)) : get_u32(at + (offset)));
+#define DECODE(name, bits, offset, way) \
+    config.limits.name = (uint##bits##_t)(bits == 16 ? get_u16(at + (offset)) : get_u32(at + (offset)));
     LIMITS_FIELDS(DECODE)
 #undef DECODE
 }

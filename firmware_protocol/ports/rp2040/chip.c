@@ -204,7 +204,8 @@ static uint64_t entropy_pool;
 
 /* Adds one bit of the ring oscillator's jitter and its sampling time. The multiplier is Knuth's 64-bit constant. */
 void chip_collect_entropy(void) {
-    entropy_pool = (entropy_pool ^ (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1) * 6364136223846793005u + 1u;
+    uint64_t sample = (REGISTER(ROSC_RANDOM_BIT) & 1u) ^ (uint64_t)REGISTER(TIMER_RAW_LOW) << 1;
+    entropy_pool = (entropy_pool ^ sample) * 6364136223846793005u + 1u;
 }
 
 uint32_t chip_entropy(void) {
@@ -222,7 +223,8 @@ int16_t chip_temperature_dc(void) {
 /* --- startup --- */
 
 void chip_start(void) {
-    static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 | RESET_TIMER | RESET_UART0;
+    static const uint32_t USED_BLOCKS = RESET_ADC | RESET_IO_BANK0 | RESET_PADS_BANK0 | RESET_PWM | RESET_SPI0 |
+                                        RESET_TIMER | RESET_UART0;
     CLEAR(WATCHDOG_CTRL) = BIT(30); /* it may still run */
     start_clocks();
     SET(RESETS) = USED_BLOCKS; /* including the pins, which pull-downs then hold */

@@ -198,7 +198,8 @@ static void check_report(const struct oracle *o, const struct parsed *frame) {
         }
         const struct observed_pulse *pulse = pulse_of(o, u32(frame->body) + (uint32_t)k, duty);
         require(pulse && pulse->to_us, "EXECUTED", "a pulse that never was");
-        uint64_t seen_us = pulse->to_us - pulse->from_us, apart_us = seen_us > on_ticks ? seen_us - on_ticks : on_ticks - seen_us;
+        uint64_t seen_us = pulse->to_us - pulse->from_us;
+        uint64_t apart_us = seen_us > on_ticks ? seen_us - on_ticks : on_ticks - seen_us;
         require(apart_us <= o->late_us || on_ticks == UINT16_MAX, "EXECUTED", "another duration than was seen");
     }
 }
@@ -317,7 +318,7 @@ static void on_state_change(struct oracle *o, uint8_t state) {
     if (o->state == STATE_ARMING && (is_leased(state) && state != STATE_ARMING)) {
         require(o->confirmed && o->now_us >= armed_us, "B11", "armed too soon, or without a confirmation");
     }
-    require(is_leased(o->state) || !is_leased(state) || state == STATE_ARMING, "B11", "armed without having been requested");
+    require(is_leased(o->state) || !is_leased(state) || state == STATE_ARMING, "B11", "armed without a request");
     require(o->state != STATE_FAULT || o->cleared, "fault", "left without being cleared");
     if (ends) {
         forget_points(o);
@@ -348,7 +349,7 @@ void oracle_check(struct oracle *o, const struct board *b) {
     require(!o->gate_on || o->state == STATE_RUNNING, "B1", "lit outside RUNNING");
     require(o->relay == (o->state != STATE_FAULT), "fault", "the relay is not as the state says");
     require(o->indicator == is_leased(o->state), "arming", "the indicator is not as the state says");
-    require(!is_leased(o->state) || o->now_us < o->lease_until_us + TICK_MAX_US + slack_us(o), "B3", "goes on without a lease");
+    require(!is_leased(o->state) || o->now_us < o->lease_until_us + TICK_MAX_US + slack_us(o), "B3", "no lease");
     require(!is_leased(o->state) || o->inputs == SAFE || o->now_us <= o->unsafe_since_us + 1000 + slack_us(o), "B9",
          "goes on though an input is not safe");
     require(o->state != STATE_HOLD || o->now_us <= o->state_since_us + HOLD_MAX_US + TICK_MAX_US + slack_us(o), "HOLD",
