@@ -1,6 +1,7 @@
 // Arming in two steps: one button requests it, another confirms it within five seconds. The page never arms by itself.
 
 import { call } from "./api.js";
+import { ARMED_STATES, BoardState } from "./board_states.js";
 
 const CONFIRM_S = 5;
 
@@ -23,14 +24,14 @@ export class ArmControl {
   show(state) {
     if (state !== this.state) {
       this.state = state;
-      this.button.disabled = state !== "DISARMED";
+      this.button.disabled = state !== BoardState.DISARMED;
       this.status.textContent =
-        state === "ARMING"
+        state === BoardState.ARMING
           ? "The indicator is on; the laser can emit after two seconds."
-          : ["ARMED", "RUNNING", "HOLD"].includes(state)
+          : ARMED_STATES.includes(state)
             ? "ARMED: the laser emits when a plan plays."
             : this.idleText;
-      if (state !== "DISARMED") {
+      if (state !== BoardState.DISARMED) {
         this.#closeConfirmation();
       }
     }
@@ -71,6 +72,6 @@ export class ArmControl {
     this.#closeConfirmation();
     this.button.disabled = true;
     await call("POST", "/v1/arm").catch(this.onError);
-    this.button.disabled = this.state !== "DISARMED";
+    this.button.disabled = this.state !== BoardState.DISARMED;
   }
 }

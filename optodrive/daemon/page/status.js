@@ -1,7 +1,8 @@
 // State of the board and the link, and what to do about a fault.
 
-const STATE_KINDS = { DISARMED: "none", ARMING: "warn", ARMED: "warn", RUNNING: "warn", HOLD: "warn", FAULT: "bad", BOOT: "none" };
-const STATE_LABELS = { HOLD: "HOLD, waiting for points" };
+import { BoardState, LEASED_STATES } from "./board_states.js";
+
+const STATE_LABELS = { [BoardState.HOLD]: "HOLD, waiting for points" };
 
 export class Status {
   constructor(find, announce, acknowledge) {
@@ -19,9 +20,9 @@ export class Status {
     const { board, link, totals } = state;
     const linked = link.state === "up";
     const label = linked ? `board: ${STATE_LABELS[board.state] ?? board.state}` : "board: no link";
-    setPill(this.boardPill, label, linked ? STATE_KINDS[board.state] ?? "none" : "bad");
+    setPill(this.boardPill, label, linked ? selectKind(board.state) : "bad");
     const current = linked ? board.state : "no link to the board";
-    if (this.announcedState && current !== this.announcedState && !["RUNNING", "HOLD"].includes(current)) {
+    if (this.announcedState && current !== this.announcedState && ![BoardState.RUNNING, BoardState.HOLD].includes(current)) {
       this.announce(`Board: ${current}`);
     }
     this.announcedState = current;
@@ -78,6 +79,13 @@ export class Status {
       this.alert.hidden = items.length === 0;
     }
   }
+}
+
+function selectKind(state) {
+  if (state === BoardState.FAULT) {
+    return "bad";
+  }
+  return LEASED_STATES.includes(state) ? "warn" : "none";
 }
 
 function setPill(item, text, kind) {

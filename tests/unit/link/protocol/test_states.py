@@ -13,6 +13,8 @@ from optodrive.link.protocol.states import TRANSITIONS, BoardState, EventReason,
 CONTRACT = Path(__file__).parents[4] / "firmware_protocol"
 TABLE = tomllib.loads((CONTRACT / "messages.toml").read_text())
 PAGE = (CONTRACT / "PROTOCOL.md").read_text()
+ROOT = CONTRACT.parent
+STATEMENTS = [ROOT / "optodrive/link/protocol/states.py", ROOT / "optodrive/daemon/page/board_states.js"]
 STATED = {(state, event): to for state, events in TRANSITIONS.items() for event, to in events.items()}
 
 
@@ -74,6 +76,12 @@ def test_only_the_arming_sequence_leads_to_armed_states():
 
 def test_a_fault_is_left_only_by_clearing_it():
     assert TRANSITIONS[BoardState.FAULT] == {EventReason.FAULT_CLEARED: BoardState.DISARMED}
+
+
+def test_no_module_states_the_states_again():
+    files = [*ROOT.glob("optodrive/**/*.py"), *ROOT.glob("optodrive/daemon/page/*.js")]
+    literal = re.compile(rf"""["']({"|".join(BoardState)})["']""")
+    assert [str(file) for file in files if file not in STATEMENTS and literal.search(file.read_text())] == []
 
 
 def test_an_event_that_the_state_does_not_know_is_an_error():
