@@ -1,0 +1,99 @@
+"""The folder of a running daemon's sockets, which only its user can open, and where commands find it."""
+
+import os
+import shutil
+import tempfile
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from optodrive.core.errors import InputError
+
+SOCKET_PATH_MAX_BYTES = 100
+"""Longest path of a socket; the kernel allows 107."""
+PREFIX = "optodrive-"
+"""Start of the name of a folder in the folder for temporary files."""
+LINK_MODE, SHARED_LINK_MODE = 0o600, 0o660
+
+
+@dataclass(frozen=True)
+class RuntimeFolder:
+    """The sockets of the daemon's processes.
+
+    path: the folder, of mode 0700; link_socket: beside the configured Unix socket if there is one, so that its group
+    reaches it
+    """
+
+    path: Path
+    link_socket: Path
+    link_socket_mode: int
+    known_as: Path
+
+    @property
+    def planner_socket(self) -> Path:
+        """Socket of the planner process."""
+        return self.path / "planner.sock"
+
+    @property
+    def preview_socket(self) -> Path:
+        """Socket of the preview process."""
+        return self.path / "preview.sock"
+
+    @property
+    def link_settings(self) -> Path:
+        """File of the link process's settings."""
+        return self.path / "link.json"
+
+    def remove(self) -> None:
+        """Remove the folder and the link socket."""
+        for path in {self.link_socket, self.known_as} - {self.path}:
+            with suppress(OSError):
+                path.unlink()
+        shutil.rmtree(self.path, ignore_errors=True)
+
+
+def find_link_socket(port: int | None, unix: Path | None) -> Path:
+    """Return the socket of the link process of a daemon, by its TCP port or its Unix socket."""
+    if unix is not None:
+        return unix.with_name(f"{unix.stem}-link.sock")
+    return Path(os.path.realpath(_build_known_path(port or 0))) / "link.sock"
+
+
+def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
+    """Create the runtime folder of the daemon on a TCP port, in place of one that a killed daemon left.
+
+    unix: the configured Unix socket. InputError if the folder cannot be created.
+    """
+    known_as = _build_known_path(port)
+    if unix is not None and len(os.fsencode(find_link_socket(None, unix))) > SOCKET_PATH_MAX_BYTES:
+        raise InputError("daemon.socket", str(unix), "a shorter path, because the link's socket lies beside it")
+    try:
+        known_as.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        _remove_left_behind(known_as)
+        if len(os.fsencode(known_as / "preview.sock")) <= SOCKET_PATH_MAX_BYTES:
+            known_as.mkdir(mode=0o700)
+            path = known_as
+        else:  # a socket does not fit there
+            path = Path(tempfile.mkdtemp(prefix=PREFIX))
+            known_as.symlink_to(path)
+    except OSError as error:
+        raise InputError(str(known_as), error.strerror, "a folder that can be created") from None
+    if unix is None:
+        return RuntimeFolder(path, path / "link.sock", LINK_MODE, known_as)
+    return RuntimeFolder(path, find_link_socket(None, unix), SHARED_LINK_MODE, known_as)
+
+
+def _build_known_path(port: int) -> Path:
+    runtime = os.environ.get("XDG_RUNTIME_DIR") or Path.home() / ".cache"
+    return Path(runtime) / "optodrive" / f"daemon-{port}"
+
+
+def _remove_left_behind(known_as: Path) -> None:
+    """Remove the folder of a killed daemon. The caller holds its TCP port, so no other daemon uses it."""
+    if known_as.is_symlink():
+        target = known_as.readlink()
+        if target.name.startswith(PREFIX):
+            shutil.rmtree(target, ignore_errors=True)
+        known_as.unlink()
+    elif known_as.exists():
+        shutil.rmtree(known_as)
