@@ -6,12 +6,14 @@ from pydantic import ValidationError
 
 from optodrive.core.errors import (
     BoardFaultError,
+    BusyError,
     InputError,
     LinkError,
     NotReadyError,
     OptodriveError,
     OverBudgetError,
     RefusedError,
+    StoppedError,
 )
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.web.tokens import ENVIRONMENT_VARIABLE
@@ -19,6 +21,8 @@ from optodrive.daemon.web.tokens import ENVIRONMENT_VARIABLE
 INPUT_ERROR_STATUSES = (400, 404, 413, 422)
 ERROR_BY_CODE: dict[str, type[OptodriveError]] = {
     "not_ready": NotReadyError,
+    "stopped": StoppedError,
+    "busy": BusyError,
     "board_fault": BoardFaultError,
     "link": LinkError,
 }

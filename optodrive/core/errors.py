@@ -58,6 +58,18 @@ class NotReadyError(OptodriveError):
     code = "not_ready"
 
 
+class StoppedError(NotReadyError):
+    """The request came before a STOP or a disarm and was not executed before it."""
+
+    code = "stopped"
+
+
+class BusyError(NotReadyError):
+    """Too many requests wait; the same request may succeed later."""
+
+    code = "busy"
+
+
 class LinkError(OptodriveError):
     """The link to the board failed; the message states the likely cause."""
 

@@ -1,8 +1,11 @@
 """The base of every JSON object that the daemon or the command line writes."""
 
+import json
+from collections.abc import Iterator
 from typing import Annotated
 
 from pydantic import BaseModel, ConfigDict, SkipValidation
+from pydantic_core import to_json
 
 FloatColumn = Annotated[list[float], SkipValidation]
 IntColumn = Annotated[list[int], SkipValidation]
@@ -24,3 +27,17 @@ class JsonModel(BaseModel):
         allow_inf_nan=False,
         json_schema_serialization_defaults_required=True,
     )
+
+
+def iterate_json(model: BaseModel) -> Iterator[bytes]:
+    """Encode a model as JSON in pieces: one for each member that is not a model itself."""
+    separator = b"{"
+    for name in type(model).model_fields:
+        value = getattr(model, name)
+        yield separator + json.dumps(name).encode() + b":"
+        if isinstance(value, BaseModel):
+            yield from iterate_json(value)
+        else:
+            yield to_json(value)
+        separator = b","
+    yield b"}" if separator == b"," else b"{}"

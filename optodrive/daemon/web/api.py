@@ -14,13 +14,14 @@ from optodrive.core.types.policy import Policy
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.live_stream import LiveStream
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
+from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.error_handlers import add_error_handlers, build_error_problem
+from optodrive.daemon.web.error_handlers import add_error_handlers
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
 from optodrive.daemon.web.openapi_bodies import (
     PARAMETERS_SCHEMA,

@@ -4,15 +4,13 @@ Requests start one at a time, none starts while STOP is being answered, and long
 """
 
 import asyncio
-import json
-from collections.abc import Iterator
 from contextlib import suppress
 
 from fastapi.responses import Response
 from pydantic import BaseModel
-from pydantic_core import to_json
 from starlette.concurrency import run_in_threadpool
 
+from optodrive.core.json_model import iterate_json
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
 
 STOP_PATH = "/v1/stop"
@@ -69,17 +67,3 @@ async def build_json_response(model: BaseModel, status: int = 200) -> Response:
     """
     body = await run_in_threadpool(lambda: b"".join(iterate_json(model)))
     return Response(body, status, media_type="application/json")
-
-
-def iterate_json(model: BaseModel) -> Iterator[bytes]:
-    """Encode a model as JSON in pieces: one for each member that is not a model itself."""
-    separator = b"{"
-    for name in type(model).model_fields:
-        value = getattr(model, name)
-        yield separator + json.dumps(name).encode() + b":"
-        if isinstance(value, BaseModel):
-            yield from iterate_json(value)
-        else:
-            yield to_json(value)
-        separator = b","
-    yield b"}" if separator == b"," else b"{}"

@@ -19,9 +19,7 @@ def decode_json(body: bytes | str, where: str) -> object:
     def require_unique_keys(pairs: list[tuple[str, object]]) -> dict[str, object]:
         table = dict(pairs)
         if len(table) < len(pairs):
-            keys = [key for key, _ in pairs]
-            repeated = next(key for position, key in enumerate(keys) if key in keys[:position])
-            raise InputError(where, repeated, "each key of an object once", code="bad_json")
+            raise InputError(where, _find_repeated_key(pairs), "each key of an object once", code="bad_json")
         return table
 
     try:
@@ -37,6 +35,16 @@ def decode_json(body: bytes | str, where: str) -> object:
         raise InputError(
             where, "a number of thousands of digits", "numbers that fit a float", code="bad_json"
         ) from None
+
+
+def _find_repeated_key(pairs: list[tuple[str, object]]) -> str | None:
+    """Return the first key that repeats an earlier one, in linear time."""
+    seen: set[str] = set()
+    for key, _ in pairs:
+        if key in seen:
+            return key
+        seen.add(key)
+    return None
 
 
 def require_object(value: object, where: str, known: Sequence[str], required: Sequence[str]) -> Mapping[str, object]:

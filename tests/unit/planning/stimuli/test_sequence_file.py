@@ -195,6 +195,14 @@ def test_a_pixel_named_twice_is_refused():
     assert refusal(text) == ("bad_json", "frames.json: got '17', expected each key of an object once")
 
 
+def test_the_search_for_a_repeated_key_is_linear():
+    keys = [f'"{k}":0' for k in range(400_000)]  # a quadratic search takes minutes
+    assert (
+        refusal("{" + ",".join([*keys, keys[-1]]) + "}")[1]
+        == "frames.json: got '399999', expected each key of an object once"
+    )
+
+
 @pytest.mark.parametrize("literal", ["NaN", "Infinity", "-Infinity", "1e999"])
 def test_non_finite_numbers_are_refused_with_their_place(literal):
     text = json.dumps(body([{"target_um": {"17": 50}}])).replace("50", literal)
