@@ -21,8 +21,8 @@ from scipy.sparse import csr_array
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config
 from optodrive.device.neighbours import Neighbours
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.simulator.virtual_run import execute
 from optodrive.physics.nominal_display import NominalThermalState
 from optodrive.physics.parameters import load_parameters
@@ -111,7 +111,7 @@ def bench_wire():
     display, sequence = build_full_frame()
     heat, budget = display.build_cold_state()
     plan = plan_sequence(display, sequence, heat, budget).plan
-    scale = BoardRequirements.from_config(display.config).scale
+    scale = build_board_requirements(display.config).scale
     points = quantise(plan, scale)
     payload = points.encode_payload()
 

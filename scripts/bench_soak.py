@@ -23,9 +23,9 @@ from rich.table import Table
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import OptodriveError
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 
@@ -68,9 +68,7 @@ def build_requirements(baud):
     )
     limits = config.limits.model_copy(update={"pulse_gap_min_s": 1e-4})
     board = config.board.model_copy(update={"baud": baud, "lease_s": 1.0})
-    return BoardRequirements.from_config(
-        config.model_copy(update={"scanner": scanner, "limits": limits, "board": board})
-    )
+    return build_board_requirements(config.model_copy(update={"scanner": scanner, "limits": limits, "board": board}))
 
 
 # --- the board process, and the process that checks its log ----------------------------------------------------------

@@ -55,14 +55,14 @@ def measure_planning():
     """Measure the CPU time from a frame to verified bytes: plan, limit, predict, quantise, decode, verify."""
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
     from optodrive.device.config_file import load_config
+    from optodrive.link.board_setup import build_board_requirements
     from optodrive.link.protocol.quantisation import decode, quantise
-    from optodrive.link.session.board_requirements import BoardRequirements
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.limiter.limiter import verify
     from optodrive.planning.pipeline import plan_sequence
 
     display = DisplayModel.from_config(load_config("display-1511"))
-    scale = BoardRequirements.from_config(display.config).scale
+    scale = build_board_requirements(display.config).scale
     rng = np.random.default_rng(5)
     heat, budget = display.build_cold_state()
     rows, times = [], []

@@ -7,6 +7,7 @@ from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
 from optodrive.device import config
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_port_settings
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning import effective_config
 from optodrive.planning.display_model import DisplayModel
@@ -32,7 +33,9 @@ all other models always have all members.
 def build_openapi():
     """Build the application's OpenAPI document without connecting to a board."""
     config = load_config()
-    engine = Engine(DisplayModel.from_config(config), find_transport_factory(config.board)(), MonotonicClock())
+    engine = Engine(
+        DisplayModel.from_config(config), find_transport_factory(build_port_settings(config.board))(), MonotonicClock()
+    )
     try:
         return build_app(engine, "unused").openapi()
     finally:

@@ -34,6 +34,7 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
     from optodrive.lab.commissioning.spot_reader import SpotReader
     from optodrive.lab.commissioning.spot_sensor_client import SpotSensorClient
+    from optodrive.link.board_setup import build_port_settings
     from optodrive.link.transport.registry import build_bench_transport
     from optodrive.link.transport.serial_port import SerialPort
     from optodrive.planning.display_model import DisplayModel
@@ -43,7 +44,7 @@ def open_board(config: str | None) -> Iterator[BoardAccess]:
     loaded = loaded.model_copy(update={"scanner": loaded.scanner.model_copy(update={"field": None})})
     announce_compilation()
     board, clock = loaded.board, MonotonicClock()
-    transport, sensor_port = build_bench_transport(board, config or DEFAULT_CONFIG)
+    transport, sensor_port = build_bench_transport(build_port_settings(board), config or DEFAULT_CONFIG)
     for signal_number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(signal_number, signal.default_int_handler)
     with ExclusiveBoard(DisplayModel.from_config(loaded), transport, clock) as exclusive_board:

@@ -4,8 +4,8 @@ from optodrive.cli.doctor_finding import Finding, report_ok, report_problem, rep
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import Config
+from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.protocol.messages import INPUTS
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.registry import find_transport_factory
@@ -21,8 +21,8 @@ UNSAFE_REASONS = {
 
 def check_board(config: Config, clock: Clock) -> list[Finding]:
     """Connect to the board, compare its limits with the configuration, measure the round trip, and stay DISARMED."""
-    board = config.board
-    session = BoardSession(find_transport_factory(board)(), clock, BoardRequirements.from_config(config))
+    transport = find_transport_factory(build_port_settings(config.board))()
+    session = BoardSession(transport, clock, build_board_requirements(config))
     try:
         session.connect()
         return [*_check_identity(session, config), _check_inputs(session), _check_round_trip(session)]

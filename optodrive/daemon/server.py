@@ -22,6 +22,7 @@ from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
 from optodrive.daemon.web.tokens import load_daemon_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
+from optodrive.link.board_setup import build_port_settings
 from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
@@ -46,7 +47,7 @@ def run(
     with ExitStack() as exit_stack:  # closes in reverse order: the engine first
         log = open_daemon_log()
         exit_stack.callback(log.close)
-        make_transport = find_transport_factory(config.board)
+        make_transport = find_transport_factory(build_port_settings(config.board))
         listeners = [open_tcp_listener(config.daemon.host, config.daemon.port)]
         exit_stack.callback(listeners[0].close)
         port = listeners[0].getsockname()[1]

@@ -14,7 +14,7 @@ from scenario import audit_log
 from session_rig import SessionRig, configured
 
 from optodrive.core.clock import MonotonicClock
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 
@@ -110,9 +110,7 @@ class PtyRig(SessionRig):
         self.proxy = Proxy(self.board.port, link, up, down)
         clock = MonotonicClock()
         port = WitnessedPort(str(link), self.witness)
-        super().__init__(
-            BoardSession(port, clock, BoardRequirements.from_config(configured(lease_s=1.0))), clock, up, down
-        )
+        super().__init__(BoardSession(port, clock, build_board_requirements(configured(lease_s=1.0))), clock, up, down)
 
     def finish(self):
         """Stop host, proxy and board; check the log and return the number of pulses."""

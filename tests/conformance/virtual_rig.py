@@ -6,7 +6,8 @@ from session_rig import SessionRig, configured
 
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import LinkError
-from optodrive.link.session.board_requirements import BITS_PER_BYTE, BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.link.session.board_requirements import BITS_PER_BYTE
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.board_limits import BoardSettings
@@ -98,7 +99,7 @@ class VirtualRig(SessionRig):
         config = config or configured()
         self.core = make_core(BoardSettings(**settings), self.log.append, seed=seed)
         self.link = FaultyMemoryLink(self.core, clock, up, down, config.board.baud / BITS_PER_BYTE if paced else 0)
-        super().__init__(BoardSession(self.link, clock, BoardRequirements.from_config(config)), clock, up, down)
+        super().__init__(BoardSession(self.link, clock, build_board_requirements(config)), clock, up, down)
 
     def check(self):
         """Check and clear the log; return the number of pulses."""

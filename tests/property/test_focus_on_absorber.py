@@ -14,10 +14,10 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.device.config import Config
 from optodrive.device.settling import SettlingTable
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.helios.encoding import PointScale, decode, encode
 from optodrive.link.helios.frames import parse_points
 from optodrive.link.protocol.quantisation import CENTRE_CODE, quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.stimuli.pattern_registry import build_pattern
@@ -70,7 +70,7 @@ def overhang_m(display, plan, position_of=ideal_position_m):
 
     It is negative if the focus never does.
     """
-    scale = BoardRequirements.from_config(display.config).scale
+    scale = build_board_requirements(display.config).scale
     points = quantise(plan, scale)
     x, y, dark, on, _ = points.table.astype(np.int64).T
     begin_s = np.concatenate([[0], np.cumsum(dark + on)[:-1]]) * scale.tick_s

@@ -6,15 +6,15 @@ import pytest
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.limiter.limiter import commit_until, verify
 from optodrive.planning.pipeline import plan_sequence
 
 CONFIG = load_config()
 DISPLAY = DisplayModel.from_config(CONFIG)
-SCALE = BoardRequirements.from_config(CONFIG).scale
+SCALE = build_board_requirements(CONFIG).scale
 STRONG, BRISK = (0.040, 0.001, 2.4), (0.010, 0.010, 1.0)
 """Width, gap, s, and power, W: three caps trim the first, sometimes to zero."""
 

@@ -15,10 +15,10 @@ import numpy as np
 from optodrive.core.clock import MonotonicClock, request_realtime_scheduling
 from optodrive.device.config import Config
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder
 from optodrive.link.protocol.quantisation import WirePoints
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 
@@ -70,7 +70,7 @@ def main(name):
     table = load_config("display-16").model_dump()
     table["board"]["baud"] = BAUD
     port = RecordingPort(name)
-    session = BoardSession(port, MonotonicClock(), BoardRequirements.from_config(Config.model_validate(table)))
+    session = BoardSession(port, MonotonicClock(), build_board_requirements(Config.model_validate(table)))
     session.connect()
     if session.board.state == "FAULT":
         session.disarm()

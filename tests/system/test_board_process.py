@@ -12,9 +12,9 @@ import serial
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.device.config_file import load_config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.serial_port import SerialPort
 from rig import wait_for
@@ -207,7 +207,7 @@ def test_the_session_works_over_the_port(board):
     session = BoardSession(
         SerialPort(str(board.port), 1_000_000),
         MonotonicClock(),
-        BoardRequirements.from_config(load_config("display-16")),
+        build_board_requirements(load_config("display-16")),
     )
     session.connect()
     try:

@@ -7,7 +7,7 @@ import pytest
 
 from optodrive.device.config import build_pixel_layout
 from optodrive.device.config_file import load_config
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
 from rig import running
 
 PWM_S = 2e-4
@@ -69,7 +69,7 @@ def cell_codes():
     """Return the codes of every pixel's centre, [p, 2]."""
     config = load_config()
     layout, angle = build_pixel_layout(config.display), 1.0 / (2.0 * config.scanner.focal_length_m)
-    scale = BoardRequirements.from_config(config).scale
+    scale = build_board_requirements(config).scale
     return np.column_stack([scale.to_codes(layout.x_m * angle), scale.to_codes(layout.y_m * angle)])
 
 

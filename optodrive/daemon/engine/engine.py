@@ -27,9 +27,9 @@ from optodrive.daemon.engine.state_report import build_state_report
 from optodrive.daemon.engine.state_waiters import StateWaiters, uncancellable_future
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import StateReport
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import WireScale
 from optodrive.link.protocol.states import ARMED_STATES, IDLE_STATES, BoardState
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.link_watch import LinkCause
 from optodrive.link.session.session import BoardSession
@@ -63,7 +63,7 @@ class Engine:
         self.on_warning: Callable[[str], None] = lambda line: None
         self.on_loop: Callable[[], None] = lambda: None
         self._clock = clock
-        self._session = BoardSession(transport, clock, BoardRequirements.from_config(display.config))
+        self._session = BoardSession(transport, clock, build_board_requirements(display.config))
         self._plan_store = PlanStore()
         self._plan_counters = PlanCounters()
         self._plan_store.end_callbacks.append(self._plan_counters.record_end)

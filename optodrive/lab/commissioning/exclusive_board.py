@@ -23,9 +23,9 @@ from optodrive.core.errors import (
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.plans import BudgetState, LimitedPlan, PulsePlan
 from optodrive.device.config import Config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import DUTY_MAX, WirePoints, decode, quantise
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 from optodrive.link.transport.base import Transport
@@ -57,8 +57,8 @@ class ExclusiveBoard:
         self._display, self._clock = display, clock
         config = display.config
         code_m = 2.0 * config.scanner.focal_length_m * config.scanner.rad_per_code
-        self.requirements = BoardRequirements.from_config(config, ceil(FIELD_MARGIN_M / code_m))
-        self._limits = self.requirements.build_limits()
+        self.requirements = build_board_requirements(config, ceil(FIELD_MARGIN_M / code_m))
+        self._limits = self.requirements.limits
         self.session = BoardSession(transport, clock, self.requirements)
         self._state = display.build_cold_state()[1]
         self._timeline_zero_s: float | None = None

@@ -147,7 +147,7 @@ class BoardSession:
         self._queue_points, self._reset_code = peer.queue_points, peer.reset_cause
         self._points.reset_indices()
         self._connection.send(
-            self._requirements.build_limits(), at_front=True
+            self._requirements.limits, at_front=True
         )  # before commands already queued for this session
         self._request_status()
 

@@ -19,6 +19,10 @@ class MemoryLink:
     def open(self) -> None:
         """Do nothing: the link is always open."""
 
+    def fileno(self) -> int | None:
+        """Return None: nothing waits for this link."""
+        return None
+
     def close(self) -> None:
         """Report the loss of the link to the board."""
         self._core.on_link_lost(self._now_us())

@@ -5,9 +5,9 @@ from collections.abc import Callable
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import BoardFaultError
 from optodrive.core.types.plans import ExecutedPulses
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import quantise
 from optodrive.link.protocol.states import IDLE_STATES, BoardState
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
@@ -27,7 +27,7 @@ def execute(
     """
     clock = ManualClock(1.0)
     core = BoardCore(seed=1)
-    session = BoardSession(MemoryLink(core, clock), clock, BoardRequirements.from_config(display.config))
+    session = BoardSession(MemoryLink(core, clock), clock, build_board_requirements(display.config))
     session.connect()
     session.arm()
     while session.board.state != BoardState.ARMED:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from optodrive.device.config import BoardSection
+from optodrive.link.transport.port_settings import PortSettings
 
 
 class Transport(Protocol):
@@ -20,6 +20,9 @@ class Transport(Protocol):
     def write(self, data: bytes) -> None:
         """Hand all of data to the operating system."""
 
+    def fileno(self) -> int | None:
+        """Return a descriptor that is readable when bytes have arrived, None if there is none or it is closed."""
+
     def close(self) -> None:
         """Close the link. It may be opened again. Do nothing if it is closed."""
 
@@ -28,7 +31,7 @@ class Transport(Protocol):
 
 
 class TransportKind(NamedTuple):
-    """Kind of transport. name: its value of `board.transport`; create: from a configuration, without opening it."""
+    """Kind of transport. name: its value of `board.transport`; create: from an address, without opening it."""
 
     name: str
-    create: Callable[[BoardSection], Transport]
+    create: Callable[[PortSettings], Transport]

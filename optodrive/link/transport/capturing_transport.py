@@ -36,6 +36,10 @@ class CapturingTransport:
         self._record(TO_BOARD, data)
         self._transport.write(data)
 
+    def fileno(self) -> int | None:
+        """Return the descriptor of the link, None without one."""
+        return self._transport.fileno()
+
     def close(self) -> None:
         """Close the link. It may be opened again."""
         self._record_close()

@@ -1,46 +1,48 @@
 """Transports by their name in the configuration."""
 
-from collections.abc import Callable
-from functools import cache, partial
+from collections.abc import Callable, Iterator
+from functools import partial
 from importlib import import_module
 from pkgutil import iter_modules
 
 from optodrive.core.errors import InputError
-from optodrive.device.config import BoardSection
 from optodrive.link import transport
 from optodrive.link.transport.base import Transport, TransportKind
+from optodrive.link.transport.port_settings import PortSettings
 from optodrive.link.transport.simulated import SimulatedBoard
 
 
-@cache
-def discover_transports() -> dict[str, Callable[[BoardSection], Transport]]:
-    """Return the factory of every module in this package that has a TRANSPORT, by its name."""
-    modules = [import_module(f"{transport.__name__}.{item.name}") for item in iter_modules(transport.__path__)]
-    kinds: list[TransportKind] = [module.TRANSPORT for module in modules if hasattr(module, "TRANSPORT")]
-    return {kind.name: kind.create for kind in kinds}
+def iterate_transports() -> Iterator[TransportKind]:
+    """Yield the TRANSPORT of every module in this package that has one. A module is imported when its turn comes."""
+    for item in iter_modules(transport.__path__):
+        module = import_module(f"{transport.__name__}.{item.name}")
+        if hasattr(module, "TRANSPORT"):
+            yield module.TRANSPORT
 
 
-def find_transport_factory(board: BoardSection) -> Callable[[], Transport]:
+def find_transport_factory(port: PortSettings) -> Callable[[], Transport]:
     """Return a factory for the configured transport, which it does not open.
 
     Raise InputError for a Helios, which does not use the board's protocol.
     """
-    factories = discover_transports()
-    if board.transport not in factories:
-        raise InputError(
-            "board.transport",
-            board.transport,
-            f"one of {', '.join(sorted(factories))}: the daemon cannot use a Helios, see `optodrive helios play`",
-        )
-    return partial(factories[board.transport], board)
+    names = []
+    for kind in iterate_transports():  # the search ends before the libraries of other transports are imported
+        if kind.name == port.transport:
+            return partial(kind.create, port)
+        names.append(kind.name)
+    raise InputError(
+        "board.transport",
+        port.transport,
+        f"one of {', '.join(sorted(names))}: the daemon cannot use a Helios, see `optodrive helios play`",
+    )
 
 
-def build_bench_transport(board: BoardSection, display: str) -> tuple[Transport, str]:
+def build_bench_transport(port: PortSettings, display: str) -> tuple[Transport, str]:
     """Return an unopened transport and the port of its simulated spot sensor, '' without one.
 
     display: file or shipped name of the configuration
     """
-    if board.transport == "simulated":
-        simulated = SimulatedBoard(board.port, board.baud, display)
+    if port.transport == "simulated":
+        simulated = SimulatedBoard(port.port, port.baud, display)
         return simulated, simulated.sensor_port
-    return find_transport_factory(board)(), ""
+    return find_transport_factory(port)(), ""

@@ -68,6 +68,10 @@ class SerialPort:
         detail = "" if Path(self.name).exists() else f"; {self.name} is missing: unplugged, or its power is off"
         return LinkError(f"link to {self.name} lost: {error}{detail}")
 
+    def fileno(self) -> int | None:
+        """Return the descriptor of the open port."""
+        return None if self._serial is None else int(self._serial.fileno())
+
     def close(self) -> None:
         """Close the port."""
         if self._serial is not None:
@@ -80,4 +84,4 @@ class SerialPort:
         self.close()
 
 
-TRANSPORT = TransportKind("serial", lambda board: SerialPort(board.port, board.baud))
+TRANSPORT = TransportKind("serial", lambda port: SerialPort(port.port, port.baud))

@@ -72,4 +72,4 @@ class SimulatedBoard(SerialPort):
             time.sleep(0.01)
 
 
-TRANSPORT = TransportKind("simulated", lambda board: SimulatedBoard(board.port, board.baud))
+TRANSPORT = TransportKind("simulated", lambda port: SimulatedBoard(port.port, port.baud))

@@ -7,8 +7,8 @@ import usb.core
 import usb.util
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.device.config import BoardSection
 from optodrive.link.transport.base import TransportKind
+from optodrive.link.transport.port_settings import PortSettings
 from optodrive.link.transport.usb_device import build_lost_error, build_open_error, find_device, timeout_ms
 
 WRITE_TIMEOUT_S = 0.5
@@ -33,11 +33,11 @@ class UsbBulk:
         self._out: Any = None
 
     @classmethod
-    def from_config(cls, board: BoardSection) -> Self:
-        """Build the transport of a configuration. Raise InputError if it names no device."""
-        if board.vendor_id is None or board.product_id is None:
+    def from_settings(cls, port: PortSettings) -> Self:
+        """Build the transport of an address. Raise InputError if it names no device."""
+        if port.vendor_id is None or port.product_id is None:
             raise InputError("board.vendor_id, board.product_id", None, "both, for transport 'usb'")
-        return cls(board.vendor_id, board.product_id, board.serial_number)
+        return cls(port.vendor_id, port.product_id, port.serial_number)
 
     def open(self) -> None:
         """Claim the device.
@@ -99,6 +99,10 @@ class UsbBulk:
         if self._device is None:
             raise LinkError(f"{self.name} is not open")
 
+    def fileno(self) -> int | None:
+        """Return None: libusb has no descriptor that reports received bytes."""
+        return None
+
     def close(self) -> None:
         """Release the device. The board does not notice and turns the gate off when its lease expires."""
         device, self._device = self._device, None
@@ -111,4 +115,4 @@ class UsbBulk:
         self.close()
 
 
-TRANSPORT = TransportKind("usb", UsbBulk.from_config)
+TRANSPORT = TransportKind("usb", UsbBulk.from_settings)

@@ -9,8 +9,8 @@ from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.device.config_file import load_config, locate_shipped
 from optodrive.device.field_loader import build_settling_table, load_scan_field
 from optodrive.device.scan_field import IdealField
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol.quantisation import decode, quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.planning.budget_setup import build_galvo_model
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.pipeline import plan_sequence
@@ -25,7 +25,7 @@ def calibrated(tmp_path_factory):
 
 def compute_landing_m(truth, config):
     """Return the true positions of a full frame's light, from the bytes on the wire, and the pixel of each pulse."""
-    display, scale = DisplayModel.from_config(config), BoardRequirements.from_config(config).scale
+    display, scale = DisplayModel.from_config(config), build_board_requirements(config).scale
     full = FrameSequence((TactileFrame("full", 0.0, 10.0, np.full(len(LAYOUT), 10e-6)),))
     plan = plan_sequence(display, full, *display.build_cold_state()).plan
     points = quantise(plan, scale)
@@ -46,20 +46,20 @@ def test_every_planned_pulse_lands_within_30_um_of_its_pixel_and_uncorrected_one
 
 def test_planner_limiter_and_board_see_the_same(calibrated):
     _, config = calibrated[0]
-    display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
+    display, requirements = DisplayModel.from_config(config), build_board_requirements(config)
     assert build_galvo_model(config).lead_in_s == display.scan_head.settling.lead_in_us * 1e-6
     x_code, y_code = (
         requirements.scale.to_codes(a) for a in display.scan_head.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
     )
-    limits = requirements.build_limits()
+    limits = requirements.limits
     assert limits.x_min <= x_code.min() <= limits.x_min + 65
     assert limits.y_max - 65 <= y_code.max() <= limits.y_max
 
 
 def test_the_board_s_own_time_of_a_move_never_passes_the_plan_s(calibrated):
     for _, config in calibrated.values():
-        display, requirements = DisplayModel.from_config(config), BoardRequirements.from_config(config)
-        moves, limits = display.scan_head.settling, requirements.build_limits()
+        display, requirements = DisplayModel.from_config(config), build_board_requirements(config)
+        moves, limits = display.scan_head.settling, requirements.limits
         angles_rad = display.scan_head.field.angles_rad(LAYOUT.x_m, LAYOUT.y_m)
         codes = [requirements.scale.to_codes(angle_rad) for angle_rad in angles_rad]
         for one, other in np.random.default_rng(0).integers(len(LAYOUT), size=(500, 2)).tolist():

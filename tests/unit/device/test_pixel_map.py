@@ -19,7 +19,7 @@ from optodrive.device.pixel_map import (
     replace_pixel_map,
     write_pixel_map,
 )
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.pipeline import plan_sequence, warm_up
@@ -140,8 +140,8 @@ def test_the_beam_is_sent_to_the_offset_and_the_board_lets_it(display):
     aimed_m = PLAIN.layout.x_m + pixel_map.offset_x_m, PLAIN.layout.y_m + pixel_map.offset_y_m
     assert plan.x_rad == pytest.approx(aimed_m[0][plan.pixel] / (2 * focal_m), rel=1e-4)
     assert plan.y_rad == pytest.approx(aimed_m[1][plan.pixel] / (2 * focal_m), rel=1e-4)
-    requirements = BoardRequirements.from_config(display.config)
-    limits = requirements.build_limits()
+    requirements = build_board_requirements(display.config)
+    limits = requirements.limits
     x_codes, y_codes = requirements.scale.to_codes(plan.x_rad), requirements.scale.to_codes(plan.y_rad)
     assert limits.x_min <= x_codes.min() <= x_codes.max() <= limits.x_max
     assert limits.y_min <= y_codes.min() <= y_codes.max() <= limits.y_max

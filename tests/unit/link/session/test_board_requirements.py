@@ -5,7 +5,7 @@ import pytest
 
 from displays import DISPLAYS
 from optodrive.device.config import Config
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, tighten
 
 
@@ -16,7 +16,7 @@ def board_us(limits, codes):
 
 def list_moves(display, rng, count=400):
     """Return codes and planned times of moves after long dwell, between pixels and from the centre."""
-    scale, moves = BoardRequirements.from_config(display.config).scale, display.scan_head.settling
+    scale, moves = build_board_requirements(display.config).scale, display.scan_head.settling
     x_rad, y_rad = display.scan_head.field.angles_rad(display.layout.x_m, display.layout.y_m)
     pairs = rng.integers(len(display.layout), size=(count, 2))
     pairs = np.concatenate([pairs, [[k, min(k + 1, len(x_rad) - 1)] for k in range(len(x_rad))]])
@@ -30,13 +30,11 @@ def list_moves(display, rng, count=400):
 @pytest.mark.parametrize("name", sorted(DISPLAYS))
 def test_the_boards_settling_time_is_just_below_the_planned_one(name):
     display = DISPLAYS[name]
-    limits = tighten(DEFAULT_LIMITS, BoardRequirements.from_config(display.config).build_limits())
+    limits = tighten(DEFAULT_LIMITS, build_board_requirements(display.config).limits)
     codes, planned_us = list_moves(display, np.random.default_rng(1))
     assert np.all(board_us(limits, codes) <= planned_us)
     pitch = (
-        BoardRequirements.from_config(display.config).scale.to_codes(np.array([display.scan_head.settling.pitch_rad]))[
-            0
-        ]
+        build_board_requirements(display.config).scale.to_codes(np.array([display.scan_head.settling.pitch_rad]))[0]
         - 32768
     )
     moves = display.scan_head.settling
@@ -48,11 +46,11 @@ def test_a_single_off_centre_pixel_includes_the_move_from_the_centre():
     table["display"] |= {"rows": 2, "columns": 2, "missing": [[0, 0], [0, 1], [1, 0]]}
     display = type(DISPLAYS["display-16"]).from_config(Config.model_validate(table))
     codes, planned_us = list_moves(display, np.random.default_rng(1), 1)
-    assert np.all(board_us(BoardRequirements.from_config(display.config).build_limits(), codes) <= planned_us)
+    assert np.all(board_us(build_board_requirements(display.config).limits, codes) <= planned_us)
 
 
 def test_the_simulated_board_settles_fast_enough_for_every_display():
     for display in DISPLAYS.values():
-        requested = BoardRequirements.from_config(display.config).build_limits()
+        requested = build_board_requirements(display.config).limits
         assert DEFAULT_LIMITS.settle_us <= requested.settle_us
         assert DEFAULT_LIMITS.settle_ns_per_code <= requested.settle_ns_per_code

@@ -10,7 +10,7 @@ import pytest
 from test_session import CONFIG, Rig, plan
 
 from optodrive.core.errors import InputError, LinkError
-from optodrive.link.session.board_requirements import BoardRequirements
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.session.likely_cause import (
     STALL_LEASE_FRACTION,
     LinkEvidence,
@@ -194,7 +194,7 @@ def test_a_fault_from_before_the_connection_is_not_explained():
     rig = Rig().connect().arm()
     rig.until(lambda: rig.session.board.state == "FAULT", lease=False)
     rig.session.close()
-    other = BoardSession(rig.link, rig.clock, BoardRequirements.from_config(CONFIG))
+    other = BoardSession(rig.link, rig.clock, build_board_requirements(CONFIG))
     other.connect()
     assert other.board.fault == "LINK"
     other.step(0.002, renew_lease=True)

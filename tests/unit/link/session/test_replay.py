@@ -4,10 +4,10 @@ import pytest
 from test_session import CONFIG, Rig, plan
 
 from optodrive.core.clock import ManualClock
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, encode_frame
 from optodrive.link.protocol.transcript import Transcript
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.replay import Replay, clock_shift_s, compare_traces
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
@@ -32,7 +32,7 @@ class CapturedRig(Rig):
         super().__init__()
         self.capture = LinkCaptureWriter(path, self.clock.now_s(), pytest.fail)
         link = CapturingTransport(MemoryLink(self.core, self.clock), self.capture, self.clock)
-        self.session = BoardSession(link, self.clock, BoardRequirements.from_config(CONFIG))
+        self.session = BoardSession(link, self.clock, build_board_requirements(CONFIG))
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def test_a_replay_follows_the_captured_clock_offset(tmp_path):
 
     rig = CapturedRig(tmp_path / "capture")
     link = CapturingTransport(Ahead(rig.core, rig.clock), rig.capture, rig.clock)
-    rig.session = BoardSession(link, rig.clock, BoardRequirements.from_config(CONFIG))
+    rig.session = BoardSession(link, rig.clock, build_board_requirements(CONFIG))
     rig.connect().arm()
     job = rig.play(plan(50))
     rig.until(lambda: job.is_finished)
@@ -166,7 +166,7 @@ def test_the_transcript_counts_agree_with_the_host(tmp_path):
     rig = Rig()
     capture = LinkCaptureWriter(tmp_path / "capture", 5.0, pytest.fail)
     rig.session = BoardSession(
-        CapturingTransport(rig.link, capture, rig.clock), rig.clock, BoardRequirements.from_config(CONFIG)
+        CapturingTransport(rig.link, capture, rig.clock), rig.clock, build_board_requirements(CONFIG)
     )
     count = iter(range(10**9))
     rig.connect().arm()

@@ -12,10 +12,10 @@ from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.core.types.plans import EMPTY_PLAN, LimitedPlan
 from optodrive.device.config import Config
+from optodrive.link.board_setup import build_board_requirements
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import FrameDecoder, encode_frame
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.clock_sync import DRIFT_MAX, ClockSync
 from optodrive.link.session.fault_hints import FAULT_HINTS, get_fault_hint
 from optodrive.link.session.session import CONNECT_TIMEOUT_S, SILENCE_TIMEOUT_S, BoardSession
@@ -56,7 +56,7 @@ class Rig:
         self.clock = ManualClock(start_s)
         self.core = BoardCore(settings, self.log.append, seed=2)
         self.link = Wire(self.core, self.clock)
-        self.session = BoardSession(self.link, self.clock, BoardRequirements.from_config(config))
+        self.session = BoardSession(self.link, self.clock, build_board_requirements(config))
 
     def connect(self):
         self.session.connect()
@@ -118,7 +118,7 @@ def test_the_handshake_tightens_limits_sets_the_clock_and_ends_disarmed(rig):
     assert session.is_acknowledged
     assert session.board.state == "DISARMED"
     assert session.board.uid == BoardSettings().uid
-    assert rig.core.machine.limits.spot_uj == session._requirements.build_limits().spot_uj < DEFAULT_LIMITS.spot_uj
+    assert rig.core.machine.limits.spot_uj == session._requirements.limits.spot_uj < DEFAULT_LIMITS.spot_uj
     assert session.board_s() == pytest.approx(rig.clock.now_s(), abs=0.003)
     assert session.collect_link_stats()["round_trip_ms"] > 0
 
@@ -179,7 +179,7 @@ def test_an_incompatible_board_is_rejected_with_the_key(settings, config, says):
 
 @pytest.mark.parametrize(("field", "value"), [("major", 2), ("tick_hz", 999)])
 def test_another_protocol_or_tick_is_rejected(field, value):
-    requirements = BoardRequirements.from_config(CONFIG)
+    requirements = build_board_requirements(CONFIG)
     fits = dict(major=1, minor=9, host_nonce=0, session=1, firmware=0, uid=bytes(12), capabilities=0, tick_hz=1_000_000)
     fits |= dict(queue_points=99, rx_window=8, cell_codes=1, reset_cause=0, limits=DEFAULT_LIMITS)
     requirements.check_board(m.HelloReply(**fits))

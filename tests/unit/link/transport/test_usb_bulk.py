@@ -11,11 +11,11 @@ from displays import DISPLAYS
 from optodrive.core.clock import ManualClock
 from optodrive.core.errors import InputError, LinkError
 from optodrive.device.config import BoardSection
+from optodrive.link.board_setup import build_board_requirements, build_port_settings
 from optodrive.link.protocol.quantisation import quantise
-from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
-from optodrive.link.transport.registry import discover_transports, find_transport_factory
+from optodrive.link.transport.registry import find_transport_factory, iterate_transports
 from optodrive.link.transport.usb_bulk import UsbBulk
 from optodrive.planning.pipeline import plan_sequence
 
@@ -29,7 +29,7 @@ class Rig:
         self.core = BoardCore(sink=self.log.append, seed=2)
         self.usb = UsbBridge(self.core, self.clock, **bridge)
         self.link = UsbBulk(0x1209, 0x0001, serial_number, self.usb)
-        self.session = BoardSession(self.link, self.clock, BoardRequirements.from_config(DISPLAY.config))
+        self.session = BoardSession(self.link, self.clock, build_board_requirements(DISPLAY.config))
 
     def until(self, condition, patience_s=20.0, lease=True):
         give_up_s = self.clock.now_s() + patience_s
@@ -155,9 +155,10 @@ def test_a_missing_libusb_is_reported(monkeypatch):
 
 def test_the_registry_builds_the_configured_transport():
     board = BoardSection(transport="usb", vendor_id=0x1209, product_id=1, serial_number="A1")
-    assert find_transport_factory(board)().name == "usb 1209:0001 A1"
-    assert find_transport_factory(BoardSection(transport="serial", port="/dev/ttyX"))().name == "/dev/ttyX"
+    assert find_transport_factory(build_port_settings(board))().name == "usb 1209:0001 A1"
+    serial = build_port_settings(BoardSection(transport="serial", port="/dev/ttyX"))
+    assert find_transport_factory(serial)().name == "/dev/ttyX"
     stated = get_args(BoardSection.model_fields["transport"].annotation)
-    assert {*discover_transports(), "helios"} == set(stated)
+    assert {*(kind.name for kind in iterate_transports()), "helios"} == set(stated)
     with pytest.raises(InputError, match="the daemon cannot use a Helios"):
-        find_transport_factory(BoardSection(transport="helios"))
+        find_transport_factory(build_port_settings(BoardSection(transport="helios")))

@@ -1,0 +1,94 @@
+"""Port settings and board requirements of a configuration, as the plain numbers that the link works with."""
+
+from math import ceil
+
+import numpy as np
+
+from optodrive.device.config import BoardSection, Config
+from optodrive.device.field_loader import build_settling_table, load_scan_field
+from optodrive.device.pixel_map import build_aim_layout
+from optodrive.link.protocol import messages as m
+from optodrive.link.protocol.quantisation import CENTRE_CODE, CODE_MAX, WireScale
+from optodrive.link.session.board_requirements import TICK_HZ, BoardRequirements, ConfiguredValues
+from optodrive.link.transport.port_settings import PortSettings
+
+CAP_MARGIN = 1.05
+"""Ratio of the board's caps to the limiter's. The board is the second line of defence behind the limiter."""
+FIELD_MARGIN_CODES = 64
+
+
+def build_port_settings(board: BoardSection) -> PortSettings:
+    """Return the address of the configured board."""
+    return PortSettings(
+        transport=board.transport,
+        port=board.port,
+        baud=board.baud,
+        vendor_id=board.vendor_id,
+        product_id=board.product_id,
+        serial_number=board.serial_number,
+    )
+
+
+def build_board_requirements(config: Config, margin_codes: int = FIELD_MARGIN_CODES) -> BoardRequirements:
+    """Derive the requirements of a configuration. The DAC codes span the whole range of the scanner.
+
+    margin_codes: DAC codes by which the permitted range extends beyond the outermost pixels
+    """
+    scale = WireScale(
+        rad_per_code=config.scanner.range_rad / (CODE_MAX - CENTRE_CODE),
+        full_power_w=config.laser.max_power_w,
+        tick_s=1.0 / TICK_HZ,
+    )
+    return BoardRequirements(
+        limits=_build_limits(config, scale, margin_codes),
+        scale=scale,
+        lease_s=config.board.lease_s,
+        baud=config.board.baud,
+        uid=config.board.uid,
+        values=ConfiguredValues(
+            bandwidth_hz=config.scanner.bandwidth_hz,
+            slew_rad_per_s=config.scanner.slew_rad_per_s,
+            pulse_width_max_s=config.limits.pulse_width_max_s,
+            max_power_w=config.laser.max_power_w,
+            pulse_energy_max_j=config.limits.pulse_energy_max_j,
+            pixel_mean_power_max_w=config.limits.pixel_mean_power_max_w,
+        ),
+    )
+
+
+def _build_limits(config: Config, scale: WireScale, margin_codes: int) -> m.Limits:
+    limits, layout = config.limits, build_aim_layout(config)
+    settle_us, settle_ns_per_code = _compute_settling(config, scale)
+    angles_rad = load_scan_field(config).angles_rad(layout.x_m, layout.y_m)
+    x_codes, y_codes = (scale.to_codes(angle_rad) for angle_rad in angles_rad)
+    return m.Limits(
+        max_on_us=ceil(limits.pulse_width_max_s * 1e6),
+        max_duty=65535,
+        mean_duty=65535,
+        spot_uj=ceil(limits.pulse_energy_max_j * 1e6 * CAP_MARGIN),
+        spot_leak_uw=ceil(limits.pixel_mean_power_max_w * 1e6 * CAP_MARGIN),
+        full_power_uw=round(config.laser.max_power_w * 1e6),
+        x_min=max(0, int(x_codes.min()) - margin_codes),
+        x_max=min(CODE_MAX, int(x_codes.max()) + margin_codes),
+        y_min=max(0, int(y_codes.min()) - margin_codes),
+        y_max=min(CODE_MAX, int(y_codes.max()) + margin_codes),
+        settle_us=settle_us,
+        settle_ns_per_code=settle_ns_per_code,
+        rest_us=round(limits.pulse_gap_min_s * 1e6),
+        lease_ms=round(config.board.lease_s * 1e3),
+    )
+
+
+def _compute_settling(config: Config, scale: WireScale) -> tuple[int, int]:
+    """Return settle_us and settle_ns_per_code, a line that nowhere exceeds the planned settling time.
+
+    Its slope is the slew rate. The planned time jumps where longer moves start to overshoot, so a steeper line
+    would have to start lower for short moves.
+    """
+    settling_table = build_settling_table(config)
+    ns_per_code = int(scale.rad_per_code / config.scanner.slew_rad_per_s * 1e9)
+    pitches = np.arange(1, len(settling_table.after_long_dwell[0]))
+    # Quantisation may lengthen a move by one code.
+    codes = np.floor(pitches * settling_table.pitch_rad / scale.rad_per_code).astype(np.int64) + 2
+    times_us = np.minimum(*(np.array(table)[pitches] for table in settling_table.after_long_dwell))
+    return int((times_us + -codes * ns_per_code // 1000).min()), ns_per_code

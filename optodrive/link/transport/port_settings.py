@@ -1,0 +1,18 @@
+"""Address of a board, as plain values."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class PortSettings:
+    """Address of a board. transport: name of a transport; port: serial device; baud: its bit rate, 1/s.
+
+    vendor_id, product_id, serial_number: of a USB device; an empty serial number accepts the only device of its kind
+    """
+
+    transport: str
+    port: str = ""
+    baud: int = 1_000_000
+    vendor_id: int | None = None
+    product_id: int | None = None
+    serial_number: str = ""
