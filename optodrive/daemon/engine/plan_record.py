@@ -33,6 +33,7 @@ class PlanRecord:
     heat_before, budget_before: initial state of the plan, on its own time line
     start_s: board time of the plan's zero
     arrived_s: board time of the request; *_after_s: time from the request to an event
+    epoch: in which the request arrived; the board executes nothing of an older one
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
     executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
@@ -49,6 +50,7 @@ class PlanRecord:
     budget_before: BudgetState
     start_s: float
     arrived_s: float
+    epoch: int = 0
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None

@@ -1,0 +1,85 @@
+"""The jobs of the preview process: parse and build a pushed body, or plan it without executing it."""
+
+import pickle
+from typing import Any, NamedTuple
+
+from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.ipc import Message
+from optodrive.core.json_model import iterate_json
+from optodrive.core.types.plans import BudgetState
+from optodrive.core.types.stimuli import FrameSequence
+from optodrive.daemon.engine.plan_making import PlanningRequest, make_record
+from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
+from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
+from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.link.protocol.quantisation import WireScale
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.stimuli.pattern_registry import build_pattern
+from optodrive.planning.stimuli.sequence_codec import encode_sequence
+from optodrive.planning.stimuli.sequence_file import parse_json, parse_sequence
+
+DRY_RUN_PLAN = "dry-run"
+"""Plan id of every dry run."""
+
+
+class DryRunStart(NamedTuple):
+    """State of the display from which a dry run is planned, on the plan's own time line.
+
+    starts_in_s: time from now to the start of a plan that is submitted now
+    """
+
+    heat: ThermalState
+    budget: BudgetState
+    starts_in_s: float
+
+
+def run_job(display: DisplayModel, scale: WireScale, job: Message) -> Message:
+    """Do a job and return its result: status and payload, or the status and the document of a problem."""
+    try:
+        body, start = _split_payload(job)
+        sequence = build_sequence(display, job.fields["source"], job.fields["name"], body)
+        if start is None:
+            return Message("result", {"status": 200}, encode_sequence(sequence))
+        report = plan_dry_run(display, scale, sequence, start, job.fields)
+        audit = {"plan": report.plan, "pattern": report.name, "pulses": report.planned, "plan_status": report.status}
+        return Message("result", {"status": 200, "audit": audit}, b"".join(iterate_json(report)))
+    except OptodriveError as error:
+        return build_refusal(error)
+
+
+def build_refusal(error: OptodriveError) -> Message:
+    """Build the result that describes an error."""
+    problem = build_error_problem(error)
+    return Message("result", {"status": problem.status}, problem.to_json())
+
+
+def _split_payload(job: Message) -> tuple[bytes, DryRunStart | None]:
+    """Return the body, and the start of a dry run."""
+    if job.kind == "build":
+        return job.payload, None
+    snapshot_bytes = job.fields["snapshot_bytes"]
+    start: DryRunStart = pickle.loads(job.payload[:snapshot_bytes])  # noqa: S301 - from the planner process
+    return job.payload[snapshot_bytes:], start
+
+
+def build_sequence(display: DisplayModel, source: str, name: str, body: bytes) -> FrameSequence:
+    """Build the sequence of a body: of FRAMES.json, or of the parameters of the named pattern. Raise InputError."""
+    if source == "sequence":
+        return parse_sequence(body, display.config, "body")
+    parameters = parse_json(body, "body") if body.strip() else {}
+    if not isinstance(parameters, dict):
+        raise InputError("body", parameters, "an object of the pattern's parameters")
+    return build_pattern(name, parameters, display.config)
+
+
+def plan_dry_run(
+    display: DisplayModel, scale: WireScale, sequence: FrameSequence, start: DryRunStart, fields: dict[str, Any]
+) -> PlanReport:
+    """Plan and prove a sequence without executing it. Raise InputError or RefusedError as the planner does."""
+    request = PlanningRequest(lambda: sequence, fields["name"], fields["policy"], fields["fit"])
+    thermal = ThermalEstimate(start.heat, start.budget)
+    snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
+    record = make_record(display, scale, request, sequence, snapshot, DRY_RUN_PLAN, lambda fraction: None)
+    return record.build_report(0.0)

@@ -1,0 +1,159 @@
+"""Main function of the preview process.
+
+One thread serves the connections and the workers. It starts no other threads, because it forks.
+"""
+
+import signal
+import time
+from dataclasses import dataclass
+
+from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.errors import OptodriveError
+from optodrive.core.ipc import Message, MessageSocket
+from optodrive.daemon.message_loop import MessageLoop, MessageServer
+from optodrive.daemon.preview.job_queue import Job, JobQueue
+from optodrive.daemon.preview.jobs import build_refusal, run_job
+from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
+from optodrive.daemon.supervisor.runtime_folder import RuntimeFolder
+from optodrive.link.board_setup import build_board_requirements
+from optodrive.planning.display_model import DisplayModel
+
+RUNNING_MAX, DRY_RUNS_MAX = 2, 1
+"""Jobs at once, and how many of them may be dry runs, so that a build never waits for one."""
+LOOP_WAIT_S = 0.1
+
+
+@dataclass
+class _Slot:
+    worker: Worker
+    job: Job | None = None
+
+
+class PreviewServer:
+    """Server of preview.sock with its workers."""
+
+    def __init__(self, loop: MessageLoop, folder: RuntimeFolder, run: JobRunner) -> None:
+        self._loop = loop
+        self._run = run
+        self._queue = JobQueue()
+        self._slots: list[_Slot] = []
+        self._server = MessageServer(loop, folder.preview_socket, self._on_request, self._on_client_lost)
+        self._add_spare()
+
+    @property
+    def worker_pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return [slot.worker.pid for slot in self._slots]
+
+    def step(self) -> None:
+        """Wait for messages for a short time, and end the jobs that have exceeded their time."""
+        next_check_s = min((slot.worker.next_check_s for slot in self._slots), default=float("inf"))
+        self._loop.poll(min(LOOP_WAIT_S, next_check_s - time.monotonic()))
+        now_s = time.monotonic()
+        for slot in list(self._slots):
+            if slot.worker.check(now_s) and slot.job is not None:
+                self._reply(slot.job, build_refusal(build_timeout_error(slot.job.message.kind)))
+                self._end_worker(slot)
+        self._start_jobs()
+
+    def close(self) -> None:
+        """End all workers and connections."""
+        for slot in self._slots:
+            self._loop.remove(slot.worker.connection)
+            slot.worker.end()
+        self._slots.clear()
+        self._server.close()
+
+    def _on_request(self, client: MessageSocket, message: Message) -> None:
+        if message.kind == "drop":
+            self._drop(client, message.fields["id"])
+        elif message.kind in ("build", "dry_run"):
+            job = Job(client, message)
+            try:
+                self._queue.add(job)
+            except OptodriveError as error:
+                self._reply(job, build_refusal(error))
+            self._start_jobs()
+
+    def _on_client_lost(self, client: MessageSocket) -> None:
+        self._drop(client, None)
+
+    def _drop(self, client: MessageSocket, job_id: int | None) -> None:
+        """Drop the waiting jobs of a lost caller, and end the workers of its running ones."""
+        self._queue.drop(client, job_id)
+        for slot in list(self._slots):
+            if slot.job is not None and slot.job.client is client and job_id in (None, slot.job.job_id):
+                self._end_worker(slot)
+
+    def _start_jobs(self) -> None:
+        """Start waiting jobs while the limits permit it. A spare worker is always ready."""
+        while True:
+            running = [slot.job for slot in self._slots if slot.job is not None]
+            dry_runs = sum(job.message.kind == "dry_run" for job in running)
+            kinds = {"build"} if dry_runs >= DRY_RUNS_MAX else {"build", "dry_run"}
+            if len(running) >= RUNNING_MAX:
+                return
+            job = self._queue.take(kinds, {job.caller for job in running})
+            if job is None:
+                return
+            slot = next((slot for slot in self._slots if slot.job is None), None) or self._add_spare()
+            slot.job = job
+            slot.worker.begin(job.message, time.monotonic())
+            self._loop.send(slot.worker.connection, job.message)
+            if all(slot.job is not None for slot in self._slots):
+                self._add_spare()
+
+    def _add_spare(self) -> _Slot:
+        slot = _Slot(Worker(self._run))
+        self._slots.append(slot)
+        self._loop.add(
+            slot.worker.connection,
+            lambda connection, message: self._on_result(slot, message),
+            lambda connection: self._on_worker_lost(slot),
+        )
+        return slot
+
+    def _on_result(self, slot: _Slot, result: Message) -> None:
+        if slot.job is not None:
+            self._reply(slot.job, result)
+        slot.job = None
+        slot.worker.finish()
+        if not slot.worker.is_reusable:
+            self._end_worker(slot)
+        self._start_jobs()
+
+    def _on_worker_lost(self, slot: _Slot) -> None:
+        self._slots.remove(slot)
+        error = slot.worker.end()
+        if slot.job is not None:
+            self._reply(slot.job, build_refusal(error))
+
+    def _end_worker(self, slot: _Slot) -> None:
+        self._slots.remove(slot)
+        self._loop.remove(slot.worker.connection)
+        slot.worker.end()
+        if not any(slot.job is None for slot in self._slots):
+            self._add_spare()
+
+    def _reply(self, job: Job, result: Message) -> None:
+        fields = {**result.fields, "id": job.job_id}
+        self._loop.send(job.client, result._replace(fields=fields))
+
+
+def run_preview(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter) -> None:
+    """Serve previews until SIGTERM or the end of the supervisor."""
+    scale = build_board_requirements(display.config).scale
+    loop = MessageLoop()
+    server = PreviewServer(loop, folder, lambda job: run_job(display, scale, job))
+    ending: list[int] = []
+    signal.signal(signal.SIGTERM, lambda number, frame: ending.append(number))
+    loop.watch(beat, beat.receive)
+    beat.report_ready()
+    try:
+        while not ending:
+            beat.beat()
+            server.step()
+    except SupervisorGoneError:
+        return
+    finally:
+        server.close()

@@ -1,0 +1,155 @@
+"""Worker process of the preview process: a forked child that does one job at a time within limits.
+
+A job that exceeds its time ends with its worker. Fresh workers serve at normal priority; dry runs, and builds that take
+longer than usual, run at low priority and are the last job of their worker.
+"""
+
+import ctypes
+import os
+import resource
+import signal
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from optodrive.core.errors import InputError, OptodriveError
+from optodrive.core.ipc import Message, MessageDecoder, MessageSocket, encode_message
+from optodrive.daemon.preview.jobs import build_refusal
+
+WALL_S = {"build": 5.0, "dry_run": 60.0}
+"""Longest duration of a job, s, including the time for which the processor serves others."""
+CPU_MARGIN_S = 1
+MEMORY_BYTES = {"build": 768_000_000, "dry_run": 1_500_000_000}
+"""Memory that a job may allocate, bytes."""
+LOW_PRIORITY = 10
+QUICK_S = 0.1
+"""Duration of a usual build, s."""
+JOBS_MAX = 200
+"""Jobs after which a worker is replaced."""
+LARGE_BYTES = 1_000_000
+"""A worker is replaced after a job of this size, because it keeps the memory."""
+PR_SET_PDEATHSIG = 1
+JobRunner = Callable[[Message], Message]
+
+
+def build_timeout_error(kind: str) -> InputError:
+    """Build the error of a job that took too long."""
+    what = "a body that is built" if kind == "build" else "a sequence that is planned"
+    return InputError("body", "a longer computation", f"{what} within {WALL_S[kind]:g} s", "too_slow")
+
+
+def build_memory_error(kind: str) -> InputError:
+    """Build the error of a job that took too much memory."""
+    expected = f"a request that takes at most {MEMORY_BYTES[kind] // 1_000_000} MB"
+    return InputError("body", "more memory", expected, "too_large")
+
+
+class Worker:
+    """Parent's side of one worker process.
+
+    connection: to the worker; deadline_s: host time at which the current job must have ended
+    """
+
+    def __init__(self, run_job: JobRunner) -> None:
+        """Fork the worker. The calling process must have no other threads."""
+        parent_end, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
+        parent = os.getpid()
+        self.pid = os.fork()
+        if self.pid == 0:
+            _run_child(child_end, run_job, parent)
+        child_end.close()
+        self.connection = MessageSocket(parent_end)
+        self.deadline_s = self._demote_at_s = float("inf")
+        self.is_reusable = True
+        self._kind = "build"
+        self._job_count = 0
+
+    def begin(self, job: Message, now_s: float) -> None:
+        """Start the clock of a job that is being sent."""
+        self._kind = job.kind
+        self._job_count += 1
+        self.is_reusable &= self._job_count < JOBS_MAX and len(job.payload) < LARGE_BYTES
+        self.deadline_s, self._demote_at_s = now_s + WALL_S[job.kind], now_s + QUICK_S
+        if job.kind == "dry_run":
+            self._demote()
+
+    def finish(self) -> None:
+        """Stop the clock."""
+        self.deadline_s = self._demote_at_s = float("inf")
+
+    @property
+    def next_check_s(self) -> float:
+        """Host time at which `check` must be called next."""
+        return min(self.deadline_s, self._demote_at_s)
+
+    def check(self, now_s: float) -> bool:
+        """Lower the priority of a slow job. Return whether the job has exceeded its time."""
+        if now_s >= self._demote_at_s:
+            self._demote()
+        return now_s >= self.deadline_s
+
+    def _demote(self) -> None:
+        self.is_reusable = False
+        self._demote_at_s = float("inf")
+        os.setpriority(os.PRIO_PROCESS, self.pid, LOW_PRIORITY)
+
+    def end(self) -> OptodriveError:
+        """Kill the process if it still runs, and return the error of a job that ended with it."""
+        os.kill(self.pid, signal.SIGKILL)  # the process is not reaped yet, so the id is its own
+        _, status = os.waitpid(self.pid, 0)
+        if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU:
+            return build_timeout_error(self._kind)
+        how = f"signal {os.WTERMSIG(status)}" if os.WIFSIGNALED(status) else f"status {os.WEXITSTATUS(status)}"
+        return OptodriveError(f"the process that worked on the request ended with {how}")
+
+
+def _run_child(connection: socket.socket, run_job: JobRunner, parent: int) -> None:
+    """Serve jobs until the parent closes the connection. Never return."""
+    try:
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_DFL)
+        _close_inherited(connection.fileno())
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        base_bytes = _read_data_bytes()
+        decoder = MessageDecoder()
+        while os.getppid() == parent:
+            data = connection.recv(1 << 20)
+            if not data:
+                break
+            for job in decoder.feed(data):
+                _limit(job.kind, base_bytes)
+                connection.sendall(encode_message(_run_safely(run_job, job)))
+    finally:
+        os._exit(0)
+
+
+def _close_inherited(kept: int) -> None:
+    """Close the descriptors of the parent's other connections, which would hide their end from the peers."""
+    highest = max(int(entry.name) for entry in Path("/proc/self/fd").iterdir())
+    os.closerange(3, kept)
+    os.closerange(kept + 1, highest + 1)
+
+
+def _read_data_bytes() -> int:
+    """Return the memory of the process that RLIMIT_DATA counts, bytes."""
+    status = Path("/proc/self/status").read_text()
+    return 1024 * int(status.partition("VmData:")[2].split()[0])
+
+
+def _limit(kind: str, base_bytes: int) -> None:
+    """Limit the processor time and the memory of the next job."""
+    cpu_s = int(time.process_time() + WALL_S[kind]) + CPU_MARGIN_S
+    for limit, value in ((resource.RLIMIT_CPU, cpu_s), (resource.RLIMIT_DATA, base_bytes + MEMORY_BYTES[kind])):
+        _, hard = resource.getrlimit(limit)
+        resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+
+
+def _run_safely(run_job: JobRunner, job: Message) -> Message:
+    try:
+        return run_job(job)
+    except MemoryError:
+        return build_refusal(build_memory_error(job.kind))
+    except Exception as error:
+        return build_refusal(OptodriveError(f"{job.kind}: {type(error).__name__}: {error}"))

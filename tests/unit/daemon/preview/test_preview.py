@@ -1,0 +1,269 @@
+"""Preview process: each job ends within its limits with one clear line, and the next one runs."""
+
+import json
+import multiprocessing as mp
+import os
+import pickle
+import signal
+import socket
+import time
+from pathlib import Path
+
+import pytest
+
+from displays import DISPLAYS
+from optodrive.core.beat import BeatWriter
+from optodrive.core.ipc import Message, MessageSocket
+from optodrive.daemon.preview import jobs, worker
+from optodrive.daemon.preview.jobs import DryRunStart
+from optodrive.daemon.preview.process import run_preview
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.supervisor.runtime_folder import open_runtime_folder
+from optodrive.planning.pipeline import warm_up
+from optodrive.planning.stimuli.sequence_codec import decode_sequence
+
+DISPLAY = DISPLAYS["display-16"]
+FRAME = {"show_at_s": 0, "duration_s": 1, "target_um": {"5": 60}}
+SMALL = json.dumps({"frames": [FRAME]}).encode()
+PATIENCE_S = 60.0
+
+
+def wait_for(condition):
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.005)
+
+
+class Preview:
+    """A preview process and one connection to it."""
+
+    def __init__(self):
+        self.folder = open_runtime_folder(0, None)
+        self.supervisor, child_end = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.process = mp.get_context("fork").Process(target=self._run, args=(child_end,))
+        self.process.start()
+        child_end.close()
+        self.supervisor.settimeout(PATIENCE_S)
+        while b"ready" not in self.supervisor.recv(1000):
+            pass
+        self.socket = self.connect()
+
+    def _run(self, child_end):
+        self.supervisor.close()
+        run_preview(DISPLAY, self.folder, BeatWriter(child_end.detach()))
+
+    def connect(self):
+        return MessageSocket.connect(self.folder.preview_socket)
+
+    def send(self, kind, job_id, payload=b"", **fields):
+        self.socket.send(Message(kind, {"id": job_id, **fields}, payload))
+
+    def build(self, job_id, body, source="sequence", name="push", **fields):
+        self.send("build", job_id, body, source=source, name=name, **fields)
+
+    def dry_run(self, job_id, body):
+        start = pickle.dumps(DryRunStart(*DISPLAY.build_cold_state(), 0.05))
+        fields = {"source": "sequence", "name": "push", "policy": "trim", "fit": "as_is"}
+        self.send("dry_run", job_id, start + body, snapshot_bytes=len(start), **fields)
+
+    def results(self, count):
+        """Wait for results and return them by id, with the time of their arrival."""
+        found = {}
+        deadline_s = time.monotonic() + PATIENCE_S
+        while len(found) < count:
+            assert time.monotonic() < deadline_s, found
+            self.socket.flush()
+            for message in self.socket.receive():
+                found[message.fields["id"]] = message
+            time.sleep(0.002)
+        return found
+
+    def result(self):
+        (message,) = self.results(1).values()
+        return message
+
+    def workers(self):
+        children = Path(f"/proc/{self.process.pid}/task/{self.process.pid}/children").read_text()
+        return {int(pid) for pid in children.split()}
+
+    def slow_workers(self):
+        """Return the workers of low priority."""
+        return {pid for pid in self.workers() if os.getpriority(os.PRIO_PROCESS, pid) == worker.LOW_PRIORITY}
+
+    def stop(self):
+        self.socket.close()
+        self.supervisor.close()
+        self.process.join(10)
+        assert self.process.exitcode in (0, -signal.SIGKILL)
+        self.folder.remove()
+
+
+@pytest.fixture
+def preview(start):
+    return start()
+
+
+def problem(message):
+    return message.fields["status"], json.loads(message.payload)
+
+
+def assert_serves(preview):
+    preview.build(99, SMALL)
+    message = preview.result()
+    assert message.fields == {"id": 99, "status": 200}
+    (frame,) = decode_sequence(message.payload).frames
+    assert frame.target_m[5] == pytest.approx(60e-6)
+
+
+def test_sequences_and_patterns_are_built_and_errors_are_problems(preview):
+    assert_serves(preview)
+    preview.build(1, b'{"pixel": 3, "height_um": 40}', "pattern", "pixel")
+    assert decode_sequence(preview.result().payload).frames[0].target_m[3] == pytest.approx(40e-6)
+    preview.build(2, b"", "pattern", "pixel")
+    assert preview.result().fields["status"] == 200
+    for body, source, name, status, code in (
+        (b"{", "sequence", "push", 422, "bad_json"),
+        (b"[]", "pattern", "pixel", 422, "bad_input"),
+        (b"{}", "pattern", "pixle", 404, "unknown_pattern"),
+    ):
+        preview.build(3, body, source, name)
+        found, document = problem(preview.result())
+        assert (found, document["code"]) == (status, code)
+
+
+def test_a_dry_run_is_planned_from_its_snapshot_and_is_not_stored(preview):
+    preview.dry_run(7, SMALL)
+    message = preview.result()
+    report = PlanReport.model_validate_json(message.payload)
+    assert (message.fields["status"], report.plan, report.status, report.planned) == (200, "dry-run", "planned", 1)
+    assert report.starts_in_s == 0.05
+    assert message.fields["audit"] == {"plan": "dry-run", "pattern": "push", "pulses": 1, "plan_status": "planned"}
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"{" + b",".join([b'"aaaaaaaaaaaa":0'] * 500_000) + b"}",
+        b"{" + b",".join(b'"%012d":0' % k for k in [*range(499_999), 499_998]) + b"}",
+    ],
+    ids=["one key", "one of many keys"],
+)
+def test_a_body_that_repeats_a_key_is_refused_in_one_line(preview, body):
+    assert len(body) > 7_900_000
+    begun_s = time.monotonic()
+    preview.build(1, body)
+    status, document = problem(preview.result())
+    assert (status, document["code"]) == (422, "bad_json")
+    assert "each key of an object once" in document["detail"]
+    assert "\n" not in document["detail"]
+    assert time.monotonic() - begun_s < worker.WALL_S["build"]
+    assert_serves(preview)
+
+
+def build_slowly(*_):
+    while True:
+        sum(range(1000))
+
+
+@pytest.fixture
+def start(tmp_path, monkeypatch):
+    """Return a function that starts a preview process; act: what building the body b"bad" does."""
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    warm_up(DISPLAY)
+    started, parse = [], jobs.parse_sequence
+
+    def start_preview(act=build_slowly):
+        monkeypatch.setattr(jobs, "parse_sequence", lambda body, *more: act() if body == b"bad" else parse(body, *more))
+        started.append(Preview())
+        return started[-1]
+
+    yield start_preview
+    for preview in started:
+        preview.stop()
+
+
+def test_a_body_that_is_built_too_slowly_ends_at_its_limit_and_others_are_built_meanwhile(start, monkeypatch):
+    monkeypatch.setitem(worker.WALL_S, "build", 1.0)
+    preview = start()
+    begun_s = time.monotonic()
+    preview.build(1, b"bad")
+    assert_serves(preview)
+    assert time.monotonic() - begun_s < 1.0
+    status, document = problem(preview.result())
+    assert (status, document["code"]) == (422, "too_slow")
+    assert document["detail"] == "body: got 'a longer computation', expected a body that is built within 1 s"
+    assert time.monotonic() - begun_s > 0.9
+    assert_serves(preview)
+
+
+def test_a_dry_run_that_takes_too_long_ends_at_its_limit(start, monkeypatch):
+    monkeypatch.setitem(worker.WALL_S, "dry_run", 0.5)
+    monkeypatch.setattr(jobs, "make_record", build_slowly)
+    preview = start()
+    preview.dry_run(1, SMALL)
+    assert_serves(preview)
+    status, document = problem(preview.result())
+    assert (status, document["code"]) == (422, "too_slow")
+    assert "a sequence that is planned within 0.5 s" in document["detail"]
+    assert_serves(preview)
+
+
+def test_a_job_that_takes_too_much_memory_is_refused(start):
+    preview = start(lambda: bytearray(2_000_000_000))
+    preview.build(1, b"bad")
+    status, document = problem(preview.result())
+    assert (status, document["code"]) == (422, "too_large")
+    assert "at most 768 MB" in document["detail"]
+    assert_serves(preview)
+
+
+def test_a_worker_that_crashes_costs_only_its_job(start):
+    preview = start(lambda: os.kill(os.getpid(), signal.SIGSEGV))
+    preview.build(1, b"bad")
+    status, document = problem(preview.result())
+    assert status == 500
+    assert document["detail"] == "the process that worked on the request ended with signal 11"
+    assert_serves(preview)
+
+
+def test_the_work_of_a_caller_that_left_ends_at_once(start, monkeypatch):
+    monkeypatch.setattr(jobs, "make_record", build_slowly)
+    preview = start()
+    for job_id in range(3):  # one runs, two wait
+        preview.dry_run(job_id, SMALL)
+    wait_for(preview.slow_workers)
+    first = preview.slow_workers()
+    assert_serves(preview)
+    preview.send("drop", 1)
+    preview.send("drop", 0)
+    wait_for(lambda: preview.slow_workers() and not preview.slow_workers() & first)  # the last one runs
+    left, preview.socket = preview.socket, preview.connect()
+    left.close()
+    wait_for(lambda: not preview.slow_workers())
+    assert_serves(preview)
+
+
+def test_the_queue_is_bounded_for_each_kind_and_each_caller(start):
+    preview = start()
+    for job_id in range(12):
+        preview.build(job_id, b"bad", caller=f"caller {job_id % 8}")
+    refused = preview.results(2)
+    for message in refused.values():
+        status, document = problem(message)
+        assert (status, document["code"]) == (503, "busy")
+        assert "too many requests wait" in document["detail"]
+    assert set(refused) == {10, 11}
+    for job_id in range(10):
+        preview.send("drop", job_id)
+    for job_id in range(20, 27):
+        preview.build(job_id, b"bad", caller="one")
+    assert set(preview.results(1)) == {26}  # two run, four of the caller wait
+
+
+def test_the_workers_end_with_the_preview_process(preview):
+    (spare,) = preview.workers()
+    preview.process.kill()
+    preview.process.join(10)
+    status = Path(f"/proc/{spare}/status")
+    wait_for(lambda: not status.exists() or "State:\tZ" in status.read_text())
