@@ -1,0 +1,255 @@
+"""The supervisor's loop: starts the children, watches their beats, restarts them, and ends them with the gate off."""
+
+import os
+import select
+import signal
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import OptodriveError
+from optodrive.daemon.log import DaemonLog
+from optodrive.daemon.notify import Notifier
+from optodrive.daemon.supervisor.child import Child
+from optodrive.daemon.supervisor.link_view import LinkView
+
+TICK_S = 0.1
+STOP_CONFIRMATION_S = 0.5
+END_GRACE_S = 3.0
+"""Time for a child to end after SIGTERM. The web server gives slow clients two seconds."""
+READY_TIMEOUT_S = 60.0
+AUDIT_MAX = 100
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class StartError(OptodriveError):
+    """A process of the daemon did not start; the message is the one that it reported."""
+
+    code = "start"
+
+    def __init__(self, message: str, exit_status: int) -> None:
+        self.exit_status = exit_status
+        super().__init__(message)
+
+
+def _build_start_error(child: Child, ended: str) -> StartError:
+    if child.failure is None:
+        return StartError(f"the {child.name} process {ended}", 1)
+    return StartError(child.failure.message, child.failure.exit_status)
+
+
+class Supervisor:
+    """Starts, watches and ends the children.
+
+    link: the child that owns the board, with its view; web: the child that answers callers, once it is known
+    on_reload: called for SIGHUP, if that asks for a reload; on_web_message: receives messages of the web process
+    on_board_seen: called when the board, or its absence, is known, and when it is first connected
+    """
+
+    def __init__(self, link: Child, link_view: LinkView, notifier: Notifier, log: DaemonLog, clock: Clock) -> None:
+        self.on_reload: Callable[[], None] | None = None
+        self.on_web_message: Callable[[dict[str, Any]], None] = lambda fields: None
+        self.on_board_seen: Callable[[LinkView], None] = lambda link_view: None
+        self.link_view = link_view
+        self.web: Child | None = None
+        self._link = link
+        self._children = [link]
+        self._notifier = notifier
+        self._log = log
+        self._clock = clock
+        self._audit: deque[dict[str, Any]] = deque(maxlen=AUDIT_MAX)
+        self._signals: set[int] = set()
+        self._wakeup_read, self._wakeup_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._is_loading, self._is_serving, self._is_ending = True, False, False
+        self._status_text = ""
+        self._reported_link_error = ""
+        self._was_connected = self._was_announced_connected = False
+
+    # --- life -------------------------------------------------------------------------------------------------------
+
+    def install_signal_handlers(self) -> None:
+        """Let SIGINT and SIGTERM end the daemon; SIGHUP as well, unless it asks for a reload.
+
+        Until the loop runs, they end the daemon by an exception.
+        """
+        signal.set_wakeup_fd(self._wakeup_write, warn_on_full_buffer=False)
+        for number in SIGNALS:
+            signal.signal(number, self._on_signal)
+
+    def _on_signal(self, number: int, frame: object) -> None:
+        if self._is_loading and number == signal.SIGINT:
+            raise KeyboardInterrupt
+        if self._is_loading:
+            raise SystemExit(0)
+        self._signals.add(number)
+
+    def start_link(self) -> None:
+        """Start the link process, which needs nothing of what the others need."""
+        self._link.start()
+
+    def start_others(self, others: list[Child], web: Child) -> bool:
+        """Start the other children; return whether all serve and the link has an answer about the board.
+
+        Return False if a signal ended the start. Raise StartError if a child cannot serve.
+        """
+        deadline_s = self._clock.now_s() + READY_TIMEOUT_S
+        self.web = web
+        self._is_loading = False
+        self._children += [*others, web]
+        for child in (*others, web):
+            child.start()
+        while not self._has_started():
+            self._step()
+            if self._is_ending:
+                return False
+            if self._clock.now_s() > deadline_s:
+                late = ", ".join(child.name for child in self._children if not child.is_ready) or self._link.name
+                raise StartError(f"not ready after {READY_TIMEOUT_S:g} s: {late}", 1)
+        return True
+
+    def _has_started(self) -> bool:
+        is_answered = bool(self.link_view.status.get("connected") or self.link_view.link_error)
+        return is_answered and all(child.is_ready for child in self._children)
+
+    def serve(self) -> None:
+        """Watch the children until a signal ends the daemon."""
+        self._is_serving = True
+        self._announce_board()
+        self._notifier.send("READY=1")
+        while not self._is_ending:
+            self._step()
+
+    def close(self) -> None:
+        """Turn the gate off, then end the children, then kill those that do not end."""
+        self._is_loading, self._is_ending = False, True
+        self._notifier.send("STOPPING=1")
+        self._stop_board()
+        self.record_audit({"event": "ended"})
+        self.send_to_web({"kind": "end"})
+        self._end([child for child in self._children if child is not self._link])
+        self._end([self._link])
+        self.link_view.close()
+        signal.set_wakeup_fd(-1)
+        os.close(self._wakeup_read)
+        os.close(self._wakeup_write)
+
+    def _stop_board(self) -> None:
+        """Send STOP and wait until the board has confirmed it, for a limited time."""
+        self.link_view.stop()
+        deadline_s = self._clock.now_s() + STOP_CONFIRMATION_S
+        while self.link_view.descriptors and not self.link_view.is_stopped and self._clock.now_s() < deadline_s:
+            self._wait(self.link_view.descriptors, 0.02)
+            self.link_view.receive()
+
+    def _end(self, children: list[Child]) -> None:
+        for child in children:
+            child.send_signal(signal.SIGTERM)
+            child.send_signal(signal.SIGCONT)
+        deadline_s = self._clock.now_s() + END_GRACE_S
+        while any(child.is_running for child in children):
+            if self._clock.now_s() > deadline_s:
+                for child in children:
+                    child.kill("did not end")
+            self._wait([descriptor for child in children for descriptor in child.descriptors], 0.05)
+            for child in children:
+                child.collect()
+
+    # --- loop -------------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        descriptors = [descriptor for child in self._children for descriptor in child.descriptors]
+        awaited = [] if self._is_serving else self.link_view.descriptors  # later it is read at every tick
+        self._wait([self._wakeup_read, *descriptors, *awaited], TICK_S)
+        with suppress(BlockingIOError):
+            os.read(self._wakeup_read, 4096)
+        self._handle_signals()
+        for child in self._children:
+            for fields in child.receive():
+                if child is self.web:
+                    self.on_web_message(fields)
+        self.link_view.receive()
+        for child in self._children:
+            self._watch(child)
+        self._deliver_audit()
+        self._publish()
+
+    def _wait(self, descriptors: list[int], timeout_s: float) -> None:
+        poll = select.poll()
+        for descriptor in descriptors:
+            poll.register(descriptor, select.POLLIN)
+        poll.poll(timeout_s * 1e3)
+
+    def _handle_signals(self) -> None:
+        signals, self._signals = self._signals, set()
+        if signals & {signal.SIGINT, signal.SIGTERM} or (signals and self.on_reload is None):
+            self._is_ending = True
+        elif signals and self._is_serving and self.on_reload is not None:
+            self.on_reload()
+
+    def _watch(self, child: Child) -> None:
+        reason = child.find_hang()
+        if reason is not None:
+            child.kill(f"killed: {reason}")
+        ended = child.collect()
+        if ended is not None:
+            if child is self._link:
+                self.link_view.close()
+            if not self._is_serving:
+                raise _build_start_error(child, ended)
+            self._report_end(child, ended)
+        if self._is_serving and child.is_due and not self._is_ending:
+            child.start()
+
+    def _report_end(self, child: Child, ended: str) -> None:
+        if child.failure is not None:
+            ended = f"{ended}: {child.failure.message}"
+        self._log.write(f"the {child.name} process {ended}; it starts again, disarmed", "err", EVENT="restarted")
+        self.record_audit({"event": "restarted", "process": child.name, "reason": ended})
+
+    def send_to_web(self, fields: dict[str, Any]) -> bool:
+        """Send a control message to the web process; return whether it serves and receives it."""
+        return self.web is not None and self.web.is_ready and self.web.send(fields)
+
+    # --- audit, service manager, log --------------------------------------------------------------------------------
+
+    def record_audit(self, fields: dict[str, Any]) -> None:
+        """Append an entry to the audit log, as soon as the web process serves."""
+        self._audit.append(fields)
+        self._deliver_audit()
+
+    def _deliver_audit(self) -> None:
+        while self._audit and self.send_to_web({"kind": "audit", "fields": self._audit[0]}):
+            self._audit.popleft()
+
+    def _publish(self) -> None:
+        """Feed the watchdog while all beats are fresh, and tell the service manager about processes and board."""
+        if all(child.is_ready and not child.killed_because for child in self._children):
+            self._notifier.feed_watchdog()
+        missing = [child.name for child in self._children if not child.is_ready]
+        board = f"board at {self.link_view.status.get('port', '')}, {self.link_view.board_state}"
+        text = f"waiting for {', '.join(missing)}" if missing else board
+        if text != self._status_text:
+            self._status_text = text
+            self._notifier.send(f"STATUS={text}")
+        if self._is_serving and not self._was_announced_connected and self.link_view.status.get("connected"):
+            self._announce_board()
+        self._report_link_error()
+
+    def _announce_board(self) -> None:
+        self._was_announced_connected = bool(self.link_view.status.get("connected"))
+        self.on_board_seen(self.link_view)
+
+    def _report_link_error(self) -> None:
+        """Log why the board is absent, before its first connection or if it contradicts the configuration.
+
+        The planner process reports the loss of a link, with its likely cause.
+        """
+        status, error = self.link_view.status, self.link_view.link_error
+        self._was_connected |= bool(status.get("connected"))
+        if not status or error == self._reported_link_error:
+            return
+        self._reported_link_error = error
+        if error and (not self._was_connected or status.get("link_error_code") == "board"):
+            self._log.warn(f"waiting for the board at {status.get('port', '')}: {error}")
