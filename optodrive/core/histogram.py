@@ -20,3 +20,12 @@ class Histogram:
     def cumulative_counts(self) -> list[int]:
         """Return the number of values up to each bound, followed by the number of all values."""
         return list(accumulate(self._counts))
+
+    @property
+    def counts(self) -> list[int]:
+        """Number of values in each interval, the last one without an upper bound."""
+        return list(self._counts)
+
+    def load(self, counts: list[int], total: float) -> None:
+        """Replace the contents by the counts and the sum of another histogram with the same bounds."""
+        self._counts, self.sum = list(counts), total

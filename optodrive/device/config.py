@@ -249,6 +249,8 @@ class DaemonSection(Section):
     """Requests of one client at once."""
     record: str = ""
     """Folder for a recording of each session."""
+    on_web_loss: Literal["dark", "finish"] = "dark"
+    """End of the web process while a plan runs: go dark at once, or finish the plan."""
 
 
 class Config(Section):

@@ -45,10 +45,18 @@ class ClockSync:
         """Shortest round trip of the recent samples, s, None without any."""
         return min((sample[0] for sample in self._samples), default=None)
 
-    def board_s(self, host_s: float) -> float:
-        """Return the board time at host time host_s, s, or 0 before the first exchange."""
+    def find_best_sample(self, host_s: float) -> tuple[float, float] | None:
+        """Return host time and board time, s, of the narrowest exchange as of host_s; None before the first."""
         samples = self._samples
         if not samples:
+            return None
+        best = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
+        return best[1:]
+
+    def board_s(self, host_s: float) -> float:
+        """Return the board time at host time host_s, s, or 0 before the first exchange."""
+        sample = self.find_best_sample(host_s)
+        if sample is None:
             return 0.0
-        _, midpoint_s, board_s = min(samples, key=lambda sample: sample[0] + DRIFT_MAX * (host_s - sample[1]))
+        midpoint_s, board_s = sample
         return board_s + (host_s - midpoint_s)

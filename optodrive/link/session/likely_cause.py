@@ -23,7 +23,7 @@ class LinkEvidence:
     silent: whether the board stopped answering, rather than the port reporting an error
     stall_s: longest time between two iterations of the host's loop
     host_bad_frames, board_bad_frames: frames received damaged
-    planner_stalled: whether the lease was withheld because the planner made no progress
+    stalled: process without whose progress the lease was withheld, '' for none
     """
 
     port: str
@@ -35,7 +35,7 @@ class LinkEvidence:
     board_bad_frames: int = 0
     retransmitted: int = 0
     naks: int = 0
-    planner_stalled: bool = False
+    stalled: str = ""
 
 
 def diagnose_port(port: str, state: PortState) -> str | None:
@@ -75,7 +75,7 @@ def diagnose_lease_expiry(evidence: LinkEvidence) -> str:
     """Return the likely cause of an expired lease while the link was up."""
     return (
         _diagnose_host_stall(evidence)
-        or _diagnose_planner_stall(evidence)
+        or _diagnose_process_stall(evidence)
         or _diagnose_corruption(evidence)
         or (
             "the host was on time and no frame arrived damaged: bytes were delayed on the link; "
@@ -93,9 +93,11 @@ def _diagnose_host_stall(evidence: LinkEvidence) -> str | None:
     )
 
 
-def _diagnose_planner_stall(evidence: LinkEvidence) -> str | None:
-    if not evidence.planner_stalled:
+def _diagnose_process_stall(evidence: LinkEvidence) -> str | None:
+    if not evidence.stalled:
         return None
+    if evidence.stalled == "web":
+        return "the web process did not respond and the lease was withheld: see the daemon's log"
     return "the planner made no progress and the lease was withheld: submit smaller plans, or check the last one"
 
 

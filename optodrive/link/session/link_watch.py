@@ -45,6 +45,7 @@ class LinkWatch:
         self._lease_s = lease_s
         self._last_loop_s: float | None = None
         self._lease_withheld_s: float | None = None
+        self._stalled = ""
         self._stall_s, self._stall_at_s = 0.0, 0.0
         self._samples: deque[tuple[float, LinkErrorCounts]] = deque()
         self._counts = LinkErrorCounts()
@@ -58,12 +59,12 @@ class LinkWatch:
         self._samples.clear()
         self._counts, self._last_loop_s, self._fault = LinkErrorCounts(), None, ""
 
-    def on_loop(self, now_s: float, may_renew_lease: bool, counts: LinkErrorCounts) -> None:
-        """Record one loop iteration. may_renew_lease: whether the planner permits a renewal."""
+    def on_loop(self, now_s: float, stalled: str, counts: LinkErrorCounts) -> None:
+        """Record one loop iteration. stalled: process because of which the lease is not renewed, '' for none."""
         self._record_stall(now_s)
         self._last_loop_s = now_s
-        if not may_renew_lease:
-            self._lease_withheld_s = now_s
+        if stalled:
+            self._lease_withheld_s, self._stalled = now_s, stalled
         self._counts = counts
         if not self._samples or now_s - self._samples[-1][0] >= SAMPLE_INTERVAL_S:
             self._samples.append((now_s, counts))
@@ -127,7 +128,7 @@ class LinkWatch:
     def _collect_evidence(self, now_s: float, state: PortState, silent: bool) -> LinkEvidence:
         oldest = self._samples[0][1] if self._samples else LinkErrorCounts()
         recent = LinkErrorCounts(*(now - then for now, then in zip(self._counts, oldest, strict=True)))
-        planner_stalled = (
+        withheld = (
             self._lease_withheld_s is not None and now_s - self._lease_withheld_s < self._lease_s + SAMPLE_INTERVAL_S
         )
         return LinkEvidence(
@@ -136,6 +137,6 @@ class LinkWatch:
             silent=silent,
             lease_s=self._lease_s,
             stall_s=self._stall_s if now_s - self._stall_at_s <= EVIDENCE_WINDOW_S else 0.0,
-            planner_stalled=planner_stalled,
+            stalled=self._stalled if withheld else "",
             **recent._asdict(),
         )

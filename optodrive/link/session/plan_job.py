@@ -78,6 +78,14 @@ class PlanJob:
         )
         return max(0, min(due_count, self._count) - position)
 
+    @property
+    def next_due_tick(self) -> float | None:
+        """Board tick from which the next point may be sent, None if it need not wait."""
+        position = self.next_to_send - self.first_index
+        if self._send_ahead_ticks == inf or position == 0 or position >= self._count:
+            return None
+        return float(self._end_tick[position - 1]) - self._send_ahead_ticks
+
     def take_payload(self, count: int, now_tick: float) -> bytes:
         """Return the bytes of the next points and mark them as sent."""
         if self.first_sent_tick is None:

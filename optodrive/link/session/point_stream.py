@@ -101,6 +101,13 @@ class PointStream:
             link.send(m.End(self._number, self._next_index))
             self._end_sent = True
 
+    def find_due_tick(self) -> float | None:
+        """Return the board tick from which the next point may be sent, None if no point waits for its time."""
+        for job in self._jobs:
+            if not job.is_fully_sent:
+                return job.next_due_tick
+        return None
+
     def _send_points(self, link: HostConnection, job: PlanJob, count: int, now_tick: float) -> None:
         watermark = min(WATERMARK_POINTS, job.count_sendable(now_tick))
         link.send(m.Data(job.next_to_send, job.take_payload(count, now_tick)))

@@ -6,7 +6,7 @@ a reconnect the board is DISARMED.
 
 import secrets
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from math import inf
 from typing import Any
@@ -16,11 +16,11 @@ from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.connection import HostConnection
 from optodrive.link.protocol.quantisation import WirePoints, WireScale
-from optodrive.link.protocol.states import IDLE_STATES, LEASED_STATES, BoardState
+from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, BoardState
 from optodrive.link.session.board_requirements import BoardRequirements
 from optodrive.link.session.board_view import BoardView
 from optodrive.link.session.clock_sync import ClockSync
-from optodrive.link.session.lease_renewal import LeaseRenewal
+from optodrive.link.session.lease_renewal import RENEWAL_FRACTION, LeaseRenewal
 from optodrive.link.session.link_watch import LinkCause, LinkErrorCounts, LinkWatch
 from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.point_stream import PointStream
@@ -33,6 +33,8 @@ CLOCK_INTERVAL_S = 1.0
 CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
+WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
+RETRANSMISSION_WAIT_S = 0.002
 SPLICE_LEAD_S = 0.01
 """Minimum time between a splice and the end of the points before it."""
 
@@ -43,6 +45,7 @@ class BoardSession:
     faults: number of times that the board reported each fault
     lease: schedule and statistics of the lease renewals
     board: latest reported state of the board
+    on_executed: called with every report of executed points
     """
 
     def __init__(self, transport: Transport, clock: Clock, requirements: BoardRequirements) -> None:
@@ -52,6 +55,8 @@ class BoardSession:
         self._connection = HostConnection()
         self._clock_sync = ClockSync()
         self._points = PointStream()
+        self._points_held = False
+        self.on_executed: Callable[[m.Executed], None] = lambda message: None
         self._hello_sent_s = 0.0
         self._refusal: str | None = None
         self._arm_nonce: int | None = None
@@ -81,6 +86,11 @@ class BoardSession:
         return self._clock_sync.board_s(self._clock.now_s())
 
     @property
+    def clock_sample(self) -> tuple[float, float] | None:
+        """Host time and board time of the exchange that board_s() uses, s, None before the first."""
+        return self._clock_sync.find_best_sample(self._clock.now_s())
+
+    @property
     def is_ready(self) -> bool:
         """Whether a job may start now."""
         return self.board.state == BoardState.ARMED and not self._points and self.is_acknowledged
@@ -98,25 +108,44 @@ class BoardSession:
         Raise LinkError without an answer, InputError if the board does not meet the requirements. After a failure the
         previous clock synchronisation stays valid, because thermal states refer to it.
         """
-        previous_sync = self._clock_sync
         try:
             self._transport.open()
-            self._handshake()
+        except (LinkError, InputError):
+            self.on_connect_failed()
+            raise
+        for _ in self.connect_step_by_step(block=True):
+            pass
+
+    def connect_step_by_step(self, block: bool = False) -> Iterator[float]:
+        """Perform the handshake over the open port, one exchange per step, and yield the longest wait before the next.
+
+        block: whether a step waits for bytes itself. Raise errors as `connect` does.
+        """
+        previous_sync = self._clock_sync
+        try:
+            for wait_s in self._handshake():
+                self._exchange(wait_s if block else 0.0)
+                yield wait_s
         except (LinkError, InputError):
             self._clock_sync = previous_sync
-            self._transport.close()
-            self._watch.on_reconnect_failed(self._clock.now_s())
+            self.on_connect_failed()
             raise
         self._watch.on_reconnected(self._clock.now_s(), self._reset_code, self.board_s(), self._count_errors())
         self.connected = True
 
-    def _handshake(self) -> None:
+    def on_connect_failed(self) -> None:
+        """Close the port, which could not be opened or whose board did not answer, and update the likely cause."""
+        self._transport.close()
+        self._watch.on_reconnect_failed(self._clock.now_s())
+
+    def _handshake(self) -> Iterator[float]:
+        """Send what is due in each step of the handshake, and yield how long to wait for bytes."""
         self._reset()
         self._send_hello()
         deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
         while self._connection.peer is None:
             self._retry_hello()
-            self._exchange(0.02)
+            yield 0.02
             if self._clock.now_s() > deadline_s:
                 raise LinkError(
                     f"{self.port} is open, but no board answers: check its power, the port and the baud rate"
@@ -124,16 +153,16 @@ class BoardSession:
         while not (self.is_acknowledged and self._clock_sync.is_synchronised and self.board.state != "UNKNOWN"):
             self._request_clock()
             self._request_status()
-            self._exchange(0.02)
+            yield 0.02
             if self._clock.now_s() > deadline_s:
                 raise LinkError(f"{self.port}: the board answers HELLO but nothing else; {self._describe_errors()}")
         for _ in range(CLOCK_INITIAL_SAMPLES):
             self._request_clock()
-            self._exchange(0.005)
+            yield 0.005
 
     def _send_hello(self) -> None:
         """Begin a session. The board ends its previous activity and goes to DISARMED."""
-        self._points.clear()
+        self.hold_points()
         self._hello_sent_s = self._clock.now_s()
         self._connection.send_hello(secrets.randbits(32))
 
@@ -193,13 +222,15 @@ class BoardSession:
 
     # --- loop ---------------------------------------------------------------------------------------------------
 
-    def step(self, wait_s: float, renew_lease: bool) -> None:
+    def step(self, wait_s: float, renew_lease: bool, stalled: str = "planner") -> None:
         """Run one loop iteration: send what is due, wait at most wait_s for bytes and process them.
 
-        renew_lease: whether the planner is alive. Raise LinkError if the link failed or the board does not answer.
+        renew_lease: whether the processes that the running plan needs are alive
+        stalled: process to name if the lease expires because it was not renewed
+        Raise LinkError if the link failed or the board does not answer.
         """
         now_s = self._clock.now_s()
-        self._watch.on_loop(now_s, renew_lease, self._count_errors())
+        self._watch.on_loop(now_s, "" if renew_lease else stalled, self._count_errors())
         if self.board.state not in LEASED_STATES:
             self.lease.pause()
         elif renew_lease:
@@ -295,6 +326,7 @@ class BoardSession:
         # A report frees queue space at once. With a small queue, waiting for ACK or STATUS would cause an underrun.
         self.board.done_index = max(self.board.done_index, message.first_index + len(message.records))
         self._points.record_executed(message)
+        self.on_executed(message)
 
     # --- commands -----------------------------------------------------------------------------------------------
 
@@ -304,14 +336,15 @@ class BoardSession:
             fault = f" {self.board.fault}" if self.board.fault else ""
             raise NotReadyError(f"the board is {self.board.state}{fault}; only a DISARMED board can be armed")
         self._refusal = None
-        self._points.clear()
+        self._drop_held_points()
+        self._points_held = False
         self._arm_nonce = secrets.randbits(32)
         self._connection.send(m.ArmReq(host_nonce=self._arm_nonce))
 
     def disarm(self) -> None:
         """Disarm the board, or acknowledge its fault in FAULT."""
         self._refusal = None
-        self._points.clear()
+        self.hold_points()
         self._connection.send(m.ClearFault() if self.board.state == BoardState.FAULT else m.Disarm())
 
     def abort(self) -> None:
@@ -320,6 +353,13 @@ class BoardSession:
         self.abort_confirmed = False
         self._connection.abort()
         self._send_hello()
+
+    def hold_points(self) -> None:
+        """Send nothing of the points handed over so far. Arming drops them."""
+        self._points_held = True
+
+    def _drop_held_points(self) -> None:
+        self._points.clear()
 
     def flush(self) -> None:
         """Turn the gate off and drop the queue. The board stays armed."""
@@ -355,13 +395,31 @@ class BoardSession:
         return self._points.truncate(kept_points)
 
     def _stream_points(self) -> None:
-        if not self._points:
+        if not self._points or self._points_held:
             return
-        if self.board.state not in IDLE_STATES:  # else the board has ended the job: only collect its reports
+        if self.board.state in ARMED_STATES:  # else the board has ended the job: only collect its reports
             now_tick = self.board_s() / self.scale.tick_s
             self._points.send(self._connection, self.board.done_index, self._queue_points, now_tick)
         self._points.request_missing_reports(self._connection, self.board.done_index, self._clock.now_s())
         self._points.drop_finished(self.board.state == BoardState.ARMED)
+
+    @property
+    def has_points(self) -> bool:
+        """Whether points were handed over whose execution is not yet reported."""
+        return bool(self._points)
+
+    def compute_wait_s(self) -> float:
+        """Return the longest time for which the next step may wait if no bytes arrive, s."""
+        wait_s = WAIT_MAX_S
+        if self.board.state in LEASED_STATES:
+            wait_s = min(wait_s, 0.5 * RENEWAL_FRACTION * self._requirements.lease_s)
+        if self._connection.outstanding:
+            wait_s = min(wait_s, RETRANSMISSION_WAIT_S)
+        if not self._points_held and self.board.state in ARMED_STATES:
+            due_tick = self._points.find_due_tick()
+            if due_tick is not None:
+                wait_s = min(wait_s, due_tick * self.scale.tick_s - self.board_s())
+        return max(wait_s, WAIT_MIN_S)
 
     # --- statistics ---------------------------------------------------------------------------------------------
 

@@ -180,9 +180,9 @@ def test_an_unknown_reset_cause_is_reported_as_a_number():
 
 def test_counters_of_an_earlier_link_are_ignored():
     watch = LinkWatch("/dev/none", LEASE_S)
-    watch.on_loop(1.0, True, LinkErrorCounts(host_bad_frames=50))
+    watch.on_loop(1.0, "", LinkErrorCounts(host_bad_frames=50))
     watch.on_opened()
-    watch.on_loop(2.0, True, LinkErrorCounts())
+    watch.on_loop(2.0, "", LinkErrorCounts())
     watch.on_status("LINK", 2.01, LinkErrorCounts())
     assert "was on time" in watch.cause.message
     before = watch.cause

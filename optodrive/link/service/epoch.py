@@ -1,0 +1,18 @@
+"""Epochs: periods between two events that stop the light."""
+
+
+class Epoch:
+    """The present epoch. number: greater than all earlier ones; reason: what has ended the one before, for people."""
+
+    def __init__(self, number: int) -> None:
+        self.number = number
+        self.reason = "the link process has started"
+
+    def end(self, reason: str) -> None:
+        """Begin the next epoch. reason: what ends this one, as the end of a sentence."""
+        self.number += 1
+        self.reason = reason
+
+    def is_current(self, number: int) -> bool:
+        """Return whether points that were accepted in an epoch may be handed over: gate 1."""
+        return number == self.number

@@ -1,0 +1,235 @@
+"""The link process without its sockets: epochs, the lease's conditions, commands of clients, status.
+
+An epoch ends with everything that stops the light: STOP, disarm, a fault, the loss of the link, of the planner or of
+the web process. Points of an ended epoch are never lit: the handover refuses them (gate 1), and arming drops those
+handed over before (gate 2, in the session).
+"""
+
+from collections.abc import Callable, Iterator
+from math import inf
+from typing import Any, NamedTuple
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
+from optodrive.core.ipc import IpcError, Message
+from optodrive.link.protocol.states import ARMED_STATES, UNARMED_STATES
+from optodrive.link.service.clients import Clients
+from optodrive.link.service.epoch import Epoch
+from optodrive.link.service.point_handover import PointHandover
+from optodrive.link.service.results import build_result
+from optodrive.link.service.settings import OnWebLoss
+from optodrive.link.service.status import StatusPublisher
+from optodrive.link.service.waiters import StateWaiters
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.session import BoardSession
+
+RETRY_INTERVAL_S = 1.0
+WAIT_MAX_S = 0.02
+"""Longest wait of the loop, so that status and beats are in time."""
+
+
+class Outgoing(NamedTuple):
+    """Message for clients."""
+
+    clients: tuple[int, ...]
+    message: Message
+
+
+class LinkService:
+    """Core of the link process.
+
+    Every method returns at once; the caller sends what `pop_outgoing` returns. Clients are numbers given by the caller.
+    open_port: opens the transport; returns False while it needs more time, raises LinkError or InputError on failure
+    first_epoch: greater than every epoch of an earlier link process
+    """
+
+    def __init__(
+        self,
+        session: BoardSession,
+        clock: Clock,
+        open_port: Callable[[], bool],
+        on_web_loss: OnWebLoss = "dark",
+        first_epoch: int = 1,
+    ) -> None:
+        self.epoch = Epoch(first_epoch)
+        self.link_error: OptodriveError | None = LinkError("the board is not reached yet")
+        self._session = session
+        self._clock = clock
+        self._open_port = open_port
+        self._clients = Clients(on_web_loss, clock)
+        self._waiters = StateWaiters()
+        self._status = StatusPublisher(session, clock)
+        self._handover = PointHandover(session, self.epoch, self._send_to_planner)
+        self._connecting: Iterator[float] | None = None
+        self._connecting_wait_s = 0.0
+        self._retry_at_s = -inf
+        self._arm_requested = self._was_armed = False
+        self._seen_fault = ""
+        self._outgoing: list[Outgoing] = []
+
+    # --- clients ------------------------------------------------------------------------------------------------
+
+    def on_message(self, client: int, message: Message, trusted: bool = True) -> None:
+        """Carry out a client's message. trusted: whether the client runs as the user of this process.
+
+        Raise IpcError for a message that the client may not send or that is malformed; the caller then ends it.
+        """
+        try:
+            if message.kind == "hello":
+                self._on_hello(client, str(message.fields["role"]), trusted)
+                return
+            self._clients.require_permission(client, message.kind)
+            if message.kind == "beat":
+                self._clients.record_beat(client, bool(message.fields["alive"]))
+            elif message.kind in ("stop", "arm", "disarm"):
+                self._command(client, message.kind, int(message.fields["id"]))
+            else:
+                self._handover.carry_out(message)
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise IpcError(f"message {message.kind!r}: {error!r}") from None
+
+    def _on_hello(self, client: int, role: str, trusted: bool) -> None:
+        replaced = self._clients.add(client, role, trusted)
+        if replaced is not None:
+            self.on_client_lost(replaced)
+            self._clients.add(client, role, trusted)
+        if role == "planner":
+            self._handover.commands = 0
+        self._status.mark_due()
+
+    def on_client_lost(self, client: int) -> None:
+        """Forget a client that has left. Without planner, or without web unless it may be lost, go dark."""
+        self._waiters.drop_client(client)
+        reason = self._clients.remove(client)
+        if reason:
+            self.go_dark(reason)
+
+    def pop_outgoing(self) -> list[Outgoing]:
+        """Return and remove the messages to send, in order."""
+        outgoing, self._outgoing = self._outgoing, []
+        return outgoing
+
+    def _send_to_planner(self, message: Message) -> None:
+        if self._clients.planner is not None:
+            self._outgoing.append(Outgoing((self._clients.planner,), message))
+
+    # --- commands -----------------------------------------------------------------------------------------------
+
+    def _command(self, client: int, command: str, request_id: int) -> None:
+        try:
+            if command == "stop":
+                self.go_dark("ended by stop")
+            elif command == "disarm":
+                self._end_epoch("ended by disarm")
+            self._require_link()
+            if command == "disarm":
+                self._session.disarm()
+            elif command == "arm":
+                self._clients.require_lease()
+                self._session.arm()
+                self._arm_requested = True
+        except OptodriveError as error:
+            self._reply(client, request_id, error)
+            return
+        self._waiters.add(client, request_id, command, self._clock.now_s())
+
+    def _require_link(self) -> None:
+        if not self._session.connected:
+            raise LinkError(self._describe_link_error() or "no link to the board")
+
+    def _describe_link_error(self) -> str:
+        return "" if self.link_error is None else str(self.link_error)
+
+    def _reply(self, client: int, request_id: int, error: OptodriveError | None) -> None:
+        fields: dict[str, Any] = {"board": self._session.board.to_dict(), "epoch": self.epoch.number}
+        self._outgoing.append(Outgoing((client,), build_result(request_id, error, fields)))
+
+    def go_dark(self, reason: str) -> None:
+        """End the epoch and abort: gate off, queue dropped, DISARMED. reason: for people, as the end of a sentence."""
+        self._end_epoch(reason)
+        if self._session.connected:
+            self._session.abort()
+
+    def _end_epoch(self, reason: str) -> None:
+        self.epoch.end(reason)
+        self._arm_requested = self._was_armed = False
+        self._session.hold_points()
+        self._handover.clear()
+        for waiter in self._waiters.pop_arming():
+            self._reply(waiter.client, waiter.request_id, NotReadyError(f"the board was not armed: {reason}"))
+
+    # --- loop ---------------------------------------------------------------------------------------------------
+
+    def compute_wait_s(self) -> float:
+        """Return the longest time for which the loop may wait for bytes of port and clients before step(), s."""
+        if self._session.connected:
+            return min(self._session.compute_wait_s(), WAIT_MAX_S)
+        return WAIT_MAX_S if self._connecting is None else min(self._connecting_wait_s, WAIT_MAX_S)
+
+    def step(self, wait_s: float = 0.0) -> None:
+        """Send what is due to the board and process what it has sent. wait_s: longest wait for its first byte."""
+        if self._session.connected:
+            self._step_session(wait_s)
+        else:
+            self._step_connecting(wait_s)
+        refusal = self._session.pop_refusal()
+        now_s = self._clock.now_s()
+        for waiter, error in self._waiters.pop_results(self._session, refusal, self._describe_link_error(), now_s):
+            self._reply(waiter.client, waiter.request_id, error)
+        status = self._status.build_if_due(self.epoch, self.link_error, self._handover.commands)
+        if status is not None:
+            self._outgoing.append(Outgoing(self._clients.list_observers(), status))
+        if refusal is not None:
+            self._send_to_planner(Message("refusal", {"reason": refusal}))
+        self._handover.report_progress()
+
+    def _step_session(self, wait_s: float) -> None:
+        stalled = self._clients.find_stalled()
+        try:
+            self._session.step(wait_s, renew_lease=not stalled, stalled=stalled)
+            self._watch_board()
+        except (LinkError, InputError) as error:
+            message = self._session.on_lost(error)
+            self.link_error = LinkError(message) if isinstance(error, LinkError) else error
+            self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
+            self._end_epoch(f"the link to the board was lost: {message}")
+
+    def _watch_board(self) -> None:
+        """End the epoch when the board has left the armed states, or has a new fault."""
+        board = self._session.board
+        if self._arm_requested and board.state in ARMED_STATES:
+            self._was_armed = True
+        if (board.fault and board.fault != self._seen_fault) or (self._was_armed and board.state in UNARMED_STATES):
+            reason = self._session.last_event_reason
+            if board.fault:
+                cause = self._session.likely_cause if board.fault == "LINK" else None
+                reason = f"{board.fault}: {get_fault_hint(board.fault) if cause is None else cause.message}"
+            self._end_epoch(f"the board went to {board.state} ({reason})")
+        self._seen_fault = board.fault
+
+    def _step_connecting(self, wait_s: float) -> None:
+        if self._connecting is None:
+            if self._clock.now_s() < self._retry_at_s:
+                self._clock.sleep(wait_s)
+                return
+            self._connecting = self._connect()
+        try:
+            self._connecting_wait_s = next(self._connecting)
+        except StopIteration:
+            self._connecting, self.link_error = None, None
+        except (LinkError, InputError) as error:
+            self._connecting, self.link_error = None, error
+            self._retry_at_s = self._clock.now_s() + RETRY_INTERVAL_S
+
+    def _connect(self) -> Iterator[float]:
+        try:
+            while not self._open_port():
+                yield WAIT_MAX_S
+        except (LinkError, InputError):
+            self._session.on_connect_failed()
+            raise
+        yield from self._session.connect_step_by_step()
+
+    def close(self) -> None:
+        """Send ABORT and close the port permanently."""
+        self._session.close()

@@ -1,0 +1,352 @@
+"""The planner's view of the session that the link process owns.
+
+Names follow `BoardSession`. One thread calls everything but `board_s`, which any thread may call.
+"""
+
+import select
+import zlib
+from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import LinkError
+from optodrive.core.histogram import Histogram
+from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
+from optodrive.link.protocol.messages import Executed
+from optodrive.link.protocol.quantisation import WirePoints, WireScale
+from optodrive.link.session.board_view import BoardView
+from optodrive.link.session.lease_renewal import AGE_BUCKETS_S
+from optodrive.link.session.link_watch import LinkCause
+from optodrive.link.session.plan_job import PlanJob
+
+REPLY_TIMEOUT_S = 0.2
+NO_EPOCH = 0
+"""Epoch while the link process is not reached. No request carries it."""
+EXECUTED_RECORD = np.dtype([("on_tick", "<u8"), ("on_ticks", "<u4"), ("duty", "<u2")])
+"""Record of an executed point in a message of kind `executed`."""
+
+
+class RemoteJob(PlanJob):
+    """Points of one plan in the link process, updated from its messages. Indices are the board's once it has begun."""
+
+    def __init__(
+        self, session: "RemoteSession", number: int, points: WirePoints, start_tick: int, ahead_ticks: float
+    ) -> None:
+        super().__init__(number, points, 0, start_tick, ahead_ticks)
+        self._session = session
+
+    def delay(self, ticks: int) -> None:
+        """Shift the plan's zero, here and in the link process."""
+        super().delay(ticks)
+        self._session.send_delay(self.number, ticks)
+
+
+class LeaseStats:
+    """Statistics of the lease renewals. ages: distribution of their intervals, s; slack_s: minimum remaining lease."""
+
+    def __init__(self) -> None:
+        self.ages = Histogram(AGE_BUCKETS_S)
+        self.slack_s: float | None = None
+
+
+class RemoteSession:
+    """Connection of the planner to the link process.
+
+    epoch: latest epoch, NO_EPOCH without a link process; epoch_reason: what raised it, as an end of a sentence
+    connected: whether the link process is reached and its link to the board is up
+    port: name of the board's port; board: latest reported state of the board; stats: link statistics
+    """
+
+    def __init__(self, scale: WireScale, clock: Clock) -> None:
+        self.scale = scale
+        self.epoch = NO_EPOCH
+        self.epoch_reason = ""
+        self.connected = False
+        self.link_error: str | None = "the link process is not reached yet"
+        self.link_error_code: str | None = "link"
+        self.port = ""
+        self.board = BoardView()
+        self.stats: dict[str, Any] = {}
+        self.faults: Counter[str] = Counter()
+        self.lease = LeaseStats()
+        self.is_acknowledged = False
+        self.last_event_reason = ""
+        self.likely_cause: LinkCause | None = None
+        self._clock = clock
+        self._socket: MessageSocket | None = None
+        self._clock_sample: tuple[float, float] | None = None
+        self._clock_shift_s: float | None = None
+        self._reported_ready = False
+        self._commands_sent = self._commands_seen = 0
+        self._refusal: str | None = None
+        self._jobs: dict[int, RemoteJob] = {}
+        self._job_number = self._request_id = 0
+        self._on_result: Callable[[dict[str, Any]], None] | None = None
+
+    # --- connection ---------------------------------------------------------------------------------------------
+
+    def connect(self, path: Path) -> None:
+        """Connect to the link process, in place of an earlier connection. Raise LinkError if it does not listen."""
+        self.close()
+        try:
+            self._socket = MessageSocket.connect(path)
+            self._commands_sent = self._commands_seen = 0
+            self._socket.send(Message("hello", {"role": "planner"}))
+        except (OSError, IpcError) as error:
+            self._on_lost(f"the link process does not answer at {path}: {error}")
+            raise LinkError(self.link_error or "") from None
+
+    @property
+    def is_attached(self) -> bool:
+        """Whether the link process is connected, with or without a board."""
+        return self._socket is not None
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when messages have arrived, −1 without a connection."""
+        return -1 if self._socket is None else self._socket.fileno()
+
+    @property
+    def wants_write(self) -> bool:
+        """Whether bytes wait until the link process reads. receive() sends them, too."""
+        return self._socket is not None and self._socket.wants_write
+
+    def receive(self) -> None:
+        """Process the messages that have arrived and send what waits. Never wait; a lost connection is no error."""
+        if self._socket is None:
+            return
+        try:
+            if self._socket.wants_write:
+                self._socket.flush()
+            while messages := self._socket.receive():
+                for message in messages:
+                    self._on_message(message)
+        except IpcError as error:
+            self._on_lost(f"the link process has ended: {error}")
+
+    def close(self) -> None:
+        """End the connection. The link process then turns the gate off."""
+        if self._socket is not None:
+            self._on_lost("the planner has ended its connection to the link process")
+
+    def _on_lost(self, message: str) -> None:
+        if self._socket is not None:
+            self._socket.close()
+        self._socket = None
+        self.connected = self.is_acknowledged = self._reported_ready = False
+        self.epoch, self.epoch_reason = NO_EPOCH, message
+        self.link_error, self.link_error_code = message, "link"
+        self._jobs.clear()
+
+    def _send(self, message: Message) -> None:
+        if self._socket is None:
+            raise LinkError(self.link_error or "")
+        try:
+            self._socket.send(message)
+        except IpcClosed as error:
+            self._on_lost(f"the link process has ended: {error}")
+            raise LinkError(self.link_error or "") from None
+
+    def _send_command(self, kind: str, fields: dict[str, Any], payload: bytes = b"") -> None:
+        self._commands_sent += 1
+        self._send(Message(kind, fields, payload))
+
+    def _request(
+        self, kind: str, fields: dict[str, Any], payload: bytes, on_result: Callable[[dict[str, Any]], None]
+    ) -> None:
+        """Send a request and wait for its result, unless the link process is lost or does not answer in time.
+
+        on_result: called with the result before any later message is processed
+        """
+        self._request_id += 1
+        self._on_result = on_result
+        with suppress(LinkError):
+            self._send_command(kind, {"id": self._request_id, **fields}, payload)
+        deadline_s = self._clock.now_s() + REPLY_TIMEOUT_S
+        while self._socket is not None and self._on_result is not None:
+            wait_s = deadline_s - self._clock.now_s()
+            if wait_s <= 0.0:
+                self._on_lost(f"the link process did not answer {kind} within {REPLY_TIMEOUT_S:g} s")
+                break
+            writable = [self._socket] if self._socket.wants_write else []
+            select.select([self._socket], writable, [], wait_s)
+            self.receive()
+        self._on_result = None
+
+    # --- messages of the link process ---------------------------------------------------------------------------
+
+    def _on_message(self, message: Message) -> None:
+        fields = message.fields
+        if message.kind == "status":
+            self._on_status(fields)
+        elif message.kind == "executed":
+            self._on_executed(fields, message.payload)
+        elif message.kind == "progress":
+            self._on_progress(fields)
+        elif message.kind == "job_refused":
+            self._jobs.pop(fields["job"], None)
+            self._keep_refusal(fields["reason"])
+        elif message.kind == "refusal":
+            self._keep_refusal(fields["reason"])
+        elif message.kind == "result" and fields["id"] == self._request_id and self._on_result is not None:
+            on_result, self._on_result = self._on_result, None
+            on_result(fields)
+
+    def _keep_refusal(self, reason: str) -> None:
+        if self._refusal is None:  # the first refusal causes the following ones
+            self._refusal = reason
+
+    def _on_status(self, fields: dict[str, Any]) -> None:
+        if fields["epoch"] != self.epoch:
+            self._jobs.clear()
+        self.epoch, self.epoch_reason = fields["epoch"], fields["epoch_reason"]
+        self._update_clock(fields["clock"], fields["connected"])
+        self.connected, self.port = fields["connected"], fields["port"]
+        self.link_error, self.link_error_code = fields["link_error"], fields["link_error_code"]
+        board = {name: value for name, value in fields["board"].items() if name != "hint"}
+        self.board = BoardView(**{**board, "fault": board["fault"] or ""})
+        self.stats, self.faults = fields["stats"], Counter(fields["faults"])
+        self.lease.ages.load(fields["lease"]["counts"], fields["lease"]["sum_s"])
+        self.lease.slack_s = fields["lease"]["slack_s"]
+        self.is_acknowledged, self._reported_ready = fields["is_acknowledged"], fields["is_ready"]
+        self._commands_seen = fields["commands"]
+        self.last_event_reason = fields["last_event_reason"]
+        self.likely_cause = None if fields["cause"] is None else LinkCause(*fields["cause"])
+
+    def _update_clock(self, sample: list[float] | None, connected: bool) -> None:
+        if sample is None:
+            return
+        midpoint_s, board_s = sample
+        if connected and not self.connected and self._clock_sample is not None:
+            now_s = self._clock.now_s()
+            self._clock_shift_s = board_s + (now_s - midpoint_s) - self.board_s()
+        self._clock_sample = midpoint_s, board_s
+
+    def _on_progress(self, fields: dict[str, Any]) -> None:
+        job = self._jobs.get(fields["job"])
+        if job is None:
+            return
+        job.first_index = fields["first_index"]
+        job.next_to_send = job.first_index + fields["sent_points"]
+        job.first_sent_tick = fields["first_sent_tick"]
+        if fields["finished"]:
+            del self._jobs[fields["job"]]
+
+    def _on_executed(self, fields: dict[str, Any], payload: bytes) -> None:
+        job = self._jobs.get(fields["job"])
+        if job is not None:
+            records = tuple(np.frombuffer(payload, EXECUTED_RECORD).tolist())
+            job.record_executed(Executed(job.first_index + fields["first_point"], records))
+
+    # --- state --------------------------------------------------------------------------------------------------
+
+    def board_s(self) -> float:
+        """Return the present board time, s, or 0 before the first status with a synchronised clock."""
+        sample = self._clock_sample
+        return 0.0 if sample is None else sample[1] + (self._clock.now_s() - sample[0])
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether a job may start now. False until the link process has carried out all commands sent."""
+        return self.connected and self._reported_ready and self._commands_seen == self._commands_sent
+
+    def pop_refusal(self) -> str | None:
+        """Return and clear the reason for which link process or board refused a command."""
+        refusal, self._refusal = self._refusal, None
+        return refusal
+
+    def pop_clock_shift(self) -> float | None:
+        """Return and clear the jump of the board's clock at a reconnection, s, None without a reconnection."""
+        shift_s, self._clock_shift_s = self._clock_shift_s, None
+        return shift_s
+
+    # --- commands -----------------------------------------------------------------------------------------------
+
+    def begin(
+        self, points: WirePoints, start_s: float, epoch: int, send_ahead_s: float = inf, crc: int | None = None
+    ) -> RemoteJob:
+        """Start to stream a plan whose zero is board time start_s. A refusal arrives later, see pop_refusal().
+
+        epoch: in which the request was accepted; send_ahead_s: maximum time from sending a point to its start
+        crc: CRC-32 of the bytes that were verified, computed from the points if None
+        """
+        payload = points.encode_payload()
+        job = self._add_job(points, max(1, round(start_s / self.scale.tick_s)), send_ahead_s)
+        fields = {
+            "job": job.number,
+            "epoch": epoch,
+            "start_s": start_s,
+            **_build_points_fields(payload, send_ahead_s, crc),
+        }
+        try:
+            self._send_command("begin", fields, payload)
+        except LinkError as error:
+            self._keep_refusal(str(error))
+        return job
+
+    def splice(
+        self, points: WirePoints, kept_points: int, epoch: int, send_ahead_s: float, crc: int | None = None
+    ) -> RemoteJob | None:
+        """Truncate the last job to `kept_points` points and continue with `points` without a pause.
+
+        Return None if it is too late for that, if the epoch has passed, or if the link process does not answer.
+        """
+        payload, last = points.encode_payload(), self._find_last_job()
+        if last is None:
+            return None
+        self._job_number += 1
+        number = self._job_number
+        fields = {"job": number, "epoch": epoch, "kept_points": kept_points}
+
+        def add_job(result: dict[str, Any]) -> None:
+            if result["start_tick"] is not None:
+                last.truncate(kept_points)
+                job = RemoteJob(self, number, points, result["start_tick"], send_ahead_s / self.scale.tick_s)
+                job.first_index = job.next_to_send = result["first_index"]
+                self._jobs[number] = job
+
+        self._request("splice", fields | _build_points_fields(payload, send_ahead_s, crc), payload, add_job)
+        return self._jobs.get(number)
+
+    def truncate(self, kept_points: int) -> bool:
+        """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
+        last = self._find_last_job()
+        results: list[dict[str, Any]] = []
+        if last is not None:
+            self._request("truncate", {"kept_points": kept_points}, b"", results.append)
+        return last is not None and bool(results) and results[0]["done"] and last.truncate(kept_points)
+
+    def flush(self) -> None:
+        """Turn the gate off and drop the queue. The board stays armed."""
+        self._jobs.clear()
+        with suppress(LinkError):
+            self._send_command("flush", {})
+
+    def beat(self, alive: bool) -> None:
+        """Prove that the planner's loop runs. alive: whether planning makes progress or is idle."""
+        with suppress(LinkError):
+            self._send(Message("beat", {"alive": alive}))
+
+    def send_delay(self, number: int, ticks: int) -> None:
+        """Shift the zero of a job in the link process."""
+        with suppress(LinkError):
+            self._send_command("delay", {"job": number, "ticks": ticks})
+
+    def _add_job(self, points: WirePoints, start_tick: int, send_ahead_s: float) -> RemoteJob:
+        self._job_number += 1
+        job = RemoteJob(self, self._job_number, points, start_tick, send_ahead_s / self.scale.tick_s)
+        self._jobs[job.number] = job
+        return job
+
+    def _find_last_job(self) -> RemoteJob | None:
+        return next(reversed(self._jobs.values()), None)
+
+
+def _build_points_fields(payload: bytes, send_ahead_s: float, crc: int | None) -> dict[str, Any]:
+    ahead_s = None if send_ahead_s == inf else send_ahead_s
+    return {"ahead_s": ahead_s, "crc": zlib.crc32(payload) if crc is None else crc}

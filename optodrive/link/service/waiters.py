@@ -1,0 +1,74 @@
+"""Clients that wait until the board reaches the state that they requested."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from optodrive.core.errors import BoardFaultError, LinkError, NotReadyError, OptodriveError
+from optodrive.link.protocol.states import IDLE_STATES, BoardState
+from optodrive.link.session.fault_hints import get_fault_hint
+from optodrive.link.session.session import BoardSession
+
+TIMEOUT_S = 5.0
+AWAITED_STATES = {"arm": (BoardState.ARMED,), "disarm": (BoardState.DISARMED,), "stop": IDLE_STATES}
+"""States that fulfil each command."""
+
+
+@dataclass(frozen=True)
+class Waiter:
+    """Client that waits for the result of a command."""
+
+    client: int
+    request_id: int
+    command: str
+    deadline_s: float
+
+
+class StateWaiters:
+    """Waiting clients. A waiter ends when the board has the state, refuses the command or exceeds the timeout."""
+
+    def __init__(self) -> None:
+        self._waiters: list[Waiter] = []
+
+    def add(self, client: int, request_id: int, command: str, now_s: float) -> None:
+        """Add a client. command: one of AWAITED_STATES."""
+        self._waiters.append(Waiter(client, request_id, command, now_s + TIMEOUT_S))
+
+    def drop_client(self, client: int) -> None:
+        """Forget a client that has left."""
+        self._waiters = [waiter for waiter in self._waiters if waiter.client != client]
+
+    def pop_arming(self) -> list[Waiter]:
+        """Remove and return the clients that wait for arming, which something has ended."""
+        arming = [waiter for waiter in self._waiters if waiter.command == "arm"]
+        self._waiters = [waiter for waiter in self._waiters if waiter.command != "arm"]
+        return arming
+
+    def pop_results(
+        self, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float
+    ) -> Iterator[tuple[Waiter, OptodriveError | None]]:
+        """Remove and yield the waiters that have a result. refusal: reason of a refusal since the last call."""
+        for waiter in self._waiters.copy():
+            error = _find_error(waiter, session, refusal, link_error, now_s)
+            if error is not None or _is_fulfilled(waiter, session):
+                self._waiters.remove(waiter)
+                yield waiter, error
+
+
+def _is_fulfilled(waiter: Waiter, session: BoardSession) -> bool:
+    has_confirmed = session.is_acknowledged or (waiter.command == "stop" and session.abort_confirmed)
+    return session.board.state in AWAITED_STATES[waiter.command] and has_confirmed
+
+
+def _find_error(
+    waiter: Waiter, session: BoardSession, refusal: str | None, link_error: str | None, now_s: float
+) -> OptodriveError | None:
+    board = session.board
+    if not session.connected:
+        return LinkError(link_error or "no link to the board")
+    if refusal is not None:
+        return NotReadyError(f"the board refuses to {waiter.command}: {refusal}")
+    if board.state == BoardState.FAULT and waiter.command == "arm":
+        return BoardFaultError(f"the board is in FAULT {board.fault}: {get_fault_hint(board.fault)}")
+    if now_s > waiter.deadline_s:
+        return NotReadyError(f"the board did not {waiter.command} within {TIMEOUT_S:g} s: it is {board.state}")
+    return None

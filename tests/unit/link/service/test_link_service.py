@@ -1,0 +1,294 @@
+"""The link service in virtual time: epochs, both gates, the lease's conditions, results and reports."""
+
+import numpy as np
+import pytest
+
+from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig, build_points
+from optodrive.core.ipc import IpcError, Message
+from optodrive.link.protocol.states import BoardState
+from optodrive.link.service.point_handover import EXECUTED
+from optodrive.link.service.remote_session import EXECUTED_RECORD
+from optodrive.link.service.results import build_error
+
+DUTY = 1000
+
+
+@pytest.fixture
+def rig():
+    return ServiceRig().hello_all().connect()
+
+
+def test_a_plan_is_executed_and_reported_to_the_planner(rig):
+    rig.arm()
+    number = rig.begin(build_points(100, DUTY))
+    rig.until(lambda: any(m.fields["finished"] for m in rig.of_kind(PLANNER, "progress")))
+    assert len(rig.list_lit()) == 100
+    last = rig.of_kind(PLANNER, "progress")[-1].fields
+    assert (last["job"], last["sent_points"], last["finished"]) == (number, 100, True)
+    positions = []
+    for message in rig.of_kind(PLANNER, "executed"):
+        records = np.frombuffer(message.payload, EXECUTED_RECORD)
+        positions += range(message.fields["first_point"], message.fields["first_point"] + len(records))
+        assert set(records["duty"]) == {DUTY}
+        assert set(records["on_ticks"]) == {200}
+    assert sorted(set(positions)) == list(range(100))
+    rig.run(0.1)
+    assert rig.of_kind(PLANNER, "status")[-1].fields["is_ready"]
+
+
+def test_the_record_of_both_ends_is_the_same():
+    record = 1 << 40, 65_535, 7
+    assert np.frombuffer(EXECUTED.pack(*record), EXECUTED_RECORD).tolist() == [record]
+
+
+@pytest.mark.parametrize("client", [WEB, OPERATOR, SUPERVISOR, PLANNER])
+def test_stop_of_any_client_ends_the_epoch_and_the_plan(rig, client):
+    rig.arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    before, lit = rig.epoch, len(rig.list_lit())
+    assert lit
+    result = rig.await_result(client, rig.request(client, "stop"))
+    assert result["error"] is None
+    assert result["board"]["state"] == BoardState.DISARMED
+    assert result["epoch"] == rig.epoch == before + 1
+    rig.run(1.0)
+    assert len(rig.list_lit()) <= lit + 2
+    rig.arm().run(1.5)
+    assert len(rig.list_lit()) <= lit + 2
+    status = rig.of_kind(PLANNER, "status")[-1].fields
+    assert (status["epoch"], status["epoch_reason"]) == (before + 1, "ended by stop")
+
+
+def test_points_of_an_older_epoch_are_refused_after_arming(rig):
+    older = rig.epoch
+    rig.await_result(WEB, rig.request(WEB, "disarm"))
+    rig.arm()
+    rig.begin(build_points(10, DUTY), epoch=older)
+    rig.run(0.5)
+    assert rig.list_lit() == []
+    assert "ended by disarm" in rig.find_refusals()[0]
+    rig.begin(build_points(10, DUTY))
+    rig.until(lambda: len(rig.list_lit()) == 10)
+
+
+def test_a_splice_of_an_older_epoch_changes_nothing(rig):
+    older = rig.epoch
+    rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    rig.arm()
+    rig.begin(build_points(200, DUTY), ahead_s=0.04)
+    rig.run(0.15)
+    _, result = rig.splice(build_points(10, 2 * DUTY), 150, epoch=older, ahead_s=0.04)
+    assert result["start_tick"] is None
+    assert "ended by stop" in result["error"]["message"]
+    rig.until(lambda: len(rig.list_lit()) == 200)
+    assert {duty for _, duty in rig.list_lit()} == {DUTY}
+
+
+def test_a_splice_continues_the_plan_without_a_pause(rig):
+    rig.arm()
+    rig.begin(build_points(200, DUTY), ahead_s=0.04)
+    rig.run(0.15)
+    number, result = rig.splice(build_points(10, 2 * DUTY), 150, ahead_s=0.04)
+    assert result["error"] is None
+    assert result["first_index"] == 150
+    rig.until(lambda: any(m.fields["finished"] and m.fields["job"] == number for m in rig.of_kind(PLANNER, "progress")))
+    lit = rig.list_lit()
+    assert [duty for _, duty in lit] == [DUTY] * 150 + [2 * DUTY] * 10
+    assert np.diff([at_s for at_s, _ in lit]) == pytest.approx(0.0022)
+
+
+def test_truncation_ends_the_plan_early(rig):
+    rig.arm()
+    rig.begin(build_points(200, DUTY), ahead_s=0.04)
+    rig.run(0.15)
+    assert rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=100))["done"]
+    assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=1))["done"]
+    rig.run(1.0)
+    assert len(rig.list_lit()) == 100
+
+
+def test_flush_ends_the_plan_and_stays_armed_in_the_same_epoch(rig):
+    rig.arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    before = rig.epoch
+    rig.send(PLANNER, "flush")
+    rig.until(lambda: rig.session.is_ready)
+    assert rig.epoch == before
+    lit = len(rig.list_lit())
+    rig.begin(build_points(5, 2 * DUTY))
+    rig.until(lambda: len(rig.list_lit()) == lit + 5)
+
+
+def test_damaged_points_are_refused(rig):
+    rig.arm()
+    rig.begin(build_points(10, DUTY), crc=1)
+    rig.run(0.5)
+    assert "CRC" in rig.find_refusals()[0]
+    assert rig.list_lit() == []
+
+
+def test_points_before_arming_and_during_a_job_are_refused(rig):
+    rig.begin(build_points(10, DUTY))
+    assert "arm it first" in rig.find_refusals()[0]
+    rig.arm()
+    rig.begin(build_points(10, DUTY))
+    rig.begin(build_points(10, 2 * DUTY))
+    assert "earlier job" in rig.find_refusals()[1]
+    rig.run(1.0)
+    assert {duty for _, duty in rig.list_lit()} == {DUTY}
+
+
+@pytest.mark.parametrize("client", [PLANNER, WEB])
+def test_the_loss_of_planner_or_web_turns_the_gate_off_at_once(rig, client):
+    rig.arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    before = rig.epoch
+    rig.leave(client)
+    rig.run(0.01)
+    assert rig.core.state == BoardState.DISARMED
+    assert rig.epoch == before + 1
+
+
+def test_a_plan_may_finish_without_web_if_so_configured():
+    rig = ServiceRig(on_web_loss="finish").hello_all().connect().arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    before = rig.epoch
+    rig.leave(WEB)
+    rig.until(lambda: len(rig.list_lit()) == 500)
+    assert rig.epoch == before
+    assert rig.core.state == BoardState.ARMED
+
+
+@pytest.mark.parametrize(("client", "says"), [(PLANNER, "planner made no progress"), (WEB, "web process did not")])
+def test_without_beats_the_lease_expires_and_the_cause_is_named(rig, client, says):
+    rig.arm()
+    rig.begin(build_points(1500, DUTY))
+    rig.run(0.3)
+    rig.alive[client] = None
+    rig.until(lambda: rig.core.fault == "LINK", patience_s=2.0)
+    rig.run(0.1)
+    status = rig.of_kind(SUPERVISOR, "status")[-1].fields
+    assert says in status["cause"][0]
+    assert says in status["epoch_reason"]
+    assert len(rig.list_lit()) < 1500
+
+
+def test_a_planner_without_progress_withholds_the_lease(rig):
+    rig.arm()
+    rig.alive[PLANNER] = False
+    rig.until(lambda: rig.core.fault == "LINK", patience_s=1.0)
+
+
+def test_arming_needs_planner_and_web(rig):
+    rig.leave(PLANNER)
+    rig.run(0.1)
+    result = rig.await_result(WEB, rig.request(WEB, "arm"))
+    assert "planner process" in result["error"]["message"]
+    rig.hello(PLANNER, "planner")
+    rig.run(0.1)
+    rig.arm()
+
+
+def test_a_fault_and_its_acknowledgement_end_epochs(rig):
+    rig.arm()
+    before = rig.epoch
+    rig.core.set_input("interlock", False, round(rig.clock.now_s() * 1e6))
+    rig.run(0.1)
+    assert rig.epoch == before + 1
+    rig.core.set_input("interlock", True, round(rig.clock.now_s() * 1e6))
+    rig.await_result(WEB, rig.request(WEB, "disarm"))
+    assert rig.epoch == before + 2
+
+
+def test_stop_while_arming_ends_the_callers_wait(rig):
+    armed = rig.request(WEB, "arm")
+    rig.run(0.5)
+    rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    error = build_error(rig.find_result(WEB, armed)["error"])
+    assert "ended by stop" in str(error)
+    assert type(error).__name__ == "NotReadyError"
+    rig.run(3.0)
+    assert rig.core.state == BoardState.DISARMED
+
+
+def test_the_link_is_retried_and_its_loss_ends_the_epoch(rig):
+    rig.arm()
+    before = rig.epoch
+    silent = rig.link.read
+    rig.link.read = lambda timeout_s: silent(timeout_s) and b""
+    rig.until(lambda: not rig.session.connected)
+    assert rig.epoch > before
+    rig.run(0.1)
+    status = rig.of_kind(WEB, "status")[-1].fields
+    assert not status["connected"]
+    assert status["link_error_code"] == "link"
+    result = rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    assert result["error"]["code"] == "link"
+    rig.link.read = silent
+    rig.until(lambda: rig.session.connected)
+    rig.run(0.1)
+    assert rig.of_kind(WEB, "status")[-1].fields["link_error"] is None
+
+
+def test_a_board_that_contradicts_the_configuration_is_said_and_retried():
+    rig = ServiceRig().hello_all()
+    accepts = rig.session._requirements
+    object.__setattr__(rig.session, "_requirements", type(accepts)(**{**vars(accepts), "uid": "00"}))
+    rig.run(0.3)
+    status = rig.of_kind(WEB, "status")[-1].fields
+    assert status["link_error_code"] == "board"
+    assert "the configured board" in status["link_error"]
+    rig.session._requirements = accepts
+    rig.until(lambda: rig.session.connected)
+
+
+@pytest.mark.parametrize(
+    ("client", "kind"),
+    [(OPERATOR, "arm"), (OPERATOR, "begin"), (WEB, "begin"), (PLANNER, "arm"), (SUPERVISOR, "arm"), (9, "stop")],
+)
+def test_roles_bound_what_a_client_may_send(rig, client, kind):
+    with pytest.raises(IpcError, match="not permitted"):
+        rig.request(client, kind)
+
+
+def test_only_the_own_user_is_more_than_an_operator(rig):
+    rig.hello(10, "operator", trusted=False)
+    with pytest.raises(IpcError, match="role"):
+        rig.hello(11, "planner", trusted=False)
+    rig.await_result(10, rig.request(10, "stop"))
+
+
+def test_a_second_planner_replaces_the_first_in_the_dark(rig):
+    rig.arm()
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    del rig.alive[PLANNER]
+    rig.hello(12, "planner")
+    rig.run(0.01)
+    assert rig.core.state == BoardState.DISARMED
+    with pytest.raises(IpcError, match="not permitted"):
+        rig.begin(build_points(5, DUTY))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        Message("begin", {}),
+        Message("begin", {"job": 1, "epoch": "x", "start_s": 0, "ahead_s": None, "crc": 0}),
+        Message("begin", {"job": 1, "epoch": 1, "start_s": 0, "ahead_s": None, "crc": 0}, b"123"),
+        Message("splice", {"id": 1}),
+        Message("truncate", {"id": None}),
+        Message("delay", {"job": [], "ticks": 0}),
+        Message("beat", {}),
+        Message("stop", {"id": "x"}),
+        Message("hello", {}),
+    ],
+)
+def test_a_malformed_message_ends_only_its_client(rig, message):
+    with pytest.raises(IpcError):
+        rig.service.on_message(PLANNER, message)
+    rig.run(0.1)
