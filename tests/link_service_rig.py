@@ -140,7 +140,7 @@ class ServiceRig:
         fields |= {"kept_points": kept_points, "crc": zlib.crc32(payload)}
         return number, self.find_result(PLANNER, self.request(PLANNER, "splice", payload, **fields))
 
-    def list_lit(self):
+    def list_emitted(self):
         """Return (time in s, duty) of all pulses that the board has emitted."""
         return [(event["on_us"] * 1e-6, event["duty"]) for event in self.log if event["event"] == "pulse"]
 

@@ -1,4 +1,4 @@
-"""Clients of the link process: their roles, what each may send, and whether they permit the lease."""
+"""The clients of the link process, with their roles and permissions, and whether they permit the lease."""
 
 from math import inf
 

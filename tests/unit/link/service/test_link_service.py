@@ -22,7 +22,7 @@ def test_a_plan_is_executed_and_reported_to_the_planner(rig):
     rig.arm()
     number = rig.begin(build_points(100, DUTY))
     rig.until(lambda: any(m.fields["finished"] for m in rig.of_kind(PLANNER, "progress")))
-    assert len(rig.list_lit()) == 100
+    assert len(rig.list_emitted()) == 100
     last = rig.of_kind(PLANNER, "progress")[-1].fields
     assert (last["job"], last["sent_points"], last["finished"]) == (number, 100, True)
     positions = []
@@ -46,16 +46,16 @@ def test_stop_of_any_client_ends_the_epoch_and_the_plan(rig, client):
     rig.arm()
     rig.begin(build_points(500, DUTY))
     rig.run(0.3)
-    before, lit = rig.epoch, len(rig.list_lit())
-    assert lit
+    before, emitted = rig.epoch, len(rig.list_emitted())
+    assert emitted
     result = rig.await_result(client, rig.request(client, "stop"))
     assert result["error"] is None
     assert result["board"]["state"] == BoardState.DISARMED
     assert result["epoch"] == rig.epoch == before + 1
     rig.run(1.0)
-    assert len(rig.list_lit()) <= lit + 2
+    assert len(rig.list_emitted()) <= emitted + 2
     rig.arm().run(1.5)
-    assert len(rig.list_lit()) <= lit + 2
+    assert len(rig.list_emitted()) <= emitted + 2
     status = rig.of_kind(PLANNER, "status")[-1].fields
     assert (status["epoch"], status["epoch_reason"]) == (before + 1, "ended by stop")
 
@@ -66,10 +66,10 @@ def test_points_of_an_older_epoch_are_refused_after_arming(rig):
     rig.arm()
     rig.begin(build_points(10, DUTY), epoch=older)
     rig.run(0.5)
-    assert rig.list_lit() == []
+    assert rig.list_emitted() == []
     assert "ended by disarm" in rig.find_refusals()[0]
     rig.begin(build_points(10, DUTY))
-    rig.until(lambda: len(rig.list_lit()) == 10)
+    rig.until(lambda: len(rig.list_emitted()) == 10)
 
 
 def test_a_splice_of_an_older_epoch_changes_nothing(rig):
@@ -81,8 +81,8 @@ def test_a_splice_of_an_older_epoch_changes_nothing(rig):
     _, result = rig.splice(build_points(10, 2 * DUTY), 150, epoch=older, ahead_s=0.04)
     assert result["start_tick"] is None
     assert "ended by stop" in result["error"]["message"]
-    rig.until(lambda: len(rig.list_lit()) == 200)
-    assert {duty for _, duty in rig.list_lit()} == {DUTY}
+    rig.until(lambda: len(rig.list_emitted()) == 200)
+    assert {duty for _, duty in rig.list_emitted()} == {DUTY}
 
 
 def test_a_splice_continues_the_plan_without_a_pause(rig):
@@ -93,9 +93,9 @@ def test_a_splice_continues_the_plan_without_a_pause(rig):
     assert result["error"] is None
     assert result["first_index"] == 150
     rig.until(lambda: any(m.fields["finished"] and m.fields["job"] == number for m in rig.of_kind(PLANNER, "progress")))
-    lit = rig.list_lit()
-    assert [duty for _, duty in lit] == [DUTY] * 150 + [2 * DUTY] * 10
-    assert np.diff([at_s for at_s, _ in lit]) == pytest.approx(0.0022)
+    emitted = rig.list_emitted()
+    assert [duty for _, duty in emitted] == [DUTY] * 150 + [2 * DUTY] * 10
+    assert np.diff([at_s for at_s, _ in emitted]) == pytest.approx(0.0022)
 
 
 def test_truncation_ends_the_plan_early(rig):
@@ -105,7 +105,7 @@ def test_truncation_ends_the_plan_early(rig):
     assert rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=100))["done"]
     assert not rig.find_result(PLANNER, rig.request(PLANNER, "truncate", kept_points=1))["done"]
     rig.run(1.0)
-    assert len(rig.list_lit()) == 100
+    assert len(rig.list_emitted()) == 100
 
 
 def test_flush_ends_the_plan_and_stays_armed_in_the_same_epoch(rig):
@@ -116,9 +116,9 @@ def test_flush_ends_the_plan_and_stays_armed_in_the_same_epoch(rig):
     rig.send(PLANNER, "flush")
     rig.until(lambda: rig.session.is_ready)
     assert rig.epoch == before
-    lit = len(rig.list_lit())
+    emitted = len(rig.list_emitted())
     rig.begin(build_points(5, 2 * DUTY))
-    rig.until(lambda: len(rig.list_lit()) == lit + 5)
+    rig.until(lambda: len(rig.list_emitted()) == emitted + 5)
 
 
 def test_damaged_points_are_refused(rig):
@@ -126,7 +126,7 @@ def test_damaged_points_are_refused(rig):
     rig.begin(build_points(10, DUTY), crc=1)
     rig.run(0.5)
     assert "CRC" in rig.find_refusals()[0]
-    assert rig.list_lit() == []
+    assert rig.list_emitted() == []
 
 
 def test_points_before_arming_and_during_a_job_are_refused(rig):
@@ -137,7 +137,7 @@ def test_points_before_arming_and_during_a_job_are_refused(rig):
     rig.begin(build_points(10, 2 * DUTY))
     assert "earlier job" in rig.find_refusals()[1]
     rig.run(1.0)
-    assert {duty for _, duty in rig.list_lit()} == {DUTY}
+    assert {duty for _, duty in rig.list_emitted()} == {DUTY}
 
 
 @pytest.mark.parametrize("client", [PLANNER, WEB])
@@ -158,7 +158,7 @@ def test_a_plan_may_finish_without_web_if_so_configured():
     rig.run(0.3)
     before = rig.epoch
     rig.leave(WEB)
-    rig.until(lambda: len(rig.list_lit()) == 500)
+    rig.until(lambda: len(rig.list_emitted()) == 500)
     assert rig.epoch == before
     assert rig.core.state == BoardState.ARMED
 
@@ -174,7 +174,7 @@ def test_without_beats_the_lease_expires_and_the_cause_is_named(rig, client, say
     status = rig.of_kind(SUPERVISOR, "status")[-1].fields
     assert says in status["cause"][0]
     assert says in status["epoch_reason"]
-    assert len(rig.list_lit()) < 1500
+    assert len(rig.list_emitted()) < 1500
 
 
 def test_a_planner_without_progress_withholds_the_lease(rig):
