@@ -2,7 +2,7 @@
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.toml_model import Section
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
 from optodrive.device import config

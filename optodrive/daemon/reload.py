@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 from optodrive.core.errors import NotReadyError, OptodriveError
-from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.tokens import read_private_tokens
 from optodrive.daemon.web.web_server import Server

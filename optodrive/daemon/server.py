@@ -10,10 +10,10 @@ import uvicorn
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import LinkError
-from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.session_recording import start_session_recorder
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
+from optodrive.daemon.one_process.engine import Engine
+from optodrive.daemon.one_process.session_recording import start_session_recorder
 from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app

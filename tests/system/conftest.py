@@ -2,7 +2,7 @@ import pytest
 
 from board_fixtures import board, daemon, disarmed, kept, make_board, make_daemon, start  # noqa: F401 - fixtures
 from optodrive.core.clock import MonotonicClock
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.device.config_file import load_config
 from optodrive.link.transport.serial_port import SerialPort
 from optodrive.planning.display_model import DisplayModel

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.engine import planner
+from optodrive.daemon.one_process import planner
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 

@@ -9,7 +9,7 @@ from optodrive.core.histogram import Histogram
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.states import BoardState
-from optodrive.link.session.session import BoardSession
+from optodrive.link.service.remote_session import RemoteSession
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 LATENCY_BUCKETS_S = (0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
@@ -33,7 +33,7 @@ class PlanCounters:
             self.first_light.add(record.first_light_after_s)
 
 
-def render_metrics(snapshot: StateReport, counters: PlanCounters, session: BoardSession, lease_s: float) -> str:
+def render_metrics(snapshot: StateReport, counters: PlanCounters, session: RemoteSession, lease_s: float) -> str:
     """Render the metrics from a state report and the counters."""
     board, link, totals, queue = snapshot.board, snapshot.link, snapshot.totals, snapshot.queue
     page = _MetricsPage()

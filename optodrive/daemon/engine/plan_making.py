@@ -1,5 +1,7 @@
 """Plan of a sequence from a planning snapshot, with the wire points and their proof."""
 
+import threading
+import zlib
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -16,6 +18,9 @@ from optodrive.planning.pipeline import plan_sequence
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
+NEVER = threading.Event()
+"""Event of a caller that does not leave."""
+
 
 class PlanningRequest(NamedTuple):
     """Request for a plan.
@@ -23,6 +28,7 @@ class PlanningRequest(NamedTuple):
     build: returns the sequence
     streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
     arrived_s: board time of the request's arrival; epoch: in which it arrived
+    caller_left: set when the caller no longer waits
     """
 
     build: Callable[[], FrameSequence]
@@ -32,6 +38,7 @@ class PlanningRequest(NamedTuple):
     streamed: bool = False
     arrived_s: float = 0.0
     epoch: int = 0
+    caller_left: threading.Event = NEVER
 
 
 def make_record(
@@ -51,7 +58,8 @@ def make_record(
     on_progress(1.0)
     points = quantise(planned.plan, scale)
     on_progress(1.0)
-    decoded = decode(points.encode_payload(), scale)
+    payload = points.encode_payload()
+    decoded = decode(payload, scale)
     verify(planned.plan, points.row[decoded.index], decoded, snapshot.budget, display.budget)
     on_progress(1.0)
     return PlanRecord(
@@ -65,6 +73,7 @@ def make_record(
         start_s=snapshot.start_s,
         arrived_s=request.arrived_s,
         epoch=request.epoch,
+        crc=zlib.crc32(payload),
         streamed=request.streamed,
         refreshed=snapshot.refreshed,
     )

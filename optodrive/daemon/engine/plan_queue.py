@@ -8,6 +8,7 @@ from collections import deque
 from concurrent.futures import Executor
 from math import inf
 
+from optodrive.core.errors import StoppedError
 from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
 from optodrive.daemon.engine.plan_simulation import simulate_record
 from optodrive.daemon.engine.planning_snapshot import (
@@ -20,9 +21,9 @@ from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, rewind_estimate
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
+from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.plan_job import PlanJob
-from optodrive.link.session.session import BoardSession
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.planning.display_model import DisplayModel
 
@@ -44,7 +45,9 @@ class PlanQueue:
     events: executed pulses and clock shifts, newest last, for one reader in another thread that removes them
     """
 
-    def __init__(self, display: DisplayModel, session: BoardSession, plan_store: PlanStore, executor: Executor) -> None:
+    def __init__(
+        self, display: DisplayModel, session: RemoteSession, plan_store: PlanStore, executor: Executor
+    ) -> None:
         self.lock = threading.RLock()
         self.running: deque[PlanRun] = deque()
         self.waiting: deque[PlanRecord] = deque()
@@ -103,8 +106,12 @@ class PlanQueue:
     # --- accepting plans ----------------------------------------------------------------------------------------
 
     def commit(self, record: PlanRecord, snapshot: PlanningSnapshot) -> bool:
-        """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late."""
+        """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late.
+
+        Raise StoppedError if the epoch of its request has passed.
+        """
         with self.lock:
+            self.require_epoch(record.epoch)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self._thermal is not snapshot.thermal:
                 return False
@@ -121,10 +128,16 @@ class PlanQueue:
             self._plan_store.add(record)
             return True
 
+    def require_epoch(self, epoch: int) -> None:
+        """Raise StoppedError if an epoch has passed. Any thread may call it."""
+        if epoch != self._session.epoch:
+            raise StoppedError(f"the request was stopped before it was carried out ({self._session.epoch_reason})")
+
     def _splice(self, record: PlanRecord, predecessor: PlanRecord, cut_row: int) -> bool:
         if not self.running or self.running[-1].record is not predecessor:
             return False
-        job = self._session.splice(record.points, predecessor.points.count_before(cut_row), STREAM_SEND_AHEAD_S)
+        kept_points = predecessor.points.count_before(cut_row)
+        job = self._session.splice(record.points, kept_points, record.epoch, STREAM_SEND_AHEAD_S, record.crc)
         if job is None:
             return False
         predecessor.dropped = len(predecessor.planned.plan) - cut_row
@@ -196,16 +209,13 @@ class PlanQueue:
                 return
             record.status = "running"
             ahead_s = STREAM_SEND_AHEAD_S if record.streamed else inf
-            self.running.append(PlanRun(record, self._session.begin(record.points, record.start_s, ahead_s)))
+            job = self._session.begin(record.points, record.start_s, record.epoch, ahead_s, record.crc)
+            self.running.append(PlanRun(record, job))
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
-        board = self._session.board
-        if board.state in UNARMED_STATES and self.is_busy:
-            cause = self._session.likely_cause if board.fault == "LINK" else None
-            cause_text = get_fault_hint(board.fault) if cause is None else cause.message
-            reason = f"{board.fault}: {cause_text}" if board.fault else self._session.last_event_reason
-            self.fail_all(f"the board went to {board.state} ({reason})")
+        if self._session.board.state in UNARMED_STATES and self.is_busy:
+            self.fail_all(self._describe_unarmed())
         for run in self.running:
             record, job = run
             executed = job.executed_count
@@ -219,6 +229,14 @@ class PlanQueue:
         if self.running and refusal is not None:
             self._session.flush()
             self.end_running("failed", f"the board refused a part of the plan ({refusal})")
+
+    def _describe_unarmed(self) -> str:
+        """Return why the board no longer executes plans, in one sentence."""
+        board = self._session.board
+        cause = self._session.likely_cause if board.fault == "LINK" else None
+        cause_text = get_fault_hint(board.fault) if cause is None else cause.message
+        reason = f"{board.fault}: {cause_text}" if board.fault else self._session.last_event_reason
+        return f"the board went to {board.state} ({reason})"
 
     def _finish_first(self) -> None:
         """End the first running plan. A delay of it shifts everything after it."""
@@ -259,8 +277,8 @@ class PlanQueue:
             for run in self.running:
                 run.job.delay(round(delay_s / self._session.scale.tick_s))
 
-    def end_running(self, status: PlanStatus, error: str | None) -> None:
-        """End all running plans and record what they executed."""
+    def end_running(self, status: PlanStatus, error: str | None, clock_shift_s: float = 0.0) -> None:
+        """End all running plans and record what they executed. clock_shift_s: as for fail_all."""
         with self.lock:
             ended = list(self.running)
             self.running.clear()
@@ -270,22 +288,25 @@ class PlanQueue:
             if delay_s > MIN_DELAY_S:
                 self._delay_all(delay_s)
             if ended and not self.waiting:
-                self._rewind_thermal_state([record for record, _ in ended])
+                self._rewind_thermal_state([record for record, _ in ended], clock_shift_s)
 
-    def _rewind_thermal_state(self, ended: list[PlanRecord]) -> None:
-        gate_off_s = self._session.board_s() + self._display.config.board.lease_s
+    def _rewind_thermal_state(self, ended: list[PlanRecord], clock_shift_s: float) -> None:
+        gate_off_s = self._session.board_s() - clock_shift_s + self._display.config.board.lease_s
         self._thermal = rewind_estimate(ended, gate_off_s, self._display.budget)
         self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
 
-    def fail_all(self, reason: str) -> None:
-        """Fail all running and waiting plans."""
+    def fail_all(self, reason: str, clock_shift_s: float = 0.0) -> None:
+        """Fail all running and waiting plans.
+
+        clock_shift_s: by which the board's clock has jumped since they were queued, see on_board_restarted
+        """
         with self.lock:
             waiting = list(self.waiting)
             self.waiting.clear()
             if self.running:
-                self.end_running("failed", reason)
+                self.end_running("failed", reason, clock_shift_s)
             elif waiting:
-                self._rewind_thermal_state(waiting[:1])
+                self._rewind_thermal_state(waiting[:1], clock_shift_s)
         for record in waiting:
             record.end("failed", reason)
 

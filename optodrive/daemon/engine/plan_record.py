@@ -11,7 +11,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
 from optodrive.core.types.plans import BudgetState, ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.engine.state_waiters import uncancellable_future
+from optodrive.daemon.engine.loop_commands import uncancellable_future
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanReport, PlanStatus
 from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session.timing_error import TimingError
@@ -34,6 +34,7 @@ class PlanRecord:
     start_s: board time of the plan's zero
     arrived_s: board time of the request; *_after_s: time from the request to an event
     epoch: in which the request arrived; the board executes nothing of an older one
+    crc: CRC-32 of the verified bytes of the points
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
     executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
@@ -50,7 +51,8 @@ class PlanRecord:
     budget_before: BudgetState
     start_s: float
     arrived_s: float
-    epoch: int = 0
+    epoch: int
+    crc: int
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None

@@ -81,7 +81,7 @@ def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) ->
     recorder = SessionRecorder(path, describe_display(engine.display), log.warn)
 
     def record_plan(record: PlanRecord) -> None:
-        recorder.record(lambda: build_plan_entry(record, engine.tick_s, engine.board_s()))
+        recorder.record(lambda: build_plan_entry(record, engine.scale.tick_s, engine.board_s()))
 
     engine.add_plan_end_callback(record_plan)
     return recorder

@@ -1,4 +1,4 @@
-"""Report of the daemon's state, the response of GET /v1/state."""
+"""The planner's part of the daemon's state, and the whole state as the planner sees it."""
 
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
@@ -7,35 +7,20 @@ from optodrive.daemon.responses.state import (
     BoardReport,
     LinkReport,
     PlannerReport,
+    PlannerState,
     PulseTotals,
     QueueReport,
     RecentPlan,
     StateReport,
 )
-from optodrive.link.session.session import BoardSession
+from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 
 
-def build_state_report(
-    display: DisplayModel,
-    session: BoardSession,
-    plan_queue: PlanQueue,
-    recent: list[PlanRecord],
-    planner: Planner,
-    link_error: str | None,
-) -> StateReport:
-    """Report the state of display, link, board, queue and planner."""
+def build_planner_state(plan_queue: PlanQueue, recent: list[PlanRecord], planner: Planner) -> PlannerState:
+    """Report the state of queue and planner."""
     running = next(iter(plan_queue.running.copy()), None)
-    return StateReport(
-        display=display.config.name,
-        pixels=len(display.layout),
-        link=LinkReport(
-            port=session.port,
-            state="up" if session.connected else "down",
-            error=link_error,
-            **session.collect_link_stats(),
-        ),
-        board=BoardReport(**session.board.to_dict()),
+    return PlannerState(
         queue=QueueReport(
             waiting=len(plan_queue.waiting),
             running=None if running is None else running.record.plan_id,
@@ -43,4 +28,22 @@ def build_state_report(
         ),
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
+    )
+
+
+def build_state_report(display: DisplayModel, session: RemoteSession, planner_state: PlannerState) -> StateReport:
+    """Report the state of display, link, board, queue and planner. A status of the link process must have arrived."""
+    return StateReport(
+        display=display.config.name,
+        pixels=len(display.layout),
+        link=LinkReport(
+            port=session.port,
+            state="up" if session.connected else "down",
+            error=session.link_error,
+            **session.stats,
+        ),
+        board=BoardReport(**session.board.to_dict()),
+        queue=planner_state.queue,
+        totals=planner_state.totals,
+        planner=planner_state.planner,
     )

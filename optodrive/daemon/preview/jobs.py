@@ -1,20 +1,19 @@
 """The jobs of the preview process: parse and build a pushed body, or plan it without executing it."""
 
 import pickle
-from typing import Any, NamedTuple
+from typing import Any
 
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.core.json_model import iterate_json
-from optodrive.core.types.plans import BudgetState
 from optodrive.core.types.stimuli import FrameSequence
+from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_record
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.protocol.quantisation import WireScale
-from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_codec import encode_sequence
@@ -22,17 +21,6 @@ from optodrive.planning.stimuli.sequence_file import parse_json, parse_sequence
 
 DRY_RUN_PLAN = "dry-run"
 """Plan id of every dry run."""
-
-
-class DryRunStart(NamedTuple):
-    """State of the display from which a dry run is planned, on the plan's own time line.
-
-    starts_in_s: time from now to the start of a plan that is submitted now
-    """
-
-    heat: ThermalState
-    budget: BudgetState
-    starts_in_s: float
 
 
 def run_job(display: DisplayModel, scale: WireScale, job: Message) -> Message:

@@ -14,7 +14,7 @@ from optodrive.daemon.message_loop import MessageLoop, MessageServer
 from optodrive.daemon.preview.job_queue import Job, JobQueue
 from optodrive.daemon.preview.jobs import build_refusal, run_job
 from optodrive.daemon.preview.worker import JobRunner, Worker, build_timeout_error
-from optodrive.daemon.supervisor.runtime_folder import RuntimeFolder
+from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_board_requirements
 from optodrive.planning.display_model import DisplayModel
 

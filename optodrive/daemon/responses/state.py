@@ -82,6 +82,14 @@ class PlannerReport(JsonModel):
     alive: bool
 
 
+class PlannerState(JsonModel):
+    """The part of the state that the planner process reports."""
+
+    queue: QueueReport
+    totals: PulseTotals
+    planner: PlannerReport
+
+
 class StateReport(JsonModel):
     """The daemon's state: display, link, board, queue, totals and planner."""
 

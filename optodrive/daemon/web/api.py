@@ -11,9 +11,9 @@ from starlette.middleware import Middleware
 from optodrive import __version__
 from optodrive.core.errors import InputError
 from optodrive.core.types.policy import Policy
-from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.live_stream import LiveStream
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
+from optodrive.daemon.one_process.engine import Engine
+from optodrive.daemon.one_process.live_stream import LiveStream
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList

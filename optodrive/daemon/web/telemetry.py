@@ -18,10 +18,10 @@ from optodrive.core.clock import Clock, MonotonicClock
 from optodrive.core.errors import NotReadyError
 from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
-from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.plan_record import PlanRecord
-from optodrive.daemon.engine.progress import ClockShift, merge_events
+from optodrive.daemon.one_process.display_snapshot import ExecutedBatch, LiveThermalState
+from optodrive.daemon.one_process.engine import Engine
+from optodrive.daemon.one_process.plan_record import PlanRecord
+from optodrive.daemon.one_process.progress import ClockShift, merge_events
 from optodrive.daemon.responses.telemetry import BudgetEvent, FaultEvent
 from optodrive.daemon.web.telemetry_events import build_display_event, build_pulse_batch, describe_caps
 

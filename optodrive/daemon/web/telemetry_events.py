@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.one_process.plan_record import PlanRecord
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PulseBatch
 from optodrive.device.config import LimitsSection
 from optodrive.physics.nominal_display import DisplayState

@@ -14,11 +14,11 @@ import pytest
 from displays import DISPLAYS
 from optodrive.core.beat import BeatWriter
 from optodrive.core.ipc import Message, MessageSocket
+from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.preview import jobs, worker
-from optodrive.daemon.preview.jobs import DryRunStart
 from optodrive.daemon.preview.process import run_preview
 from optodrive.daemon.responses.plan import PlanReport
-from optodrive.daemon.supervisor.runtime_folder import open_runtime_folder
+from optodrive.daemon.runtime_folder import open_runtime_folder
 from optodrive.planning.pipeline import warm_up
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 

@@ -3,7 +3,7 @@
 import pytest
 
 from optodrive.core.clock import MonotonicClock
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.responses.telemetry import EVENTS
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app

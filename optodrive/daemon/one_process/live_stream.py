@@ -10,7 +10,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from optodrive.core.errors import OptodriveError
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult

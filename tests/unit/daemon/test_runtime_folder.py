@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.daemon.supervisor.runtime_folder import SOCKET_PATH_MAX_BYTES, find_link_socket, open_runtime_folder
+from optodrive.daemon.runtime_folder import SOCKET_PATH_MAX_BYTES, find_link_socket, open_runtime_folder
 
 
 @pytest.fixture(params=["short", "a-folder-" + "far-too-long-for-a-socket-" * 5])

@@ -1,0 +1,26 @@
+"""State from which another process plans a dry run."""
+
+import pickle
+from typing import NamedTuple
+
+from optodrive.core.types.plans import BudgetState
+from optodrive.daemon.engine.engine import Engine
+from optodrive.physics.thermal_state import ThermalState
+
+
+class DryRunStart(NamedTuple):
+    """State of the display at the start of a plan that is submitted now, on the plan's own time line.
+
+    starts_in_s: time from now to that start
+    """
+
+    heat: ThermalState
+    budget: BudgetState
+    starts_in_s: float
+
+
+def build_dry_run_start(engine: Engine) -> bytes:
+    """Return the pickled start of a dry run."""
+    snapshot = engine.plan_queue.make_snapshot(streamed=False, planning_time_s=0.0)
+    start = DryRunStart(snapshot.heat, snapshot.budget, snapshot.start_s - engine.board_s())
+    return pickle.dumps(start, pickle.HIGHEST_PROTOCOL)

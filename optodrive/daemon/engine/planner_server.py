@@ -1,0 +1,221 @@
+"""Server of planner.sock: requests of the web process, pushed state, ended streamed plans and telemetry."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from optodrive.core.clock import Clock
+from optodrive.core.errors import OptodriveError
+from optodrive.core.ipc import Message, MessageSocket
+from optodrive.core.json_model import iterate_json
+from optodrive.daemon.engine.dry_run import build_dry_run_start
+from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
+from optodrive.daemon.message_loop import MessageServer
+from optodrive.daemon.responses.error_problem import build_error_problem
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.planning.stimuli.sequence_codec import decode_sequence
+
+STATE_PERIOD_S = 0.5
+
+
+@dataclass
+class _Client:
+    """State of a connection. requests: events of callers that wait, by id; readers: of its telemetry."""
+
+    requests: dict[int, tuple[threading.Event, "Future[PlanReport]"]] = field(default_factory=dict)
+    readers: int = 0
+    rate_hz: float = 1.0
+    batch_number: int = 0
+
+
+class PlannerServer:
+    """Clients of the planner process. The engine's thread calls everything."""
+
+    def __init__(self, engine: Engine, path: Path, clock: Clock) -> None:
+        self._engine = engine
+        self._clock = clock
+        self._clients: dict[MessageSocket, _Client] = {}
+        self._report_executor = ThreadPoolExecutor(1, thread_name_prefix="reports")
+        self._state_key: object = None
+        self._state_due_s = 0.0
+        self._server = MessageServer(engine.message_loop, path, self._on_message, self._on_lost)
+        self._telemetry = TelemetryProducer(
+            engine, clock, lambda message: engine.commands.post(partial(self._send_telemetry, message))
+        )
+        self._telemetry.start()
+        engine.add_plan_end_callback(lambda record: engine.commands.post(partial(self._report_end, record)))
+
+    def close(self) -> None:
+        """End the connections and the threads."""
+        self._telemetry.close()
+        self._report_executor.shutdown(wait=False, cancel_futures=True)
+        self._server.close()
+
+    # --- requests -----------------------------------------------------------------------------------------------
+
+    def _on_message(self, connection: MessageSocket, message: Message) -> None:
+        client = self._clients.setdefault(connection, _Client())
+        fields = message.fields
+        handlers: dict[str, Callable[[], object]] = {
+            "submit": lambda: self._submit(connection, client, message),
+            "drop": lambda: self._drop(client, fields["id"]),
+            "get_plan": lambda: self._answer(
+                connection, fields["id"], lambda: self._engine.get_plan(fields["plan"], fields["pulses"])
+            ),
+            "cancel": lambda: self._cancel(connection, fields["id"], fields["plan"]),
+            "metrics": lambda: self._reply(connection, fields["id"], 200, self._engine.render_metrics().encode()),
+            "snapshot": lambda: self._reply(connection, fields["id"], 200, build_dry_run_start(self._engine)),
+            "end_stream": lambda: self._engine.end_stream(fields["epoch"]),
+            "telemetry": lambda: self._set_readers(connection, client, fields["readers"], fields["rate_hz"]),
+        }
+        try:
+            handlers[message.kind]()
+        except OptodriveError as error:
+            self._refuse(connection, fields.get("id"), error)
+
+    def _on_lost(self, connection: MessageSocket) -> None:
+        client = self._clients.pop(connection, _Client())
+        for request_id in list(client.requests):
+            self._drop(client, request_id)
+        self._update_readers()
+
+    def _submit(self, connection: MessageSocket, client: _Client, message: Message) -> None:
+        fields, request_id, caller_left = message.fields, message.fields["id"], threading.Event()
+        future = self._engine.submit(
+            partial(decode_sequence, message.payload),
+            fields["name"],
+            fields["policy"],
+            fields["fit"],
+            fields["streamed"],
+            fields["arrived_s"],
+            fields["epoch"],
+            caller_left,
+        )
+        client.requests[request_id] = caller_left, future
+
+        def finish(done: "Future[PlanReport]") -> None:
+            if done.cancelled():
+                return
+            answer = _encode(done.result, 201)  # in the planner's thread
+            self._engine.commands.post(partial(self._finish, connection, client, request_id, *answer))
+
+        future.add_done_callback(finish)
+
+    def _finish(
+        self, connection: MessageSocket, client: _Client, request_id: int, status: int, payload: bytes, audit: Any
+    ) -> None:
+        if client.requests.pop(request_id, None) is not None:
+            self._reply(connection, request_id, status, payload, audit)
+
+    def _drop(self, client: _Client, request_id: int) -> None:
+        """Forget a request: one that waits is not planned, and one that is being planned ends."""
+        caller_left, future = client.requests.pop(request_id, (None, None))
+        if caller_left is not None and future is not None:
+            caller_left.set()
+            future.cancel()
+
+    def _answer(self, connection: MessageSocket, request_id: int, build: Callable[[], PlanReport]) -> None:
+        """Build and encode a report in another thread, and reply."""
+
+        def work() -> None:
+            answer = _encode(build, 200)
+            self._engine.commands.post(partial(self._reply, connection, request_id, *answer))
+
+        self._report_executor.submit(work)
+
+    def _cancel(self, connection: MessageSocket, request_id: int, plan: str) -> None:
+        self._engine.cancel(plan).add_done_callback(
+            lambda done: self._answer(connection, request_id, done.result)  # the future is done
+        )
+
+    def _refuse(self, connection: MessageSocket, request_id: int | None, error: OptodriveError) -> None:
+        if request_id is not None:
+            problem = build_error_problem(error)
+            self._reply(connection, request_id, problem.status, problem.to_json())
+
+    def _reply(
+        self,
+        connection: MessageSocket,
+        request_id: int,
+        status: int,
+        payload: bytes,
+        audit: dict[str, object] | None = None,
+    ) -> None:
+        """Send a result, after the state that explains it."""
+        self.publish_state()
+        fields = {"id": request_id, "status": status, "audit": audit or {}}
+        self._engine.message_loop.send(connection, Message("result", fields, payload))
+
+    # --- pushed messages ----------------------------------------------------------------------------------------
+
+    def publish_state(self) -> None:
+        """Send the state to all clients if it has changed or is due. Call it in every loop iteration."""
+        key = self._engine.compute_state_key(), len(self._server.clients)
+        now_s = self._clock.now_s()
+        if key == self._state_key and now_s < self._state_due_s:
+            return
+        self._state_key, self._state_due_s = key, now_s + STATE_PERIOD_S
+        self._server.broadcast(Message("state", self._engine.build_planner_state().model_dump(mode="json")))
+
+    def _report_end(self, record: PlanRecord) -> None:
+        if not record.streamed:
+            return
+        self.publish_state()
+        report = record.build_report(self._engine.board_s(), pulses=False)
+        self._server.broadcast(Message("ended", {"plan": record.plan_id}, report.model_dump_json().encode()))
+
+    # --- telemetry ----------------------------------------------------------------------------------------------
+
+    def _set_readers(self, connection: MessageSocket, client: _Client, readers: int, rate_hz: float) -> None:
+        is_new = readers and not client.readers
+        client.readers, client.rate_hz = readers, rate_hz
+        self._update_readers()
+        if is_new:
+            client.batch_number = 0
+            for message in self._telemetry.restart():
+                self._send_batch(connection, client, message)
+
+    def _update_readers(self) -> None:
+        reading = [client for client in self._clients.values() if client.readers]
+        self._telemetry.set_readers(len(reading), max((client.rate_hz for client in reading), default=1.0))
+
+    def _send_telemetry(self, message: Message) -> None:
+        for connection, client in list(self._clients.items()):
+            if not client.readers:
+                continue
+            if message.kind == "pulses":
+                self._send_batch(connection, client, message)
+            else:
+                self._engine.message_loop.send(connection, message)
+
+    def _send_batch(self, connection: MessageSocket, client: _Client, message: Message) -> None:
+        """Send a batch of pulses once."""
+        number: int = message.fields["number"]
+        if number > client.batch_number:
+            client.batch_number = number
+            self._engine.message_loop.send(connection, message)
+
+
+def _encode(get_report: Callable[[], PlanReport], status: int) -> tuple[int, bytes, dict[str, object]]:
+    """Return status, JSON and audit fields of a report, or of the problem that its future holds."""
+    try:
+        report = get_report()
+    except OptodriveError as error:
+        problem = build_error_problem(error)
+        return problem.status, problem.to_json(), {}
+    except Exception as error:
+        problem = build_error_problem(OptodriveError(f"{type(error).__name__}: {error}"))
+        return problem.status, problem.to_json(), {}
+    audit: dict[str, object] = {
+        "plan": report.plan,
+        "pattern": report.name,
+        "pulses": report.planned,
+        "plan_status": report.status,
+    }
+    return status, b"".join(iterate_json(report)), audit

@@ -1,0 +1,180 @@
+"""Producer of the telemetry's display, budget and pulses events as text, from executed reports.
+
+It runs in a thread of its own. Without readers it only follows the executed pulses.
+"""
+
+import threading
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from optodrive.core.clock import Clock
+from optodrive.core.ipc import Message
+from optodrive.core.json_model import JsonModel
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
+from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.progress import ClockShift, merge_events
+from optodrive.daemon.engine.telemetry_events import build_display_event, build_pulse_batch, describe_caps
+from optodrive.daemon.responses.telemetry import BudgetEvent
+
+IDLE_RATE_HZ = 20.0
+BUDGET_PERIOD_S, COLD_DISPLAY_PERIOD_S = 0.25, 1.0
+DRAIN_PERIOD_S = 1.0
+"""Interval between two collections of executed pulses without readers."""
+WARM_DISPLACEMENT_M, WARM_RISE_K = 5e-8, 0.1
+"""A pixel above either threshold is warm."""
+ANNOUNCE_LEAD_S = 1.0
+"""Planned pulses are published this long before they start."""
+BATCHES_MAX = 300
+"""Batches of pulses that are kept for later readers."""
+PULSES_MAX = 3000
+
+
+class TelemetryProducer:
+    """Thread that produces events at the highest rate of the readers.
+
+    publish: called in the thread with each message, see `TelemetryHub`; must not block
+    """
+
+    def __init__(self, engine: Engine, clock: Clock, publish: Callable[[Message], None]) -> None:
+        self._engine = engine
+        self._config = engine.display.config
+        self._clock = clock
+        self._publish_message = publish
+        self._executed_state = LiveThermalState(engine.display)
+        self._batches: deque[Message] = deque(maxlen=BATCHES_MAX)
+        self._batch_number = 0
+        self._announced_rows: dict[str, int] = {}
+        self._next_s: dict[str, float] = {}
+        self._board_clock_reference = (0.0, 0.0)
+        self._is_warm = self._has_upcoming = False
+        self._readers, self._rate_hz = 0, IDLE_RATE_HZ
+        self._is_closing = False
+        self._wake = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="telemetry", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._is_closing = True
+        self._wake.set()
+        self._thread.join(timeout=5.0)
+
+    def set_readers(self, readers: int, rate_hz: float) -> None:
+        """Set the number of readers and their highest rate. Any thread may call it."""
+        self._readers, self._rate_hz = readers, rate_hz
+        self._wake.set()
+
+    def restart(self) -> list[Message]:
+        """Return the kept batches for a new consumer, and send it all other events at once. Any thread may call it."""
+        self._next_s = {}
+        return list(self._batches)
+
+    def _run(self) -> None:
+        next_s = self._clock.now_s()
+        while not self._is_closing:
+            self._wake.clear()
+            self.produce()
+            next_s = max(next_s + self._compute_period_s(), self._clock.now_s())
+            if self._wake.wait(next_s - self._clock.now_s()):
+                next_s = self._clock.now_s()
+
+    def _compute_period_s(self) -> float:
+        if not self._readers:
+            return DRAIN_PERIOD_S
+        is_busy = self._is_warm or self._has_upcoming
+        return 1.0 / (self._rate_hz if is_busy else min(self._rate_hz, IDLE_RATE_HZ))
+
+    def produce(self) -> None:
+        """Collect the executed and the planned pulses, and publish the events that are due if there are readers."""
+        now_s = self._clock.now_s()
+        board_s = self._estimate_board_s(now_s)
+        self._collect_executed()
+        self._announce_planned(board_s)
+        if not self._readers:
+            return
+        self._publish_display(now_s, board_s)
+        if self._is_due("budget", now_s, BUDGET_PERIOD_S):
+            usages = self._executed_state.compute_usage(board_s)
+            self._publish("budget", BudgetEvent(board_s=board_s, caps=describe_caps(usages, self._config.limits)))
+
+    def _estimate_board_s(self, now_s: float) -> float:
+        """Estimate the board's time; it is extrapolated while there is no link."""
+        if self._engine.is_linked:
+            self._board_clock_reference = now_s, self._engine.board_s()
+        return self._board_clock_reference[1] + now_s - self._board_clock_reference[0]
+
+    def _is_due(self, kind: str, now_s: float, period_s: float) -> bool:
+        due = now_s >= self._next_s.get(kind, now_s)
+        if due:
+            self._next_s[kind] = now_s + period_s
+        return due
+
+    def _publish(self, event: str, model: JsonModel) -> None:
+        fields = {"event": event, "warm": self._is_warm, "upcoming": self._has_upcoming}
+        text = f"event: {event}\ndata: {model.model_dump_json()}\n\n"
+        self._publish_message(Message("telemetry", fields, text.encode()))
+
+    def _publish_display(self, now_s: float, board_s: float) -> None:
+        pixel_state = self._executed_state.state_at(board_s)
+        was_warm = self._is_warm
+        self._is_warm = bool(
+            pixel_state.displacement_m.max() > WARM_DISPLACEMENT_M or np.abs(pixel_state.absorber_k).max() > WARM_RISE_K
+        )
+        if self._is_warm or was_warm or self._is_due("display", now_s, COLD_DISPLAY_PERIOD_S):
+            self._publish("display", build_display_event(board_s, self._is_warm, pixel_state, self._config.ambient_c))
+
+    def _collect_executed(self) -> None:
+        for event in merge_events(self._engine.drain_events()):
+            if isinstance(event, ClockShift):
+                self._executed_state.shift_clock(event.delay_s)
+                continue
+            executed = ExecutedBatch.from_progress(event, self._engine.scale)
+            if len(executed.row):
+                self._executed_state.apply(executed)
+                columns = (executed.start_s, executed.width_s, executed.power_w)
+                self._add_batch("executed", executed.record, executed.row, *columns)
+
+    def _announce_planned(self, board_s: float) -> None:
+        """Publish the planned pulses that start soon."""
+        records = self._engine.list_upcoming()
+        self._has_upcoming = bool(records)
+        self._announced_rows = {record.plan_id: self._announced_rows.get(record.plan_id, 0) for record in records}
+        for record in records:
+            plan, begin = record.planned.plan, self._announced_rows[record.plan_id]
+            end = int(np.searchsorted(plan.start_s, board_s + ANNOUNCE_LEAD_S - record.start_s))
+            if end > begin:
+                row = np.arange(begin, end)
+                columns = (plan.start_s[begin:end] + record.start_s, plan.width_s[begin:end], plan.power_w[begin:end])
+                self._add_batch("planned", record, row, *columns)
+                self._announced_rows[record.plan_id] = end
+
+    def _add_batch(
+        self,
+        kind: str,
+        record: PlanRecord,
+        row: IntArray,
+        start_s: FloatArray,
+        width_s: FloatArray,
+        power_w: FloatArray,
+    ) -> None:
+        newest = slice(-PULSES_MAX, None)
+        row = row[newest]
+        batch = build_pulse_batch(record, row, start_s[newest], width_s[newest], power_w[newest])
+        self._batch_number += 1
+        fields = {
+            "number": self._batch_number,
+            "batch": kind,
+            "count": len(row),
+            "board_s": self._board_clock_reference[1],
+        }
+        message = Message("pulses", fields, batch.model_dump_json().encode())
+        self._batches.append(message)
+        if self._readers:
+            self._publish_message(message)

@@ -1,0 +1,84 @@
+"""Present state of the display from the pulses that the board has reported, in board time.
+
+The planner's thermal state is ahead of emission; this one follows it. It is not thread-safe.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.daemon.one_process.plan_record import PlanRecord
+from optodrive.daemon.one_process.progress import PlanProgress
+from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
+from optodrive.physics.nominal_display import DisplayState
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.limiter.limiter import commit_executed, shift_state
+from optodrive.planning.limiter.usage import Usage, compute_usage
+
+
+class ExecutedBatch(NamedTuple):
+    """Executed pulses of a plan, [n], also as input for the limiter.
+
+    row: plan row
+    start_s: board time
+    """
+
+    record: PlanRecord
+    row: IntArray
+    pixel: IntArray
+    start_s: FloatArray
+    width_s: FloatArray
+    power_w: FloatArray
+    x_rad: FloatArray
+    y_rad: FloatArray
+
+    @classmethod
+    def from_progress(cls, progress: PlanProgress, scale: WireScale) -> "ExecutedBatch":
+        """Build the batch from the board's reports."""
+        record, job = progress.run
+        plan, reported = record.planned.plan, job.read_reported(progress.begin, progress.end)
+        row = reported.row
+        return cls(
+            record=record,
+            row=row,
+            pixel=plan.pixel[row],
+            start_s=np.asarray(reported.on_tick * scale.tick_s, dtype=np.float64),
+            width_s=np.asarray(reported.on_ticks * scale.tick_s, dtype=np.float64),
+            power_w=np.asarray(reported.duty / DUTY_MAX * scale.full_power_w, dtype=np.float64),
+            x_rad=plan.x_rad[row],
+            y_rad=plan.y_rad[row],
+        )
+
+
+class LiveThermalState:
+    """Heat and budget after the executed pulses. The initial state is cold, because the daemon knows no earlier one.
+
+    out_of_order: number of pulses omitted from the heat because they precede another pulse on their pixel
+    """
+
+    def __init__(self, display: DisplayModel) -> None:
+        self._display = display
+        self._heat, self._budget = display.build_cold_state()
+        self.out_of_order = 0
+
+    def apply(self, executed: ExecutedBatch) -> None:
+        """Add pulses, in order of time."""
+        columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+        try:
+            self._heat.apply_pulses(*columns)
+        except ValueError:
+            self.out_of_order += len(executed.row)
+        self._budget = commit_executed(executed.pixel, executed, self._budget, self._display.budget)
+
+    def shift_clock(self, delay_s: float) -> None:
+        """Shift all past pulses by delay_s after a restart of the board's clock."""
+        self._heat, self._budget = self._heat.copy_shifted(delay_s), shift_state(self._budget, delay_s)
+
+    def state_at(self, board_s: float) -> DisplayState:
+        """Return the state of all pixels at a board time, s."""
+        return self._heat.state_at(board_s)
+
+    def compute_usage(self, board_s: float) -> tuple[Usage, ...]:
+        """Compute the usage of every cap at a board time, s."""
+        return compute_usage(self._budget, self._display.budget, board_s)

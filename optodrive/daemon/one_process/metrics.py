@@ -1,0 +1,127 @@
+"""Metrics of GET /metrics in the Prometheus text format, version 0.0.4."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from optodrive import __version__
+from optodrive.core.histogram import Histogram
+from optodrive.daemon.one_process.plan_record import PlanRecord
+from optodrive.daemon.responses.state import StateReport
+from optodrive.link.protocol.states import BoardState
+from optodrive.link.session.session import BoardSession
+
+CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
+LATENCY_BUCKETS_S = (0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.15, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+REPORTED_STATES = tuple(state for state in BoardState if state != BoardState.BOOT)
+Labels = Mapping[str, str]
+
+
+class PlanCounters:
+    """Counters of ended plans: number by status, and latency from request to first emission."""
+
+    def __init__(self) -> None:
+        self.ended: Counter[str] = Counter(dict.fromkeys(("done", "superseded", "failed", "cancelled"), 0))
+        self.first_light = Histogram(LATENCY_BUCKETS_S)
+        self.min_headroom_k: float | None = None
+
+    def record_end(self, record: PlanRecord) -> None:
+        """Count an ended plan. The loop's thread and the simulation thread call it, for different plans."""
+        self.ended[record.status] += 1
+        self.min_headroom_k = float(record.planned.plan.headroom_k.min())
+        if record.first_light_after_s is not None:
+            self.first_light.add(record.first_light_after_s)
+
+
+def render_metrics(snapshot: StateReport, counters: PlanCounters, session: BoardSession, lease_s: float) -> str:
+    """Render the metrics from a state report and the counters."""
+    board, link, totals, queue = snapshot.board, snapshot.link, snapshot.totals, snapshot.queue
+    page = _MetricsPage()
+    page.add_gauge("info", "Version and display", [({"version": __version__, "display": snapshot.display}, 1)])
+    page.add_gauge(
+        "board_state", "1 for the board's state", [({"state": s}, int(board.state == s)) for s in REPORTED_STATES]
+    )
+    page.add_counter(
+        "board_faults_total", "Number of transitions of the board to each fault", _label_counts("fault", session.faults)
+    )
+    page.add_counter("laser_on_seconds_total", "Gate-on time × duty since the board's power-up, s", board.laser_on_s)
+    page.add_counter("underruns_total", "Number of times the board ran out of points", board.underruns)
+    page.add_gauge("board_temperature_celsius", "The board's temperature", board.temperature_c)
+    page.add_gauge("link_up", "1 while the link to the board is up", int(link.state == "up"))
+    received, sent = {"at": "host"}, {"at": "board"}
+    bad = [(received, link.host_bad_frames), (sent, link.board_bad_frames)]
+    page.add_counter("link_bad_frames_total", "Damaged frames since the link was opened", bad)
+    page.add_counter("link_retransmitted_total", "Frames retransmitted since the link was opened", link.retransmitted)
+    page.add_counter("link_naks_total", "Frames the board refused since the link was opened", link.naks)
+    page.add_gauge("link_round_trip_seconds", "Shortest recent round trip to the board", _ms_to_s(link.round_trip_ms))
+    page.add_gauge("link_longest_stall_seconds", "Longest iteration of the loop", _ms_to_s(link.longest_stall_ms))
+    pulses = [({"stage": stage}, getattr(totals, stage)) for stage in ("planned", "sent", "executed")]
+    page.add_counter("pulses_total", "Pulses planned, sent to the board, executed by it", pulses)
+    page.add_counter("plans_total", "Ended plans by status", _label_counts("status", counters.ended))
+    page.add_gauge("plans_waiting", "Plans waiting for the beam", queue.waiting)
+    page.add_gauge("planner_alive", "1 while the planner is idle or makes progress", int(snapshot.planner.alive))
+    page.add_gauge(
+        "plan_headroom_kelvin",
+        "Minimum distance of an absorber's bound from its cap, last plan",
+        counters.min_headroom_k,
+    )
+    page.add_histogram("first_light_seconds", "Time from a plan's arrival to its first emission", counters.first_light)
+    page.add_histogram("lease_age_seconds", "Age of the lease at its renewal", session.lease.ages)
+    page.add_gauge("lease_seconds", "Age of the lease at which the board turns the gate off", lease_s)
+    page.add_gauge("lease_slack_seconds", "Minimum remaining lease at a renewal", session.lease.slack_s)
+    return page.render()
+
+
+class _MetricsPage:
+    def __init__(self) -> None:
+        self._lines: list[str] = []
+
+    def add_gauge(self, name: str, help_text: str, value: "float | Iterable[tuple[Labels, float]] | None") -> None:
+        """Add a gauge, or nothing if its value is unknown."""
+        self._add_family(name, "gauge", help_text, value)
+
+    def add_counter(self, name: str, help_text: str, value: "float | Iterable[tuple[Labels, float]]") -> None:
+        """Add a counter."""
+        self._add_family(name, "counter", help_text, value)
+
+    def add_histogram(self, name: str, help_text: str, histogram: Histogram) -> None:
+        """Add a histogram."""
+        self._add_header(name, "histogram", help_text)
+        bounds = [*(repr(bound) for bound in histogram.bounds), "+Inf"]
+        counts, total = histogram.cumulative_counts(), histogram.sum
+        for bound, count in zip(bounds, counts, strict=True):
+            self._add_sample(f"{name}_bucket", {"le": bound}, count)
+        self._add_sample(f"{name}_sum", {}, total)
+        self._add_sample(f"{name}_count", {}, counts[-1])
+
+    def render(self) -> str:
+        """Return the text of all metrics."""
+        return "\n".join(self._lines) + "\n"
+
+    def _add_family(self, name: str, kind: str, help_text: str, value: Any) -> None:
+        if value is None:
+            return
+        self._add_header(name, kind, help_text)
+        for labels, number in [({}, value)] if isinstance(value, int | float) else value:
+            self._add_sample(name, labels, number)
+
+    def _add_header(self, name: str, kind: str, help_text: str) -> None:
+        self._lines += [f"# HELP optodrive_{name} {help_text}.", f"# TYPE optodrive_{name} {kind}"]
+
+    def _add_sample(self, name: str, labels: Labels, number: float) -> None:
+        label_text = ",".join(f'{key}="{_escape_label(text)}"' for key, text in labels.items())
+        self._lines.append(f"optodrive_{name}{f'{{{label_text}}}' if label_text else ''} {number!r}")
+
+
+def _label_counts(label: str, counts: Counter[str]) -> list[tuple[Labels, float]]:
+    return [
+        ({label: name}, count) for name, count in counts.copy().items()
+    ]  # a copy, because another thread may add a name
+
+
+def _ms_to_s(milliseconds: float | None) -> float | None:
+    return None if milliseconds is None else milliseconds * 1e-3
+
+
+def _escape_label(text: str) -> str:
+    return text.replace("\\", "\\\\").replace("\n", "\\n").replace('"', '\\"')

@@ -1,0 +1,62 @@
+"""Thermal state and budget state on the board's time line, as estimated by the daemon."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from optodrive.core.types.plans import BudgetState, ExecutedPulses
+from optodrive.daemon.one_process.plan_record import PlanRecord
+from optodrive.physics.thermal_state import ThermalState
+from optodrive.planning.limiter.budget import Budget
+from optodrive.planning.limiter.limiter import commit_until, shift_state
+
+
+@dataclass(frozen=True, eq=False)
+class ThermalEstimate:
+    """Heat (best estimate) and budget (bound) after all pulses planned so far, in board time."""
+
+    heat: ThermalState
+    budget: BudgetState
+
+    def shift_to_plan(self, start_s: float) -> tuple[ThermalState, BudgetState]:
+        """Return both on the time line of a plan whose zero is board time start_s."""
+        return self.heat.copy_shifted(-start_s), shift_state(self.budget, -start_s)
+
+    @classmethod
+    def from_plan(cls, heat: ThermalState, budget: BudgetState, start_s: float) -> "ThermalEstimate":
+        """Build the estimate from states on the time line of a plan whose zero is board time start_s."""
+        return cls(heat.copy_shifted(start_s), shift_state(budget, start_s))
+
+    def with_delay(self, delay_s: float) -> "ThermalEstimate":
+        """Return the estimate with every pulse delay_s later."""
+        return ThermalEstimate(self.heat.copy_shifted(delay_s), shift_state(self.budget, delay_s))
+
+
+def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalState:
+    """Return the thermal state after executed pulses. Both arguments are on the plan's time line."""
+    heat = before.copy()
+    heat.apply_pulses(executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    return heat
+
+
+def rewind_estimate(ended: Sequence[PlanRecord], gate_off_s: float, budget: Budget) -> ThermalEstimate:
+    """Build the estimate after plans that ended early, without their dropped pulses.
+
+    The heat counts only executed pulses. The budget counts every pulse that may have started before board time
+    gate_off_s, when the gate is off for certain.
+    """
+    first = ended[0]
+    heat, state, zero_s = first.heat_before, first.budget_before, first.start_s
+    for record in ended:
+        plan = record.planned.plan
+        heat, state = heat.copy_shifted(zero_s - record.start_s), shift_state(state, zero_s - record.start_s)
+        zero_s = record.start_s
+        kept_pulses = len(plan) - record.dropped
+        if kept_pulses:
+            until_s = min(gate_off_s - record.start_s, float(np.nextafter(plan.start_s[kept_pulses - 1], inf)))
+            state = commit_until(plan, until_s, state, budget)
+        if record.executed is not None:
+            heat = apply_executed(heat, record.executed)
+    return ThermalEstimate.from_plan(heat, state, zero_s)

@@ -1,0 +1,135 @@
+"""The planner in virtual time: its real queue and session over the real link service and a simulated board."""
+
+from concurrent.futures import Executor, Future
+from types import SimpleNamespace
+
+import numpy as np
+
+from displays import DISPLAYS
+from link_service_rig import PLANNER, ServiceRig
+from optodrive.core.ipc import MessageDecoder, encode_message
+from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.daemon.engine.plan_making import PlanningRequest
+from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.plan_record import PlanStore
+from optodrive.daemon.engine.planner import Planner
+from optodrive.link.service import remote_session
+from optodrive.link.service.remote_session import RemoteSession
+
+DISPLAY = DISPLAYS["display-16"]
+
+
+class InlineExecutor(Executor):
+    """Runs each function at once, in the caller's thread."""
+
+    def submit(self, function, /, *arguments, **named):
+        future = Future()
+        try:
+            future.set_result(function(*arguments, **named))
+        except BaseException as error:
+            future.set_exception(error)
+        return future
+
+
+class ServiceChannel:
+    """Connection of the planner's session to a link service in the same thread. Messages pass through their bytes."""
+
+    wants_write = False
+    is_closed = False
+
+    def __init__(self, rig):
+        self._rig = rig
+        self._read = 0
+        self._decoder = MessageDecoder()
+
+    def fileno(self):
+        return -1
+
+    def send(self, message):
+        (copy,) = MessageDecoder().feed(encode_message(message))
+        self._rig.service.on_message(PLANNER, copy)
+        self._rig.collect()
+
+    def flush(self):
+        pass
+
+    def receive(self):
+        self._rig.collect()
+        waiting = self._rig.received[PLANNER][self._read :]
+        self._read += len(waiting)
+        return self._decoder.feed(b"".join(encode_message(message) for message in waiting))
+
+    def close(self):
+        self._rig.leave(PLANNER)
+
+
+class DirectSession(RemoteSession):
+    """A session on a channel in place of a socket."""
+
+    def attach(self, channel):
+        self._socket = channel
+
+
+class PlannerRig(ServiceRig):
+    """Planner, queue and session on a link service with its board, in one thread and in virtual time.
+
+    before_loop_action: called before each action that the planner hands over to the loop, that is, between planning
+    and commit
+    """
+
+    def __init__(self, monkeypatch, queue_type=PlanQueue, **options):
+        super().__init__(**options)
+        # A reply is there as soon as the request has been sent.
+        monkeypatch.setattr(remote_session, "select", SimpleNamespace(select=lambda *_: ([], [], [])))
+        self.hello_all()
+        self.remote = DirectSession(self.session.scale, self.clock)
+        self.remote.attach(ServiceChannel(self))
+        self.store = PlanStore()
+        self.queue = queue_type(DISPLAY, self.remote, self.store, InlineExecutor())
+        self.before_loop_action = lambda: None
+        self.planner = Planner(
+            DISPLAY, self.remote, self.queue, self.clock, InlineExecutor(), self._run_in_loop, lambda: None
+        )
+        self._seen_epoch = None
+
+    def _run_in_loop(self, action):
+        self.before_loop_action()
+        return action()
+
+    def run(self, duration_s=0.002):
+        super().run(duration_s)
+        self.loop_once()
+
+    def loop_once(self):
+        """Run one iteration of the engine's loop."""
+        self.remote.receive()
+        shift_s = self.remote.pop_clock_shift()
+        if self.remote.epoch != self._seen_epoch:
+            self._seen_epoch = self.remote.epoch
+            self.queue.fail_all(self.remote.epoch_reason, shift_s or 0.0)
+        if shift_s is not None:
+            self.queue.on_board_restarted(shift_s)
+        self.queue.update_jobs(self.remote.pop_refusal())
+        self.queue.start_next()
+
+    def submit(self, sequence, epoch, streamed=False):
+        """Plan a sequence; return its future."""
+        return self.planner.submit(
+            PlanningRequest(lambda: sequence, "push", streamed=streamed, arrived_s=self.remote.board_s(), epoch=epoch)
+        )
+
+    def ready(self):
+        """Connect, and wait for the planner's view of it."""
+        self.connect()
+        self.until(lambda: self.remote.connected)
+        return self
+
+
+def build_frame(height_um=60.0, pixels=range(16), duration_s=1.0):
+    target_m = np.zeros(16)
+    target_m[list(pixels)] = height_um * 1e-6
+    return FrameSequence((TactileFrame("f", 0.0, duration_s, target_m),))
+
+
+def build_train(seconds, pixel=3):
+    return FrameSequence((), (PulseTrain(pixel, 0.0, seconds, 0.01, 0.01, 1.0),))

@@ -1,0 +1,181 @@
+"""Queue and planner over a real link service in virtual time: epochs, streams, cancelling, clocks."""
+
+import threading
+
+import pytest
+
+from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
+from optodrive.core.errors import BusyError, StoppedError
+from optodrive.daemon.engine.plan_making import PlanningRequest
+from optodrive.daemon.engine.plan_queue import PlanQueue
+from optodrive.daemon.engine.planner import REQUESTS_MAX
+from planner_rig import PlannerRig, build_frame, build_train
+
+
+@pytest.fixture
+def rig(monkeypatch):
+    rig = PlannerRig(monkeypatch).ready()
+    rig.arm()
+    rig.run(0.01)
+    return rig
+
+
+def submit(rig, sequence, streamed=False):
+    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed).result().plan)
+
+
+def finish(rig, record):
+    rig.until(lambda: record.has_ended)
+    return record
+
+
+def stop(rig):
+    rig.await_result(OPERATOR, rig.request(OPERATOR, "stop"))
+    rig.run(0.01)
+
+
+def test_plans_are_executed_in_order_with_the_points_that_were_proven(rig):
+    first, second = submit(rig, build_frame(60.0)), submit(rig, build_frame(90.0))
+    finish(rig, second)
+    assert (first.status, second.status) == ("done", "done")
+    assert first.executed_count == second.executed_count == 16
+    assert len(rig.list_emitted()) == 32
+    assert float(second.simulated_m.max()) == pytest.approx(90e-6, rel=0.01)
+
+
+def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
+    first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
+    rig.until(lambda: first.executed_count >= 3)
+    second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True)
+    finish(rig, second)
+    assert (first.status, second.status) == ("superseded", "done")
+    assert first.executed_count + first.dropped == 16
+    assert rig.session.board.underruns == 0
+
+
+def test_stop_ends_running_and_waiting_plans_and_says_so(rig):
+    running, waiting = submit(rig, build_train(3.0)), submit(rig, build_frame())
+    rig.until(lambda: running.executed_count > 5)
+    stop(rig)
+    assert [record.status for record in (running, waiting)] == ["failed", "failed"]
+    assert running.error == waiting.error == "ended by stop"
+    count = len(rig.list_emitted())
+    rig.arm()
+    rig.run(1.0)
+    assert len(rig.list_emitted()) == count
+
+
+def test_a_request_from_before_stop_is_answered_stopped_and_never_lights(rig):
+    epoch = rig.remote.epoch
+    stop(rig)
+    rig.arm()
+    rig.run(0.01)
+    with pytest.raises(StoppedError, match="ended by stop"):
+        rig.submit(build_frame(), epoch).result()
+    rig.run(1.0)
+    assert not rig.list_emitted()
+
+
+def stop_and_arm_before_commit(rig):
+    """Submit a plan, and stop and arm between its planning and its commit."""
+
+    def stop_and_arm():
+        rig.before_loop_action = lambda: None
+        stop(rig)
+        rig.arm()
+        rig.run(0.01)
+
+    rig.before_loop_action = stop_and_arm
+    return rig.submit(build_frame(), rig.remote.epoch)
+
+
+def test_stop_between_planning_and_commit_is_answered_stopped(rig):
+    with pytest.raises(StoppedError, match="ended by stop"):
+        stop_and_arm_before_commit(rig).result()
+    rig.run(1.0)
+    assert not rig.list_emitted()
+    assert finish(rig, submit(rig, build_frame())).status == "done"
+
+
+class UncheckedQueue(PlanQueue):
+    """Mutant: accepts plans of every epoch."""
+
+    def require_epoch(self, epoch):
+        """Permit every epoch."""
+
+
+def test_without_the_check_at_commit_such_a_plan_is_accepted_but_the_link_refuses_its_points(monkeypatch):
+    rig = PlannerRig(monkeypatch, queue_type=UncheckedQueue).ready()
+    rig.arm()
+    rig.run(0.01)
+    report = stop_and_arm_before_commit(rig).result()
+    record = finish(rig, rig.store.find(report.plan))
+    assert record.status == "failed"
+    assert "epoch" in record.error
+    assert not rig.list_emitted()
+
+
+def test_a_streamed_request_from_before_stop_preempts_nothing(rig):
+    epoch = rig.remote.epoch
+    stop(rig)
+    rig.arm()
+    rig.run(0.01)
+    running = submit(rig, build_train(0.5))
+    rig.until(lambda: running.executed_count > 3)
+    with pytest.raises(StoppedError):
+        rig.submit(build_frame(), epoch, streamed=True).result()
+    assert finish(rig, running).status == "done"
+
+
+def test_a_request_whose_caller_left_is_not_committed(rig):
+    left = threading.Event()
+    left.set()
+    request = PlanningRequest(build_frame, "push", epoch=rig.remote.epoch, caller_left=left)
+    with pytest.raises(StoppedError, match="left"):
+        rig.planner.submit(request).result()
+    assert not rig.queue.is_busy
+
+
+def test_too_many_waiting_requests_are_refused(rig):
+    rig.planner._pending_count = REQUESTS_MAX + 1
+    with pytest.raises(BusyError, match="too many requests wait"):
+        rig.submit(build_frame(), rig.remote.epoch)
+
+
+def test_a_cancelled_plan_ends_and_the_next_one_runs(rig):
+    running, waiting = submit(rig, build_train(3.0)), submit(rig, build_frame())
+    rig.until(lambda: running.executed_count > 5)
+    rig.queue.cancel(running)
+    assert (running.status, running.error) == ("cancelled", "cancelled while running")
+    assert finish(rig, waiting).status == "done"
+    assert rig.session.board.state == "ARMED"
+
+
+@pytest.mark.parametrize("client", [WEB, PLANNER])
+def test_the_loss_of_a_process_ends_all_plans(rig, client):
+    running = submit(rig, build_train(3.0))
+    rig.until(lambda: running.executed_count > 5)
+    if client == PLANNER:
+        rig.remote.close()
+        rig.loop_once()
+    else:
+        rig.leave(client)
+        rig.run(0.05)
+    assert running.status == "failed"
+    assert "process" in running.error
+    count = len(rig.list_emitted())
+    ServiceRig.run(rig, 1.0)  # without the planner's loop
+    assert len(rig.list_emitted()) <= count + 1
+
+
+def test_heat_and_budget_follow_a_restart_of_the_board_s_clock(rig):
+    finish(rig, submit(rig, build_frame(90.0)))
+    before, now_s = rig.queue.make_snapshot(False, 0.0), rig.remote.board_s()
+    stop(rig)
+    rig.queue.on_board_restarted(-now_s)
+    after = rig.queue.make_snapshot(False, 0.0)
+    assert float(after.thermal.budget.at_s - before.thermal.budget.at_s) == pytest.approx(-now_s)
+
+
+def test_an_empty_plan_is_done_at_once(rig):
+    assert finish(rig, submit(rig, build_frame(0.0))).status == "done"
