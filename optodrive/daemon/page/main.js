@@ -2,6 +2,7 @@
 
 import { ArmControl } from "./arm.js";
 import { call } from "./api.js";
+import { LEASED_STATES } from "./board_states.js";
 import { setCapLabels } from "./caps.js";
 import { buildColourMap } from "./colours.js";
 import { DisplayView } from "./display.js";
@@ -24,6 +25,7 @@ const announce = (text) => (find("said").textContent = text);
 
 // STOP first: it depends on nothing that follows.
 let plans = null;
+let mayEmit = () => true;
 new StopControl(
   find("stop"),
   find("stopping"),
@@ -32,6 +34,7 @@ new StopControl(
     telemetry.pause(true);
   },
   () => telemetry.pause(document.hidden),
+  () => mayEmit(),
 );
 if (location.hash) {
   history.replaceState(null, "", location.pathname);
@@ -145,10 +148,11 @@ function updateLegend() {
 }
 
 function applyColourMap() {
-  const bytes = buildColourMap(find("colours").value);
+  const name = readChoice("colours");
+  const bytes = buildColourMap(name);
   const pixels = Uint8ClampedArray.from({ length: 256 * 48 }, (_, k) => bytes[k % 1024]);
   find("legend").getContext("2d").putImageData(new ImageData(pixels, 256, 12), 0, 0);
-  view.setColourMap(find("colours").value);
+  view.setColourMap(name);
 }
 
 function describeSelected() {
@@ -173,7 +177,9 @@ function describeDisplay() {
 for (const radio of document.querySelectorAll('input[name="show"]')) {
   radio.addEventListener("change", () => showQuantity(readChoice("show")));
 }
-find("colours").addEventListener("change", applyColourMap);
+for (const radio of document.querySelectorAll('input[name="colours"]')) {
+  radio.addEventListener("change", applyColourMap);
+}
 bindThemeButton(find("theme"), () => {
   view.applyTheme();
   timeline.applyTheme();
@@ -196,7 +202,10 @@ telemetry.addEventListener("down", () => {
   arm.show("");
 });
 telemetry.addEventListener("unauthorized", () => status.showTokenChange());
+let isOff = false;
+mayEmit = () => !(telemetry.live && isOff);
 telemetry.addEventListener("state", ({ detail }) => {
+  isOff = detail.link.state === "up" && !LEASED_STATES.includes(detail.board.state);
   if (detail.display !== config.name || detail.pixels !== grid.pixels) {
     location.reload(); // the restarted daemon has another display
   }
