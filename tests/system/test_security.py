@@ -11,8 +11,6 @@ from functools import partial
 
 import httpx
 import pytest
-from fastapi import FastAPI
-from starlette.routing import Mount, Route, WebSocketRoute
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
@@ -23,7 +21,7 @@ from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.roles import ROLES
-from optodrive.daemon.web.route_table import ARM, ROUTES, STOP
+from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
 from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
@@ -34,8 +32,13 @@ from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
 LAST_LINE = "lease_s = 1.0"
 
 
-LOGIN_ROUTES = {f"GET {path}" for path in LOGIN_PATHS}
-"""Separate entries within the page's route."""
+def build_application():
+    """Build the application on an engine that is not started."""
+    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
+    return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+
+
+ROUTES = RouteTable(build_application().routes).roles
 
 
 def build_daemon_replacement(text):
@@ -60,29 +63,6 @@ def running(folder):
             daemon.stop()
     finally:
         board.stop()
-
-
-@pytest.fixture(scope="module")
-def app():
-    """Application with an engine that is not started."""
-    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
-    return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
-
-
-def list_routes(application):
-    """Return every route of an application in the form of the table."""
-    found = set()
-    for route in application.routes:
-        if isinstance(route, WebSocketRoute):
-            found.add(f"WEBSOCKET {route.path}")
-        elif isinstance(route, Route):
-            # Starlette adds HEAD to every GET. The guard rejects routes that are not in the table.
-            found |= {f"{method} {route.path}" for method in route.methods - {"HEAD"}}
-        elif isinstance(route, Mount):
-            found.add(f"GET {route.path}/{{path:path}}")
-        else:
-            raise AssertionError(f"a route of a kind that this test does not know: {route}")
-    return found
 
 
 def read_role_tokens(daemon):
@@ -119,26 +99,19 @@ def request_route(daemon, key, headers):
     return 101, None
 
 
-def test_the_table_has_every_route_and_no_other(app):
-    assert list_routes(app) == set(ROUTES) - LOGIN_ROUTES
-
-
 def test_the_files_of_the_login_are_public_and_hold_no_secret(running):
-    for key in LOGIN_ROUTES:
-        response = httpx.get(running.url + key.partition(" ")[2])
+    for path in LOGIN_PATHS:
+        response = httpx.get(running.url + path)
         assert response.status_code == 200
         assert TOKEN not in response.text
 
 
-def test_a_route_without_an_entry_is_rejected_and_detected():
-    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
-    mutant = build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+def test_a_route_that_is_added_later_is_not_answered():
+    mutant = build_application()
 
     @mutant.post("/v1/laser")
     async def laser():
         return {"on": True}
-
-    assert list_routes(mutant) - set(ROUTES) == {"POST /v1/laser"}
 
     async def call():
         async with httpx.AsyncClient(transport=httpx.ASGITransport(mutant), base_url="http://localhost") as client:
@@ -146,10 +119,6 @@ def test_a_route_without_an_entry_is_rejected_and_detected():
 
     response = asyncio.run(call())
     assert (response.status_code, response.json()["code"]) == (404, "route_not_found")
-
-
-def test_a_missing_guard_is_detected():
-    assert list_routes(FastAPI()) - set(ROUTES)
 
 
 REFUSALS = {

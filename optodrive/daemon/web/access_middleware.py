@@ -17,7 +17,7 @@ from optodrive.daemon.web.request_limits import (
     Send,
     receive_empty_body,
 )
-from optodrive.daemon.web.route_table import ARM, STOP
+from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
 
 AUDIT_FIELDS = "optodrive.audit_fields"
@@ -27,9 +27,10 @@ AUDIT_FIELDS = "optodrive.audit_fields"
 class AccessMiddleware:
     """Refuses the requests that the policy does not accept, and forwards the others with their input bounded."""
 
-    def __init__(self, app: App, policy: AccessPolicy) -> None:
+    def __init__(self, app: App, policy: AccessPolicy, table: RouteTable) -> None:
         self._app = app
         self._policy = policy
+        self._table = table
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send a refusal, or forward the request."""
@@ -37,7 +38,7 @@ class AccessMiddleware:
             await self._app(scope, receive, send)
             return
         request = _read_request(scope)
-        problem = self._policy.check(request)
+        problem = self._policy.check(request, self._table)
         if problem is None and request.route is not None and request.route.key == ARM:
             problem = await self._record_intent(request)
         if problem is None:

@@ -11,7 +11,7 @@ from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.rate_limit import RateLimiter
 from optodrive.daemon.web.roles import is_role_sufficient
-from optodrive.daemon.web.route_table import ROUTES, STOP, Route, RouteTable
+from optodrive.daemon.web.route_table import STOP, Route, RouteTable
 from optodrive.daemon.web.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
@@ -57,7 +57,6 @@ class AccessPolicy:
     ) -> None:
         self.audit = audit
         self._now_s = now_s
-        self._route_table = RouteTable(ROUTES)
         self.update(tokens, daemon)
 
     def update(self, tokens: Tokens, daemon: DaemonSection) -> None:
@@ -67,12 +66,12 @@ class AccessPolicy:
         self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
         self._rate_limiter = RateLimiter(daemon.requests_per_s, daemon.requests_burst)
 
-    def check(self, request: RequestContext) -> Problem | None:
+    def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
         """Identify token and route of a request; return why it is refused, None if it is accepted."""
         problem = self._check_host_and_origin(request)
         if problem is not None:
             return problem
-        route = self._route_table.find(request.method, request.path)
+        route = table.find(request.method, request.path)
         is_stop = route is not None and route.key == STOP
         if route is None or route.min_role is not None:
             token = self.tokens.find(_read_presented_token(request))
@@ -85,7 +84,7 @@ class AccessPolicy:
         request.route = route
         if is_stop:
             return None
-        return self._check_rate(request) or self._check_route(request) or self._check_size(request)
+        return self._check_rate(request) or self._check_route(request, table) or self._check_size(request)
 
     def acquire_frame(self, request: RequestContext) -> float:
         """Count one streamed frame against the caller's rate; return the time to wait first, s."""
@@ -109,10 +108,10 @@ class AccessPolicy:
         detail = f"this caller exceeds its request rate; retry in {wait_s:.3f} s"
         return build_problem(429, "too_many_requests", "Too many requests", detail, retry_after_s=round(wait_s, 3))
 
-    def _check_route(self, request: RequestContext) -> Problem | None:
+    def _check_route(self, request: RequestContext, table: RouteTable) -> Problem | None:
         method_and_path = f"{request.method} {request.path}"
         if request.route is None:
-            methods = self._route_table.find_methods(request.path)
+            methods = table.find_methods(request.path)
             if methods:
                 return build_problem(
                     405, "method_not_allowed", "Method Not Allowed", method_and_path, allow=", ".join(methods)
