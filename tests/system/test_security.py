@@ -6,6 +6,7 @@ import os
 import resource
 import socket
 import subprocess
+import time
 import tomllib
 from functools import partial
 
@@ -128,6 +129,10 @@ REFUSALS = {
     "another scheme": ({"Authorization": f"Basic {TOKEN}"}, (401, "bad_token")),
     "a foreign Host": ({**build_bearer_header(TOKEN), "Host": "evil.example"}, (421, "host_not_allowed")),
     "a Host like ours": ({**build_bearer_header(TOKEN), "Host": "localhost.evil.example"}, (421, "host_not_allowed")),
+    "another port's Origin": (
+        {**build_bearer_header(TOKEN), "Origin": "http://127.0.0.1:1"},
+        (403, "origin_not_allowed"),
+    ),
     "a foreign Origin": ({**build_bearer_header(TOKEN), "Origin": "https://evil.example"}, (403, "origin_not_allowed")),
     "no page's Origin": ({**build_bearer_header(TOKEN), "Origin": "null"}, (403, "origin_not_allowed")),
 }
@@ -222,6 +227,37 @@ def test_stop_does_not_wait_for_the_body(running, body):
     secret = read_role_tokens(running)["viewer"]
     given = send_raw(running, f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {secret}\r\n{body}")
     assert given.startswith("HTTP/1.1 200 ")
+
+
+def test_a_host_that_begins_like_an_address_is_refused(running):
+    given = send_raw(running, "GET /v1/health HTTP/1.1\r\nHost: [::1].evil\r\n\r\n")
+    assert given.startswith("HTTP/1.1 421 ")
+
+
+def test_a_client_that_hangs_up_during_its_body_leaves_no_traceback(running):
+    host, port = running.url.removeprefix("http://").split(":")
+    for path in ("/v1/plans", "/v1/patterns/pixel"):
+        with socket.create_connection((host, int(port)), timeout=10) as link:
+            link.sendall(f"POST {path} HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n".encode())
+            link.sendall(b"Content-Length: 1000\r\n\r\n{")
+    running.call("GET", "/v1/state")
+    assert "Traceback" not in running.errors.read_text()
+
+
+def test_a_stuck_audit_pipe_does_not_keep_the_daemon_from_ending(make_daemon, board, tmp_path):
+    pipe = tmp_path / "audit.pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        daemon = make_daemon(board, replace=build_daemon_replacement(f'audit = "{pipe}"'))
+        for _ in range(1000):  # more than a pipe holds
+            httpx.post(f"{daemon.url}/v1/disarm", headers=build_bearer_header(TOKEN))
+        begin_s = time.monotonic()
+        daemon.process.terminate()
+        assert daemon.process.wait(timeout=20) == 0
+        assert time.monotonic() - begin_s < 10
+    finally:
+        os.close(reader)
 
 
 def read_audit(folder):

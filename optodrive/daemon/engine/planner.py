@@ -31,6 +31,8 @@ PLANNING_TIME_FACTOR = 1.5
 """Planning time reserved for a streamed plan, as a multiple of the last one."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
+DRY_RUN_ID = "dry-run"
+"""Identifier in the report of a dry run, which is not stored."""
 T = TypeVar("T")
 
 
@@ -141,7 +143,7 @@ class Planner:
         planned, feasibility = self._make_plan(sequence, request, snapshot)
         points = quantise(planned.plan, self._session.scale)
         record = PlanRecord(
-            plan_id=f"p{next(self._ids)}",
+            plan_id=DRY_RUN_ID if request.dry_run else f"p{next(self._ids)}",
             name=request.name,
             planned=planned,
             feasibility=feasibility,

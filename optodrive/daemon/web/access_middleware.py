@@ -5,6 +5,8 @@ It runs in front of the application, so that no new route can omit the checks.
 
 import math
 
+from starlette.requests import ClientDisconnect
+
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
 from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.web.request_limits import (
@@ -44,8 +46,9 @@ class AccessMiddleware:
         if problem is None:
             await self._forward(request, scope, receive, send)
             return
-        if problem.status != 429:
-            self._record(request, {"event": "refused", "status": problem.status, "code": problem.code})
+        self._policy.refusals.record(
+            problem.code, request.audit_fields | request.provenance | {"status": problem.status}
+        )
         prefix = "websocket.http" if scope["type"] == "websocket" else "http"
         if problem.status == 401 and is_page_request(request.method, request.path):
             await _send_login_page(send, prefix)
@@ -59,6 +62,8 @@ class AccessMiddleware:
         status_recorder = _StatusRecorder(send)
         try:
             await self._app(scope, body, status_recorder)
+        except ClientDisconnect:  # within its body: there is nobody to answer
+            audit_fields["hung_up"] = True
         finally:
             if isinstance(body, BoundedBody | RateLimitedFrames):
                 audit_fields |= body.audit_fields
