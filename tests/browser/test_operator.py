@@ -1,7 +1,11 @@
 """The page as an operator uses it beside a laser: STOP, states, plans, roles and history."""
 
+import re
+
+import pytest
 from playwright.sync_api import expect
 
+from rig import long_train
 from test_page import arm
 
 STOP = "**/v1/stop"
@@ -27,7 +31,7 @@ def test_escape_is_stop_while_any_control_is_open(visit, daemon):
             if control.is_visible() and control.is_enabled():
                 control.click(force=True)  # the label of a radio button lies over it
                 press_escape(page)
-                expect(page.locator("#board")).to_have_text("board: DISARMED")
+                expect(page.locator("#board-state")).to_have_text("DISARMED")
 
 
 def test_escape_is_stop_while_a_file_dialog_is_open(visit, daemon):
@@ -37,7 +41,7 @@ def test_escape_is_stop_while_a_file_dialog_is_open(visit, daemon):
     arm(page)
     with page.expect_response(STOP, timeout=5_000):
         page.locator("#picture").click()
-    expect(page.locator("#board")).to_have_text("board: DISARMED")
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
 
 
 def test_the_browsers_menu_takes_no_escape_while_the_laser_may_emit(visit, daemon):
@@ -50,3 +54,84 @@ def test_the_browsers_menu_takes_no_escape_while_the_laser_may_emit(visit, daemo
     page.locator("#display").click(button="right")
     assert page.evaluate("window.wasPrevented") is True
     press_escape(page)
+
+
+ESTOP_AND_KEY = """
+[[step]]
+from = "light"
+at_s = 0.5
+set = "estop"
+value = true
+
+[[step]]
+from = "light"
+at_s = 1.5
+set = "key"
+value = false
+"""
+
+
+def read_look(page):
+    """Return what distinguishes a state in the header: word, outline of the sign, pattern of the border, ground."""
+    return page.evaluate("""() => {
+        const bar = document.getElementById("bar");
+        const style = getComputedStyle(bar);
+        return {
+            word: document.getElementById("board-state").textContent,
+            sign: document.getElementById("sign").getAttribute("d"),
+            border: style.borderImageSource,
+            ground: style.backgroundColor,
+        };
+    }""")
+
+
+def play_for(daemon, seconds, **fields):
+    return daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds), **fields)["plan"]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_disarmed_armed_and_running_differ_in_the_whole_header(visit, daemon, scheme):
+    page = visit(daemon, color_scheme=scheme).open()
+    state = page.locator("#board-state")
+    expect(state).to_have_text("DISARMED")
+    looks = [read_look(page)]
+    arm(page)
+    looks.append(read_look(page))
+    play_for(daemon, 5.0)
+    expect(state).to_have_text("RUNNING")
+    looks.append(read_look(page))
+    for what in ("word", "sign", "border", "ground"):
+        assert len({look[what] for look in looks}) == 3, what
+    expect(page).to_have_title(re.compile("^RUNNING · "))
+    press_escape(page)
+    expect(state).to_have_text("DISARMED")
+    assert read_look(page) == looks[0]
+
+
+def test_lamps_show_the_safety_inputs_and_the_header_the_fault(visit, make_board, make_daemon):
+    board = make_board(script=ESTOP_AND_KEY)
+    daemon = make_daemon(board)
+    page = visit(daemon).open()
+    lamps = page.get_by_role("list", name="Safety inputs").get_by_role("listitem")
+    expect(lamps).to_have_text(["Interlock closed", "Key on", "E-stop released"])
+    daemon.arm()
+    play_for(daemon, 5.0)
+    expect(page.locator("#board-state")).to_have_text("FAULT")
+    expect(page.locator("#board-means")).to_have_text("ESTOP")
+    expect(lamps).to_have_text(["Interlock closed", "Key off", "E-stop pressed"])
+    assert [lamp.get_attribute("data-kind") for lamp in lamps.all()] == ["safe", "unsafe", "unsafe"]
+
+
+def test_a_link_that_goes_down_while_it_runs_shows_nothing_as_known(visit, make_board, make_daemon):
+    board = make_board()
+    daemon = make_daemon(board)
+    page = visit(daemon).open()
+    daemon.arm()
+    play_for(daemon, 10.0)
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    board.stop()
+    expect(page.locator("#board-state")).to_have_text("UNKNOWN")
+    expect(page.locator("#board-means")).to_have_text("no link to the board")
+    expect(page.locator("#lamps")).to_have_text(re.compile("Interlock unknown.*Key unknown.*E-stop unknown"))
+    state = daemon.state()
+    assert (state["link"]["state"], state["board"]["state"], state["board"]["fault"]) == ("down", "UNKNOWN", None)

@@ -35,7 +35,7 @@ def build_state_report(
             error=link_error,
             **session.collect_link_stats(),
         ),
-        board=BoardReport(**session.board.to_dict()),
+        board=_build_board_report(session),
         queue=QueueReport(
             waiting=len(plan_queue.waiting),
             running=None if running is None else running.record.plan_id,
@@ -44,3 +44,11 @@ def build_state_report(
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
     )
+
+
+def _build_board_report(session: BoardSession) -> BoardReport:
+    """Report the board; without a link its state is unknown, and the last one would be a claim."""
+    report = BoardReport(**session.board.to_dict())
+    if session.connected:
+        return report
+    return report.model_copy(update={"state": "UNKNOWN", "fault": None, "hint": ""})

@@ -9,6 +9,7 @@ import { DisplayView } from "./display.js";
 import { Drawing } from "./draw.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
+import { Header } from "./header.js";
 import { PatternLibrary } from "./patterns.js";
 import { buildFrames, PlanControl } from "./plans.js";
 import { Status } from "./status.js";
@@ -65,10 +66,10 @@ const showError = (error) => {
   announce(error.message);
 };
 const arm = new ArmControl(find, announce, showError);
-const status = new Status(find, announce, () => arm.disarm());
+const header = new Header(find, announce);
+const status = new Status(find, () => arm.disarm());
 const library = new PatternLibrary(find, patterns, () => view.cursor);
-find("display-name").textContent = `${config.name}, ${grid.pixels} pixels`;
-document.title = `${config.name} · optodrive`;
+find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
 
 // --- controls -------------------------------------------------------------------------------------------------------
 
@@ -193,15 +194,23 @@ onStimulusChange();
 view.canvas.toggleAttribute("data-editing", true);
 
 telemetry.addEventListener("up", () => {
-  status.showConnection(true);
+  header.showConnection("live", "good");
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {
-  status.showConnection(false);
+  header.showConnection("no daemon, trying again", "bad");
+  header.showUnknown("no daemon");
+  status.showNoDaemon();
+  showTitle();
   find("stale").hidden = false;
   arm.show("");
 });
-telemetry.addEventListener("unauthorized", () => status.showTokenChange());
+telemetry.addEventListener("unauthorized", () => {
+  header.showConnection("another token", "bad");
+  status.showTokenChange();
+});
+const showTitle = () => (document.title = `${header.state} · ${config.name} · optodrive`);
+showTitle();
 let isOff = false;
 mayEmit = () => !(telemetry.live && isOff);
 telemetry.addEventListener("state", ({ detail }) => {
@@ -209,6 +218,8 @@ telemetry.addEventListener("state", ({ detail }) => {
   if (detail.display !== config.name || detail.pixels !== grid.pixels) {
     location.reload(); // the restarted daemon has another display
   }
+  header.showState(detail);
+  showTitle();
   status.showState(detail);
   arm.show(detail.link.state === "up" ? detail.board.state : "");
 });
