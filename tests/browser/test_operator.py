@@ -5,7 +5,7 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from rig import long_train
+from rig import long_train, wait_for
 from test_page import arm
 
 STOP = "**/v1/stop"
@@ -135,3 +135,45 @@ def test_a_link_that_goes_down_while_it_runs_shows_nothing_as_known(visit, make_
     expect(page.locator("#lamps")).to_have_text(re.compile("Interlock unknown.*Key unknown.*E-stop unknown"))
     state = daemon.state()
     assert (state["link"]["state"], state["board"]["state"], state["board"]["fault"]) == ("down", "UNKNOWN", None)
+
+
+def test_what_plays_and_waits_is_named_and_can_be_cancelled(visit, daemon):
+    page = visit(daemon).open()
+    playing = page.get_by_role("region", name="Playing")
+    expect(playing).to_contain_text("Nothing plays.")
+    daemon.arm()
+    running, first, second = (play_for(daemon, seconds) for seconds in (8.0, 3.0, 4.0))
+    now = page.locator("#now")
+    expect(now.locator(".plan")).to_have_text(f"{running} push by armer")
+    expect(now.locator(".left")).to_have_text(re.compile(r"^[1-9]\d* of 400 pulses, [0-7]\.\d s left$"))
+    rows = page.get_by_role("list", name="Waiting plans").get_by_role("listitem")
+    expect(rows).to_have_count(2)
+    expect(rows.nth(0)).to_have_text(re.compile(f"^{first} push by armer3.0 s, starts in [5-8] s"))
+    page.get_by_role("button", name=f"Cancel {first} push").click()
+    expect(rows).to_have_count(1)
+    expect(rows).to_contain_text(second)
+    assert daemon.finished(first)["status"] == "cancelled"
+    page.get_by_role("button", name=f"End {running} push").click()
+    expect(now.locator(".plan")).to_have_text(f"{second} push by armer")
+    assert daemon.finished(running)["status"] == "cancelled"
+    assert daemon.board_state() in ("ARMED", "RUNNING")
+    press_escape(page)
+    expect(playing).to_contain_text("Nothing plays.")
+    expect(rows).to_have_count(0)
+
+
+def test_the_state_tells_whose_plans_run_and_wait(daemon):
+    daemon.arm()
+    running, waiting = play_for(daemon, 6.0), play_for(daemon, 2.0)
+    wait_for(lambda: daemon.state()["queue"]["active"][0]["executed"] > 10, "light")
+    queue = daemon.state()["queue"]
+    first, second = queue["active"]
+    assert (first["plan"], second["plan"], queue["running"], queue["waiting"]) == (running, waiting, running, 1)
+    assert (first["status"], second["status"]) == ("running", "queued")
+    assert {first["caller"], second["caller"], daemon.call("GET", f"/v1/plans/{waiting}")["caller"]} == {"armer"}
+    assert 0 < first["executed"] < first["planned"] == 300
+    assert first["starts_in_s"] < 0 < first["ends_in_s"] < 6.0
+    assert (
+        second["ends_in_s"] - second["starts_in_s"] == pytest.approx(second["duration_s"]) == pytest.approx(2, abs=0.1)
+    )
+    assert queue["plans"][-1] == {key: second[key] for key in queue["plans"][-1]}

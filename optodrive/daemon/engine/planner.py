@@ -44,7 +44,7 @@ class LoopRunner(Protocol):
 
 
 class PlanningRequest(NamedTuple):
-    """Request for a plan. build: returns the sequence; arrived_s: board time."""
+    """Request for a plan. build: returns the sequence; arrived_s: board time; caller: name of its token."""
 
     build: Callable[[], FrameSequence]
     name: str
@@ -53,6 +53,7 @@ class PlanningRequest(NamedTuple):
     fit: FitMode
     streamed: bool
     arrived_s: float
+    caller: str
 
 
 class Planner:
@@ -152,6 +153,7 @@ class Planner:
             budget_before=budget,
             start_s=snapshot.start_s,
             arrived_s=request.arrived_s,
+            caller=request.caller,
             streamed=request.streamed,
             refreshed=snapshot.refreshed,
         )

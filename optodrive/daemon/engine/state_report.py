@@ -3,13 +3,12 @@
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.planner import Planner
+from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
     LinkReport,
     PlannerReport,
     PulseTotals,
-    QueueReport,
-    RecentPlan,
     StateReport,
 )
 from optodrive.link.session.session import BoardSession
@@ -25,7 +24,6 @@ def build_state_report(
     link_error: str | None,
 ) -> StateReport:
     """Report the state of display, link, board, queue and planner."""
-    running = next(iter(plan_queue.running.copy()), None)
     return StateReport(
         display=display.config.name,
         pixels=len(display.layout),
@@ -36,11 +34,7 @@ def build_state_report(
             **session.collect_link_stats(),
         ),
         board=_build_board_report(session),
-        queue=QueueReport(
-            waiting=len(plan_queue.waiting),
-            running=None if running is None else running.record.plan_id,
-            plans=[RecentPlan(plan=item.plan_id, name=item.name, status=item.status) for item in recent],
-        ),
+        queue=build_queue_report(plan_queue, recent, session.board_s()),
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
     )

@@ -12,6 +12,7 @@ import { decodeUint16, Grid } from "./grid.js";
 import { Header } from "./header.js";
 import { PatternLibrary } from "./patterns.js";
 import { buildFrames, PlanControl } from "./plans.js";
+import { QueueView } from "./queue.js";
 import { Status } from "./status.js";
 import { StopControl } from "./stop.js";
 import { Telemetry } from "./telemetry.js";
@@ -68,6 +69,7 @@ const showError = (error) => {
 const arm = new ArmControl(find, announce, showError);
 const header = new Header(find, announce);
 const status = new Status(find, () => arm.disarm());
+const queue = new QueueView(find, announce, showError);
 const library = new PatternLibrary(find, patterns, () => view.cursor);
 find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
 
@@ -201,6 +203,7 @@ telemetry.addEventListener("down", () => {
   header.showConnection("no daemon, trying again", "bad");
   header.showUnknown("no daemon");
   status.showNoDaemon();
+  queue.clear("Unknown: the daemon does not answer.");
   showTitle();
   find("stale").hidden = false;
   arm.show("");
@@ -221,6 +224,7 @@ telemetry.addEventListener("state", ({ detail }) => {
   header.showState(detail);
   showTitle();
   status.showState(detail);
+  queue.show(detail.queue);
   arm.show(detail.link.state === "up" ? detail.board.state : "");
 });
 telemetry.addEventListener("fault", ({ detail }) => status.showFault(detail));

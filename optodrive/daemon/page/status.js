@@ -10,7 +10,6 @@ export class Status {
 
   showState(state) {
     const { board, link, totals } = state;
-    const waiting = `${state.queue.waiting} waiting`;
     const rows = {
       Port: link.port,
       "Round trip": link.round_trip_ms === null ? "–" : `${link.round_trip_ms.toFixed(1)} ms`,
@@ -18,7 +17,6 @@ export class Status {
       Underruns: board.underruns,
       "Laser on": `${board.laser_on_s.toFixed(2)} s`,
       "Pulses executed": totals.executed,
-      Queue: state.queue.running ? `${state.queue.running} running, ${waiting}` : waiting,
       Temperature: board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
     };
     this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));

@@ -22,6 +22,8 @@ from optodrive.daemon.web.request_limits import (
 from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
 
+CALLER = "optodrive.caller"
+"""Key in the ASGI scope of the token that the request presented."""
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
 
@@ -59,6 +61,7 @@ class AccessMiddleware:
         body = self._bound_receive(request, receive)
         audit_fields: dict[str, object] = {}
         scope[AUDIT_FIELDS] = audit_fields
+        scope[CALLER] = request.token
         status_recorder = _StatusRecorder(send)
         try:
             await self._app(scope, body, status_recorder)

@@ -13,11 +13,12 @@ from optodrive.core.types.policy import Policy
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.live_stream import LiveStream
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
+from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
+from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, CALLER, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.error_handlers import add_error_handlers, build_error_problem
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
@@ -32,6 +33,7 @@ from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.web.static_files import add_page_routes
 from optodrive.daemon.web.stop_priority import StopPriorityMiddleware, build_json_response
 from optodrive.daemon.web.telemetry import DEFAULT_RATE_HZ, EventStream, Telemetry
+from optodrive.daemon.web.tokens import Token
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.pipeline import resolve_policy
@@ -80,6 +82,12 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         """Return the state of board, link, queue and planner."""
         return engine.snapshot()
 
+    @routes.get("/v1/me", "viewer")
+    async def get_me(request: Request) -> CallerReport:
+        """Return name and role of the token that the request presented, and the routes that the role may not call."""
+        token: Token = request.scope[CALLER]
+        return CallerReport(name=token.name, role=token.role, refused=table.list_refused(token.role))
+
     @routes.get("/metrics", "viewer", response_class=PlainTextResponse)
     async def get_metrics() -> PlainTextResponse:
         """Return metrics for Prometheus."""
@@ -125,14 +133,20 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         body = await request.body()
         policy = resolve_policy(policy, strict)
         future = engine.submit(
-            lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
+            lambda: parse_sequence(body, display.config, "body"),
+            "push",
+            dry_run,
+            policy,
+            fit,
+            streamed=newest,
+            caller=request.scope[CALLER].name,
         )
         return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
     @routes.websocket("/v1/stream", "operator")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
         """Show streamed frames, of which the newest wins, and send the result of each."""
-        await LiveStream(engine, socket, policy, build_error_problem).run()
+        await LiveStream(engine, socket, policy, socket.scope[CALLER].name, build_error_problem).run()
 
     @routes.get("/v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:
@@ -178,7 +192,14 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         if not isinstance(parameters, dict):
             raise InputError("body", parameters, "an object of the pattern's parameters")
         policy = resolve_policy(policy, strict)
-        future = engine.submit(lambda: build_pattern(name, parameters, display.config), name, dry_run, policy, fit)
+        future = engine.submit(
+            lambda: build_pattern(name, parameters, display.config),
+            name,
+            dry_run,
+            policy,
+            fit,
+            caller=request.scope[CALLER].name,
+        )
         return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
     @routes.get("/openapi.json", "viewer", include_in_schema=False)

@@ -12,7 +12,7 @@ from fastapi import FastAPI
 from starlette.routing import BaseRoute, WebSocketRoute, compile_path
 from starlette.routing import Route as HttpRoute
 
-from optodrive.daemon.web.roles import Role
+from optodrive.daemon.web.roles import Role, is_role_sufficient
 
 STOP = "POST /v1/stop"
 ARM = "POST /v1/arm"
@@ -78,6 +78,14 @@ class RouteTable:
     def roles(self) -> dict[str, Role | None]:
         """Method and path template of every route → the lowest role that may call it; None: no token."""
         return {route.key: route.min_role for route in self._routes}
+
+    def list_refused(self, role: Role) -> dict[str, str]:
+        """List the routes that a role may not call, with the roles that they require."""
+        return {
+            key: min_role
+            for key, min_role in self.roles.items()
+            if min_role is not None and not is_role_sufficient(role, min_role)
+        }
 
     def find(self, method: str, path: str) -> Route | None:
         """Return the route of a request; None if there is none."""
