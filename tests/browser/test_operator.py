@@ -5,7 +5,7 @@ import re
 import pytest
 from playwright.sync_api import expect
 
-from rig import long_train, wait_for
+from rig import long_train, read_role_tokens, wait_for
 from test_page import arm
 
 STOP = "**/v1/stop"
@@ -177,3 +177,34 @@ def test_the_state_tells_whose_plans_run_and_wait(daemon):
         second["ends_in_s"] - second["starts_in_s"] == pytest.approx(second["duration_s"]) == pytest.approx(2, abs=0.1)
     )
     assert queue["plans"][-1] == {key: second[key] for key in queue["plans"][-1]}
+
+
+@pytest.mark.parametrize(
+    ("role", "refused"),
+    [
+        ("viewer", {"Arm …": "armer", "Disarm": "operator", "Preview": "operator", "End p": "operator"}),
+        ("operator", {"Arm …": "armer"}),
+        ("armer", {}),
+    ],
+)
+def test_the_role_is_shown_and_what_it_may_not_use_is_disabled(visit, daemon, axe, role, refused):
+    daemon.arm()
+    play_for(daemon, 20.0)
+    window = visit(daemon)
+    page = window.open(read_role_tokens(daemon)[role])
+    expect(page.locator("#caller")).to_have_text(role)
+    page.locator("#now").wait_for()
+    for name in ("Disarm", "Preview", "End p"):
+        button = page.get_by_role("button", name=name)
+        expect(button).to_be_disabled() if name in refused else expect(button).to_be_enabled()
+    reasons = page.locator(".reason").locator("visible=true").all_inner_texts()
+    assert len(reasons) == len(refused)
+    for required in refused.values():
+        assert any(f"needs the role {required}; token “{role}” has the role {role}." in text for text in reasons)
+    page.evaluate(axe)
+    assert page.evaluate("axe.run()")["violations"] == []
+    press_escape(page)
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    arming = page.get_by_role("button", name="Arm …")
+    expect(arming).to_be_disabled() if refused else expect(arming).to_be_enabled()
+    assert window.unexpected_errors() == []

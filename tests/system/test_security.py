@@ -7,7 +7,6 @@ import resource
 import socket
 import subprocess
 import time
-import tomllib
 from functools import partial
 
 import httpx
@@ -28,7 +27,7 @@ from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
 from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
-from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, wait_for
+from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, read_role_tokens, wait_for
 
 LAST_LINE = "lease_s = 1.0"
 
@@ -64,12 +63,6 @@ def running(folder):
             daemon.stop()
     finally:
         board.stop()
-
-
-def read_role_tokens(daemon):
-    path = next((daemon.config.parent / "optodrive").glob("token-*"))
-    entries = tomllib.loads(path.read_text())["token"]
-    return {entry["role"]: entry["secret"] for entry in entries}
 
 
 def build_bearer_header(secret):

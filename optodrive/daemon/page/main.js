@@ -11,6 +11,7 @@ import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
 import { Header } from "./header.js";
 import { PatternLibrary } from "./patterns.js";
+import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
 import { QueueView } from "./queue.js";
 import { Status } from "./status.js";
@@ -68,7 +69,8 @@ const showError = (error) => {
 };
 const arm = new ArmControl(find, announce, showError);
 const header = new Header(find, announce);
-const status = new Status(find, () => arm.disarm());
+const permissions = new Permissions(find);
+const status = new Status(find, () => arm.disarm(), () => permissions.apply());
 const queue = new QueueView(find, announce, showError);
 const library = new PatternLibrary(find, patterns, () => view.cursor);
 find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
@@ -197,6 +199,7 @@ view.canvas.toggleAttribute("data-editing", true);
 
 telemetry.addEventListener("up", () => {
   header.showConnection("live", "good");
+  permissions.load();
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {

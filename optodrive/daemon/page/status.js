@@ -1,10 +1,12 @@
 // What to do about a fault, and the figures of the board and the link.
 
 export class Status {
-  constructor(find, acknowledge) {
+  // onControlAdded: called after a control has been added to the page
+  constructor(find, acknowledge, onControlAdded) {
     this.alert = find("trouble");
     this.stats = find("figures");
     this.acknowledge = acknowledge;
+    this.onControlAdded = onControlAdded;
     this.alertText = "";
   }
 
@@ -33,7 +35,10 @@ export class Status {
       button.type = "button";
       button.id = "acknowledge";
       button.addEventListener("click", this.acknowledge);
-      items.push(button);
+      const controls = Object.assign(document.createElement("fieldset"), { className: "bare" });
+      Object.assign(controls.dataset, { route: "POST /v1/disarm", action: "Acknowledging" });
+      controls.append(button);
+      items.push(controls);
     }
     this.#showAlert(items);
   }
@@ -53,6 +58,7 @@ export class Status {
       this.alertText = text;
       this.alert.replaceChildren(...items);
       this.alert.hidden = items.length === 0;
+      this.onControlAdded();
     }
   }
 }

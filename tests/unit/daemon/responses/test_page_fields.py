@@ -11,6 +11,7 @@ import pytest
 from pydantic import BaseModel
 
 import optodrive.daemon
+from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
@@ -34,6 +35,7 @@ VARIABLES = {
     "grid.js": {"config": EffectiveConfig, "display": EffectiveConfig.model_fields["display"].annotation},
     "main.js": {"config": EffectiveConfig, "pulses": PulseColumns},
     "patterns.js": {"pattern": PatternDescription, "parameter": PatternParameter},
+    "permissions.js": {"caller": CallerReport},
     "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
     "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
     "header.js": {"board": StateReport.model_fields["board"].annotation},
@@ -45,6 +47,7 @@ EVENT_DETAILS = {"state": StateReport, "fault": FaultEvent, "budget": BudgetEven
 DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
     ("header.js", r"showState\(\{([^}]*)\}\)"): StateReport,
+    ("permissions.js", r"const \{([^}]*)\} = this.caller;"): CallerReport,
     ("plans.js", r"const \{([^}]*)\} = plan;"): PlanReport,
     ("status.js", r"const \{([^}]*)\} = state;"): StateReport,
     ("timeline.js", r"addPulses\(\{([^}]*)\}\)"): PulsesEvent,
