@@ -32,7 +32,7 @@ def build_header(table: Table) -> str:
 
 
 def build_page_module(table: Table) -> str:
-    """Return the JavaScript module of the board's states and groups of states."""
+    """Return the JavaScript module of the board's states, groups of states and inputs."""
     states = table["enumerations"]["state"]
     lines = [
         "// Generated from firmware_protocol/messages.toml by generate.py: do not edit.",
@@ -44,6 +44,8 @@ def build_page_module(table: Table) -> str:
     for name, members in table["state_group"].items():
         listed = ", ".join(f"BoardState.{state}" for state in members)
         lines += ["", f"export const {name.upper()}_STATES = Object.freeze([{listed}]);"]
+    inputs = ", ".join(f'"{word}"' for word in table["enumerations"]["input_bit"])
+    lines += ["", "// The inputs by bit, bit 0 first.", f"export const INPUTS = Object.freeze([{inputs}]);"]
     return "\n".join(lines) + "\n"
 
 

@@ -46,15 +46,15 @@ def measure_snapshots():
 def measure_page():
     """Measure the frames painted per second, and the longest stall of the daemon's loop."""
     from rig import Board, Daemon
-    from window import Visit, chromium
+    from window import PageVisit, launch_chromium
 
     with tempfile.TemporaryDirectory() as folder:
         board = Board(Path(folder))
         daemon = None
         try:
             daemon = Daemon(Path(folder), board.port, name="display-1511")
-            with chromium() as browser:
-                page = Visit(browser, daemon.url).open()
+            with launch_chromium() as browser:
+                page = PageVisit(browser, daemon.url).open()
                 daemon.arm()
                 daemon.call("POST", "/v1/patterns/all", json={"height_um": 30, "seconds": PERIODS_S})
                 daemon.call("POST", "/v1/patterns/all", json={"height_um": 30, "seconds": PERIODS_S})

@@ -8,7 +8,7 @@ ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT / "tests" / folder) for folder in ("system", "browser")]
 
 from rig import Board, Daemon, wait_for  # noqa: E402
-from window import PHONE, WIDE, Visit, chromium  # noqa: E402
+from window import PHONE, WIDE, PageVisit, launch_chromium  # noqa: E402
 
 OUT = ROOT / "docs" / "pictures"
 HEART = ("..##.##..", ".#######.", ".#######.", "..#####..", "...###...", "....#....")
@@ -29,7 +29,7 @@ def draw_heart(page):
 
 def take_screenshot(browser, daemon, name, viewport, scheme):
     """Draw, play and save a screenshot while the pulses are executed."""
-    window = Visit(browser, daemon.url, viewport=viewport, color_scheme=scheme, device_scale_factor=1)
+    window = PageVisit(browser, daemon.url, viewport=viewport, color_scheme=scheme, device_scale_factor=1)
     page = window.open()
     draw_heart(page)
     page.locator("#rate").fill("6")
@@ -56,7 +56,7 @@ def main():
         try:
             daemon = Daemon(Path(folder), board.port)
             try:
-                with chromium() as browser:
+                with launch_chromium() as browser:
                     for name, viewport in (("desk", WIDE), ("phone", PHONE)):
                         for scheme in ("light", "dark"):
                             take_screenshot(browser, daemon, name, viewport, scheme)

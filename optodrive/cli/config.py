@@ -1,5 +1,8 @@
 """`optodrive config show | check`: show or check a configuration."""
 
+import os
+from pathlib import Path
+
 import typer
 
 from optodrive.cli.options import ConfigOption, JsonOption
@@ -38,11 +41,15 @@ def show(config: ConfigOption = None, json: JsonOption = False) -> None:
 
 
 def check(config: ConfigOption = None, json: JsonOption = False) -> None:
-    """Check a configuration file and the files that it names."""
+    """Check a configuration file and the files that it names; the tokens only for the daemon's user."""
+    from optodrive.daemon.web.tokens import read_private_tokens
     from optodrive.device.config_file import load_config
     from optodrive.planning.display_model import DisplayModel
 
     display = DisplayModel.from_config(load_config(config))
+    tokens = display.config.daemon.tokens
+    if tokens and os.access(tokens, os.R_OK):
+        read_private_tokens(Path(tokens))
     if json:
         print_json({"name": display.config.name, "pixels": len(display.layout), "ok": True})
     else:

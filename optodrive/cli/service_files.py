@@ -9,6 +9,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Literal
 
+from optodrive.cli.service_program import check_program
 from optodrive.core.errors import InputError, RefusedError
 from optodrive.core.files import atomic_write
 from optodrive.device.config import Config
@@ -21,7 +22,6 @@ RULES_PATH = Path("/etc/udev/rules.d/60-optodrive.rules")
 MANIFEST_PATH = Path("/etc/optodrive/installed.json")
 FORMAT, VERSION = "optodrive-service", 1
 DEVICE_LINK = "/dev/optodrive-board"
-HIDDEN_FOLDERS = ("/home", "/root", "/run/user", "/tmp", "/var/tmp")  # noqa: S108 - folders that the unit cannot access
 DAEMON_PATHS = {
     "socket": "/run/optodrive/optodrive.sock",
     "tokens": "/var/lib/optodrive/tokens.toml",
@@ -72,14 +72,7 @@ def _load_configuration(source: str | Path | None) -> tuple[Config, str]:
 
 
 def _render_unit(config: Config, program: Path) -> str:
-    if not program.is_absolute() or any(c.isspace() or c in "%$\"'\\" for c in str(program)):
-        raise InputError("--program", str(program), "an absolute path of plain characters")
-    hidden = next((folder for folder in HIDDEN_FOLDERS if program.is_relative_to(folder)), None)
-    if hidden is not None:
-        raise RefusedError(
-            f"the service has no access to {hidden}, the folder of {program}; install optodrive where all may read "
-            "it (python3 -m venv /opt/optodrive), and run its `optodrive service install`, or name it with --program"
-        )
+    check_program(program)
     text = locate_shipped("systemd", "optodrive.service").read_text("utf-8").replace("@PROGRAM@", str(program))
     if config.board.transport in ("usb", "helios"):
         text = text.replace("\nRestrictAddressFamilies=", f"\n{USB_UNIT_LINES}RestrictAddressFamilies=", 1)

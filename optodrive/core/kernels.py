@@ -173,19 +173,7 @@ def is_cold() -> bool:
 
 def kernel(function: Callable[P, T]) -> Callable[P, T]:
     """Compile a function on its first use and cache the machine code on disk."""
-    return _compile(function)
-
-
-def vector_kernel(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile as `kernel` and allow sums in any order, so that the processor's vector units apply.
-
-    The last digits of a result then depend on the processor.
-    """
-    return _compile(function, fastmath={"reassoc", "contract", "arcp"})
-
-
-def _compile(function: Callable[P, T], **options: Any) -> Callable[P, T]:
-    compiled: Any = numba.njit(nogil=True, error_model="numpy", **options)(function)
+    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
     if CACHED:
         compiled._cache = _new_cache(function)
         _caches.append(compiled._cache)

@@ -1,33 +1,61 @@
 """Log of the daemon: lines on stderr, or entries with fields if stderr is connected to the journal.
 
 Entries go to the journal's socket as non-blocking datagrams. A pipe to a stalled journal would block its writers, the
-engine's loop among them.
+engine's loop among them. What the log writes per minute is bounded, so that no caller can fill a disk with it.
 """
 
 import logging
 import os
 import socket
 import sys
+import threading
 from contextlib import suppress
 from pathlib import Path
 from typing import Literal
 
+from optodrive.core.clock import Clock, MonotonicClock
+
 JOURNAL = Path("/run/systemd/journal/socket")
 LINE_MAX = 8000
+BYTES_MAX = 256_000
+PERIOD_S = 60.0
+"""At most BYTES_MAX bytes of lines are written per period; the number of those omitted follows in one line."""
 LogLevel = Literal["err", "warning", "notice", "info"]
 PRIORITY: dict[LogLevel, int] = {"err": 3, "warning": 4, "notice": 5, "info": 6}
 
 
 class DaemonLog:
-    """Writer of log lines. journal: path of the journal's socket, None for stderr."""
+    """Writer of log lines, for any thread. journal: path of the journal's socket, None for stderr."""
 
-    def __init__(self, journal: Path | None = None) -> None:
+    def __init__(self, journal: Path | None = None, clock: Clock | None = None) -> None:
         self._journal = None if journal is None else str(journal)
+        self._clock = clock or MonotonicClock()
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
+        self._lock = threading.Lock()
+        self._period_end_s = 0.0
+        self._bytes = self._suppressed = 0
 
     def write(self, line: str, level: LogLevel = "info", **fields: object) -> None:
         """Write a line, or drop it on failure. fields: additional upper-case fields, for the journal only."""
+        line = line if len(line) <= LINE_MAX else line[:LINE_MAX] + "…"
+        with self._lock:
+            now_s = self._clock.now_s()
+            if now_s >= self._period_end_s:
+                self._report_suppressed()
+                self._period_end_s, self._bytes = now_s + PERIOD_S, 0
+            self._bytes += len(line)
+            if self._bytes > BYTES_MAX:
+                self._suppressed += 1
+                return
+            self._emit(line, level, fields)
+
+    def _report_suppressed(self) -> None:
+        if self._suppressed:
+            self._emit(f"{self._suppressed} lines suppressed", "warning", {})
+        self._suppressed = 0
+
+    def _emit(self, line: str, level: LogLevel, fields: dict[str, object]) -> None:
         with suppress(OSError):  # a failing log must not end the daemon
             if self._journal is None:
                 sys.stderr.write(f"optodrive: {line}\n")
@@ -40,7 +68,9 @@ class DaemonLog:
         self.write(line, "warning")
 
     def close(self) -> None:
-        """Close the socket."""
+        """Write the number of suppressed lines and close the socket."""
+        with self._lock:
+            self._report_suppressed()
         self._socket.close()
 
     def attach_to_root_logger(self) -> None:

@@ -18,7 +18,7 @@ from optodrive.daemon.reload import ConfigReloader
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.audit import AuditLog
-from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
+from optodrive.daemon.web.listeners import describe_exposure, open_tcp_listener, open_unix_listener
 from optodrive.daemon.web.tokens import load_daemon_tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import Config
@@ -77,6 +77,10 @@ def run(
         exit_stack.callback(engine.close)
         engine.start()
         access_policy = AccessPolicy(tokens, config.daemon, audit)
+        exit_stack.callback(access_policy.refusals.flush)
+        exposure = describe_exposure(config.daemon.host)
+        if exposure is not None:
+            log.warn(exposure)
         app = build_app(engine, access_policy)
         server = Server(
             uvicorn.Config(

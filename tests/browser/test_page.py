@@ -43,7 +43,7 @@ def draw_line(page):
 def arm(page):
     page.get_by_role("button", name="Arm …").click()
     page.get_by_role("button", name="Confirm: arm the laser").click()
-    expect(page.locator("#board")).to_have_text("board: ARMED")
+    expect(page.locator("#board-state")).to_have_text("ARMED")
 
 
 def preview(page):
@@ -58,7 +58,7 @@ def start_long_pattern(page):
     page.get_by_label("seconds, s").fill("20")
     preview(page)
     page.get_by_role("button", name="Play").click()
-    expect(page.locator("#board")).to_have_text("board: RUNNING")
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
 
 
 def test_draw_preview_arm_play_and_what_was_felt(visit, daemon):
@@ -112,7 +112,7 @@ def test_stop_ends_what_plays(visit, daemon, board, how):
         page.keyboard.press("Escape")
     else:
         page.get_by_role("button", name="STOP").click()
-    expect(page.locator("#board")).to_have_text("board: DISARMED")
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
     assert board.of("gate")[-1]["on"] is False
     expect(page.locator("#result")).to_contain_text("failed: ended by stop")
 
@@ -148,10 +148,10 @@ def test_an_open_interlock_is_said_in_words_and_acknowledged(visit, make_board, 
     start_long_pattern(page)
     trouble = page.get_by_role("alert").filter(has_text="Fault: INTERLOCK")
     expect(trouble).to_contain_text("close the enclosure")
-    expect(page.locator("#board")).to_have_text("board: FAULT")
+    expect(page.locator("#board-state")).to_have_text("FAULT")
     wait_for(lambda: len(board.of("input")) == 2, "it closes")
     page.get_by_role("button", name="Acknowledge").click()
-    expect(page.locator("#board")).to_have_text("board: DISARMED")
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
     expect(trouble).to_be_hidden()
     arm(page)
     assert window.unexpected_errors() == []
@@ -169,7 +169,7 @@ def test_a_daemon_started_anew_is_found_again_and_not_armed(visit, make_board, m
     expect(page.locator("#stale")).to_be_visible()
     second = make_daemon(board, options=("--port", str(port)))
     expect(page.locator("#link")).to_have_text("live")
-    expect(page.locator("#board")).to_have_text("board: DISARMED")
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
     expect(page.locator("#stale")).to_be_hidden()
     assert second.board_state() == "DISARMED"
     draw_line(page)

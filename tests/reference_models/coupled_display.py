@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.kernels import vector_kernel
+from optodrive.core.kernels import kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.nominal_display import TIME_ROUNDING_S, build_kernel_columns
@@ -197,7 +197,7 @@ def _zero_amplitudes(modes: int) -> ModalAmplitudes:
     return ModalAmplitudes(np.zeros(modes), np.zeros(modes), np.zeros(modes))
 
 
-@vector_kernel
+@kernel
 def _apply_pulses(
     modes: Modes,
     now: ModalAmplitudes,
@@ -245,7 +245,7 @@ def _apply_pulses(
     return len(pixel)
 
 
-@vector_kernel
+@kernel
 def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatArray:
     """Return the start of the next pulse on the pixel of each pulse, [n]; infinite for its last one."""
     coming_s = np.full(pixels, np.inf)
@@ -256,7 +256,7 @@ def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatAr
     return next_s
 
 
-@vector_kernel
+@kernel
 def _advance(
     modes: Modes, before: ModalAmplitudes, after: ModalAmplitudes, pixel: int, power_w: float, time_s: float
 ) -> None:
@@ -273,7 +273,7 @@ def _advance(
         after.gas_k[k] = before.gas_k[k] * gas_left + gas_light_j * share[k] * modes.gas_k_per_j[k]
 
 
-@vector_kernel
+@kernel
 def _advance_motion(
     before_k: FloatArray,
     after_k: FloatArray,
@@ -288,7 +288,7 @@ def _advance_motion(
         after_k[k] = before_k[k] * left[k] + light_j * share[k] * k_per_j[k] * mean[k]
 
 
-@vector_kernel
+@kernel
 def _decay(rate_per_s: FloatArray, max_per_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean of e^(−rate t) over the time and its value at the end, each [p].
 
@@ -310,7 +310,7 @@ def _decay(rate_per_s: FloatArray, max_per_s: float, time_s: float) -> tuple[Flo
     return mean, left
 
 
-@vector_kernel
+@kernel
 def _series(x: float) -> float:
     """Return (1 − e^(−x))/x = Σ (−x)^n/(n+1)!."""
     total = 0.0
@@ -319,7 +319,7 @@ def _series(x: float) -> float:
     return total
 
 
-@vector_kernel
+@kernel
 def _read_rises(modes: Modes, heat: ModalAmplitudes, pixel: int) -> tuple[float, float, float]:
     """Return the rises of absorber, wall and gas of one pixel, K."""
     absorber_k, wall_k, gas_k = 0.0, 0.0, 0.0

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+import tomllib
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -195,6 +196,13 @@ class Daemon:
         self.process.wait(timeout=15)
         self.process.stdout.close()
         self.client.close()
+
+
+def read_role_tokens(daemon):
+    """Return the secret of each role that the daemon wrote at its start."""
+    path = next((daemon.config.parent / "optodrive").glob("token-*"))
+    entries = tomllib.loads(path.read_text())["token"]
+    return {entry["role"]: entry["secret"] for entry in entries}
 
 
 @contextmanager

@@ -1,6 +1,8 @@
 """The daemon as a systemd service: the unit, notifications, SIGHUP and the sandbox."""
 
 import json
+import os
+import re
 import shutil
 import signal
 import socket
@@ -16,7 +18,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.core.kernels import code_folder
 from optodrive.daemon.notify import Notifier
 from optodrive.device.config_file import locate_shipped
-from rig import TOKEN, Daemon, long_train, wait_for
+from rig import OPTODRIVE, TOKEN, Daemon, long_train, wait_for
 from sandbox import build_sandboxed, find_obstacle
 
 TRANSPORTS = {
@@ -25,8 +27,8 @@ TRANSPORTS = {
 }
 HEAD = 'format = "optodrive-tokens"\nversion = 1\n'
 ENTRY = '[[token]]\nname = "{}"\nrole = "armer"\nsecret = "{}"\n'
-EXPOSURE_MAX = "15"
-"""Value of --threshold=, in tenths: 1.5."""
+EXPOSURE_MAX = "14"
+"""Value of --threshold=, in tenths: 1.4."""
 
 
 @pytest.fixture(params=sorted(TRANSPORTS))
@@ -170,6 +172,41 @@ def test_sighup_with_a_wrong_configuration_changes_nothing(manager, board, make_
     daemon.call("GET", "/v1/health", status=421, headers={"Host": "lab"})
 
 
+def run_unit_reload(daemon):
+    """Run the unit's ExecReload= commands one after the other until one fails, as systemd does; return its result."""
+    unit = locate_shipped("systemd", "optodrive.service").read_text()
+    names = {"@PROGRAM@": OPTODRIVE, "/etc/optodrive/config.toml": daemon.config, "$MAINPID": daemon.process.pid}
+    for command in re.findall(r"^ExecReload=(.+)$", unit, re.MULTILINE):
+        words = [str(names.get(word, word)) for word in command.split()]
+        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+        if done.returncode != 0:
+            break
+    return done
+
+
+def test_a_reload_of_the_unit_fails_with_a_wrong_configuration(manager, board, make_daemon, tmp_path):
+    daemon = make_daemon(board)
+    good, before = daemon.config.read_text(), daemon.errors.read_text()
+    tokens = tmp_path / "tokens.toml"
+    tokens.write_text(HEAD + ENTRY.format("rig", TOKEN))
+    tokens.chmod(0o644)
+    for wrong, naming in (
+        (good.replace("damping =", "dampin ="), "dampin"),
+        (good + f'\n[daemon]\ntokens = "{tokens}"\n', "chmod 600"),
+    ):
+        daemon.config.write_text(wrong)
+        done = run_unit_reload(daemon)
+        assert done.returncode != 0
+        assert done.stderr.count("\n") == 1
+        assert naming in done.stderr
+    assert "RELOADING=1" not in manager.listen()
+    assert daemon.errors.read_text() == before
+    daemon.config.write_text(good + '\n[daemon]\nhosts = ["lab.example"]\n')
+    assert run_unit_reload(daemon).returncode == 0
+    wait_for(lambda: manager.listen().count("READY=1") == 2, "the reload's end")
+    daemon.call("GET", "/v1/health", headers={"Host": "lab.example"})
+
+
 def test_sighup_while_armed_changes_nothing_and_keeps_the_board_armed(manager, board, make_daemon):
     daemon = make_daemon(board)
     daemon.arm()
@@ -242,7 +279,7 @@ def test_the_test_fails_without_the_sandbox(tmp_path, monkeypatch):
     inside = build_sandboxed(tmp_path, writable=state)
     tries = {
         "a file of the system": f"open({str(tmp_path / 'elsewhere')!r}, 'w')",
-        "a call that the unit does not allow": "import os; os.setpriority(os.PRIO_PROCESS, 0, 5)",
+        "a call that the unit does not allow": "import os; os.sched_setaffinity(0, os.sched_getaffinity(0))",
         "another user": "import os; os.setuid(1234)",
     }
     for what, code in tries.items():
@@ -250,6 +287,18 @@ def test_the_test_fails_without_the_sandbox(tmp_path, monkeypatch):
         assert done.returncode == 1, what
         assert "Error" in done.stderr, what
     assert subprocess.run([inside, "-c", f"open({str(state / 'x')!r}, 'w').write('y')"]).returncode == 0
+
+
+@pytest.mark.skipif(find_obstacle() is not None, reason=str(find_obstacle()))
+def test_the_sandbox_permits_real_time_scheduling_and_a_lower_priority(tmp_path, monkeypatch):
+    """The call is tried with the ordinary policy, because the machine of the tests may not grant another."""
+    state = tmp_path / "state"
+    state.mkdir()
+    monkeypatch.setattr("sandbox.OPTODRIVE", sys.executable)
+    inside = build_sandboxed(tmp_path, writable=state)
+    code = "import os; os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0)); os.nice(5); print(os.nice(0))"
+    done = subprocess.run([inside, "-c", code], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, f"{min(19, os.nice(0) + 5)}\n"), done.stderr
 
 
 def innermost_status(pid):

@@ -143,12 +143,14 @@ class Engine:
         streamed: bool = False,
         arrived_s: float | None = None,
         epoch: int | None = None,
+        caller: str = "",
         caller_left: threading.Event = NEVER,
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan. Raise BusyError if too many requests wait.
 
         streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
         arrived_s: host time at which the request arrived; epoch: in which it arrived; both now by default
+        caller: name of the token that submitted it
         caller_left: set when the caller no longer waits, which ends the planning
         """
         if streamed and fit != "as_is":
@@ -156,7 +158,9 @@ class Engine:
         epoch = self._session.epoch if epoch is None else epoch
         ago_s = 0.0 if arrived_s is None else self._clock.now_s() - arrived_s
         board_s = self.board_s() - ago_s
-        return self._planner.submit(PlanningRequest(build, name, policy, fit, streamed, board_s, epoch, caller_left))
+        return self._planner.submit(
+            PlanningRequest(build, name, policy, fit, streamed, board_s, epoch, caller, caller_left)
+        )
 
     def _require_armed(self) -> None:
         """Raise LinkError or NotReadyError if the board accepts no plans."""
@@ -169,10 +173,12 @@ class Engine:
         if len(self._plan_queue.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans are already waiting; wait for one to end, or cancel one")
 
-    def end_stream(self, epoch: int | None = None) -> "Future[PlanReport]":
+    def end_stream(self, epoch: int | None = None, caller: str = "") -> "Future[PlanReport]":
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
-        return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True, epoch=epoch)
+        return self.submit(
+            lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True, epoch=epoch, caller=caller
+        )
 
     def get_end_future(self, plan_id: str) -> "Future[None]":
         """Return a future that is done when a plan has ended. Raise InputError (plan_not_found) for an unknown plan."""
@@ -242,7 +248,7 @@ class Engine:
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""
-        return build_planner_state(self._plan_queue, self._plan_store.list_recent(), self._planner)
+        return build_planner_state(self._plan_queue, self._plan_store.list_recent(), self._planner, self.board_s())
 
     def snapshot(self) -> StateReport:
         """Report everything that GET /v1/state sends."""

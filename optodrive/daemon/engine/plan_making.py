@@ -28,7 +28,7 @@ class PlanningRequest(NamedTuple):
     build: returns the sequence
     streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
     arrived_s: board time of the request's arrival; epoch: in which it arrived
-    caller_left: set when the caller no longer waits
+    caller: name of the token that submitted it; caller_left: set when the caller no longer waits
     """
 
     build: Callable[[], FrameSequence]
@@ -38,6 +38,7 @@ class PlanningRequest(NamedTuple):
     streamed: bool = False
     arrived_s: float = 0.0
     epoch: int = 0
+    caller: str = ""
     caller_left: threading.Event = NEVER
 
 
@@ -74,6 +75,7 @@ def make_record(
         arrived_s=request.arrived_s,
         epoch=request.epoch,
         crc=zlib.crc32(payload),
+        caller=request.caller,
         streamed=request.streamed,
         refreshed=snapshot.refreshed,
     )

@@ -35,6 +35,7 @@ class PlanRecord:
     arrived_s: board time of the request; *_after_s: time from the request to an event
     epoch: in which the request arrived; the board executes nothing of an older one
     crc: CRC-32 of the verified bytes of the points
+    caller: name of the token that submitted it
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
     executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
@@ -53,6 +54,7 @@ class PlanRecord:
     arrived_s: float
     epoch: int
     crc: int
+    caller: str = ""
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None
@@ -88,6 +90,7 @@ class PlanRecord:
         return PlanReport(
             plan=self.plan_id,
             name=self.name,
+            caller=self.caller,
             status=self.status,
             error=self.error,
             starts_in_s=self.start_s + self.delay_s - board_now_s,

@@ -71,7 +71,7 @@ class PlannerServer:
             "cancel": lambda: self._cancel(connection, fields["id"], fields["plan"]),
             "metrics": lambda: self._reply(connection, fields["id"], 200, self._engine.render_metrics().encode()),
             "snapshot": lambda: self._reply(connection, fields["id"], 200, build_dry_run_start(self._engine)),
-            "end_stream": lambda: self._engine.end_stream(fields["epoch"]),
+            "end_stream": lambda: self._engine.end_stream(fields["epoch"], fields["caller"]),
             "telemetry": lambda: self._set_readers(connection, client, fields["readers"], fields["rate_hz"]),
         }
         try:
@@ -95,6 +95,7 @@ class PlannerServer:
             fields["streamed"],
             fields["arrived_s"],
             fields["epoch"],
+            fields["caller"],
             caller_left,
         )
         client.requests[request_id] = caller_left, future

@@ -3,29 +3,25 @@
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.planner import Planner
+from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
     LinkReport,
     PlannerReport,
     PlannerState,
     PulseTotals,
-    QueueReport,
-    RecentPlan,
     StateReport,
 )
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 
 
-def build_planner_state(plan_queue: PlanQueue, recent: list[PlanRecord], planner: Planner) -> PlannerState:
+def build_planner_state(
+    plan_queue: PlanQueue, recent: list[PlanRecord], planner: Planner, board_now_s: float
+) -> PlannerState:
     """Report the state of queue and planner."""
-    running = next(iter(plan_queue.running.copy()), None)
     return PlannerState(
-        queue=QueueReport(
-            waiting=len(plan_queue.waiting),
-            running=None if running is None else running.record.plan_id,
-            plans=[RecentPlan(plan=item.plan_id, name=item.name, status=item.status) for item in recent],
-        ),
+        queue=build_queue_report(plan_queue, recent, board_now_s),
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
     )
@@ -42,8 +38,16 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
             error=session.link_error,
             **session.stats,
         ),
-        board=BoardReport(**session.board.to_dict()),
+        board=_build_board_report(session),
         queue=planner_state.queue,
         totals=planner_state.totals,
         planner=planner_state.planner,
     )
+
+
+def _build_board_report(session: RemoteSession) -> BoardReport:
+    """Report the board; without a link its state is unknown, and the last one would be a claim."""
+    report = BoardReport(**session.board.to_dict())
+    if session.connected:
+        return report
+    return report.model_copy(update={"state": "UNKNOWN", "fault": None, "hint": ""})

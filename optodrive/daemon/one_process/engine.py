@@ -213,17 +213,19 @@ class Engine:
         fit: FitMode = "as_is",
         streamed: bool = False,
         arrived_s: float | None = None,
+        caller: str = "",
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan unless dry_run.
 
         streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
         arrived_s: board time at which the request arrived, if not now
+        caller: name of the token that submitted it
         """
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
         arrived_s = self.board_s() if arrived_s is None else arrived_s
         return self._planner.submit(
-            PlanningRequest(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s)
+            PlanningRequest(build, name, dry_run, policy, fit, streamed and not dry_run, arrived_s, caller)
         )
 
     def _require_armed(self) -> None:
@@ -250,10 +252,10 @@ class Engine:
         """Return a future that is done when a plan has ended. Raise InputError (plan_not_found) for an unknown plan."""
         return self._plan_store.find(plan_id).end_future
 
-    def end_stream(self) -> "Future[PlanReport]":
+    def end_stream(self, caller: str = "") -> "Future[PlanReport]":
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""
         blank_frame = TactileFrame("", 0.0, 1.0, np.zeros(len(self.display.layout)))
-        return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True)
+        return self.submit(lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True, caller=caller)
 
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
         """Report a plan. Raise InputError (plan_not_found) for an unknown plan."""

@@ -25,8 +25,11 @@ ProblemFormatter = Callable[[OptodriveError], Problem]
 class LiveStream:
     """Stream of one client. A new frame replaces one that waits for the planner, and all unsent pulses."""
 
-    def __init__(self, engine: Engine, socket: WebSocket, policy: Policy, to_problem: ProblemFormatter) -> None:
+    def __init__(
+        self, engine: Engine, socket: WebSocket, policy: Policy, caller: str, to_problem: ProblemFormatter
+    ) -> None:
         self._engine = engine
+        self._caller = caller
         self._socket = socket
         self._policy = policy
         self._to_problem = to_problem
@@ -46,7 +49,9 @@ class LiveStream:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             if self._last_end_future is not None and not self._last_end_future.done():
-                self._engine.end_stream()  # first, because this coroutine may be cancelled at its next await
+                self._engine.end_stream(
+                    self._caller
+                )  # first, because this coroutine may be cancelled at its next await
             for task in (*tasks, *self._watchers):
                 task.cancel()
             await asyncio.gather(*tasks, *self._watchers, return_exceptions=True)
@@ -80,6 +85,7 @@ class LiveStream:
                 policy=self._policy,
                 streamed=True,
                 arrived_s=arrived_s,
+                caller=self._caller,
             )
             try:
                 report = await asyncio.wrap_future(future)

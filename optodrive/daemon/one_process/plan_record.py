@@ -33,6 +33,7 @@ class PlanRecord:
     heat_before, budget_before: initial state of the plan, on its own time line
     start_s: board time of the plan's zero
     arrived_s: board time of the request; *_after_s: time from the request to an event
+    caller: name of the token that submitted it
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
     executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
     refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
@@ -49,6 +50,7 @@ class PlanRecord:
     budget_before: BudgetState
     start_s: float
     arrived_s: float
+    caller: str = ""
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None
@@ -84,6 +86,7 @@ class PlanRecord:
         return PlanReport(
             plan=self.plan_id,
             name=self.name,
+            caller=self.caller,
             status=self.status,
             error=self.error,
             starts_in_s=self.start_s + self.delay_s - board_now_s,

@@ -31,6 +31,8 @@ PLANNING_TIME_FACTOR = 1.5
 """Planning time reserved for a streamed plan, as a multiple of the last one."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
+DRY_RUN_ID = "dry-run"
+"""Identifier in the report of a dry run, which is not stored."""
 T = TypeVar("T")
 
 
@@ -42,7 +44,7 @@ class LoopRunner(Protocol):
 
 
 class PlanningRequest(NamedTuple):
-    """Request for a plan. build: returns the sequence; arrived_s: board time."""
+    """Request for a plan. build: returns the sequence; arrived_s: board time; caller: name of its token."""
 
     build: Callable[[], FrameSequence]
     name: str
@@ -51,6 +53,7 @@ class PlanningRequest(NamedTuple):
     fit: FitMode
     streamed: bool
     arrived_s: float
+    caller: str
 
 
 class Planner:
@@ -141,7 +144,7 @@ class Planner:
         planned, feasibility = self._make_plan(sequence, request, snapshot)
         points = quantise(planned.plan, self._session.scale)
         record = PlanRecord(
-            plan_id=f"p{next(self._ids)}",
+            plan_id=DRY_RUN_ID if request.dry_run else f"p{next(self._ids)}",
             name=request.name,
             planned=planned,
             feasibility=feasibility,
@@ -150,6 +153,7 @@ class Planner:
             budget_before=budget,
             start_s=snapshot.start_s,
             arrived_s=request.arrived_s,
+            caller=request.caller,
             streamed=request.streamed,
             refreshed=snapshot.refreshed,
         )

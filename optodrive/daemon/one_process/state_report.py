@@ -3,13 +3,12 @@
 from optodrive.daemon.one_process.plan_queue import PlanQueue
 from optodrive.daemon.one_process.plan_record import PlanRecord
 from optodrive.daemon.one_process.planner import Planner
+from optodrive.daemon.one_process.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
     LinkReport,
     PlannerReport,
     PulseTotals,
-    QueueReport,
-    RecentPlan,
     StateReport,
 )
 from optodrive.link.session.session import BoardSession
@@ -25,7 +24,6 @@ def build_state_report(
     link_error: str | None,
 ) -> StateReport:
     """Report the state of display, link, board, queue and planner."""
-    running = next(iter(plan_queue.running.copy()), None)
     return StateReport(
         display=display.config.name,
         pixels=len(display.layout),
@@ -35,12 +33,16 @@ def build_state_report(
             error=link_error,
             **session.collect_link_stats(),
         ),
-        board=BoardReport(**session.board.to_dict()),
-        queue=QueueReport(
-            waiting=len(plan_queue.waiting),
-            running=None if running is None else running.record.plan_id,
-            plans=[RecentPlan(plan=item.plan_id, name=item.name, status=item.status) for item in recent],
-        ),
+        board=_build_board_report(session),
+        queue=build_queue_report(plan_queue, recent, session.board_s()),
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
     )
+
+
+def _build_board_report(session: BoardSession) -> BoardReport:
+    """Report the board; without a link its state is unknown, and the last one would be a claim."""
+    report = BoardReport(**session.board.to_dict())
+    if session.connected:
+        return report
+    return report.model_copy(update={"state": "UNKNOWN", "fault": None, "hint": ""})

@@ -36,6 +36,9 @@ export async function call(method, path, options = {}) {
     throw new Problem(0, { detail: "The daemon does not answer." });
   }
   const body = await response.json().catch(() => ({}));
+  if (response.status === 403) {
+    dispatchEvent(new Event("refused")); // the token may have another role than before
+  }
   if (!response.ok) {
     throw new Problem(response.status, body);
   }

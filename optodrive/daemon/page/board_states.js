@@ -15,3 +15,6 @@ export const LEASED_STATES = Object.freeze([BoardState.ARMING, BoardState.ARMED,
 export const ARMED_STATES = Object.freeze([BoardState.ARMED, BoardState.RUNNING, BoardState.HOLD]);
 
 export const IDLE_STATES = Object.freeze([BoardState.DISARMED, BoardState.FAULT]);
+
+// The inputs by bit, bit 0 first.
+export const INPUTS = Object.freeze(["interlock", "key", "estop"]);

@@ -2,14 +2,18 @@
 
 import { ArmControl } from "./arm.js";
 import { call } from "./api.js";
+import { LEASED_STATES } from "./board_states.js";
 import { setCapLabels } from "./caps.js";
 import { buildColourMap } from "./colours.js";
 import { DisplayView } from "./display.js";
 import { Drawing } from "./draw.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
+import { Header } from "./header.js";
 import { PatternLibrary } from "./patterns.js";
+import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
+import { QueueView } from "./queue.js";
 import { Status } from "./status.js";
 import { StopControl } from "./stop.js";
 import { Telemetry } from "./telemetry.js";
@@ -24,6 +28,7 @@ const announce = (text) => (find("said").textContent = text);
 
 // STOP first: it depends on nothing that follows.
 let plans = null;
+let mayEmit = () => true;
 new StopControl(
   find("stop"),
   find("stopping"),
@@ -32,6 +37,7 @@ new StopControl(
     telemetry.pause(true);
   },
   () => telemetry.pause(document.hidden),
+  () => mayEmit(),
 );
 if (location.hash) {
   history.replaceState(null, "", location.pathname);
@@ -62,10 +68,12 @@ const showError = (error) => {
   announce(error.message);
 };
 const arm = new ArmControl(find, announce, showError);
-const status = new Status(find, announce, () => arm.disarm());
+const header = new Header(find, announce);
+const permissions = new Permissions(find);
+const status = new Status(find, () => arm.disarm(), () => permissions.apply());
+const queue = new QueueView(find, announce, showError);
 const library = new PatternLibrary(find, patterns, () => view.cursor);
-find("display-name").textContent = `${config.name}, ${grid.pixels} pixels`;
-document.title = `${config.name} · optodrive`;
+find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
 
 // --- controls -------------------------------------------------------------------------------------------------------
 
@@ -145,10 +153,11 @@ function updateLegend() {
 }
 
 function applyColourMap() {
-  const bytes = buildColourMap(find("colours").value);
+  const name = readChoice("colours");
+  const bytes = buildColourMap(name);
   const pixels = Uint8ClampedArray.from({ length: 256 * 48 }, (_, k) => bytes[k % 1024]);
   find("legend").getContext("2d").putImageData(new ImageData(pixels, 256, 12), 0, 0);
-  view.setColourMap(find("colours").value);
+  view.setColourMap(name);
 }
 
 function describeSelected() {
@@ -173,7 +182,9 @@ function describeDisplay() {
 for (const radio of document.querySelectorAll('input[name="show"]')) {
   radio.addEventListener("change", () => showQuantity(readChoice("show")));
 }
-find("colours").addEventListener("change", applyColourMap);
+for (const radio of document.querySelectorAll('input[name="colours"]')) {
+  radio.addEventListener("change", applyColourMap);
+}
 bindThemeButton(find("theme"), () => {
   view.applyTheme();
   timeline.applyTheme();
@@ -187,20 +198,36 @@ onStimulusChange();
 view.canvas.toggleAttribute("data-editing", true);
 
 telemetry.addEventListener("up", () => {
-  status.showConnection(true);
+  header.showConnection("live", "good");
+  permissions.load();
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {
-  status.showConnection(false);
+  header.showConnection("no daemon, trying again", "bad");
+  header.showUnknown("no daemon");
+  status.showNoDaemon();
+  queue.clear("Unknown: the daemon does not answer.");
+  showTitle();
   find("stale").hidden = false;
   arm.show("");
 });
-telemetry.addEventListener("unauthorized", () => status.showTokenChange());
+telemetry.addEventListener("unauthorized", () => {
+  header.showConnection("another token", "bad");
+  status.showTokenChange();
+});
+const showTitle = () => (document.title = `${header.state} · ${config.name} · optodrive`);
+showTitle();
+let isOff = false;
+mayEmit = () => !(telemetry.live && isOff);
 telemetry.addEventListener("state", ({ detail }) => {
+  isOff = detail.link.state === "up" && !LEASED_STATES.includes(detail.board.state);
   if (detail.display !== config.name || detail.pixels !== grid.pixels) {
     location.reload(); // the restarted daemon has another display
   }
+  header.showState(detail);
+  showTitle();
   status.showState(detail);
+  queue.show(detail.queue);
   arm.show(detail.link.state === "up" ? detail.board.state : "");
 });
 telemetry.addEventListener("fault", ({ detail }) => status.showFault(detail));

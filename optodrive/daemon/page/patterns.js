@@ -13,6 +13,7 @@ export class PatternLibrary extends EventTarget {
     }
     this.select.addEventListener("change", () => this.#showFields());
     this.container.addEventListener("input", () => this.dispatchEvent(new Event("changed")));
+    this.select.selectedIndex = 0;
     this.#showFields();
   }
 
@@ -63,11 +64,13 @@ export class PatternLibrary extends EventTarget {
 
 function createField(parameter) {
   if (parameter.kind === "choice") {
-    const select = document.createElement("select");
+    // A list instead of a dropdown, which would take Escape from STOP.
+    const select = Object.assign(document.createElement("select"), { size: Math.max(2, parameter.choices.length) });
     select.append(...parameter.choices.map((choice) => new Option(choice, choice, false, choice === parameter.default)));
     return select;
   }
   const field = document.createElement("input");
+  field.autocomplete = "off"; // suggestions of the browser would take Escape from STOP
   field.type = { flag: "checkbox", text: "text", file: "file" }[parameter.kind] ?? "number";
   if (field.type === "number") {
     field.step = parameter.kind === "number" ? "any" : "1";

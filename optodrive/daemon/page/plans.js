@@ -21,6 +21,8 @@ export function buildFrames(heights, rateHz, seconds) {
   return { frames };
 }
 
+const readPolicy = () => document.querySelector('input[name="policy"]:checked').value;
+
 export class PlanControl extends EventTarget {
   // buildRequest(): returns path and body of the present stimulus
   constructor(find, buildRequest, announce) {
@@ -29,13 +31,14 @@ export class PlanControl extends EventTarget {
     this.announce = announce;
     this.previewButton = find("preview");
     this.playButton = find("play");
-    this.policy = find("policy");
     this.result = find("result");
     this.previewed = null;
     this.abort = null;
     this.previewButton.addEventListener("click", () => this.#preview());
     this.playButton.addEventListener("click", () => this.#play());
-    this.policy.addEventListener("change", () => this.invalidate());
+    for (const radio of document.querySelectorAll('input[name="policy"]')) {
+      radio.addEventListener("change", () => this.invalidate());
+    }
   }
 
   // Discard the preview: the stimulus has changed.
@@ -57,7 +60,7 @@ export class PlanControl extends EventTarget {
     this.#showLines(["soft", "Planning …"]);
     this.previewButton.disabled = true;
     try {
-      const stimulus = { ...(await this.buildRequest()), policy: this.policy.value };
+      const stimulus = { ...(await this.buildRequest()), policy: readPolicy() };
       const query = `?dry_run=true&policy=${stimulus.policy}`;
       const plan = await call("POST", stimulus.path + query, { body: stimulus.body, signal: this.abort.signal });
       this.previewed = stimulus;

@@ -1,4 +1,6 @@
 // STOP: sent at once and repeated until the daemon answers; it depends on no other part of the page.
+// Escape is STOP everywhere: the page has no dropdown, because the browser would close an open one with the key and
+// not report it. What the browser opens itself is refused or watched while the laser may emit.
 
 import { request } from "./api.js";
 
@@ -7,14 +9,25 @@ const RETRY_MS = 300;
 
 export class StopControl {
   // beforeRetry: closes connections that may block the request; onAnswered: the daemon has answered
-  constructor(button, status, beforeRetry, onAnswered) {
+  // mayEmit(): returns whether the laser may emit; true if that is unknown
+  constructor(button, status, beforeRetry, onAnswered, mayEmit) {
     this.status = status;
     this.beforeRetry = beforeRetry;
     this.onAnswered = onAnswered;
     this.running = false;
     button.addEventListener("click", () => this.stop());
     // Captured before any other handler of the page.
-    window.addEventListener("keydown", (event) => event.key === "Escape" && this.stop(), { capture: true });
+    window.addEventListener("keydown", (event) => this.#onKeyDown(event), { capture: true });
+    window.addEventListener("contextmenu", (event) => mayEmit() && event.preventDefault(), { capture: true });
+    // The browser reports only the end of a file dialog: Escape in it, or its Cancel.
+    window.addEventListener("cancel", () => mayEmit() && this.stop(), { capture: true });
+  }
+
+  #onKeyDown(event) {
+    if (event.key === "Escape" || event.code === "Escape") {
+      event.preventDefault(); // Firefox would end the connections of the page
+      this.stop();
+    }
   }
 
   async stop() {

@@ -39,12 +39,14 @@ class ExecutedColumns(JsonModel):
 class PlanReport(JsonModel):
     """A plan: what was planned, sent and executed.
 
+    caller: name of the token that submitted it
     pulses, executed_pulses: None if they were not requested or are too many
     executed_complete, delay_s: None before the plan has ended
     """
 
     plan: str
     name: str
+    caller: str
     status: PlanStatus
     error: str | None
     starts_in_s: float

@@ -51,18 +51,31 @@ class BoardReport(JsonModel):
 
 
 class RecentPlan(JsonModel):
-    """One of the latest plans."""
+    """One of the latest plans: its caller (the name of a token), and how many of its planned pulses were executed."""
 
     plan: str
     name: str
+    caller: str
     status: PlanStatus
+    planned: int
+    executed: int
+    error: str | None
+
+
+class QueuedPlan(RecentPlan):
+    """A plan that runs or waits; starts_in_s is negative once it has started."""
+
+    duration_s: float
+    starts_in_s: float
+    ends_in_s: float
 
 
 class QueueReport(JsonModel):
-    """Plans: how many wait, which one runs, and the latest 20."""
+    """Plans: how many wait, which one runs, both as a list in the order of the beam, and the latest 20."""
 
     waiting: int
     running: str | None
+    active: list[QueuedPlan]
     plans: list[RecentPlan]
 
 

@@ -5,6 +5,8 @@ It runs in front of the application, so that no new route can omit the checks.
 
 import math
 
+from starlette.requests import ClientDisconnect
+
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
 from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.web.request_limits import (
@@ -17,9 +19,11 @@ from optodrive.daemon.web.request_limits import (
     Send,
     receive_empty_body,
 )
-from optodrive.daemon.web.route_table import ARM, STOP
+from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
 
+CALLER = "optodrive.caller"
+"""Key in the ASGI scope of the token that the request presented."""
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
 
@@ -27,9 +31,10 @@ AUDIT_FIELDS = "optodrive.audit_fields"
 class AccessMiddleware:
     """Refuses the requests that the policy does not accept, and forwards the others with their input bounded."""
 
-    def __init__(self, app: App, policy: AccessPolicy) -> None:
+    def __init__(self, app: App, policy: AccessPolicy, table: RouteTable) -> None:
         self._app = app
         self._policy = policy
+        self._table = table
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send a refusal, or forward the request."""
@@ -37,14 +42,15 @@ class AccessMiddleware:
             await self._app(scope, receive, send)
             return
         request = _read_request(scope)
-        problem = self._policy.check(request)
+        problem = self._policy.check(request, self._table)
         if problem is None and request.route is not None and request.route.key == ARM:
             problem = await self._record_intent(request)
         if problem is None:
             await self._forward(request, scope, receive, send)
             return
-        if problem.status != 429:
-            self._record(request, {"event": "refused", "status": problem.status, "code": problem.code})
+        self._policy.refusals.record(
+            problem.code, request.audit_fields | request.provenance | {"status": problem.status}
+        )
         prefix = "websocket.http" if scope["type"] == "websocket" else "http"
         if problem.status == 401 and is_page_request(request.method, request.path):
             await _send_login_page(send, prefix)
@@ -55,9 +61,12 @@ class AccessMiddleware:
         body = self._bound_receive(request, receive)
         audit_fields: dict[str, object] = {}
         scope[AUDIT_FIELDS] = audit_fields
+        scope[CALLER] = request.token
         status_recorder = _StatusRecorder(send)
         try:
             await self._app(scope, body, status_recorder)
+        except ClientDisconnect:  # within its body: there is nobody to answer
+            audit_fields["hung_up"] = True
         finally:
             if isinstance(body, BoundedBody | RateLimitedFrames):
                 audit_fields |= body.audit_fields

@@ -3,20 +3,26 @@
 The checks run in that order, before any route. STOP needs a token of any role; its rate and body are not checked.
 """
 
+import re
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.rate_limit import RateLimiter
+from optodrive.daemon.web.refusal_audit import RefusalAudit
 from optodrive.daemon.web.roles import is_role_sufficient
-from optodrive.daemon.web.route_table import ROUTES, STOP, Route, RouteTable
+from optodrive.daemon.web.route_table import STOP, Route, RouteTable
 from optodrive.daemon.web.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
 
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
+DEFAULT_PORTS = {"http": "80", "https": "443"}
+AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:/?#@\s]+)(?::([0-9]{0,5}))?")
+TEXT_MAX = 100
 ANONYMOUS = Token("", "viewer", "")
 
 
@@ -36,10 +42,15 @@ class RequestContext:
         """Fields for the audit log: who calls what from where."""
         return {
             "name": self.token.name,
-            "role": self.token.role,
+            "role": self.token.role if self.token.secret else None,
             "address": self.address,
             "call": f"{self.method} {self.path[:200]}",
         }
+
+    @property
+    def provenance(self) -> dict[str, object]:
+        """Fields for the audit log of a refusal: the Host and Origin that the request states, if it does."""
+        return {name: self.headers[name][:TEXT_MAX] for name in ("host", "origin") if name in self.headers}
 
 
 class AccessPolicy:
@@ -56,8 +67,8 @@ class AccessPolicy:
         now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self.audit = audit
+        self.refusals = RefusalAudit(audit, now_s)
         self._now_s = now_s
-        self._route_table = RouteTable(ROUTES)
         self.update(tokens, daemon)
 
     def update(self, tokens: Tokens, daemon: DaemonSection) -> None:
@@ -67,12 +78,12 @@ class AccessPolicy:
         self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
         self._rate_limiter = RateLimiter(daemon.requests_per_s, daemon.requests_burst)
 
-    def check(self, request: RequestContext) -> Problem | None:
+    def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
         """Identify token and route of a request; return why it is refused, None if it is accepted."""
         problem = self._check_host_and_origin(request)
         if problem is not None:
             return problem
-        route = self._route_table.find(request.method, request.path)
+        route = table.find(request.method, request.path)
         is_stop = route is not None and route.key == STOP
         if route is None or route.min_role is not None:
             token = self.tokens.find(_read_presented_token(request))
@@ -85,7 +96,7 @@ class AccessPolicy:
         request.route = route
         if is_stop:
             return None
-        return self._check_rate(request) or self._check_route(request) or self._check_size(request)
+        return self._check_rate(request) or self._check_route(request, table) or self._check_size(request)
 
     def acquire_frame(self, request: RequestContext) -> float:
         """Count one streamed frame against the caller's rate; return the time to wait first, s."""
@@ -93,12 +104,13 @@ class AccessPolicy:
 
     def _check_host_and_origin(self, request: RequestContext) -> Problem | None:
         host = request.headers.get("host", "")
-        if _parse_hostname(host) not in self._hosts:
-            detail = f"this daemon does not answer to host {host!r}"
+        own = _parse_authority(host)
+        if own is None or own.name not in self._hosts:
+            detail = f"this daemon does not answer to host {host[:TEXT_MAX]!r}"
             return build_problem(421, "host_not_allowed", "Misdirected request", detail)
         origin = request.headers.get("origin")
-        if origin is not None and _parse_hostname(origin.partition("://")[2]) not in self._hosts:
-            detail = f"requests from origin {origin!r} are not answered"
+        if origin is not None and not _is_same_origin(origin, own):
+            detail = f"requests from origin {origin[:TEXT_MAX]!r} are not answered"
             return build_problem(403, "origin_not_allowed", "Origin not allowed", detail)
         return None
 
@@ -109,10 +121,10 @@ class AccessPolicy:
         detail = f"this caller exceeds its request rate; retry in {wait_s:.3f} s"
         return build_problem(429, "too_many_requests", "Too many requests", detail, retry_after_s=round(wait_s, 3))
 
-    def _check_route(self, request: RequestContext) -> Problem | None:
+    def _check_route(self, request: RequestContext, table: RouteTable) -> Problem | None:
         method_and_path = f"{request.method} {request.path}"
         if request.route is None:
-            methods = self._route_table.find_methods(request.path)
+            methods = table.find_methods(request.path)
             if methods:
                 return build_problem(
                     405, "method_not_allowed", "Method Not Allowed", method_and_path, allow=", ".join(methods)
@@ -142,8 +154,24 @@ def _read_presented_token(request: RequestContext) -> str:
     return credentials.strip() if scheme.lower() == "bearer" else ""
 
 
-def _parse_hostname(authority: str) -> str:
-    authority = authority.strip().lower()
-    if authority.startswith("["):
-        return authority.partition("]")[0] + "]"
-    return authority.partition(":")[0]
+class _Authority(NamedTuple):
+    name: str
+    port: str
+
+
+def _parse_authority(text: str) -> _Authority | None:
+    match = AUTHORITY.fullmatch(text.strip().lower())
+    return None if match is None else _Authority(match[1], match[2] or "")
+
+
+def _is_same_origin(origin: str, own: _Authority) -> bool:
+    """Return whether an Origin is the one at which the browser found this daemon, as its Host header states.
+
+    https is possible only behind a proxy, for one of the configured names.
+    """
+    scheme, _, text = origin.strip().lower().partition("://")
+    authority = _parse_authority(text)
+    if authority is None or scheme not in DEFAULT_PORTS or (scheme == "https" and own.name in LOOPBACK_NAMES):
+        return False
+    default = DEFAULT_PORTS[scheme]
+    return authority.name == own.name and (authority.port or default) == (own.port or default)

@@ -5,8 +5,7 @@ from concurrent.futures import Future
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request, WebSocket
-from fastapi.responses import PlainTextResponse, Response
-from starlette.middleware import Middleware
+from fastapi.responses import JSONResponse, PlainTextResponse, Response
 
 from optodrive import __version__
 from optodrive.core.errors import InputError
@@ -14,12 +13,13 @@ from optodrive.core.types.policy import Policy
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
 from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.one_process.live_stream import LiveStream
+from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
+from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, CALLER, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.error_handlers import add_error_handlers
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
@@ -30,9 +30,11 @@ from optodrive.daemon.web.openapi_bodies import (
     SEQUENCE_SCHEMA,
     build_request_body,
 )
+from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.web.static_files import add_page_routes
 from optodrive.daemon.web.stop_priority import StopPriorityMiddleware, build_json_response
 from optodrive.daemon.web.telemetry import DEFAULT_RATE_HZ, EventStream, Telemetry
+from optodrive.daemon.web.tokens import Token
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.pipeline import resolve_policy
@@ -60,53 +62,61 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         generate_unique_id_function=lambda route: route.name,
         title="optodrive",
         version=__version__,
-        middleware=[Middleware(StopPriorityMiddleware), Middleware(AccessMiddleware, policy=policy)],
         responses=ERROR_RESPONSES,
+        openapi_url=None,
         docs_url=None,
         redoc_url=None,
         lifespan=telemetry.lifespan,
     )
     app.state.telemetry = telemetry
     add_error_handlers(app)
-    add_page_routes(app)
+    routes = RoleRoutes(app)
+    add_page_routes(routes)
 
-    @app.get("/v1/health")
+    @routes.get("/v1/health", None)
     async def get_health() -> HealthReport:
         """Return whether the daemon runs; needs no token."""
         return HealthReport(version=__version__)
 
-    @app.get("/v1/state")
+    @routes.get("/v1/state", "viewer")
     async def get_state() -> StateReport:
         """Return the state of board, link, queue and planner."""
         return engine.snapshot()
 
-    @app.get("/metrics", response_class=PlainTextResponse)
+    @routes.get("/v1/me", "viewer")
+    async def get_me(request: Request) -> CallerReport:
+        """Return name and role of the token that the request presented, and the routes that the role may not call."""
+        token: Token = request.scope[CALLER]
+        return CallerReport(name=token.name, role=token.role, refused=table.list_refused(token.role))
+
+    @routes.get("/metrics", "viewer", response_class=PlainTextResponse)
     async def get_metrics() -> PlainTextResponse:
         """Return metrics for Prometheus."""
         return PlainTextResponse(engine.render_metrics(), media_type=CONTENT_TYPE)
 
-    @app.get("/v1/config")
+    @routes.get("/v1/config", "viewer")
     async def get_config() -> EffectiveConfig:
         """Return the effective configuration, as `optodrive config show --json`."""
         return build_effective_config(display)
 
-    @app.post("/v1/arm")
+    @routes.post("/v1/arm", "armer")
     async def arm() -> StateReport:
         """Arm the board; its indicator is on for at least two seconds before it emits."""
         return await asyncio.wrap_future(engine.arm())
 
-    @app.post("/v1/disarm")
+    @routes.post("/v1/disarm", "operator")
     async def disarm() -> StateReport:
         """Disarm the board; this also acknowledges a fault whose cause is gone."""
         return await asyncio.wrap_future(engine.disarm())
 
-    @app.post("/v1/stop")
+    @routes.post("/v1/stop", "viewer")
     async def stop() -> StateReport:
         """Switch the gate off, drop everything queued, disarm the board."""
         return await asyncio.wrap_future(engine.stop())
 
-    @app.post(
+    @routes.post(
         "/v1/plans",
+        "operator",
         status_code=201,
         response_model=PlanReport,
         responses=DRY_RUN_RESPONSES,
@@ -124,39 +134,46 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         body = await request.body()
         policy = resolve_policy(policy, strict)
         future = engine.submit(
-            lambda: parse_sequence(body, display.config, "body"), "push", dry_run, policy, fit, streamed=newest
+            lambda: parse_sequence(body, display.config, "body"),
+            "push",
+            dry_run,
+            policy,
+            fit,
+            streamed=newest,
+            caller=request.scope[CALLER].name,
         )
         return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
-    @app.websocket("/v1/stream")
+    @routes.websocket("/v1/stream", "operator")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
         """Show streamed frames, of which the newest wins, and send the result of each."""
-        await LiveStream(engine, socket, policy, build_error_problem).run()
+        await LiveStream(engine, socket, policy, socket.scope[CALLER].name, build_error_problem).run()
 
-    @app.get("/v1/telemetry", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
+    @routes.get("/v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:
         """Send server-sent events until the client disconnects: state, display, pulses, budget, fault."""
         telemetry.require_capacity()
         return EventStream(telemetry.stream_events(rate_hz))
 
-    @app.get("/v1/plans/{plan_id}", response_model=PlanReport)
+    @routes.get("/v1/plans/{plan_id}", "viewer", response_model=PlanReport)
     async def get_plan(plan_id: PlanId, pulses: PulsesQuery = True) -> Response:
         """Return one plan: what was planned, sent and executed."""
         return await build_json_response(engine.get_plan(plan_id, pulses))
 
-    @app.delete("/v1/plans/{plan_id}", response_model=PlanReport)
+    @routes.delete("/v1/plans/{plan_id}", "operator", response_model=PlanReport)
     async def cancel_plan(plan_id: PlanId) -> Response:
         """Remove a plan from the queue, or end it if it runs; the board stays armed."""
         report: PlanReport = await asyncio.wrap_future(engine.cancel(plan_id))
         return await build_json_response(report)
 
-    @app.get("/v1/patterns")
+    @routes.get("/v1/patterns", "viewer")
     async def list_patterns() -> PatternList:
         """Return the named patterns and their parameters."""
         return PatternList(patterns=describe_patterns())
 
-    @app.post(
+    @routes.post(
         "/v1/patterns/{name}",
+        "operator",
         status_code=201,
         response_model=PlanReport,
         responses=DRY_RUN_RESPONSES,
@@ -176,10 +193,26 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         if not isinstance(parameters, dict):
             raise InputError("body", parameters, "an object of the pattern's parameters")
         policy = resolve_policy(policy, strict)
-        future = engine.submit(lambda: build_pattern(name, parameters, display.config), name, dry_run, policy, fit)
+        future = engine.submit(
+            lambda: build_pattern(name, parameters, display.config),
+            name,
+            dry_run,
+            policy,
+            fit,
+            caller=request.scope[CALLER].name,
+        )
         return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
 
-    extend_openapi(app)
+    @routes.get("/openapi.json", "viewer", include_in_schema=False)
+    async def get_openapi() -> JSONResponse:
+        """Return the OpenAPI document."""
+        return JSONResponse(app.openapi())
+
+    table = RouteTable(app.routes)
+    extend_openapi(app, table)
+    # The one that is added last is the outermost; both run in front of every route.
+    app.add_middleware(AccessMiddleware, policy=policy, table=table)
+    app.add_middleware(StopPriorityMiddleware)
     return app
 
 

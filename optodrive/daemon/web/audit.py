@@ -1,21 +1,29 @@
-"""The audit log: one line of JSON per request that is not a read, appended to a file.
+"""The audit log: one line of JSON per refused request and per request that is not a read, appended to a file.
 
-A separate thread writes it, so that a slow disk delays nothing. Only arming waits until its entry is on the disk, and
-is refused if the entry cannot be written; STOP never waits.
+A separate thread writes it, so that a slow disk delays nothing, not even the end of the process. Only arming waits
+until its entry is on the disk, and is refused if the entry cannot be written; STOP never waits.
 """
 
 import asyncio
 import json
 import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from datetime import UTC, datetime
 from pathlib import Path
-from threading import Semaphore
+from queue import SimpleQueue
+from threading import Semaphore, Thread
+from typing import NamedTuple
 
 QUEUE_MAX = 1000
 WRITE_TIMEOUT_S = 2.0
 AuditFields = Mapping[str, object]
+
+
+class _Entry(NamedTuple):
+    line: str
+    to_disk: bool
+    future: "Future[None]"
 
 
 class AuditLog:
@@ -33,7 +41,10 @@ class AuditLog:
         self._path = path
         self._report = report
         self._now = now
-        self._writer = ThreadPoolExecutor(1, thread_name_prefix="audit")
+        self._queue: SimpleQueue[_Entry | None] = SimpleQueue()
+        # A daemon thread: one that hangs in a write must not keep the process from ending.
+        self._writer = Thread(target=self._run, name="audit", daemon=True)
+        self._writer.start()
         self._free_slots = Semaphore(QUEUE_MAX)
         self._has_partial_line = False
         self._is_failing = False
@@ -55,9 +66,20 @@ class AuditLog:
 
     def _enqueue(self, fields: AuditFields, to_disk: bool) -> "Future[None]":
         line = json.dumps({"at": self._now().isoformat(timespec="milliseconds"), **fields})
-        future = self._writer.submit(self._write, line, to_disk)
-        future.add_done_callback(lambda _: self._free_slots.release())
-        return future
+        entry = _Entry(line, to_disk, Future())
+        self._queue.put(entry)
+        return entry.future
+
+    def _run(self) -> None:
+        while (entry := self._queue.get()) is not None:
+            try:
+                self._write(entry.line, entry.to_disk)
+                error = None
+            except OSError as caught:
+                error = caught
+            self._free_slots.release()
+            if entry.future.set_running_or_notify_cancel():
+                entry.future.set_result(None) if error is None else entry.future.set_exception(error)
 
     def _write(self, line: str, to_disk: bool) -> None:
         try:
@@ -75,7 +97,9 @@ class AuditLog:
 
     def _append(self, text: str, to_disk: bool) -> None:
         # Opened for each entry: a file that was moved away is created anew, and a lost disk is detected.
-        handle = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        # Non-blocking: a pipe without a reader is an error, not a wait.
+        flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+        handle = os.open(self._path, flags, 0o600)
         try:
             data = text.encode("ascii")
             written = os.write(handle, data)
@@ -90,9 +114,7 @@ class AuditLog:
 
     def close(self) -> None:
         """Write the waiting entries, for at most two seconds."""
-        last = self._writer.submit(lambda: None)
-        try:
-            last.result(WRITE_TIMEOUT_S)
-        except TimeoutError:
+        self._queue.put(None)
+        self._writer.join(WRITE_TIMEOUT_S)
+        if self._writer.is_alive():
             self._report(f"audit: {self._path} is slow; its last entries may be missing")
-        self._writer.shutdown(wait=False, cancel_futures=True)

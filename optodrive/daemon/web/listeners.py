@@ -3,6 +3,8 @@
 import os
 import socket
 import stat
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 
 from optodrive.core.errors import InputError
@@ -23,6 +25,19 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
         listener.close()
         raise InputError("daemon.port", port, f"a free port on {host} ({error.strerror})") from None
     return listener
+
+
+def describe_exposure(host: str) -> str | None:
+    """Return a warning if other computers can reach an address to listen on; None for loopback."""
+    with suppress(ValueError):
+        if ip_address(host).is_loopback:
+            return None
+    if host == "localhost":
+        return None
+    return (
+        f"listening on {host}: other computers can reach the daemon, and tokens travel unencrypted; "
+        "a TLS proxy in front of loopback avoids both"
+    )
 
 
 def open_unix_listener(path: Path) -> socket.socket:

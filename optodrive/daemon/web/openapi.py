@@ -9,7 +9,7 @@ from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.daemon.web.route_table import ROUTES
+from optodrive.daemon.web.route_table import RouteTable
 
 REF_TEMPLATE = "#/components/schemas/{model}"
 
@@ -64,9 +64,9 @@ PLAN_LINKS: dict[str, Any] = {
 }
 
 
-def extend_openapi(app: FastAPI) -> None:
+def extend_openapi(app: FastAPI, table: RouteTable) -> None:
     """Add models of errors, events and stream messages, required roles, and links from a new plan."""
-    build_document = app.openapi
+    build_document, roles = app.openapi, table.roles
 
     def openapi() -> dict[str, Any]:
         if app.openapi_schema:
@@ -77,7 +77,7 @@ def extend_openapi(app: FastAPI) -> None:
         components["schemas"] = _list_extra_schemas() | components.get("schemas", {})
         for path, methods in document["paths"].items():
             for method, operation in methods.items():
-                min_role = ROUTES[f"{method.upper()} {path}"]
+                min_role = roles[f"{method.upper()} {path}"]
                 operation["security"] = [] if min_role is None else [{"token": []}]
                 operation["x-min-role"] = min_role
                 if "201" in operation["responses"]:

@@ -9,9 +9,11 @@ from importlib.resources import files
 from importlib.resources.abc import Traversable
 from mimetypes import guess_type
 
-from fastapi import FastAPI
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import Response
+
+from optodrive.daemon.web.route_table import RoleRoutes
 
 LOGIN_PATHS = ("/page/login.js", "/page/login.css", "/page/colours.css")
 """The files of the login page; they contain no secret."""
@@ -58,15 +60,22 @@ def _get_page_folder() -> Traversable:
     return files("optodrive.daemon").joinpath("page")
 
 
-def add_page_routes(app: FastAPI) -> None:
+def add_page_routes(routes: RoleRoutes) -> None:
     """Serve the page at `/` and its files below `/page/`; all are read beforehand, so that no path leads elsewhere."""
     contents = dict(_read_files(_get_page_folder(), ""))
 
-    @app.get("/", include_in_schema=False)
+    @routes.get("/", "viewer", include_in_schema=False)
     async def get_index() -> Response:
         return _build_response("index.html", contents["index.html"])
 
-    @app.get("/page/{name:path}", include_in_schema=False)
+    async def get_login_file(request: Request) -> Response:
+        name = request.url.path.removeprefix("/page/")
+        return _build_response(name, contents[name])
+
+    for path in LOGIN_PATHS:
+        routes.get(path, None, include_in_schema=False)(get_login_file)
+
+    @routes.get("/page/{name:path}", "viewer", include_in_schema=False)
     async def get_file(name: str) -> Response:
         if name not in contents:
             raise HTTPException(404)

@@ -5,8 +5,9 @@ from contextlib import closing
 
 import pytest
 
+from optodrive.core.clock import ManualClock
 from optodrive.daemon import log as log_module
-from optodrive.daemon.log import DaemonLog, format_entry, open_daemon_log
+from optodrive.daemon.log import BYTES_MAX, PERIOD_S, DaemonLog, format_entry, open_daemon_log
 
 
 def fields(data):
@@ -83,3 +84,26 @@ def test_log_records_of_libraries_are_written(capsys):
         root.handlers[:] = before
         log.close()
     assert capsys.readouterr().err == "optodrive: no good\n"
+
+
+def test_a_minute_of_the_log_is_bounded_and_says_what_is_missing(capsys):
+    clock = ManualClock()
+    with closing(DaemonLog(None, clock)) as log:
+        for _ in range(1000):
+            log.warn("x" * 1000)
+        written = capsys.readouterr().err
+        assert BYTES_MAX - 2000 < len(written) < BYTES_MAX * 1.05
+        kept = written.count("\n")
+        clock.sleep(PERIOD_S)
+        log.warn("the next minute")
+        assert capsys.readouterr().err == (f"optodrive: {1000 - kept} lines suppressed\noptodrive: the next minute\n")
+        for _ in range(300):
+            log.warn("y" * 1000)
+        capsys.readouterr()
+    assert capsys.readouterr().err.endswith("lines suppressed\n")
+
+
+def test_one_line_is_bounded(capsys):
+    with closing(DaemonLog(None, ManualClock())) as log:
+        log.warn("x" * 1_000_000)
+    assert len(capsys.readouterr().err) < 9000

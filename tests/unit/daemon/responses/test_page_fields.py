@@ -11,10 +11,11 @@ import pytest
 from pydantic import BaseModel
 
 import optodrive.daemon
+from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.state import StateReport
+from optodrive.daemon.responses.state import QueuedPlan, QueueReport, StateReport
 from optodrive.daemon.responses.telemetry import (
     BudgetEvent,
     CapUsage,
@@ -34,14 +35,19 @@ VARIABLES = {
     "grid.js": {"config": EffectiveConfig, "display": EffectiveConfig.model_fields["display"].annotation},
     "main.js": {"config": EffectiveConfig, "pulses": PulseColumns},
     "patterns.js": {"pattern": PatternDescription, "parameter": PatternParameter},
+    "permissions.js": {"caller": CallerReport},
     "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
-    "status.js": {"fault": FaultEvent, "state": StateReport, "board": StateReport.model_fields["board"].annotation},
+    "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
+    "header.js": {"board": StateReport.model_fields["board"].annotation},
+    "status.js": {"fault": FaultEvent, "board": StateReport.model_fields["board"].annotation},
     "timeline.js": {"batch": PulseBatch},
 }
 """The models that the page's variables hold, by module."""
 EVENT_DETAILS = {"state": StateReport, "fault": FaultEvent, "budget": BudgetEvent, "display": DisplayEvent}
 DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
+    ("header.js", r"showState\(\{([^}]*)\}\)"): StateReport,
+    ("permissions.js", r"const \{([^}]*)\} = this.caller;"): CallerReport,
     ("plans.js", r"const \{([^}]*)\} = plan;"): PlanReport,
     ("status.js", r"const \{([^}]*)\} = state;"): StateReport,
     ("timeline.js", r"addPulses\(\{([^}]*)\}\)"): PulsesEvent,

@@ -5,7 +5,7 @@ import json
 import numpy as np
 
 from optodrive.core.clock import MonotonicClock
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config_file import load_config
 from optodrive.link.transport.simulated import SimulatedBoard

@@ -1,6 +1,9 @@
 import asyncio
 import json
+import os
 import resource
+import subprocess
+import sys
 import threading
 from datetime import UTC, datetime
 
@@ -81,3 +84,28 @@ def test_a_durable_entry_has_a_timeout(audit, monkeypatch):
     monkeypatch.setattr(audit, "_append", lambda *_: go_on.wait())
     assert "not written within" in asyncio.run(audit.record_durably({"event": "requested"}))
     go_on.set()
+
+
+def test_a_pipe_that_nobody_reads_is_an_error_at_once(audit, tmp_path, reports):
+    os.mkfifo(tmp_path / "audit.jsonl")
+    assert asyncio.run(audit.record_durably({"event": "requested"})) is not None
+    assert "cannot be written" in reports[0]
+
+
+HUNG_WRITER = """
+import sys, time
+from pathlib import Path
+from optodrive.daemon.web import audit
+audit.WRITE_TIMEOUT_S = 0.2
+log = audit.AuditLog(Path(sys.argv[1]), print)
+log._append = lambda *_: time.sleep(600)
+log.record({"event": "stop"})
+log.close()
+"""
+
+
+def test_a_write_that_hangs_does_not_keep_the_process_from_ending(tmp_path):
+    command = [sys.executable, "-c", HUNG_WRITER, tmp_path / "audit.jsonl"]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    assert "its last entries may be missing" in ended.stdout

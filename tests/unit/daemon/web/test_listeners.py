@@ -4,7 +4,7 @@ import stat
 import pytest
 
 from optodrive.core.errors import InputError
-from optodrive.daemon.web.listeners import open_unix_listener
+from optodrive.daemon.web.listeners import describe_exposure, open_unix_listener
 
 
 def test_a_socket_is_for_owner_and_group(tmp_path):
@@ -27,3 +27,13 @@ def test_a_live_socket_and_any_other_file_are_kept(tmp_path):
     assert (tmp_path / "file").read_text() == "kept"
     with pytest.raises(InputError, match="No such file"):
         open_unix_listener(tmp_path / "nowhere" / "s")
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
+def test_loopback_needs_no_warning(host):
+    assert describe_exposure(host) is None
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.7", "display.example", ""])
+def test_an_address_of_the_network_is_warned_of(host):
+    assert "other computers can reach the daemon" in describe_exposure(host)

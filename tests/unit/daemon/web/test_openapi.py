@@ -2,25 +2,13 @@
 
 import pytest
 
-from optodrive.core.clock import MonotonicClock
-from optodrive.daemon.one_process.engine import Engine
 from optodrive.daemon.responses.telemetry import EVENTS
-from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.api import build_app
-from optodrive.daemon.web.tokens import Tokens
-from optodrive.device.config import DaemonSection
-from optodrive.device.config_file import load_config
-from optodrive.link.transport.simulated import SimulatedBoard
-from optodrive.planning.display_model import DisplayModel
+from optodrive.daemon.web.route_table import RouteTable
 
 
 @pytest.fixture(scope="module")
-def document():
-    engine = Engine(
-        DisplayModel.from_config(load_config("display-16")), SimulatedBoard("", 1_000_000), MonotonicClock()
-    )
-    yield build_app(engine, AccessPolicy(Tokens(()), DaemonSection())).openapi()
-    engine.close()
+def document(app):
+    return app.openapi()
 
 
 def list_schemas(node):
@@ -89,3 +77,12 @@ def test_the_links_from_a_new_plan_lead_to_operations(document):
     operations = {operation["operationId"] for methods in document["paths"].values() for operation in methods.values()}
     links = document["paths"]["/v1/plans"]["post"]["responses"]["201"]["links"]
     assert {link["operationId"] for link in links.values()} < operations
+
+
+def test_every_operation_names_its_role_and_the_document_is_served(app, document, send):
+    roles = RouteTable(app.routes).roles
+    for path, methods in document["paths"].items():
+        for method, operation in methods.items():
+            assert operation["x-min-role"] == roles[f"{method.upper()} {path}"]
+    assert send("GET", "/openapi.json", "viewer").json() == document
+    assert send("GET", "/openapi.json", None).status_code == 401

@@ -1,8 +1,15 @@
 import pytest
+from fastapi import FastAPI
+from starlette.routing import Mount
 
 from optodrive.daemon.web.roles import ROLES, is_role_sufficient
-from optodrive.daemon.web.route_table import ROUTES, RouteTable
+from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.web.static_files import LOGIN_PATHS
+
+
+@pytest.fixture
+def table(app):
+    return RouteTable(app.routes)
 
 
 def test_each_role_may_do_what_the_lesser_ones_may():
@@ -21,8 +28,8 @@ def test_each_role_may_do_what_the_lesser_ones_may():
         ("WEBSOCKET", "/v1/stream", "WEBSOCKET /v1/stream"),
     ],
 )
-def test_a_request_is_found_by_its_template(method, path, key):
-    assert RouteTable(ROUTES).find(method, path).key == key
+def test_a_request_is_found_by_its_template(table, method, path, key):
+    assert table.find(method, path).key == key
 
 
 @pytest.mark.parametrize(
@@ -38,14 +45,40 @@ def test_a_request_is_found_by_its_template(method, path, key):
         ("GET", "/v1/health\n"),
     ],
 )
-def test_what_is_not_in_the_table_is_not_found(method, path):
-    assert RouteTable(ROUTES).find(method, path) is None
+def test_what_is_not_in_the_table_is_not_found(table, method, path):
+    assert table.find(method, path) is None
 
 
-def test_stop_asks_for_the_least_role_and_arm_for_the_highest():
-    assert ROUTES["POST /v1/stop"] == ROLES[0]
-    assert ROUTES["POST /v1/arm"] == ROLES[-1]
-    assert [key for key, minimum in ROUTES.items() if minimum is None] == [
+def test_stop_asks_for_the_least_role_and_arm_for_the_highest(table):
+    assert table.roles["POST /v1/stop"] == ROLES[0]
+    assert table.roles["POST /v1/arm"] == ROLES[-1]
+    assert {key for key, minimum in table.roles.items() if minimum is None} == {
         "GET /v1/health",
         *(f"GET {path}" for path in LOGIN_PATHS),
-    ]
+    }
+
+
+def test_routes_of_one_handler_keep_their_own_roles():
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    routes = RoleRoutes(app)
+
+    async def handler():
+        return None
+
+    routes.get("/a", None)(handler)
+    routes.post("/a", "armer")(handler)
+    assert RouteTable(app.routes).roles == {"GET /a": None, "POST /a": "armer"}
+
+
+def test_an_application_with_a_route_without_a_role_is_refused():
+    app = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
+    assert RouteTable(app.routes).roles == {}
+
+    @app.post("/v1/laser")
+    async def laser():
+        return {"on": True}
+
+    with pytest.raises(TypeError, match="/v1/laser states no role"):
+        RouteTable(app.routes)
+    with pytest.raises(TypeError, match="states no role"):
+        RouteTable([Mount("/files", FastAPI())])

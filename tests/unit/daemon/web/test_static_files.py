@@ -1,11 +1,13 @@
 """Who may have the page, and by what."""
 
 import asyncio
+from functools import partial
 
 import pytest
 
 from optodrive.daemon.web.access_middleware import AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.route_table import RouteTable
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
@@ -19,7 +21,7 @@ async def serve_inner(scope, receive, send):
     await send({"type": "http.response.body", "body": b"inside"})
 
 
-def send_request(path, method="GET", **headers):
+def request(app, path, method="GET", **headers):
     """Status, headers and body of what the guard lets through or answers itself."""
     sent = []
 
@@ -36,22 +38,27 @@ def send_request(path, method="GET", **headers):
         "path": path,
         "headers": [(name.encode(), value.encode()) for name, value in request_headers.items()],
     }
-    asyncio.run(AccessMiddleware(serve_inner, POLICY)(scope, receive, send))
-    lead_periods = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
-    return sent[0]["status"], lead_periods, sent[1]["body"]
+    asyncio.run(AccessMiddleware(serve_inner, POLICY, RouteTable(app.routes))(scope, receive, send))
+    response_headers = {name.decode(): value.decode() for name, value in sent[0]["headers"]}
+    return sent[0]["status"], response_headers, sent[1]["body"]
 
 
-def test_without_a_token_the_page_asks_for_it_and_the_api_answers_a_problem():
-    status, lead_periods, body = send_request("/")
-    assert (status, lead_periods["content-type"]) == (401, "text/html")
-    assert lead_periods["content-security-policy"] == SECURITY_HEADERS["Content-Security-Policy"]
+@pytest.fixture
+def send_request(app):
+    return partial(request, app)
+
+
+def test_without_a_token_the_page_asks_for_it_and_the_api_answers_a_problem(send_request):
+    status, response_headers, body = send_request("/")
+    assert (status, response_headers["content-type"]) == (401, "text/html")
+    assert response_headers["content-security-policy"] == SECURITY_HEADERS["Content-Security-Policy"]
     assert b"<form" in body
     assert send_request("/page/main.js")[0] == 401
-    status, lead_periods, _ = send_request("/v1/state")
-    assert (status, lead_periods["content-type"]) == (401, "application/problem+json")
+    status, response_headers, _ = send_request("/v1/state")
+    assert (status, response_headers["content-type"]) == (401, "application/problem+json")
 
 
-def test_the_cookie_opens_the_page_for_get_alone():
+def test_the_cookie_opens_the_page_for_get_alone(send_request):
     cookie = f"optodrive-8450={TOKEN}"
     assert send_request("/", cookie=cookie)[0] == 200
     assert send_request("/page/vendor/uplot/uPlot.esm.js", cookie=cookie)[0] == 200
@@ -61,22 +68,22 @@ def test_the_cookie_opens_the_page_for_get_alone():
 
 
 @pytest.mark.parametrize("cookie", ["optodrive-8450=wrong", "optodrive-8451=the-token", "optodrive-8450=", "=;=;", ""])
-def test_any_other_cookie_opens_nothing(cookie):
+def test_any_other_cookie_opens_nothing(send_request, cookie):
     assert send_request("/", cookie=cookie)[0] == 401
 
 
-def test_a_wrong_bearer_is_not_made_good_by_a_cookie():
+def test_a_wrong_bearer_is_not_made_good_by_a_cookie(send_request):
     assert send_request("/", cookie=f"optodrive-8450={TOKEN}", authorization="Bearer wrong")[0] == 401
     assert send_request("/", authorization=f"Bearer {TOKEN}")[0] == 200
 
 
-def test_a_foreign_host_or_origin_is_refused_with_the_cookie_too():
+def test_a_foreign_host_or_origin_is_refused_with_the_cookie_too(send_request):
     cookie = f"optodrive-8450={TOKEN}"
     assert send_request("/", cookie=cookie, host="elsewhere.example:8450")[0] == 421
     assert send_request("/", cookie=cookie, origin="http://elsewhere.example")[0] == 403
 
 
-def test_what_asks_for_the_token_is_open_and_holds_none():
+def test_what_asks_for_the_token_is_open_and_holds_none(send_request):
     for path in ("/page/login.js", "/page/login.css", "/page/colours.css"):
         assert send_request(path)[0] == 200
 

@@ -1,0 +1,105 @@
+// What plays, by whom and for how much longer, and what waits for the beam.
+
+import { call } from "./api.js";
+
+const TICK_MS = 200;
+
+export class QueueView {
+  constructor(find, announce, onError) {
+    this.title = find("playing-title");
+    this.idle = find("idle");
+    this.now = find("now");
+    this.list = find("queue");
+    this.announce = announce;
+    this.onError = onError;
+    this.rows = new Map();
+    this.running = null;
+    this.clear();
+    find("end").addEventListener("click", () => this.#cancel(this.running));
+    setInterval(() => this.#showTimeLeft(), TICK_MS);
+  }
+
+  // Show nothing: what plays is unknown.
+  clear(text = "") {
+    this.running = null;
+    this.now.hidden = true;
+    this.idle.hidden = false;
+    this.idle.textContent = text;
+    this.#showWaiting([]);
+  }
+
+  show(queue) {
+    const [first, ...others] = queue.active;
+    const isRunning = first?.plan === queue.running && first !== undefined;
+    this.idle.hidden = isRunning;
+    this.now.hidden = !isRunning;
+    this.idle.textContent = first ? "The next plan starts." : "Nothing plays.";
+    this.running = isRunning ? first : null;
+    this.at = performance.now();
+    if (isRunning) {
+      this.#showRunning(first);
+    }
+    this.#showWaiting(isRunning ? others : queue.active);
+  }
+
+  #showRunning(plan) {
+    const { now } = this;
+    now.querySelector(".plan").textContent = describe(plan);
+    const bar = now.querySelector("progress");
+    bar.max = Math.max(1, plan.planned);
+    bar.value = plan.executed;
+    now.querySelector("button").setAttribute("aria-label", `End ${describe(plan)}`);
+    this.#showTimeLeft();
+  }
+
+  #showTimeLeft() {
+    const plan = this.running;
+    if (plan) {
+      const leftS = Math.max(0, plan.ends_in_s - (performance.now() - this.at) / 1000);
+      this.now.querySelector(".left").textContent = `${plan.executed} of ${plan.planned} pulses, ${leftS.toFixed(1)} s left`;
+    }
+  }
+
+  // Waiting plans never change their order. Rows are kept, so that the focus stays on their button.
+  #showWaiting(plans) {
+    const waiting = new Set(plans.map((plan) => plan.plan));
+    for (const [id, row] of this.rows) {
+      if (!waiting.has(id)) {
+        const hadFocus = row.contains(document.activeElement);
+        row.remove();
+        this.rows.delete(id);
+        if (hadFocus) {
+          (this.list.querySelector("button") ?? this.title).focus();
+        }
+      }
+    }
+    for (const plan of plans) {
+      const row = this.rows.get(plan.plan) ?? this.#createRow(plan);
+      row.querySelector(".soft").textContent = `${plan.duration_s.toFixed(1)} s, starts in ${Math.max(0, plan.starts_in_s).toFixed(0)} s`;
+    }
+    this.list.hidden = plans.length === 0;
+  }
+
+  #createRow(plan) {
+    const row = document.createElement("li");
+    const text = Object.assign(document.createElement("span"), { className: "plan", textContent: describe(plan) });
+    const times = Object.assign(document.createElement("span"), { className: "soft" });
+    const button = Object.assign(document.createElement("button"), { type: "button", className: "quiet", textContent: "Cancel" });
+    button.setAttribute("aria-label", `Cancel ${describe(plan)}`);
+    button.addEventListener("click", () => this.#cancel(plan));
+    row.append(text, times, button);
+    this.list.append(row);
+    this.rows.set(plan.plan, row);
+    return row;
+  }
+
+  async #cancel(plan) {
+    if (plan) {
+      await call("DELETE", `/v1/plans/${plan.plan}`).then(() => this.announce(`${plan.plan} is cancelled.`), this.onError);
+    }
+  }
+}
+
+function describe(plan) {
+  return `${plan.plan} ${plan.name}${plan.caller ? ` by ${plan.caller}` : ""}`;
+}

@@ -1,0 +1,210 @@
+"""The page as an operator uses it beside a laser: STOP, states, plans, roles and history."""
+
+import re
+
+import pytest
+from playwright.sync_api import expect
+
+from rig import long_train, read_role_tokens, wait_for
+from test_page import arm
+
+STOP = "**/v1/stop"
+
+
+def press_escape(page):
+    """Press Escape and wait until STOP, which it must send, has been answered."""
+    with page.expect_response(STOP, timeout=5_000):
+        page.keyboard.press("Escape")
+    expect(page.locator("#stopping")).to_be_hidden()
+
+
+def test_escape_is_stop_while_any_control_is_open(visit, daemon):
+    page = visit(daemon).open()
+    arm(page)
+    for source in ("Draw", "Library"):
+        page.get_by_text(source, exact=True).click()
+        if source == "Library":
+            page.locator("#pattern").select_option("experiment-2")
+        controls = page.locator("main select, main input:not([type=file]), main button").locator("visible=true")
+        assert controls.count() > 5
+        for control in controls.element_handles():
+            if control.is_visible() and control.is_enabled():
+                control.click(force=True)  # the label of a radio button lies over it
+                press_escape(page)
+                expect(page.locator("#board-state")).to_have_text("DISARMED")
+
+
+def test_escape_is_stop_while_a_file_dialog_is_open(visit, daemon):
+    page = visit(daemon).open()
+    devtools = page.context.new_cdp_session(page)
+    devtools.send("Page.setInterceptFileChooserDialog", {"enabled": True, "cancel": True})
+    arm(page)
+    with page.expect_response(STOP, timeout=5_000):
+        page.locator("#picture").click()
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+
+
+def test_the_browsers_menu_takes_no_escape_while_the_laser_may_emit(visit, daemon):
+    page = visit(daemon).open()
+    page.evaluate("addEventListener('contextmenu', (event) => (window.wasPrevented = event.defaultPrevented))")
+    page.locator("#display").click(button="right")
+    assert page.evaluate("window.wasPrevented") is False
+    page.keyboard.press("Escape")
+    arm(page)
+    page.locator("#display").click(button="right")
+    assert page.evaluate("window.wasPrevented") is True
+    press_escape(page)
+
+
+ESTOP_AND_KEY = """
+[[step]]
+from = "light"
+at_s = 0.5
+set = "estop"
+value = true
+
+[[step]]
+from = "light"
+at_s = 1.5
+set = "key"
+value = false
+"""
+
+
+def read_look(page):
+    """Return what distinguishes a state in the header: word, outline of the sign, pattern of the border, ground."""
+    return page.evaluate("""() => {
+        const bar = document.getElementById("bar");
+        const style = getComputedStyle(bar);
+        return {
+            word: document.getElementById("board-state").textContent,
+            sign: document.getElementById("sign").getAttribute("d"),
+            border: style.borderImageSource,
+            ground: style.backgroundColor,
+        };
+    }""")
+
+
+def play_for(daemon, seconds, **fields):
+    return daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds), **fields)["plan"]
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_disarmed_armed_and_running_differ_in_the_whole_header(visit, daemon, scheme):
+    page = visit(daemon, color_scheme=scheme).open()
+    state = page.locator("#board-state")
+    expect(state).to_have_text("DISARMED")
+    looks = [read_look(page)]
+    arm(page)
+    looks.append(read_look(page))
+    play_for(daemon, 5.0)
+    expect(state).to_have_text("RUNNING")
+    looks.append(read_look(page))
+    for what in ("word", "sign", "border", "ground"):
+        assert len({look[what] for look in looks}) == 3, what
+    expect(page).to_have_title(re.compile("^RUNNING · "))
+    press_escape(page)
+    expect(state).to_have_text("DISARMED")
+    assert read_look(page) == looks[0]
+
+
+def test_lamps_show_the_safety_inputs_and_the_header_the_fault(visit, make_board, make_daemon):
+    board = make_board(script=ESTOP_AND_KEY)
+    daemon = make_daemon(board)
+    page = visit(daemon).open()
+    lamps = page.get_by_role("list", name="Safety inputs").get_by_role("listitem")
+    expect(lamps).to_have_text(["Interlock closed", "Key on", "E-stop released"])
+    daemon.arm()
+    play_for(daemon, 5.0)
+    expect(page.locator("#board-state")).to_have_text("FAULT")
+    expect(page.locator("#board-means")).to_have_text("ESTOP")
+    expect(lamps).to_have_text(["Interlock closed", "Key off", "E-stop pressed"])
+    assert [lamp.get_attribute("data-kind") for lamp in lamps.all()] == ["safe", "unsafe", "unsafe"]
+
+
+def test_a_link_that_goes_down_while_it_runs_shows_nothing_as_known(visit, make_board, make_daemon):
+    board = make_board()
+    daemon = make_daemon(board)
+    page = visit(daemon).open()
+    daemon.arm()
+    play_for(daemon, 10.0)
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    board.stop()
+    expect(page.locator("#board-state")).to_have_text("UNKNOWN")
+    expect(page.locator("#board-means")).to_have_text("no link to the board")
+    expect(page.locator("#lamps")).to_have_text(re.compile("Interlock unknown.*Key unknown.*E-stop unknown"))
+    state = daemon.state()
+    assert (state["link"]["state"], state["board"]["state"], state["board"]["fault"]) == ("down", "UNKNOWN", None)
+
+
+def test_what_plays_and_waits_is_named_and_can_be_cancelled(visit, daemon):
+    page = visit(daemon).open()
+    playing = page.get_by_role("region", name="Playing")
+    expect(playing).to_contain_text("Nothing plays.")
+    daemon.arm()
+    running, first, second = (play_for(daemon, seconds) for seconds in (8.0, 3.0, 4.0))
+    now = page.locator("#now")
+    expect(now.locator(".plan")).to_have_text(f"{running} push by armer")
+    expect(now.locator(".left")).to_have_text(re.compile(r"^[1-9]\d* of 400 pulses, [0-7]\.\d s left$"))
+    rows = page.get_by_role("list", name="Waiting plans").get_by_role("listitem")
+    expect(rows).to_have_count(2)
+    expect(rows.nth(0)).to_have_text(re.compile(f"^{first} push by armer3.0 s, starts in [5-8] s"))
+    page.get_by_role("button", name=f"Cancel {first} push").click()
+    expect(rows).to_have_count(1)
+    expect(rows).to_contain_text(second)
+    assert daemon.finished(first)["status"] == "cancelled"
+    page.get_by_role("button", name=f"End {running} push").click()
+    expect(now.locator(".plan")).to_have_text(f"{second} push by armer")
+    assert daemon.finished(running)["status"] == "cancelled"
+    assert daemon.board_state() in ("ARMED", "RUNNING")
+    press_escape(page)
+    expect(playing).to_contain_text("Nothing plays.")
+    expect(rows).to_have_count(0)
+
+
+def test_the_state_tells_whose_plans_run_and_wait(daemon):
+    daemon.arm()
+    running, waiting = play_for(daemon, 6.0), play_for(daemon, 2.0)
+    wait_for(lambda: daemon.state()["queue"]["active"][0]["executed"] > 10, "light")
+    queue = daemon.state()["queue"]
+    first, second = queue["active"]
+    assert (first["plan"], second["plan"], queue["running"], queue["waiting"]) == (running, waiting, running, 1)
+    assert (first["status"], second["status"]) == ("running", "queued")
+    assert {first["caller"], second["caller"], daemon.call("GET", f"/v1/plans/{waiting}")["caller"]} == {"armer"}
+    assert 0 < first["executed"] < first["planned"] == 300
+    assert first["starts_in_s"] < 0 < first["ends_in_s"] < 6.0
+    assert (
+        second["ends_in_s"] - second["starts_in_s"] == pytest.approx(second["duration_s"]) == pytest.approx(2, abs=0.1)
+    )
+    assert queue["plans"][-1] == {key: second[key] for key in queue["plans"][-1]}
+
+
+@pytest.mark.parametrize(
+    ("role", "refused"),
+    [
+        ("viewer", {"Arm …": "armer", "Disarm": "operator", "Preview": "operator", "End p": "operator"}),
+        ("operator", {"Arm …": "armer"}),
+        ("armer", {}),
+    ],
+)
+def test_the_role_is_shown_and_what_it_may_not_use_is_disabled(visit, daemon, axe, role, refused):
+    daemon.arm()
+    play_for(daemon, 20.0)
+    window = visit(daemon)
+    page = window.open(read_role_tokens(daemon)[role])
+    expect(page.locator("#caller")).to_have_text(role)
+    page.locator("#now").wait_for()
+    for name in ("Disarm", "Preview", "End p"):
+        button = page.get_by_role("button", name=name)
+        expect(button).to_be_disabled() if name in refused else expect(button).to_be_enabled()
+    reasons = page.locator(".reason").locator("visible=true").all_inner_texts()
+    assert len(reasons) == len(refused)
+    for required in refused.values():
+        assert any(f"needs the role {required}; token “{role}” has the role {role}." in text for text in reasons)
+    page.evaluate(axe)
+    assert page.evaluate("axe.run()")["violations"] == []
+    press_escape(page)
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    arming = page.get_by_role("button", name="Arm …")
+    expect(arming).to_be_disabled() if refused else expect(arming).to_be_enabled()
+    assert window.unexpected_errors() == []

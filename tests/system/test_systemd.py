@@ -1,0 +1,86 @@
+"""The service under a running systemd, with a simulated board."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import pytest
+
+from optodrive.core.kernels import code_folder
+from optodrive.device.config_file import locate_shipped
+from systemd_machine import ENVIRONMENT, PROGRAM, find_obstacle, machine_files, run_script
+
+DROP_IN = f"""[Service]
+# The simulated board is a pseudo-terminal.
+DeviceAllow=/dev/ptmx rw
+DeviceAllow=char-pts rw
+{ENVIRONMENT}
+"""
+SCRIPT = f"""
+say() {{ echo "$1=$(echo $2)"; }}
+show() {{ systemctl show optodrive --property "$1" --value; }}
+board() {{ OPTODRIVE_TOKENS=/var/lib/optodrive/tokens.toml {PROGRAM} status --json |
+    sed -n 's/.*"state": *"\\(DISARMED\\|ARMED\\|FAULT\\)".*/\\1/p' | head -1; }}
+has_restarted() {{ [ "$(show MainPID)" != "$1" ] && [ "$(show ActiveState)" = active ]; }}
+await_restart() {{ for i in $(seq 300); do has_restarted "$1" && return; sleep 0.1; done; }}
+systemd-sysusers optodrive.conf
+chown -R optodrive: /var/cache/optodrive
+systemctl daemon-reload
+systemctl start optodrive
+say started $?
+if [ "$(show ActiveState)" != active ]; then journalctl --no-pager >&2; exit 1; fi
+say active "$(show ActiveState)"
+say user "$(ps -o user= -p $(show MainPID))"
+say socket "$(stat -c '%U:%G %a' /run/optodrive/optodrive.sock)"
+say descriptors "$(show LimitNOFILE)"
+say board "$(board)"
+systemctl reload optodrive
+say reloaded $?
+sed -i 's/^damping =/dampin =/' /etc/optodrive/config.toml
+systemctl reload optodrive
+say reloaded_wrong $?
+say active_after_wrong "$(show ActiveState)"
+sed -i 's/^dampin =/damping =/' /etc/optodrive/config.toml
+first=$(show MainPID)
+kill -9 $first
+await_restart $first
+say restarts "$(show NRestarts)"
+say board_after_kill "$(board)"
+systemctl stop optodrive
+say stopped "$(show ActiveState) $(show Result)"
+journalctl -u optodrive -o cat --no-pager >&2
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_obstacle() is not None, reason=str(find_obstacle()))
+def test_the_service_starts_reloads_restarts_and_stops(tmp_path):
+    with machine_files(tmp_path) as root:
+        config = tmp_path / "mine.toml"
+        config.write_text(locate_shipped("display-437.toml").read_text())
+        command = [sys.executable, "-m", "optodrive.cli.main", "service", "install", "--program", PROGRAM]
+        subprocess.run([*command, "--root", root, "--config", config], check=True, capture_output=True)
+        drop_in = root / "etc/systemd/system/optodrive.service.d/board.conf"
+        drop_in.parent.mkdir()
+        drop_in.write_text(DROP_IN)
+        kernels = code_folder()
+        if kernels is not None:  # otherwise they would be compiled there, which takes a minute
+            shutil.copytree(kernels, root / "var/cache/optodrive/optodrive/kernels")
+        results, errors = run_script(root, SCRIPT)
+    said = dict(line.split("=", 1) for line in results.splitlines())
+    assert said == {
+        "started": "0",
+        "active": "active",
+        "user": "optodrive",
+        "socket": "optodrive:optodrive 660",
+        "descriptors": "16384",
+        "board": "DISARMED",
+        "reloaded": "0",
+        "reloaded_wrong": "1",
+        "active_after_wrong": "active",
+        "restarts": "1",
+        "board_after_kill": "DISARMED",
+        "stopped": "inactive success",
+    }, json.dumps(said) + errors
+    assert "dampin" in errors
