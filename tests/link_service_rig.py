@@ -3,30 +3,19 @@
 import itertools
 import zlib
 
-import numpy as np
-
-from displays import DISPLAYS
 from optodrive.core.clock import ManualClock
 from optodrive.core.ipc import Message
+from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.protocol.dac_codes import BipolarDac
-from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
 
-CONFIG = DISPLAYS["display-16"].config
+CONFIG = load_config("display-16")
 REQUIREMENTS = build_board_requirements(CONFIG)
 PLANNER, WEB, OPERATOR, SUPERVISOR = 1, 2, 3, 4
 STEP_S = 0.002
-CENTRE = BipolarDac(16).centre
-
-
-def build_points(count, duty, dark_us=2000, on_us=200):
-    """Return points that light the centre of the field. duty: tells the points of one push from those of another."""
-    table = np.array([(CENTRE, CENTRE, dark_us, on_us, duty)] * count, dtype=np.uint16).reshape(-1, 5)
-    return WirePoints(table, np.arange(count))
 
 
 class ServiceRig:

@@ -104,6 +104,20 @@ class LinkService:
         if reason:
             self.go_dark(reason)
 
+    @property
+    def planner(self) -> int | None:
+        """Number of the planner, None without one."""
+        return self._clients.planner
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the link to the board is up."""
+        return self._session.connected
+
+    def list_observers(self) -> tuple[int, ...]:
+        """Return the clients that must stay connected: all but operators."""
+        return self._clients.list_observers()
+
     def pop_outgoing(self) -> list[Outgoing]:
         """Return and remove the messages to send, in order."""
         outgoing, self._outgoing = self._outgoing, []
