@@ -31,7 +31,7 @@ def stop_board(path: Path, timeout_s: float = TIMEOUT_S) -> dict[str, Any] | Non
             result = _await_result(connection, deadline_s)
         except (OSError, IpcError) as error:
             raise LinkError(
-                f"stop was not answered by {path} ({error or type(error).__name__}): use the emergency stop or the key"
+                f"stop was not answered by {path} ({str(error) or type(error).__name__}): use the emergency stop or the key"
             ) from None
     if result["error"] is not None:
         raise build_error(result["error"])
