@@ -30,9 +30,8 @@ def stop_board(path: Path, timeout_s: float = TIMEOUT_S) -> dict[str, Any] | Non
             connection.sendall(encode_message(Message("stop", {"id": REQUEST_ID})))
             result = _await_result(connection, deadline_s)
         except (OSError, IpcError) as error:
-            raise LinkError(
-                f"stop was not answered by {path} ({str(error) or type(error).__name__}): use the emergency stop or the key"
-            ) from None
+            reason = str(error) or type(error).__name__
+            raise LinkError(f"stop was not answered by {path} ({reason}): use the emergency stop or the key") from None
     if result["error"] is not None:
         raise build_error(result["error"])
     return result
