@@ -21,12 +21,12 @@ STEP_S = 0.002
 class ServiceRig:
     """A link service with its board. log: events of the board; received: messages by client, oldest first."""
 
-    def __init__(self, on_web_loss="dark", link_type=MemoryLink, core=None, session_type=BoardSession):
+    def __init__(self, on_web_loss="dark", link_type=MemoryLink, settings=None, requirements=REQUIREMENTS):
         self.log = []
         self.clock = ManualClock(5.0)
-        self.core = core or BoardCore(sink=self.log.append, seed=3)
+        self.core = BoardCore(settings, sink=self.log.append, seed=3)
         self.link = link_type(self.core, self.clock)
-        self.session = session_type(self.link, self.clock, REQUIREMENTS)
+        self.session = BoardSession(self.link, self.clock, requirements)
         self.service = LinkService(self.session, self.clock, self.open_port, on_web_loss)
         self.received = {}
         self.alive = {}
@@ -78,17 +78,17 @@ class ServiceRig:
 
     # --- time
 
-    def run(self, duration_s=STEP_S):
+    def run(self, duration_s=STEP_S, step_s=STEP_S):
         until_s = self.clock.now_s() + duration_s
         while self.clock.now_s() < until_s:
             for client, alive in self.alive.items():
                 if alive is not None:
                     self.service.on_message(client, Message("beat", {"alive": alive}))
             before_s = self.clock.now_s()
-            self.service.step(STEP_S)
+            self.service.step(step_s)
             self.collect()
             if self.clock.now_s() == before_s:
-                self.clock.sleep(STEP_S)
+                self.clock.sleep(step_s)
 
     def until(self, condition, patience_s=12.0):
         give_up_s = self.clock.now_s() + patience_s

@@ -85,7 +85,7 @@ class LinkService:
                 self._command(client, message.kind, int(message.fields["id"]))
             else:
                 self._handover.carry_out(message)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise IpcError(f"message {message.kind!r}: {error!r}") from None
 
     def _on_hello(self, client: int, role: str, trusted: bool) -> None:
