@@ -3,41 +3,30 @@
 import itertools
 import zlib
 
-import numpy as np
-
-from displays import DISPLAYS
 from optodrive.core.clock import ManualClock
 from optodrive.core.ipc import Message
+from optodrive.device.config_file import load_config
 from optodrive.link.board_setup import build_board_requirements
-from optodrive.link.protocol.dac_codes import BipolarDac
-from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.service.link_service import LinkService
 from optodrive.link.session.session import BoardSession
 from optodrive.link.simulator.board_core import BoardCore
 from optodrive.link.simulator.memory_link import MemoryLink
 
-CONFIG = DISPLAYS["display-16"].config
+CONFIG = load_config("display-16")
 REQUIREMENTS = build_board_requirements(CONFIG)
 PLANNER, WEB, OPERATOR, SUPERVISOR = 1, 2, 3, 4
 STEP_S = 0.002
-CENTRE = BipolarDac(16).centre
-
-
-def build_points(count, duty, dark_us=2000, on_us=200):
-    """Return points that light the centre of the field. duty: tells the points of one push from those of another."""
-    table = np.array([(CENTRE, CENTRE, dark_us, on_us, duty)] * count, dtype=np.uint16).reshape(-1, 5)
-    return WirePoints(table, np.arange(count))
 
 
 class ServiceRig:
     """A link service with its board. log: events of the board; received: messages by client, oldest first."""
 
-    def __init__(self, on_web_loss="dark", link_type=MemoryLink, core=None, session_type=BoardSession):
+    def __init__(self, on_web_loss="dark", link_type=MemoryLink, settings=None, requirements=REQUIREMENTS):
         self.log = []
         self.clock = ManualClock(5.0)
-        self.core = core or BoardCore(sink=self.log.append, seed=3)
+        self.core = BoardCore(settings, sink=self.log.append, seed=3)
         self.link = link_type(self.core, self.clock)
-        self.session = session_type(self.link, self.clock, REQUIREMENTS)
+        self.session = BoardSession(self.link, self.clock, requirements)
         self.service = LinkService(self.session, self.clock, self.open_port, on_web_loss)
         self.received = {}
         self.alive = {}
@@ -89,17 +78,17 @@ class ServiceRig:
 
     # --- time
 
-    def run(self, duration_s=STEP_S):
+    def run(self, duration_s=STEP_S, step_s=STEP_S):
         until_s = self.clock.now_s() + duration_s
         while self.clock.now_s() < until_s:
             for client, alive in self.alive.items():
                 if alive is not None:
                     self.service.on_message(client, Message("beat", {"alive": alive}))
             before_s = self.clock.now_s()
-            self.service.step(STEP_S)
+            self.service.step(step_s)
             self.collect()
             if self.clock.now_s() == before_s:
-                self.clock.sleep(STEP_S)
+                self.clock.sleep(step_s)
 
     def until(self, condition, patience_s=12.0):
         give_up_s = self.clock.now_s() + patience_s

@@ -75,6 +75,11 @@ class HostConnection:
         return len(self._unacked) + len(self._queued)
 
     @property
+    def has_unsequenced(self) -> bool:
+        """Whether messages wait that go out at once, ABORT among them."""
+        return bool(self._control)
+
+    @property
     def counters(self) -> LinkCounters:
         """Error counters since the connection was created."""
         frame_counters = self._decoder.counters

@@ -85,7 +85,7 @@ class LinkService:
                 self._command(client, message.kind, int(message.fields["id"]))
             else:
                 self._handover.carry_out(message)
-        except (KeyError, TypeError, ValueError, OverflowError) as error:
+        except (LookupError, TypeError, ValueError, OverflowError) as error:
             raise IpcError(f"message {message.kind!r}: {error!r}") from None
 
     def _on_hello(self, client: int, role: str, trusted: bool) -> None:
@@ -103,6 +103,20 @@ class LinkService:
         reason = self._clients.remove(client)
         if reason:
             self.go_dark(reason)
+
+    @property
+    def planner(self) -> int | None:
+        """Number of the planner, None without one."""
+        return self._clients.planner
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the link to the board is up."""
+        return self._session.connected
+
+    def list_observers(self) -> tuple[int, ...]:
+        """Return the clients that must stay connected: all but operators."""
+        return self._clients.list_observers()
 
     def pop_outgoing(self) -> list[Outgoing]:
         """Return and remove the messages to send, in order."""

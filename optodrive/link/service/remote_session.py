@@ -219,10 +219,10 @@ class RemoteSession:
         self.likely_cause = None if fields["cause"] is None else LinkCause(*fields["cause"])
 
     def _update_clock(self, sample: list[float] | None, connected: bool) -> None:
-        if sample is None:
+        if sample is None or not connected:
             return
         midpoint_s, board_s = sample
-        if connected and not self.connected and self._clock_sample is not None:
+        if not self.connected and self._clock_sample is not None:
             now_s = self._clock.now_s()
             self._clock_shift_s = board_s + (now_s - midpoint_s) - self.board_s()
         self._clock_sample = midpoint_s, board_s

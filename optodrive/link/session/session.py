@@ -410,6 +410,8 @@ class BoardSession:
 
     def compute_wait_s(self) -> float:
         """Return the longest time for which the next step may wait if no bytes arrive, s."""
+        if self._connection.has_unsequenced:
+            return 0.0
         wait_s = WAIT_MAX_S
         if self.board.state in LEASED_STATES:
             wait_s = min(wait_s, 0.5 * RENEWAL_FRACTION * self._requirements.lease_s)

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 
-from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig, build_points
+from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.point_handover import EXECUTED
 from optodrive.link.service.remote_session import EXECUTED_RECORD
 from optodrive.link.service.results import build_error
+from wire_points import build_points
 
 DUTY = 1000
 

@@ -1,0 +1,198 @@
+"""The link process: python -m optodrive.link.service.process --settings FILE --supervisor DESCRIPTOR.
+
+It serves its socket and the board's port in one thread, and ends dark with its supervisor. SIGUSR1 is STOP, SIGTERM
+ends it.
+"""
+
+import argparse
+import ctypes
+import gc
+import select
+import signal
+import socket
+import sys
+import threading
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.clock import Clock, MonotonicClock, request_realtime_scheduling
+from optodrive.core.errors import InputError, OptodriveError
+from optodrive.link.service.client_sockets import ClientSockets
+from optodrive.link.service.link_service import LinkService
+from optodrive.link.service.settings import LinkSettings
+from optodrive.link.session.session import BoardSession
+from optodrive.link.transport.base import Transport
+from optodrive.link.transport.capturing_transport import CapturingTransport
+from optodrive.link.transport.link_capture import LinkCaptureWriter
+from optodrive.link.transport.registry import find_transport_factory
+
+PR_SET_PDEATHSIG = 1
+POLL_TRANSPORT_S = 0.001
+"""Interval at which a port without a descriptor is read."""
+OPENING_WAIT_S = 0.002
+CAPTURES_MAX = 1000
+
+
+class PortOpener:
+    """Opens a port in a thread, because a driver, or the start of a simulated board, may block for seconds."""
+
+    def __init__(self, transport: Transport) -> None:
+        self._transport = transport
+        self._thread: threading.Thread | None = None
+        self._error: Exception | None = None
+
+    def __call__(self) -> bool:
+        """Return whether the port is open, False while it needs more time. Raise the error of a failure."""
+        if self._thread is None:
+            self._error = None
+            self._thread = threading.Thread(target=self._open, name="open-port", daemon=True)
+            self._thread.start()
+        self._thread.join(OPENING_WAIT_S)
+        if self._thread.is_alive():
+            return False
+        self._thread = None
+        if self._error is not None:
+            raise self._error
+        return True
+
+    def _open(self) -> None:
+        try:
+            self._transport.open()
+        except Exception as error:  # raised in the loop's thread
+            self._error = error
+
+
+class LinkProcess:
+    """Loop over the port, the clients, the supervisor and signals."""
+
+    def __init__(self, settings: LinkSettings, transport: Transport, clock: Clock, supervisor: BeatWriter) -> None:
+        session = BoardSession(transport, clock, settings.requirements)
+        # Later than every epoch of an earlier link process, which began at most once per microsecond.
+        first_epoch = int(clock.now_s() * 1e6)
+        self._service = LinkService(session, clock, PortOpener(transport), settings.on_web_loss, first_epoch)
+        self._transport = transport
+        self._supervisor = supervisor
+        self._clients = ClientSockets(settings.socket_path, settings.socket_mode, self._service)
+        self._wakeup, self._wakeup_write = socket.socketpair()
+        self._ending = self._stop_requested = False
+
+    def install_signals(self) -> None:
+        """Let SIGUSR1 stop and SIGTERM end; ignore the terminal's signals, which the supervisor handles."""
+        self._wakeup.setblocking(False)
+        self._wakeup_write.setblocking(False)
+        signal.set_wakeup_fd(self._wakeup_write.fileno(), warn_on_full_buffer=False)
+        signal.signal(signal.SIGTERM, self._on_signal)
+        signal.signal(signal.SIGUSR1, self._on_signal)
+        for number in (signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, signal.SIG_IGN)
+
+    def _on_signal(self, number: int, frame: object) -> None:
+        if number == signal.SIGUSR1:
+            self._stop_requested = True
+        else:
+            self._ending = True
+
+    def run(self) -> None:
+        """Serve until SIGTERM or the end of the supervisor."""
+        self._supervisor.report_ready()
+        while not self._ending:
+            try:
+                self._run_once()
+            except SupervisorGoneError:
+                return
+
+    def _run_once(self) -> None:
+        port = self._transport.fileno()
+        poll = select.poll()
+        for descriptor in (self._supervisor.fileno(), self._wakeup.fileno()):
+            poll.register(descriptor, select.POLLIN)
+        if port is not None:
+            poll.register(port, select.POLLIN)
+        self._clients.register(poll)
+        is_polled = port is None and self._service.is_connected
+        wait_s = 0.0 if is_polled else self._service.compute_wait_s()
+        ready = {descriptor for descriptor, _ in poll.poll(wait_s * 1e3)}
+        if self._wakeup.fileno() in ready:
+            with suppress(BlockingIOError):
+                self._wakeup.recv(4096)
+        if self._stop_requested:
+            self._stop_requested = False
+            self._service.go_dark("ended by SIGUSR1")
+        self._clients.process(ready)
+        self._service.step(POLL_TRANSPORT_S if is_polled else 0.0)
+        self._clients.deliver()
+        self._supervisor.beat()
+        if self._supervisor.fileno() in ready:
+            self._supervisor.receive()
+
+    def close(self) -> None:
+        """Send ABORT to the board and close everything."""
+        self._service.close()
+        self._clients.close()
+        signal.set_wakeup_fd(-1)
+        self._wakeup.close()
+        self._wakeup_write.close()
+
+
+def end_with_parent() -> None:
+    """Request SIGTERM when the supervisor dies, besides the end of file on its channel."""
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+
+
+def open_capture(path: Path, clock: Clock, supervisor: BeatWriter) -> LinkCaptureWriter:
+    """Open a capture at the path, or with a number after a restart. Raise InputError if it cannot be written."""
+
+    def warn(line: str) -> None:
+        supervisor.send({"kind": "warning", "message": line})
+
+    for number in range(1, CAPTURES_MAX):
+        numbered = path if number == 1 else path.with_name(f"{path.stem}-{number}{path.suffix}")
+        if not numbered.exists():
+            return LinkCaptureWriter(numbered, clock.now_s(), warn)
+    raise InputError("--capture", str(path), "a name that is free: nothing is overwritten")
+
+
+def read_settings(path: Path) -> LinkSettings:
+    """Read the settings that the supervisor wrote. Raise InputError if that is impossible."""
+    try:
+        return LinkSettings.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError("--settings", str(path), f"the link process's settings ({error})") from None
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the link process; return its exit status."""
+    parser = argparse.ArgumentParser(prog="optodrive.link.service.process", description="Link process of the daemon.")
+    parser.add_argument("--settings", type=Path, required=True, help="file of the settings, JSON")
+    parser.add_argument("--supervisor", type=int, required=True, help="descriptor of the supervisor's channel")
+    options = parser.parse_args(arguments)
+    end_with_parent()
+    supervisor = BeatWriter(options.supervisor)
+    with ExitStack() as exit_stack:
+        exit_stack.callback(supervisor.close)
+        try:
+            settings, clock = read_settings(options.settings), MonotonicClock()
+            transport = find_transport_factory(settings.port)()
+            if settings.capture_path is not None:
+                capture = open_capture(settings.capture_path, clock, supervisor)
+                transport = CapturingTransport(transport, capture, clock)
+            process = LinkProcess(settings, transport, clock, supervisor)
+        except OptodriveError as error:
+            supervisor.report_failure(str(error), error.exit_status)
+            return error.exit_status
+        exit_stack.callback(process.close)
+        process.install_signals()
+        gc.collect()
+        gc.freeze()
+        request_realtime_scheduling()
+        try:
+            process.run()
+        except BaseException as error:
+            supervisor.report_failure(f"the link process failed: {error!r}")
+            raise
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,143 @@
+"""The real link process with a stand-in for its supervisor, and its clients."""
+
+import json
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import replace
+
+from optodrive.core.clock import MonotonicClock
+from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.device.config_file import load_config
+from optodrive.link.service.link_settings_builder import build_link_settings
+from optodrive.link.service.remote_session import RemoteSession
+from optodrive.link.transport.port_settings import PortSettings
+from rig import PATIENCE_S
+
+CONFIG = load_config("display-16")
+BEAT_INTERVAL_S = 0.05
+LINK_PROCESS = sys.executable, "-m", "optodrive.link.service.process"
+
+
+class LinkProcess:
+    """Link process on a board's port. ready_s: time from its start until it serves its socket."""
+
+    def __init__(self, folder, port, lease_s=1.0, **settings):
+        self.path = folder / "link.sock"
+        built = build_link_settings(CONFIG, self.path, 0o600, settings.pop("capture_path", None))
+        requirements = replace(
+            built.requirements,
+            lease_s=lease_s,
+            limits=replace(built.requirements.limits, lease_ms=round(lease_s * 1e3)),
+        )
+        built = replace(built, port=PortSettings("serial", str(port)), requirements=requirements, **settings)
+        file = folder / "link.json"
+        file.write_text(built.to_json())
+        self.supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        begin_s = time.monotonic()
+        self.process = subprocess.Popen(
+            [*LINK_PROCESS, "--settings", file, "--supervisor", str(channel.fileno())],
+            pass_fds=[channel.fileno()],
+            env=os.environ | {"OPENBLAS_NUM_THREADS": "1"},
+        )
+        channel.close()
+        self.supervisor.settimeout(PATIENCE_S)
+        self.reports = [self.receive_report()]
+        while self.reports[-1]["kind"] == "beat":
+            self.reports.append(self.receive_report())
+        self.ready_s = time.monotonic() - begin_s
+        self.clients, self.planner = [], None
+
+    def receive_report(self):
+        packet = self.supervisor.recv(256_000)
+        return json.loads(packet) if packet else {"kind": "end"}
+
+    def open_planner(self):
+        self.planner = RemoteSession(
+            build_link_settings(CONFIG, self.path, 0, None).requirements.scale, MonotonicClock()
+        )
+        self.planner.connect(self.path)
+        return self.planner
+
+    def open_client(self, role):
+        client = Client(self.path, role)
+        self.clients.append(client)
+        return client
+
+    def run(self, duration_s=BEAT_INTERVAL_S):
+        """Beat as planner and web, and process what arrives."""
+        until_s = time.monotonic() + duration_s
+        while True:
+            self.planner.beat(True)
+            for client in self.clients:
+                client.beat()
+            wait_s = min(BEAT_INTERVAL_S, until_s - time.monotonic())
+            watched = [item for item in (self.planner, *self.clients) if item.fileno() >= 0]
+            select.select(watched, [], [], max(0.0, wait_s))
+            self.planner.receive()
+            for client in self.clients:
+                client.receive()
+            if wait_s <= 0:
+                return
+
+    def until(self, condition, patience_s=PATIENCE_S):
+        give_up_s = time.monotonic() + patience_s
+        while not (result := condition()):
+            assert time.monotonic() < give_up_s, f"timed out: {self.planner.board} {self.planner.link_error}"
+            self.run(0.005)
+        return result
+
+    def await_result(self, client, kind):
+        request_id = client.request(kind)
+        return self.until(lambda: client.results.get(request_id))
+
+    def stop(self):
+        for client in (*self.clients, self.planner):
+            if client is not None:
+                client.close()
+        self.supervisor.close()
+        try:
+            self.process.wait(5)
+        except subprocess.TimeoutExpired:
+            self.process.send_signal(signal.SIGKILL)
+            raise
+
+
+class Client:
+    """Client with a role. status: latest status; results: by request."""
+
+    def __init__(self, path, role):
+        self.role, self.status, self.results = role, None, {}
+        self._socket = MessageSocket.connect(path)
+        self._socket.send(Message("hello", {"role": role}))
+        self._request_id = 0
+
+    def fileno(self):
+        return self._socket.fileno()
+
+    def request(self, kind):
+        self._request_id += 1
+        self._socket.send(Message(kind, {"id": self._request_id}))
+        return self._request_id
+
+    def beat(self):
+        if self.role == "web" and not self._socket.is_closed:
+            self._socket.send(Message("beat", {"alive": True}))
+
+    def receive(self):
+        try:
+            messages = self._socket.receive()
+        except IpcError:
+            return
+        for message in messages:
+            if message.kind == "status":
+                self.status = message.fields
+            elif message.kind == "result":
+                self.results[message.fields["id"]] = message.fields
+
+    def close(self):
+        self._socket.close()

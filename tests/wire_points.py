@@ -1,0 +1,11 @@
+"""Points for the link's tests, which no planner has made."""
+
+import numpy as np
+
+from optodrive.link.protocol.quantisation import CENTRE_CODE, WirePoints
+
+
+def build_points(count, duty, dark_us=2000, on_us=200):
+    """Return points that light the centre of the field. duty: tells the points of one push from those of another."""
+    table = np.array([(CENTRE_CODE, CENTRE_CODE, dark_us, on_us, duty)] * count, dtype=np.uint16).reshape(-1, 5)
+    return WirePoints(table, np.arange(count))
