@@ -1,0 +1,171 @@
+"""Telemetry as server-sent events: state, display, pulses, budget, fault.
+
+The planner process produces the display, pulses and budget events as text; this hub makes the state and fault events
+and distributes all of them. Readers pull: a slow reader receives the newest events when it is ready, and nothing waits
+for it.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import AsyncIterator, Callable
+from typing import NamedTuple
+
+from starlette.responses import StreamingResponse
+
+from optodrive.core.clock import Clock, MonotonicClock
+from optodrive.core.errors import NotReadyError
+from optodrive.core.ipc import Message
+from optodrive.core.json_model import JsonModel
+from optodrive.daemon.responses.state import StateReport
+from optodrive.daemon.responses.telemetry import FaultEvent
+
+DEFAULT_RATE_HZ = 30.0
+IDLE_RATE_HZ = 20.0
+READERS_MAX = 64
+STATE_PERIOD_S, PULSES_PERIOD_S = 0.5, 0.08
+BATCHES_MAX = 300
+"""Batches of pulses that are kept for slow readers."""
+PULSES_MAX = 6000
+"""Pulses of one event."""
+
+
+class EventStream(StreamingResponse):
+    """A response of server-sent events."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, events: AsyncIterator[bytes]) -> None:
+        super().__init__(events, headers={"Cache-Control": "no-store", "X-Content-Type-Options": "nosniff"})
+
+
+class _Batch(NamedTuple):
+    number: int
+    pulse_count: int
+    kind: str
+    text: str
+
+
+class TelemetryHub:
+    """Latest events for up to READERS_MAX readers. The web server's thread calls everything.
+
+    on_readers: called with the number of readers and their highest rate, 1/s, whenever they change
+    """
+
+    def __init__(self, clock: Clock | None = None) -> None:
+        self.on_readers: Callable[[int, float], None] = lambda readers, rate_hz: None
+        self._clock = clock or MonotonicClock()
+        self._rates_hz: list[float] = []
+        self._closed = False
+        self._latest: dict[str, tuple[int, str]] = {}
+        self._event_number = 0
+        self._batches: deque[_Batch] = deque(maxlen=BATCHES_MAX)
+        self._batch_number = 0
+        self._board_s = 0.0
+        self._state_due_s = -float("inf")
+        self._state_key: object = None
+        self._fault_key: object = None
+        self._is_busy = False
+
+    def close(self) -> None:
+        """End all event streams at their next event."""
+        self._closed = True
+
+    @property
+    def readers(self) -> tuple[int, float]:
+        """Number of readers and their highest rate, 1/s."""
+        return len(self._rates_hz), max(self._rates_hz, default=DEFAULT_RATE_HZ)
+
+    def require_capacity(self) -> None:
+        """Raise NotReadyError if there are too many readers."""
+        if len(self._rates_hz) >= READERS_MAX:
+            raise NotReadyError(f"{READERS_MAX} clients read the telemetry already")
+
+    # --- events -------------------------------------------------------------------------------------------------
+
+    def receive(self, message: Message) -> None:
+        """Take an event, or a batch of pulses, from the planner process."""
+        fields = message.fields
+        if message.kind == "telemetry":
+            self._is_busy = bool(fields["warm"] or fields["upcoming"])
+            self._set_latest(str(fields["event"]), message.payload.decode())
+        elif message.kind == "pulses":
+            self._batch_number += 1
+            self._board_s = fields["board_s"]
+            text = message.payload.decode()
+            self._batches.append(_Batch(self._batch_number, fields["count"], str(fields["batch"]), text))
+
+    def publish_state(self, state: StateReport) -> None:
+        """Make the state event if the state has changed or the event is due, and the fault event if that has changed.
+
+        Call it whenever a status of the link or planner process has arrived.
+        """
+        board, link, now_s = state.board, state.link, self._clock.now_s()
+        plans = tuple((plan.plan, plan.status) for plan in state.queue.plans)
+        key = (board.state, board.fault, board.inputs, link.state, state.planner.busy, plans)
+        if key != self._state_key or now_s >= self._state_due_s:
+            self._state_key, self._state_due_s = key, now_s + STATE_PERIOD_S
+            self._publish("state", state)
+        fault_key = board.fault, board.hint, link.error
+        if fault_key != self._fault_key:
+            self._fault_key = fault_key
+            fault, hint, link_error = fault_key
+            event = FaultEvent(board=board.state, link=link.state, fault=fault, hint=hint, link_error=link_error)
+            self._publish("fault", event)
+
+    def _publish(self, kind: str, event: JsonModel) -> None:
+        self._set_latest(kind, f"event: {kind}\ndata: {event.model_dump_json()}\n\n")
+
+    def _set_latest(self, kind: str, text: str) -> None:
+        self._event_number += 1
+        self._latest[kind] = self._event_number, text
+
+    # --- readers ------------------------------------------------------------------------------------------------
+
+    async def stream_events(self, rate_hz: float = DEFAULT_RATE_HZ) -> AsyncIterator[bytes]:
+        """Yield the new events for one reader every 1 / rate_hz seconds, until it disconnects."""
+        event_number = batch_number = 0
+        next_s, pulses_s = self._clock.now_s(), 0.0
+        self._add_reader(rate_hz)
+        try:
+            while not self._closed:
+                text = "".join(event for number, event in self._latest.values() if number > event_number)
+                event_number = self._event_number
+                now_s = self._clock.now_s()
+                if self._newest_batch > batch_number and now_s >= pulses_s:
+                    text += self._format_pulses_since(batch_number)
+                    batch_number, pulses_s = self._batch_number, now_s + PULSES_PERIOD_S
+                if text:
+                    yield text.encode()
+                is_busy = self._is_busy or self._newest_batch > batch_number
+                next_s = max(next_s + 1.0 / (rate_hz if is_busy else min(rate_hz, IDLE_RATE_HZ)), self._clock.now_s())
+                await asyncio.sleep(next_s - self._clock.now_s())
+        finally:
+            self._remove_reader(rate_hz)
+
+    @property
+    def _newest_batch(self) -> int:
+        """Number of the newest kept batch."""
+        return self._batches[-1].number if self._batches else 0
+
+    def _add_reader(self, rate_hz: float) -> None:
+        self._rates_hz.append(rate_hz)
+        self.on_readers(*self.readers)
+
+    def _remove_reader(self, rate_hz: float) -> None:
+        self._rates_hz.remove(rate_hz)
+        if not self._rates_hz:  # the planner repeats its batches for the next reader; its events will be newer
+            self._batches.clear()
+            self._latest = {kind: self._latest[kind] for kind in ("state", "fault") if kind in self._latest}
+        self.on_readers(*self.readers)
+
+    def _format_pulses_since(self, number: int) -> str:
+        """Format the event of all batches after a number, a `PulsesEvent`; of the newest if those are too many."""
+        texts: dict[str, list[str]] = {"planned": [], "executed": []}
+        pulses = 0
+        for batch in reversed(self._batches):
+            pulses += batch.pulse_count
+            if batch.number <= number or pulses > PULSES_MAX:
+                break
+            texts[batch.kind].insert(0, batch.text)
+        lists = ",".join(f'"{kind}":[{",".join(batches)}]' for kind, batches in texts.items())
+        return f'event: pulses\ndata: {{"board_s":{self._board_s:.6f},{lists}}}\n\n'
