@@ -110,6 +110,7 @@ class PlanQueue:
 
         Raise StoppedError if the epoch of its request has passed.
         """
+        self._session.receive()  # a STOP that has been answered is known from here on
         with self.lock:
             self.require_epoch(record.epoch)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.

@@ -25,7 +25,7 @@ def build_state(board="DISARMED", fault=None, error=None):
             "pixels": 16,
             "link": LINK | {"port": "p", "state": "down" if error else "up", "error": error},
             "board": BOARD | {"state": board, "fault": fault, "hint": ""},
-            "queue": {"waiting": 0, "running": None, "plans": []},
+            "queue": {"waiting": 0, "running": None, "active": [], "plans": []},
             "totals": {"planned": 0, "sent": 0, "executed": 0, "timing_error": None},
             "planner": {"busy": False, "alive": True},
         }
@@ -130,15 +130,15 @@ def test_a_slow_reader_gets_the_newest_pulses(monkeypatch):
 
 def test_the_planner_is_told_of_the_readers_and_their_highest_rate():
     async def scenario(hub):
-        told = []
-        hub.on_readers = lambda *readers: told.append(readers)
+        calls = []
+        hub.on_readers = lambda *readers: calls.append(readers)
         first, second = Reader(hub, 10.0), Reader(hub, 50.0)
         await asyncio.sleep(0.01)
         hub.receive(build_event("display", "old"))
         hub.receive(build_batch("old", [0]))
         await first.leave()
         await second.leave()
-        assert told == [(1, 10.0), (2, 50.0), (1, 50.0), (0, telemetry_hub.DEFAULT_RATE_HZ)]
+        assert calls == [(1, 10.0), (2, 50.0), (1, 50.0), (0, telemetry_hub.DEFAULT_RATE_HZ)]
         hub.publish_state(build_state())
         third = Reader(hub)
         await third.until(2)
