@@ -6,8 +6,9 @@ import pytest
 from playwright.sync_api import expect
 
 from rig import long_train, read_role_tokens, wait_for
-from test_page import arm
+from test_page import INTERLOCK, arm
 
+SAFE_INPUTS = 0b011  # interlock closed, key on, emergency stop released
 STOP = "**/v1/stop"
 
 
@@ -207,4 +208,34 @@ def test_the_role_is_shown_and_what_it_may_not_use_is_disabled(visit, daemon, ax
     expect(page.locator("#board-state")).to_have_text("DISARMED")
     arming = page.get_by_role("button", name="Arm …")
     expect(arming).to_be_disabled() if refused else expect(arming).to_be_enabled()
+    assert window.unexpected_errors() == []
+
+
+def test_faults_and_plans_stay_in_the_history_across_a_reload(visit, make_board, make_daemon):
+    daemon = make_daemon(make_board(script=INTERLOCK))
+    window = visit(daemon)
+    page = window.open()
+    faults = page.get_by_role("list", name="Faults").get_by_role("listitem")
+    plans = page.get_by_role("list", name="Plans").get_by_role("listitem")
+    expect(faults).to_have_text(["None."])
+    daemon.arm()
+    failed, waiting = play_for(daemon, 8.0), play_for(daemon, 1.0)
+    expect(faults).to_have_text([re.compile(r"^\d.*\d INTERLOCK: the interlock opened")])
+    expect(plans).to_have_text(
+        [
+            re.compile(rf"\d {waiting} push by armer: failed \(.*INTERLOCK.*\), 0 of 50 pulses$"),
+            re.compile(rf"\d {failed} push by armer: failed \(.*INTERLOCK.*\), [1-9]\d* of 400 pulses$"),
+        ]
+    )
+    wait_for(lambda: daemon.state()["board"]["inputs"] == SAFE_INPUTS, "the interlock to close")
+    page.get_by_role("button", name="Acknowledge").click()
+    expect(faults).to_have_count(2)
+    daemon.arm()
+    done = play_for(daemon, 0.2)
+    expect(plans.first).to_have_text(re.compile(f"{done} push by armer: done, 10 of 10 pulses"))
+    texts = [(item.all_inner_texts()) for item in (faults, plans)]
+    page.reload()
+    page.get_by_text("live", exact=True).wait_for()
+    page.wait_for_timeout(600)  # the state event, which must add nothing
+    assert [(item.all_inner_texts()) for item in (faults, plans)] == texts
     assert window.unexpected_errors() == []

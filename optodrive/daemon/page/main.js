@@ -10,6 +10,7 @@ import { Drawing } from "./draw.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
 import { Header } from "./header.js";
+import { History } from "./history.js";
 import { PatternLibrary } from "./patterns.js";
 import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
@@ -71,6 +72,7 @@ const arm = new ArmControl(find, announce, showError);
 const header = new Header(find, announce);
 const permissions = new Permissions(find);
 const status = new Status(find, () => arm.disarm(), () => permissions.apply());
+const pastEvents = new History(find);
 const queue = new QueueView(find, announce, showError);
 const library = new PatternLibrary(find, patterns, () => view.cursor);
 find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
@@ -206,6 +208,9 @@ telemetry.addEventListener("down", () => {
   header.showConnection("no daemon, trying again", "bad");
   header.showUnknown("no daemon");
   status.showNoDaemon();
+  if (!document.hidden) {
+    pastEvents.addNoDaemon();
+  }
   queue.clear("Unknown: the daemon does not answer.");
   showTitle();
   find("stale").hidden = false;
@@ -228,9 +233,13 @@ telemetry.addEventListener("state", ({ detail }) => {
   showTitle();
   status.showState(detail);
   queue.show(detail.queue);
+  pastEvents.showPlans(detail);
   arm.show(detail.link.state === "up" ? detail.board.state : "");
 });
-telemetry.addEventListener("fault", ({ detail }) => status.showFault(detail));
+telemetry.addEventListener("fault", ({ detail }) => {
+  status.showFault(detail);
+  pastEvents.addFault(detail);
+});
 telemetry.addEventListener("budget", ({ detail }) => gauges.show(detail.caps));
 telemetry.addEventListener("pulses", ({ detail }) => timeline.addPulses(detail));
 telemetry.addEventListener("display", ({ detail }) => {
