@@ -1,6 +1,7 @@
 """The page as an operator uses it beside a laser: STOP, states, plans, roles and history."""
 
 import re
+import signal
 
 import pytest
 from playwright.sync_api import expect
@@ -239,3 +240,60 @@ def test_faults_and_plans_stay_in_the_history_across_a_reload(visit, make_board,
     page.wait_for_timeout(600)  # the state event, which must add nothing
     assert [(item.all_inner_texts()) for item in (faults, plans)] == texts
     assert window.unexpected_errors() == []
+
+
+def read_focus(page):
+    return page.evaluate("document.activeElement.id")
+
+
+def test_confirm_follows_arm_and_the_focus_is_kept(visit, daemon):
+    page = visit(daemon).open()
+    page.get_by_role("button", name="Arm …").focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert read_focus(page) == "confirm-arm"
+    expect(page.locator("#confirm-arm")).to_be_hidden()  # the time is up
+    assert read_focus(page) == "arm"
+    assert daemon.board_state() == "DISARMED"
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert read_focus(page) == "arm"
+    expect(page.locator("#board-state")).to_have_text("ARMED")
+    assert read_focus(page) == "arm"
+    expect(page.get_by_role("button", name="Arm …")).to_be_disabled()
+    page.keyboard.press("Enter")
+    expect(page.locator("#confirm-arm")).to_be_hidden()
+    page.keyboard.press("Tab")
+    assert read_focus(page) == "disarm"
+
+
+def test_figures_that_stop_arriving_are_marked_as_stale(visit, make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    page = visit(daemon).open()
+    daemon.arm()
+    play_for(daemon, 20.0)
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    panels = [page.get_by_role("region", name=name) for name in ("Budgets", "Board", "Pulses", "Playing")]
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_be_hidden()
+    daemon.process.send_signal(signal.SIGSTOP)
+    expect(page.locator("#board-state")).to_have_text("UNKNOWN", timeout=2_900)  # before the connection counts as lost
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_have_text(re.compile(r"^stale since \d\d:\d\d:\d\d$"))
+    expect(page.locator("#idle")).to_contain_text("Unknown")
+    daemon.process.send_signal(signal.SIGCONT)
+    expect(page.locator("#board-state")).to_have_text("FAULT")
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_be_hidden()
+
+
+def test_without_a_link_the_boards_figures_and_the_budgets_are_stale(visit, make_board, make_daemon):
+    board = make_board()
+    page = visit(make_daemon(board)).open()
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    board.stop()
+    for name, is_stale in (("Board", True), ("Budgets", True), ("Playing", False)):
+        mark = page.get_by_role("region", name=name, exact=True).locator(".stale-mark")
+        expect(mark).to_be_visible() if is_stale else expect(mark).to_be_hidden()
+    expect(page.locator("#link")).to_have_text("live")
