@@ -105,7 +105,6 @@ class ConfigReloader:
         file = Path(daemon.tokens) if daemon.tokens else None
         tokens = self._access_policy.tokens if file is None else read_private_tokens(file)
         self._access_policy.update(tokens, daemon)
-        self._server.config.ws_max_size = daemon.body_max_bytes
         if self._access_policy.audit is not None:
             self._access_policy.audit.record({"event": "reloaded", "applied": reloaded, "waiting": waiting})
         return describe_reload(reloaded, waiting, file)

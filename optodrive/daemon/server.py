@@ -6,8 +6,6 @@ from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-import uvicorn
-
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import LinkError
 from optodrive.daemon.log import open_daemon_log
@@ -27,8 +25,6 @@ from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning.display_model import DisplayModel
-
-SHUTDOWN_GRACE_S = 2
 
 
 def run(
@@ -82,18 +78,7 @@ def run(
         if exposure is not None:
             log.warn(exposure)
         app = build_app(engine, access_policy)
-        server = Server(
-            uvicorn.Config(
-                app,
-                log_config=None,
-                access_log=False,
-                server_header=False,
-                proxy_headers=False,  # a client must not set its own address
-                timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
-                ws="websockets-sansio",
-                ws_max_size=config.daemon.body_max_bytes,
-            )
-        )
+        server = Server(app)
         log.attach_to_root_logger()
 
         def shut_down(*_: object) -> None:

@@ -1,13 +1,15 @@
 """The page as an operator uses it beside a laser: STOP, states, plans, roles and history."""
 
 import re
+import signal
 
 import pytest
 from playwright.sync_api import expect
 
 from rig import long_train, read_role_tokens, wait_for
-from test_page import arm
+from test_page import INTERLOCK, arm
 
+SAFE_INPUTS = 0b011  # interlock closed, key on, emergency stop released
 STOP = "**/v1/stop"
 
 
@@ -208,3 +210,90 @@ def test_the_role_is_shown_and_what_it_may_not_use_is_disabled(visit, daemon, ax
     arming = page.get_by_role("button", name="Arm …")
     expect(arming).to_be_disabled() if refused else expect(arming).to_be_enabled()
     assert window.unexpected_errors() == []
+
+
+def test_faults_and_plans_stay_in_the_history_across_a_reload(visit, make_board, make_daemon):
+    daemon = make_daemon(make_board(script=INTERLOCK))
+    window = visit(daemon)
+    page = window.open()
+    faults = page.get_by_role("list", name="Faults").get_by_role("listitem")
+    plans = page.get_by_role("list", name="Plans").get_by_role("listitem")
+    expect(faults).to_have_text(["None."])
+    daemon.arm()
+    failed, waiting = play_for(daemon, 8.0), play_for(daemon, 1.0)
+    expect(faults).to_have_text([re.compile(r"^\d.*\d INTERLOCK: the interlock opened")])
+    expect(plans).to_have_text(
+        [
+            re.compile(rf"\d {waiting} push by armer: failed \(.*INTERLOCK.*\), 0 of 50 pulses$"),
+            re.compile(rf"\d {failed} push by armer: failed \(.*INTERLOCK.*\), [1-9]\d* of 400 pulses$"),
+        ]
+    )
+    wait_for(lambda: daemon.state()["board"]["inputs"] == SAFE_INPUTS, "the interlock to close")
+    page.get_by_role("button", name="Acknowledge").click()
+    expect(faults).to_have_count(2)
+    daemon.arm()
+    done = play_for(daemon, 0.2)
+    expect(plans.first).to_have_text(re.compile(f"{done} push by armer: done, 10 of 10 pulses"))
+    texts = [(item.all_inner_texts()) for item in (faults, plans)]
+    page.reload()
+    page.get_by_text("live", exact=True).wait_for()
+    page.wait_for_timeout(600)  # the state event, which must add nothing
+    assert [(item.all_inner_texts()) for item in (faults, plans)] == texts
+    assert window.unexpected_errors() == []
+
+
+def read_focus(page):
+    return page.evaluate("document.activeElement.id")
+
+
+def test_confirm_follows_arm_and_the_focus_is_kept(visit, daemon):
+    page = visit(daemon).open()
+    page.get_by_role("button", name="Arm …").focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    assert read_focus(page) == "confirm-arm"
+    expect(page.locator("#confirm-arm")).to_be_hidden()  # the time is up
+    assert read_focus(page) == "arm"
+    assert daemon.board_state() == "DISARMED"
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    page.keyboard.press("Enter")
+    assert read_focus(page) == "arm"
+    expect(page.locator("#board-state")).to_have_text("ARMED")
+    assert read_focus(page) == "arm"
+    expect(page.get_by_role("button", name="Arm …")).to_be_disabled()
+    page.keyboard.press("Enter")
+    expect(page.locator("#confirm-arm")).to_be_hidden()
+    page.keyboard.press("Tab")
+    assert read_focus(page) == "disarm"
+
+
+def test_figures_that_stop_arriving_are_marked_as_stale(visit, make_board, make_daemon):
+    daemon = make_daemon(make_board())
+    page = visit(daemon).open()
+    daemon.arm()
+    play_for(daemon, 20.0)
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    panels = [page.get_by_role("region", name=name) for name in ("Budgets", "Board", "Pulses", "Playing")]
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_be_hidden()
+    daemon.process.send_signal(signal.SIGSTOP)
+    expect(page.locator("#board-state")).to_have_text("UNKNOWN", timeout=2_900)  # before the connection counts as lost
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_have_text(re.compile(r"^stale since \d\d:\d\d:\d\d$"))
+    expect(page.locator("#idle")).to_contain_text("Unknown")
+    daemon.process.send_signal(signal.SIGCONT)
+    expect(page.locator("#board-state")).to_have_text("FAULT")
+    for panel in panels:
+        expect(panel.locator(".stale-mark")).to_be_hidden()
+
+
+def test_without_a_link_the_boards_figures_and_the_budgets_are_stale(visit, make_board, make_daemon):
+    board = make_board()
+    page = visit(make_daemon(board)).open()
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    board.stop()
+    for name, is_stale in (("Board", True), ("Budgets", True), ("Playing", False)):
+        mark = page.get_by_role("region", name=name, exact=True).locator(".stale-mark")
+        expect(mark).to_be_visible() if is_stale else expect(mark).to_be_hidden()
+    expect(page.locator("#link")).to_have_text("live")

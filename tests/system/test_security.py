@@ -7,6 +7,7 @@ import resource
 import socket
 import subprocess
 import time
+from contextlib import ExitStack
 from functools import partial
 
 import httpx
@@ -225,6 +226,17 @@ def test_stop_does_not_wait_for_the_body(running, body):
 def test_a_host_that_begins_like_an_address_is_refused(running):
     given = send_raw(running, "GET /v1/health HTTP/1.1\r\nHost: [::1].evil\r\n\r\n")
     assert given.startswith("HTTP/1.1 421 ")
+
+
+def test_stop_gets_in_while_idle_connections_flood_the_daemon(running):
+    host, port = running.url.removeprefix("http://").split(":")
+    with ExitStack() as stack:
+        for _ in range(700):
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=10))
+        headers = build_bearer_header(read_role_tokens(running)["viewer"])
+        for _ in range(20):
+            assert httpx.post(f"{running.url}/v1/stop", headers=headers, timeout=5).status_code == 200
+    assert len(running.errors.read_bytes()) < 100_000
 
 
 def test_a_client_that_hangs_up_during_its_body_leaves_no_traceback(running):

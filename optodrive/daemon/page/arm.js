@@ -8,7 +8,7 @@ const CONFIRM_S = 5;
 export class ArmControl {
   constructor(find, announce, onError) {
     this.button = find("arm");
-    this.confirmation = find("confirm");
+    this.confirmButton = find("confirm-arm");
     this.countdown = find("confirm-left");
     this.status = find("arming");
     this.idleText = this.status.textContent;
@@ -16,7 +16,7 @@ export class ArmControl {
     this.onError = onError;
     this.state = "";
     this.button.addEventListener("click", () => this.#requestConfirmation());
-    find("confirm-arm").addEventListener("click", () => this.#confirm());
+    this.confirmButton.addEventListener("click", () => this.#confirm());
     find("disarm").addEventListener("click", () => this.disarm());
   }
 
@@ -24,7 +24,7 @@ export class ArmControl {
   show(state) {
     if (state !== this.state) {
       this.state = state;
-      this.button.disabled = state !== BoardState.DISARMED;
+      this.#setEnabled(state === BoardState.DISARMED);
       this.status.textContent =
         state === BoardState.ARMING
           ? "The indicator is on; the laser can emit after two seconds."
@@ -42,9 +42,17 @@ export class ArmControl {
     await call("POST", "/v1/disarm").catch(this.onError);
   }
 
+  // A button that is disabled loses the focus; this one keeps it and does nothing.
+  #setEnabled(enabled) {
+    this.button.setAttribute("aria-disabled", !enabled);
+  }
+
   #requestConfirmation() {
+    if (this.button.getAttribute("aria-disabled") === "true") {
+      return;
+    }
     this.deadline = performance.now() + CONFIRM_S * 1000;
-    this.confirmation.hidden = false;
+    this.confirmButton.hidden = this.countdown.hidden = false;
     this.announce("To arm the laser, press the button Confirm within five seconds.");
     clearInterval(this.timer);
     this.timer = setInterval(() => this.#updateCountdown(), 100);
@@ -62,16 +70,19 @@ export class ArmControl {
 
   #closeConfirmation() {
     clearInterval(this.timer);
-    this.confirmation.hidden = true;
+    if (document.activeElement === this.confirmButton) {
+      this.button.focus();
+    }
+    this.confirmButton.hidden = this.countdown.hidden = true;
   }
 
   async #confirm() {
-    if (this.confirmation.hidden || performance.now() > this.deadline) {
+    if (this.confirmButton.hidden || performance.now() > this.deadline) {
       return;
     }
     this.#closeConfirmation();
-    this.button.disabled = true;
+    this.#setEnabled(false);
     await call("POST", "/v1/arm").catch(this.onError);
-    this.button.disabled = this.state !== BoardState.DISARMED;
+    this.#setEnabled(this.state === BoardState.DISARMED);
   }
 }

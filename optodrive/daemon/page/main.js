@@ -7,9 +7,11 @@ import { setCapLabels } from "./caps.js";
 import { buildColourMap } from "./colours.js";
 import { DisplayView } from "./display.js";
 import { Drawing } from "./draw.js";
+import { Freshness } from "./freshness.js";
 import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
 import { Header } from "./header.js";
+import { History } from "./history.js";
 import { PatternLibrary } from "./patterns.js";
 import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
@@ -71,6 +73,17 @@ const arm = new ArmControl(find, announce, showError);
 const header = new Header(find, announce);
 const permissions = new Permissions(find);
 const status = new Status(find, () => arm.disarm(), () => permissions.apply());
+const panelOf = (id) => find(id).closest(".panel");
+const freshness = new Freshness(
+  {
+    state: [panelOf("now")],
+    board: [panelOf("figures")],
+    budget: [panelOf("gauges")],
+    display: [panelOf("display"), panelOf("timeline"), panelOf("trace")],
+  },
+  (source) => source === "state" && showNothingKnown("no data from the daemon"),
+);
+const pastEvents = new History(find);
 const queue = new QueueView(find, announce, showError);
 const library = new PatternLibrary(find, patterns, () => view.cursor);
 find("display-name").textContent = `${config.name}, ${grid.pixels} px`;
@@ -197,44 +210,72 @@ applyColourMap();
 onStimulusChange();
 view.canvas.toggleAttribute("data-editing", true);
 
+let isOff = false;
+let hasLink = false;
+mayEmit = () => !(telemetry.live && isOff);
+const showTitle = () => (document.title = `${header.state} · ${config.name} · optodrive`);
+showTitle();
+
+// The state is old: nothing on the page claims that the laser runs, or that it does not.
+function showNothingKnown(reason) {
+  isOff = false;
+  header.showUnknown(reason);
+  queue.clear(`Unknown: ${reason}.`);
+  arm.show("");
+  showTitle();
+}
+
 telemetry.addEventListener("up", () => {
-  header.showConnection("live", "good");
   permissions.load();
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {
   header.showConnection("no daemon, trying again", "bad");
-  header.showUnknown("no daemon");
+  freshness.lose();
+  showNothingKnown("no daemon");
   status.showNoDaemon();
-  queue.clear("Unknown: the daemon does not answer.");
-  showTitle();
+  if (!document.hidden) {
+    pastEvents.addNoDaemon();
+  }
   find("stale").hidden = false;
-  arm.show("");
 });
 telemetry.addEventListener("unauthorized", () => {
   header.showConnection("another token", "bad");
   status.showTokenChange();
 });
-const showTitle = () => (document.title = `${header.state} · ${config.name} · optodrive`);
-showTitle();
-let isOff = false;
-mayEmit = () => !(telemetry.live && isOff);
 telemetry.addEventListener("state", ({ detail }) => {
-  isOff = detail.link.state === "up" && !LEASED_STATES.includes(detail.board.state);
+  const isLinked = detail.link.state === "up";
+  isOff = isLinked && !LEASED_STATES.includes(detail.board.state);
   if (detail.display !== config.name || detail.pixels !== grid.pixels) {
     location.reload(); // the restarted daemon has another display
   }
+  header.showConnection("live", "good");
   header.showState(detail);
   showTitle();
   status.showState(detail);
   queue.show(detail.queue);
-  arm.show(detail.link.state === "up" ? detail.board.state : "");
+  pastEvents.showPlans(detail);
+  arm.show(isLinked ? detail.board.state : "");
+  hasLink = isLinked;
+  freshness.see("state");
+  if (isLinked) {
+    freshness.see("board");
+  }
 });
-telemetry.addEventListener("fault", ({ detail }) => status.showFault(detail));
-telemetry.addEventListener("budget", ({ detail }) => gauges.show(detail.caps));
+telemetry.addEventListener("fault", ({ detail }) => {
+  status.showFault(detail);
+  pastEvents.addFault(detail);
+});
+telemetry.addEventListener("budget", ({ detail }) => {
+  gauges.show(detail.caps);
+  if (hasLink) {
+    freshness.see("budget"); // without a link nobody knows what the board executes
+  }
+});
 telemetry.addEventListener("pulses", ({ detail }) => timeline.addPulses(detail));
 telemetry.addEventListener("display", ({ detail }) => {
   find("stale").hidden = true;
+  freshness.see("display");
   const fromTenths = (values) => Float32Array.from(values, (value) => value / 10);
   const [height, absorber] = [fromTenths(decodeUint16(detail.height)), fromTenths(decodeUint16(detail.absorber))];
   view.beamPath = find("beam").checked ? timeline.beamPath() : [];

@@ -4,6 +4,9 @@ It runs in front of the application, so that no new route can omit the checks.
 """
 
 import math
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from starlette.requests import ClientDisconnect
 
@@ -26,6 +29,9 @@ CALLER = "optodrive.caller"
 """Key in the ASGI scope of the token that the request presented."""
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
+STREAMS = ("GET /v1/telemetry", "WEBSOCKET /v1/stream")
+STREAMS_PER_CALLER_MAX = 16
+"""Streams that the same token may have open from the same address."""
 
 
 class AccessMiddleware:
@@ -35,6 +41,7 @@ class AccessMiddleware:
         self._app = app
         self._policy = policy
         self._table = table
+        self._streams = StreamCounter()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send a refusal, or forward the request."""
@@ -46,8 +53,10 @@ class AccessMiddleware:
         if problem is None and request.route is not None and request.route.key == ARM:
             problem = await self._record_intent(request)
         if problem is None:
-            await self._forward(request, scope, receive, send)
-            return
+            with self._streams.count(request) as problem:
+                if problem is None:
+                    await self._forward(request, scope, receive, send)
+                    return
         self._policy.refusals.record(
             problem.code, request.audit_fields | request.provenance | {"status": problem.status}
         )
@@ -92,6 +101,32 @@ class AccessMiddleware:
     def _record(self, request: RequestContext, fields: dict[str, object]) -> None:
         if self._policy.audit is not None and request.route is not None and request.route.is_audited:
             self._policy.audit.record(request.audit_fields | fields)
+
+
+class StreamCounter:
+    """Bounds the streams, which have no end of their own, that one caller has open."""
+
+    def __init__(self) -> None:
+        self._open: Counter[tuple[str, str]] = Counter()
+
+    @contextmanager
+    def count(self, request: RequestContext) -> Iterator[Problem | None]:
+        """Count a request while it is served, if it is a stream. Yield why it is refused."""
+        if request.route is None or request.route.key not in STREAMS:
+            yield None
+            return
+        caller = request.token.name, request.address
+        if self._open[caller] >= STREAMS_PER_CALLER_MAX:
+            detail = f"this caller has {STREAMS_PER_CALLER_MAX} streams open; close one"
+            yield build_problem(429, "too_many_streams", "Too many streams", detail, retry_after_s=1.0)
+            return
+        self._open[caller] += 1
+        try:
+            yield None
+        finally:
+            self._open[caller] -= 1
+            if not self._open[caller]:
+                del self._open[caller]
 
 
 class _StatusRecorder:

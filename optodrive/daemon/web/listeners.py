@@ -10,6 +10,7 @@ from pathlib import Path
 from optodrive.core.errors import InputError
 
 SOCKET_MODE = 0o660
+BACKLOG = 1024
 
 
 def open_tcp_listener(host: str, port: int) -> socket.socket:
@@ -20,7 +21,7 @@ def open_tcp_listener(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        listener.listen()  # connections are accepted from the line that prints the address on
+        listener.listen(BACKLOG)  # connections are accepted from the line that prints the address on
     except OSError as error:
         listener.close()
         raise InputError("daemon.port", port, f"a free port on {host} ({error.strerror})") from None
@@ -56,7 +57,7 @@ def open_unix_listener(path: Path) -> socket.socket:
             listener.bind(str(path))
         finally:
             os.umask(previous_umask)
-        listener.listen()
+        listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         reason = error.strerror or error

@@ -1,11 +1,24 @@
-"""The web server, with signal handling left to the daemon."""
+"""The web server: uvicorn with bounded connections, STOP first, and signal handling left to the daemon."""
 
 import asyncio
+import resource
 import socket
+import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 import uvicorn
+
+from optodrive.daemon.web.acceptor import Acceptor
+from optodrive.daemon.web.bounded_http import BoundedHttp
+from optodrive.daemon.web.bounded_websocket import MESSAGE_MAX_BYTES, BoundedWebSocket
+from optodrive.daemon.web.connections import PHASE_MAX_S, Connections
+from optodrive.daemon.web.request_limits import App
+from optodrive.daemon.web.server_state import ServerState
+from optodrive.daemon.web.stop_first_selector import StopFirstSelector
+
+SHUTDOWN_GRACE_S = 2
+DESCRIPTORS_MIN = 1024
 
 
 class Server(uvicorn.Server):
@@ -14,6 +27,33 @@ class Server(uvicorn.Server):
     on_ready: Callable[[], None] = staticmethod(lambda: None)
     loop: asyncio.AbstractEventLoop | None = None
 
+    def __init__(self, app: App) -> None:
+        super().__init__(
+            uvicorn.Config(
+                app,
+                http=BoundedHttp,
+                ws=BoundedWebSocket,
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,  # a client must not set its own address
+                timeout_graceful_shutdown=SHUTDOWN_GRACE_S,
+                timeout_keep_alive=round(PHASE_MAX_S["idle"]),
+                ws_max_size=MESSAGE_MAX_BYTES,
+                ws_per_message_deflate=False,  # a small frame could need any amount of memory
+            )
+        )
+        self._selector = StopFirstSelector()
+        self._connections = Connections(time.monotonic)
+        self.server_state: ServerState = ServerState(self._connections, self._selector)
+        self._acceptor: Acceptor | None = None
+
+    def run(self, sockets: list[socket.socket] | None = None) -> None:
+        """Serve on listening sockets until `should_exit`."""
+        _raise_descriptor_limit()
+        with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(self._selector)) as runner:
+            runner.run(self.serve(sockets=sockets))
+
     @contextmanager
     def capture_signals(self) -> Iterator[None]:
         """Capture no signals."""
@@ -21,6 +61,30 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept requests."""
-        await super().startup(sockets)
+        await super().startup(sockets=[])
         self.loop = asyncio.get_running_loop()
+        self._acceptor = Acceptor(sockets or [], self._selector, self._connections, self._create_protocol)
+        self._acceptor.start()
         self.on_ready()
+
+    def _create_protocol(self) -> asyncio.Protocol:
+        return BoundedHttp(self.config, self.server_state, self.lifespan.state)
+
+    async def on_tick(self, counter: int) -> bool:
+        """Close connections that take too long. Return whether the server must end."""
+        self._connections.close_expired()
+        return await super().on_tick(counter)
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """End all connections."""
+        if self._acceptor is not None:
+            self._acceptor.close()
+        await super().shutdown(sockets)
+
+
+def _raise_descriptor_limit() -> None:
+    """Permit a descriptor for every connection that the bounds allow, if the system does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < DESCRIPTORS_MIN:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (min(DESCRIPTORS_MIN, hard), hard))

@@ -15,7 +15,7 @@ from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.state import QueuedPlan, QueueReport, StateReport
+from optodrive.daemon.responses.state import PulseTotals, QueuedPlan, QueueReport, RecentPlan, StateReport
 from optodrive.daemon.responses.telemetry import (
     BudgetEvent,
     CapUsage,
@@ -33,6 +33,7 @@ VARIABLES = {
     "api.js": {"problem": Problem},
     "gauges.js": {"cap": CapUsage},
     "grid.js": {"config": EffectiveConfig, "display": EffectiveConfig.model_fields["display"].annotation},
+    "history.js": {"fault": FaultEvent, "plan": RecentPlan, "queue": QueueReport, "totals": PulseTotals},
     "main.js": {"config": EffectiveConfig, "pulses": PulseColumns},
     "patterns.js": {"pattern": PatternDescription, "parameter": PatternParameter},
     "permissions.js": {"caller": CallerReport},

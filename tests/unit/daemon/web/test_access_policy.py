@@ -3,14 +3,21 @@
 import asyncio
 import json
 import logging
+import re
+from contextlib import ExitStack
 
 import pytest
 from starlette.requests import ClientDisconnect
 
-from optodrive.daemon.web.access_middleware import AccessMiddleware
+from optodrive.daemon.web.access_middleware import (
+    STREAMS,
+    STREAMS_PER_CALLER_MAX,
+    AccessMiddleware,
+    StreamCounter,
+)
 from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.web.audit import AuditLog
-from optodrive.daemon.web.route_table import RouteTable
+from optodrive.daemon.web.route_table import Route, RouteTable
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
 
@@ -170,3 +177,26 @@ def test_a_client_that_hangs_up_during_its_body_is_no_error(audited, caplog):
         assert audited("POST", "/v1/plans", "bob", first_message="http.disconnect") is None
     (entry,) = audited.read()
     assert (entry["event"], entry["hung_up"], entry["status"]) == ("answered", True, None)
+
+
+def test_the_streams_of_one_caller_are_bounded():
+    counter = StreamCounter()
+
+    def ask(token, key, address="127.0.0.1"):
+        method, _, path = key.partition(" ")
+        return RequestContext(method, path, {}, address, token, Route(key, "viewer", method, re.compile(path)))
+
+    eve, bob = TOKENS.all
+    with ExitStack() as stack:
+        for _ in range(STREAMS_PER_CALLER_MAX):
+            assert stack.enter_context(counter.count(ask(eve, "GET /v1/telemetry"))) is None
+        for key in STREAMS:
+            assert stack.enter_context(counter.count(ask(eve, key))).code == "too_many_streams"
+        for request in (
+            ask(bob, "GET /v1/telemetry"),
+            ask(eve, "GET /v1/telemetry", "10.0.0.1"),
+            ask(eve, "GET /v1/state"),
+        ):
+            assert stack.enter_context(counter.count(request)) is None
+    with counter.count(ask(eve, "WEBSOCKET /v1/stream")) as problem:
+        assert problem is None

@@ -1,0 +1,96 @@
+// History of faults and plans since the page was opened in this tab; a reload keeps it.
+
+const FAULTS_MAX = 50;
+const PLANS_MAX = 50;
+const STORE = "history";
+const TIME = new Intl.DateTimeFormat(undefined, { timeStyle: "medium", hourCycle: "h23" });
+const FRAME_NAME = /^frame \d+$/; // of a streamed frame, as the daemon names its plan
+
+export class History {
+  constructor(find) {
+    this.lists = { faults: find("fault-history"), plans: find("plan-history") };
+    this.entries = { faults: [], plans: [] };
+    this.planned = 0;
+    this.#restore();
+    this.#show("faults");
+    this.#show("plans");
+  }
+
+  addFault(fault) {
+    if (fault.link === "down") {
+      this.#addFault("bad", `No link to the board${fault.link_error ? `: ${fault.link_error}` : ""}`);
+    } else if (fault.fault) {
+      this.#addFault("bad", `${fault.fault}: ${fault.hint}`);
+    } else if (this.entries.faults[0]?.kind === "bad") {
+      this.#addFault("good", "No fault, the link is up");
+    }
+  }
+
+  addNoDaemon() {
+    this.#addFault("bad", "The daemon does not answer");
+  }
+
+  showPlans({ queue, totals }) {
+    if (totals.planned < this.planned) {
+      this.entries.plans.forEach((entry) => (entry.plan = null)); // a restarted daemon numbers its plans anew
+    }
+    this.planned = totals.planned;
+    let changed = false;
+    for (const plan of queue.plans) {
+      changed = this.#updatePlan(plan) || changed;
+    }
+    if (changed) {
+      this.#show("plans");
+    }
+  }
+
+  #updatePlan(plan) {
+    const isFrame = FRAME_NAME.test(plan.name);
+    const [newest] = this.entries.plans;
+    let entry = this.entries.plans.find((each) => each.plan === plan.plan);
+    if (!entry && isFrame && newest?.stream === plan.caller) {
+      entry = newest; // one entry for the frames of a stream
+    }
+    if (!entry) {
+      entry = { at: Date.now(), kind: "", text: "", plan: plan.plan, stream: isFrame ? plan.caller : null };
+      this.entries.plans.unshift(entry);
+      this.entries.plans.splice(PLANS_MAX);
+    } else if (entry.stream !== null && Number(plan.plan.slice(1)) < Number(entry.plan.slice(1))) {
+      return false; // an earlier frame of the stream
+    }
+    const by = plan.caller ? ` by ${plan.caller}` : "";
+    const cause = plan.error ? ` (${plan.error})` : "";
+    const text = `${plan.plan} ${plan.name}${by}: ${plan.status}${cause}, ${plan.executed} of ${plan.planned} pulses`;
+    const changed = entry.text !== text;
+    Object.assign(entry, { plan: plan.plan, text, kind: plan.status === "failed" ? "bad" : "" });
+    return changed;
+  }
+
+  #addFault(kind, text) {
+    if (this.entries.faults[0]?.text !== text) {
+      this.entries.faults.unshift({ at: Date.now(), kind, text });
+      this.entries.faults.splice(FAULTS_MAX);
+      this.#show("faults");
+    }
+  }
+
+  #show(name) {
+    const rows = this.entries[name].map(({ at, kind, text }) => {
+      const row = Object.assign(document.createElement("li"), { className: kind });
+      row.append(Object.assign(document.createElement("time"), { textContent: TIME.format(at) }), ` ${text}`);
+      return row;
+    });
+    this.lists[name].replaceChildren(...(rows.length ? rows : [Object.assign(document.createElement("li"), { textContent: "None." })]));
+    sessionStorage.setItem(STORE, JSON.stringify({ ...this.entries, planned: this.planned }));
+  }
+
+  #restore() {
+    try {
+      const { faults, plans, planned } = JSON.parse(sessionStorage.getItem(STORE));
+      this.entries = { faults, plans };
+      this.planned = planned;
+    } catch {
+      // Nothing is kept yet.
+    }
+  }
+}

@@ -1,0 +1,123 @@
+"""The WebSocket protocol of the web server: bounded messages, fragments and control frames.
+
+What a client sends is parsed in small slices. Control frames and fragments, which carry no message by themselves, are
+paced; what exceeds the pace waits in the client's socket.
+"""
+
+import asyncio
+from typing import Any, cast
+
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
+
+from optodrive.daemon.web.connections import PhaseOfRequest
+from optodrive.daemon.web.server_state import ServerState
+
+MESSAGE_MAX_BYTES = 262_144
+FRAGMENTS_MAX = 64
+"""Fragments of one message."""
+SLICE_BYTES = 1024
+SLICES_PER_TURN = 16
+READ_BYTES = 16_384
+FRAMES_PER_S, FRAMES_BURST = 50.0, 100.0
+"""Pace of control frames and fragments."""
+TOO_BIG = 1009
+
+
+class BoundedWebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's protocol with bounded and paced input."""
+
+    _pump_handle: asyncio.Handle | None = None
+
+    def __init__(self, server_state: ServerState, **options: Any) -> None:
+        super().__init__(server_state=server_state, **options)
+        self._state = server_state
+        self._unparsed = bytearray()
+        self._allowance = FRAMES_BURST
+        self._allowance_s = self.loop.time()
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Replace the HTTP protocol in the table of open connections."""
+        super().connection_made(transport)
+        cast(Any, transport).max_size = READ_BYTES
+        self._state.clients.add(self.transport, self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Remove the connection."""
+        self._state.forget(self.transport)
+        if self._pump_handle is not None:
+            self._pump_handle.cancel()
+        super().connection_lost(exc)
+
+    def get_phase(self) -> PhaseOfRequest:
+        """Return the present phase."""
+        return PhaseOfRequest("stream" if self.writable.is_set() else "stalled")
+
+    def resume_writing(self) -> None:
+        """Continue to parse once the client reads again."""
+        super().resume_writing()
+        self._pump()
+
+    def data_received(self, data: bytes) -> None:
+        """Parse the handshake at once, and frames at their pace; read no more until they are parsed."""
+        if not self.handshake_initiated:
+            super().data_received(data)
+            return
+        self._unparsed += data
+        self.transport.pause_reading()
+        self._pump()
+
+    async def receive(self) -> Any:
+        """Return the next message, and continue to parse once the application has taken all."""
+        message = await self.queue.get()
+        if self.read_paused and self.queue.empty():
+            self.read_paused = False
+            self._pump()
+        return message
+
+    def _pump(self) -> None:
+        """Parse what has been read until a message is complete, the pace is exceeded or the turn is over."""
+        if self._pump_handle is not None:
+            self._pump_handle.cancel()
+            self._pump_handle = None
+        for _ in range(SLICES_PER_TURN):
+            if self.read_paused or not self.writable.is_set() or self.transport.is_closing():
+                return
+            if not self._unparsed:
+                self.transport.resume_reading()
+                return
+            wait_s = self._compute_wait_s()
+            if wait_s > 0.0:
+                self._pump_handle = self.loop.call_later(wait_s, self._pump)
+                return
+            piece = bytes(self._unparsed[:SLICE_BYTES])
+            del self._unparsed[:SLICE_BYTES]
+            super().data_received(piece)
+        self._pump_handle = self.loop.call_soon(self._pump)
+
+    def _compute_wait_s(self) -> float:
+        now_s = self.loop.time()
+        self._allowance = min(FRAMES_BURST, self._allowance + (now_s - self._allowance_s) * FRAMES_PER_S)
+        self._allowance_s = now_s
+        return max(0.0, -self._allowance / FRAMES_PER_S)
+
+    def handle_ping(self) -> None:
+        """Answer a ping, at its pace."""
+        self._allowance -= 1.0
+        super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take a pong, at its pace."""
+        self._allowance -= 1.0
+        super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        """Add a fragment; close the connection if its message has too many."""
+        self._allowance -= 1.0
+        if self.close_sent:
+            return
+        if len(self.frames) >= FRAGMENTS_MAX:
+            self.conn.fail(TOO_BIG, f"more than {FRAGMENTS_MAX} fragments")
+            self.handle_parser_exception()
+            return
+        super().handle_cont(event)

@@ -1,0 +1,24 @@
+"""State that the web server shares with the protocols of its connections."""
+
+import asyncio
+
+import uvicorn.server
+
+from optodrive.daemon.web.connections import Connections
+from optodrive.daemon.web.stop_first_selector import StopFirstSelector
+
+
+class ServerState(uvicorn.server.ServerState):
+    """uvicorn's state with the table of open connections."""
+
+    def __init__(self, clients: Connections, selector: StopFirstSelector) -> None:
+        super().__init__()
+        self.clients = clients
+        self.selector = selector
+
+    def forget(self, transport: asyncio.Transport) -> None:
+        """Remove a connection that is about to be closed."""
+        self.clients.remove(transport)
+        sock = transport.get_extra_info("socket")
+        if sock is not None:
+            self.selector.remove_client(sock.fileno())

@@ -1,0 +1,58 @@
+"""The selector of the web server's loop: few clients per turn, those that request STOP first.
+
+asyncio serves everything that is ready before it polls its sockets again. With hundreds of busy clients such a turn
+takes a tenth of a second, for which a STOP that has just arrived would wait.
+"""
+
+import selectors
+import socket
+from collections.abc import Iterable
+
+CLIENTS_PER_TURN = 6
+STOP_LINE = b"POST /v1/stop"
+
+
+def is_stop(sock: socket.socket) -> bool:
+    """Return whether the bytes that wait in a socket begin with a request for STOP. They stay there."""
+    try:
+        return sock.recv(len(STOP_LINE), socket.MSG_PEEK | socket.MSG_DONTWAIT) == STOP_LINE
+    except OSError:
+        return False
+
+
+class StopFirstSelector(selectors.EpollSelector):
+    """A selector that defers clients beyond the first of a turn; their sockets stay ready for the next turn."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._clients: dict[int, socket.socket] = {}
+        self._deferred: dict[int, None] = {}
+
+    def add_client(self, sock: socket.socket) -> None:
+        """Defer the input of a socket if too many clients are ready."""
+        self._clients[sock.fileno()] = sock
+
+    def remove_client(self, fileno: int) -> None:
+        """Forget a socket that is about to be closed."""
+        self._clients.pop(fileno, None)
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        """Return what is ready: everything but clients, STOP first, then the clients that have waited longest."""
+        ready = super().select(timeout)
+        if len(ready) <= CLIENTS_PER_TURN:
+            return ready
+        clients = {key.fd: (key, events) for key, events in ready if self._is_input(key.fd, events)}
+        others = [(key, events) for key, events in ready if key.fd not in clients]
+        chosen = self._choose(clients)
+        return [clients[fd] for fd in chosen] + others
+
+    def _is_input(self, fileno: int, events: int) -> bool:
+        return fileno in self._clients and events == selectors.EVENT_READ
+
+    def _choose(self, filenos: Iterable[int]) -> list[int]:
+        ready = dict.fromkeys(filenos)
+        queue = dict.fromkeys([fd for fd in self._deferred if fd in ready]) | ready
+        stops = dict.fromkeys(fd for fd in queue if is_stop(self._clients[fd]))
+        chosen = list(stops | queue)[:CLIENTS_PER_TURN]
+        self._deferred = {fd: None for fd in queue if fd not in chosen}
+        return chosen

@@ -1,0 +1,80 @@
+import selectors
+import socket
+from contextlib import ExitStack
+
+import pytest
+
+from optodrive.daemon.web.stop_first_selector import CLIENTS_PER_TURN, StopFirstSelector
+
+CLIENTS = 40
+STOP = b"POST /v1/stop HTTP/1.1\r\n"
+
+
+@pytest.fixture
+def make_pair():
+    with ExitStack() as stack:
+
+        def make():
+            pair = socket.socketpair()
+            for sock in pair:
+                stack.enter_context(sock)
+            return pair
+
+        yield make
+
+
+@pytest.fixture
+def selector():
+    with StopFirstSelector() as selector:
+        yield selector
+
+
+def add_client(selector, pair, text):
+    own, peer = pair
+    selector.register(own, selectors.EVENT_READ)
+    selector.add_client(own)
+    peer.sendall(text)
+    return own.fileno()
+
+
+def select_read(selector):
+    return [key.fd for key, _ in selector.select(0) if key.fd]
+
+
+def test_stop_precedes_all_clients_that_are_ready(selector, make_pair):
+    for _ in range(CLIENTS):
+        add_client(selector, make_pair(), b"GET /v1/state HTTP/1.1\r\n")
+    stop = add_client(selector, make_pair(), STOP)
+    ready = select_read(selector)
+    assert ready[0] == stop
+    assert len(ready) == CLIENTS_PER_TURN
+    assert len(select_read(super(StopFirstSelector, selector))) == CLIENTS + 1  # without the bound
+
+
+def test_every_client_gets_its_turn_while_all_stay_ready(selector, make_pair):
+    filenos = {add_client(selector, make_pair(), b"GET") for _ in range(CLIENTS)}
+    turns = [select_read(selector) for _ in range(-(-CLIENTS // CLIENTS_PER_TURN))]
+    assert {fd for turn in turns for fd in turn} == filenos
+    assert all(len(turn) <= CLIENTS_PER_TURN for turn in turns)
+
+
+def test_other_descriptors_are_never_deferred(selector, make_pair):
+    for _ in range(CLIENTS):
+        add_client(selector, make_pair(), b"GET")
+    own, peer = make_pair()
+    selector.register(own, selectors.EVENT_READ)
+    peer.sendall(STOP)
+    for _ in range(5):
+        assert own.fileno() in select_read(selector)
+
+
+def test_the_request_stays_in_the_socket_and_a_removed_client_is_forgotten(selector, make_pair):
+    pairs = [make_pair() for _ in range(CLIENTS)]
+    for pair in pairs:
+        add_client(selector, pair, STOP)
+    select_read(selector)
+    for own, _ in pairs:
+        assert own.recv(100) == STOP
+        selector.remove_client(own.fileno())
+        selector.unregister(own)
+    assert select_read(selector) == []
