@@ -26,9 +26,9 @@ LINK_PROCESS = sys.executable, "-m", "optodrive.link.service.process"
 class LinkProcess:
     """Link process on a board's port. ready_s: time from its start until it serves its socket."""
 
-    def __init__(self, folder, port, lease_s=1.0, **settings):
+    def __init__(self, folder, port, lease_s=1.0, config=CONFIG, **settings):
         self.path = folder / "link.sock"
-        built = build_link_settings(CONFIG, self.path, 0o600, settings.pop("capture_path", None))
+        built = build_link_settings(config, self.path, 0o600, settings.pop("capture_path", None))
         requirements = replace(
             built.requirements,
             lease_s=lease_s,

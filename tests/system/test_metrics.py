@@ -3,7 +3,7 @@
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from optodrive.daemon.one_process.metrics import PlanCounters
+from optodrive.daemon.engine.metrics import PlanCounters
 from rig import ended, long_train, wait_for
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
-from optodrive.daemon.one_process import planner
+from optodrive.daemon.engine import plan_making
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
@@ -56,7 +56,7 @@ def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
         tries.append(time.sleep(next(naps_s)))
         return plan_sequence(*arguments, **more)
 
-    monkeypatch.setattr(planner, "plan_sequence", slowly)
+    monkeypatch.setattr(plan_making, "plan_sequence", slowly)
     second = stream(armed, frame(range(40, 60)))
     records = [ended(armed, answer) for answer in (first, second)]
     assert len(tries) in (3, 4)  # once more if the running plan was late, which changed the heat

@@ -84,12 +84,18 @@ class Engine:
     # --- loop ---------------------------------------------------------------------------------------------------
 
     def run(self, is_closing: Callable[[], bool]) -> None:
-        """Run the loop until is_closing() returns true. The display must be warm: compilation reports no progress."""
+        """Run the loop until is_closing() returns true, then end the connection to the link process.
+
+        The display must be warm, because compilation reports no progress.
+        """
         # While the planner computes, the loop would wait 5 ms for the interpreter lock each time it continues.
         sys.setswitchinterval(SWITCH_INTERVAL_S)
-        while not is_closing():
-            self.run_once(LOOP_WAIT_S)
-            self.on_loop()
+        try:
+            while not is_closing():
+                self.run_once(LOOP_WAIT_S)
+                self.on_loop()
+        finally:
+            self._connection.close()
 
     def run_once(self, wait_s: float) -> None:
         """Run one loop iteration, which waits at most wait_s for messages and commands."""
@@ -118,8 +124,7 @@ class Engine:
                 self.on_warning(f"board at {self._session.port}: {cause.message}")
 
     def close(self) -> None:
-        """End the connection to the link process, which turns the gate off, and the threads."""
-        self._connection.close()
+        """End the threads and close the loop, after run()."""
         self._planning_executor.shutdown(wait=False, cancel_futures=True)
         self._simulation_executor.shutdown(wait=False, cancel_futures=True)
         self.message_loop.close()

@@ -170,13 +170,16 @@ class RemoteSession:
         deadline_s = self._clock.now_s() + REPLY_TIMEOUT_S
         while self._socket is not None and self._on_result is not None:
             wait_s = deadline_s - self._clock.now_s()
-            if wait_s <= 0.0:
-                self._on_lost(f"the link process did not answer {kind} within {REPLY_TIMEOUT_S:g} s")
-                break
             writable = [self._socket] if self._socket.wants_write else []
-            select.select([self._socket], writable, [], wait_s)
+            # Without time left, read once more: this process may have waited for the processor.
+            select.select([self._socket], writable, [], max(0.0, wait_s))
             self.receive()
+            if wait_s <= 0.0 and self._is_waiting():
+                self._on_lost(f"the link process did not answer {kind} within {REPLY_TIMEOUT_S:g} s")
         self._on_result = None
+
+    def _is_waiting(self) -> bool:
+        return self._on_result is not None
 
     # --- messages of the link process ---------------------------------------------------------------------------
 
@@ -303,15 +306,18 @@ class RemoteSession:
         number = self._job_number
         fields = {"job": number, "epoch": epoch, "kept_points": kept_points}
 
+        added: list[RemoteJob] = []
+
         def add_job(result: dict[str, Any]) -> None:
             if result["start_tick"] is not None:
                 last.truncate(kept_points)
                 job = RemoteJob(self, number, points, result["start_tick"], send_ahead_s / self.scale.tick_s)
                 job.first_index = job.next_to_send = result["first_index"]
                 self._jobs[number] = job
+                added.append(job)  # a job without points may be finished, and forgotten, before the next line is read
 
         self._request("splice", fields | _build_points_fields(payload, send_ahead_s, crc), payload, add_job)
-        return self._jobs.get(number)
+        return added[0] if added and self._socket is not None else None
 
     def truncate(self, kept_points: int) -> bool:
         """Truncate the last job to `kept_points` points. Return False, unchanged, if more were sent."""
