@@ -1,14 +1,14 @@
 """The REST reference, generated from the application's own OpenAPI document; run as a script, it prints the page."""
 
-from optodrive.core.clock import MonotonicClock
+from pathlib import Path
+
 from optodrive.core.toml_model import Section
-from optodrive.daemon.one_process.engine import Engine
+from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.openapi import ERROR_RESPONSES
 from optodrive.device import config
 from optodrive.device.config_file import load_config
-from optodrive.link.board_setup import build_port_settings
-from optodrive.link.transport.registry import find_transport_factory
 from optodrive.planning import effective_config
 from optodrive.planning.display_model import DisplayModel
 
@@ -31,15 +31,9 @@ all other models always have all members.
 
 
 def build_openapi():
-    """Build the application's OpenAPI document without connecting to a board."""
-    config = load_config()
-    engine = Engine(
-        DisplayModel.from_config(config), find_transport_factory(build_port_settings(config.board))(), MonotonicClock()
-    )
-    try:
-        return build_app(engine, "unused").openapi()
-    finally:
-        engine.close()
+    """Build the application's OpenAPI document without the other processes of the daemon."""
+    folder = RuntimeFolder(Path(), Path("link.sock"), 0o600, Path())
+    return build_app(DaemonClient(DisplayModel.from_config(load_config()), folder), "unused").openapi()
 
 
 def build_rest_reference():

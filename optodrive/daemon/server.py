@@ -77,7 +77,7 @@ def run(
         exposure = describe_exposure(config.daemon.host)
         if exposure is not None:
             log.warn(exposure)
-        app = build_app(engine, access_policy)
+        app = build_app(engine, access_policy)  # type: ignore[arg-type]
         server = Server(app)
         log.attach_to_root_logger()
 

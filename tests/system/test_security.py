@@ -9,6 +9,7 @@ import subprocess
 import time
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 
 import httpx
 import pytest
@@ -16,17 +17,16 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from optodrive.client import AsyncDisplay, Display
-from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import NotReadyError
-from optodrive.daemon.engine.engine import Engine
+from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.roles import ROLES
 from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
 from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
-from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 from rig import OPTODRIVE, TOKEN, Board, Daemon, long_train, read_role_tokens, wait_for
 
@@ -34,9 +34,10 @@ LAST_LINE = "lease_s = 1.0"
 
 
 def build_application():
-    """Build the application on an engine that is not started."""
-    engine = Engine(DisplayModel.from_config(load_config()), SimulatedBoard("", 1_000_000), MonotonicClock())
-    return build_app(engine, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
+    """Build the application without the other processes of the daemon."""
+    folder = RuntimeFolder(Path(), Path("link.sock"), 0o600, Path())
+    daemon = DaemonClient(DisplayModel.from_config(load_config()), folder)
+    return build_app(daemon, AccessPolicy(Tokens((Token("test", "armer", TOKEN),)), load_config().daemon))
 
 
 ROUTES = RouteTable(build_application().routes).roles

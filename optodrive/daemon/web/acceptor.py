@@ -7,7 +7,7 @@ from functools import partial
 from typing import NamedTuple
 
 from optodrive.daemon.web.connections import Connections
-from optodrive.daemon.web.stop_first_selector import StopFirstSelector, is_stop
+from optodrive.daemon.web.stop_first_selector import StopFirstSelector, has_input, is_stop
 
 ACCEPTS_PER_TURN = 32
 OPENED_PER_TURN = 3
@@ -91,9 +91,9 @@ class Acceptor:
         """Open connections as far as there is room; keep the others, which may yet request STOP, for a while."""
         stops = [waiting for waiting in self._waiting if is_stop(waiting.sock)]
         others = [waiting for waiting in self._waiting if waiting not in stops]
-        opened = [waiting for waiting in stops[:OPENED_PER_TURN] if self._open(waiting.sock, True)]
+        opened = [waiting for waiting in stops[:OPENED_PER_TURN] if self._open(waiting, True)]
         for waiting in others[:OPENED_PER_TURN]:
-            if not self._open(waiting.sock, False):
+            if not self._open(waiting, False):
                 break
             opened.append(waiting)
         oldest_s = self._loop.time() - WAIT_MAX_S
@@ -108,10 +108,11 @@ class Acceptor:
         self._waiting = kept
         self._schedule(0.0 if opened else RETRY_S)
 
-    def _open(self, sock: socket.socket, for_stop: bool) -> bool:
+    def _open(self, waiting: _Waiting, for_stop: bool) -> bool:
         if not self._connections.make_room(for_stop):
             return False
-        self._selector.add_client(sock)
+        sock = waiting.sock
+        self._selector.add_client(sock, waiting.arrived_s if has_input(sock) else None)
         self._connections.opening += 1
         task: asyncio.Task[object] = self._loop.create_task(
             self._loop.connect_accepted_socket(self._create_protocol, sock)

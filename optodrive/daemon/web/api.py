@@ -1,27 +1,29 @@
-"""The REST API, version 1, over a running engine."""
+"""The REST API, version 1, over the daemon's other processes."""
 
 import asyncio
-from concurrent.futures import Future
+import time
+from collections.abc import Coroutine
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request, WebSocket
 from fastapi.responses import JSONResponse, PlainTextResponse, Response
+from starlette.requests import ClientDisconnect
 
 from optodrive import __version__
-from optodrive.core.errors import InputError
+from optodrive.core.ipc import Message
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.engine.metrics import CONTENT_TYPE
-from optodrive.daemon.one_process.engine import Engine
-from optodrive.daemon.one_process.live_stream import LiveStream
 from optodrive.daemon.responses.caller import CallerReport
-from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.health import HealthReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.problem import MEDIA_TYPE
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, CALLER, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.daemon_client import DaemonClient, PushFields
 from optodrive.daemon.web.error_handlers import add_error_handlers
+from optodrive.daemon.web.live_stream import LiveStream
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
 from optodrive.daemon.web.openapi_bodies import (
     PARAMETERS_SCHEMA,
@@ -31,15 +33,15 @@ from optodrive.daemon.web.openapi_bodies import (
     build_request_body,
 )
 from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
+from optodrive.daemon.web.server_state import ARRIVED_S
 from optodrive.daemon.web.static_files import add_page_routes
-from optodrive.daemon.web.stop_priority import StopPriorityMiddleware, build_json_response
-from optodrive.daemon.web.telemetry import DEFAULT_RATE_HZ, EventStream, Telemetry
+from optodrive.daemon.web.stop_priority import StopPriorityMiddleware
+from optodrive.daemon.web.telemetry_hub import DEFAULT_RATE_HZ, EventStream
 from optodrive.daemon.web.tokens import Token
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.pipeline import resolve_policy
-from optodrive.planning.stimuli.pattern_registry import build_pattern, describe_patterns
-from optodrive.planning.stimuli.sequence_file import parse_json, parse_sequence
+from optodrive.planning.stimuli.pattern_registry import describe_patterns
 
 PlanId = Annotated[str, Path(max_length=40)]
 DryRunQuery = Annotated[bool, Query(description="plan and limit only; nothing moves")]
@@ -54,10 +56,8 @@ DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
 RateQuery = Annotated[float, Query(ge=1, le=60, description="display events per second while a pixel is warm")]
 
 
-def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
-    """Build the daemon's web application over a running engine."""
-    display = engine.display
-    telemetry = Telemetry(engine)
+def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
+    """Build the daemon's web application."""
     app = FastAPI(
         generate_unique_id_function=lambda route: route.name,
         title="optodrive",
@@ -66,9 +66,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         openapi_url=None,
         docs_url=None,
         redoc_url=None,
-        lifespan=telemetry.lifespan,
     )
-    app.state.telemetry = telemetry
     add_error_handlers(app)
     routes = RoleRoutes(app)
     add_page_routes(routes)
@@ -81,7 +79,7 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
     @routes.get("/v1/state", "viewer")
     async def get_state() -> StateReport:
         """Return the state of board, link, queue and planner."""
-        return engine.snapshot()
+        return daemon.build_state()
 
     @routes.get("/v1/me", "viewer")
     async def get_me(request: Request) -> CallerReport:
@@ -90,29 +88,32 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         return CallerReport(name=token.name, role=token.role, refused=table.list_refused(token.role))
 
     @routes.get("/metrics", "viewer", response_class=PlainTextResponse)
-    async def get_metrics() -> PlainTextResponse:
+    async def get_metrics() -> Response:
         """Return metrics for Prometheus."""
-        return PlainTextResponse(engine.render_metrics(), media_type=CONTENT_TYPE)
+        return _relay(await daemon.planner.call("metrics"), CONTENT_TYPE)
 
     @routes.get("/v1/config", "viewer")
     async def get_config() -> EffectiveConfig:
         """Return the effective configuration, as `optodrive config show --json`."""
-        return build_effective_config(display)
+        return build_effective_config(daemon.display)
 
     @routes.post("/v1/arm", "armer")
     async def arm() -> StateReport:
         """Arm the board; its indicator is on for at least two seconds before it emits."""
-        return await asyncio.wrap_future(engine.arm())
+        await daemon.link.command("arm")
+        return daemon.build_state()
 
     @routes.post("/v1/disarm", "operator")
     async def disarm() -> StateReport:
         """Disarm the board; this also acknowledges a fault whose cause is gone."""
-        return await asyncio.wrap_future(engine.disarm())
+        await daemon.link.command("disarm")
+        return daemon.build_state()
 
     @routes.post("/v1/stop", "viewer")
     async def stop() -> StateReport:
         """Switch the gate off, drop everything queued, disarm the board."""
-        return await asyncio.wrap_future(engine.stop())
+        await daemon.link.command("stop")
+        return daemon.build_state()
 
     @routes.post(
         "/v1/plans",
@@ -131,40 +132,29 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         fit: FitQuery = "as_is",
     ) -> Response:
         """Plan frames and trains, and show them."""
-        body = await request.body()
-        policy = resolve_policy(policy, strict)
-        future = engine.submit(
-            lambda: parse_sequence(body, display.config, "body"),
-            "push",
-            dry_run,
-            policy,
-            fit,
-            streamed=newest,
-            caller=request.scope[CALLER].name,
-        )
-        return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
+        push = _read_push(daemon, request, "push", resolve_policy(policy, strict), fit, newest)
+        return await _plan_body(daemon, request, "sequence", push, dry_run)
 
     @routes.websocket("/v1/stream", "operator")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
         """Show streamed frames, of which the newest wins, and send the result of each."""
-        await LiveStream(engine, socket, policy, socket.scope[CALLER].name, build_error_problem).run()
+        await LiveStream(daemon, socket, policy, socket.scope[CALLER].name).run()
 
     @routes.get("/v1/telemetry", "viewer", status_code=200, response_class=EventStream, responses=EVENT_RESPONSES)
     async def stream_telemetry(rate_hz: RateQuery = DEFAULT_RATE_HZ) -> EventStream:
         """Send server-sent events until the client disconnects: state, display, pulses, budget, fault."""
-        telemetry.require_capacity()
-        return EventStream(telemetry.stream_events(rate_hz))
+        daemon.hub.require_capacity()
+        return EventStream(daemon.hub.stream_events(rate_hz))
 
     @routes.get("/v1/plans/{plan_id}", "viewer", response_model=PlanReport)
     async def get_plan(plan_id: PlanId, pulses: PulsesQuery = True) -> Response:
         """Return one plan: what was planned, sent and executed."""
-        return await build_json_response(engine.get_plan(plan_id, pulses))
+        return _relay(await daemon.planner.call("get_plan", plan=plan_id, pulses=pulses))
 
     @routes.delete("/v1/plans/{plan_id}", "operator", response_model=PlanReport)
     async def cancel_plan(plan_id: PlanId) -> Response:
         """Remove a plan from the queue, or end it if it runs; the board stays armed."""
-        report: PlanReport = await asyncio.wrap_future(engine.cancel(plan_id))
-        return await build_json_response(report)
+        return _relay(await daemon.planner.call("cancel", plan=plan_id))
 
     @routes.get("/v1/patterns", "viewer")
     async def list_patterns() -> PatternList:
@@ -188,20 +178,8 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
         fit: FitQuery = "as_is",
     ) -> Response:
         """Build a named pattern, plan it, and show it."""
-        body = await request.body()
-        parameters = parse_json(body, "body") if body.strip() else {}
-        if not isinstance(parameters, dict):
-            raise InputError("body", parameters, "an object of the pattern's parameters")
-        policy = resolve_policy(policy, strict)
-        future = engine.submit(
-            lambda: build_pattern(name, parameters, display.config),
-            name,
-            dry_run,
-            policy,
-            fit,
-            caller=request.scope[CALLER].name,
-        )
-        return await build_json_response(await _await_plan(request, future), 200 if dry_run else 201)
+        push = _read_push(daemon, request, name, resolve_policy(policy, strict), fit, False)
+        return await _plan_body(daemon, request, "pattern", push, dry_run)
 
     @routes.get("/openapi.json", "viewer", include_in_schema=False)
     async def get_openapi() -> JSONResponse:
@@ -216,13 +194,45 @@ def build_app(engine: Engine, policy: AccessPolicy) -> FastAPI:
     return app
 
 
-async def _await_plan(request: Request, future: "Future[PlanReport]") -> PlanReport:
-    """Wait for a plan and add its fields to the audit log."""
-    report: PlanReport = await asyncio.wrap_future(future)
-    request.scope[AUDIT_FIELDS] |= {
-        "plan": report.plan,
-        "pattern": report.name,
-        "pulses": report.planned,
-        "plan_status": report.status,
-    }
-    return report
+def _read_push(
+    daemon: DaemonClient, request: Request, name: str, policy: Policy, fit: FitMode, streamed: bool
+) -> PushFields:
+    """Read the fields of a push before its body. Its epoch is that of the arrival: a STOP since then ends it."""
+    arrived_s = request.scope.get("state", {}).get(ARRIVED_S) or time.monotonic()
+    epoch = daemon.link.require_epoch_at(arrived_s)
+    return PushFields(name, policy, fit, streamed, arrived_s, epoch, request.scope[CALLER].name)
+
+
+async def _plan_body(
+    daemon: DaemonClient, request: Request, source: str, push: PushFields, is_dry_run: bool
+) -> Response:
+    body = await request.body()
+    work = daemon.plan_dry_run(source, body, push) if is_dry_run else daemon.push(source, body, push)
+    result = await _finish_unless_left(request, work)
+    request.scope[AUDIT_FIELDS] |= result.fields.get("audit") or {}
+    return _relay(result)
+
+
+async def _finish_unless_left(request: Request, work: Coroutine[Any, Any, Message]) -> Message:
+    """Return the result of some work, which is dropped when the caller leaves: nobody waits for it."""
+    task, leaving = asyncio.ensure_future(work), asyncio.ensure_future(_wait_until_left(request))
+    try:
+        await asyncio.wait((task, leaving), return_when=asyncio.FIRST_COMPLETED)
+        if task.done():
+            return task.result()
+        raise ClientDisconnect
+    finally:
+        for each in (task, leaving):
+            each.cancel()
+        await asyncio.gather(task, leaving, return_exceptions=True)
+
+
+async def _wait_until_left(request: Request) -> None:
+    while (await request.receive())["type"] != "http.disconnect":
+        pass
+
+
+def _relay(result: Message, media_type: str = "application/json") -> Response:
+    """Answer with the body of another process's result."""
+    status: int = result.fields["status"]
+    return Response(result.payload, status, media_type=media_type if status < 400 else MEDIA_TYPE)

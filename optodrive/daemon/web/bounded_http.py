@@ -7,7 +7,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, ServerState
 
 HEADER_READ_BYTES, BODY_READ_BYTES = 2048, 8192
 """The size of one read: a body of chunks of one byte takes 2 µs per byte to parse, and STOP waits meanwhile."""
@@ -39,6 +39,7 @@ class BoundedHttp(H11Protocol):
             if self._drained_bytes > DRAIN_MAX_BYTES:
                 self.transport.abort()
                 return
+        self.app_state = {**self.app_state, ARRIVED_S: self.server_state.pop_arrival_s(self.transport)}
         super().data_received(data)
         self._set_read_size(BODY_READ_BYTES if self.get_phase().phase in ("body", "drain") else HEADER_READ_BYTES)
 

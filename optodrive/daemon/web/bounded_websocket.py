@@ -1,7 +1,8 @@
 """The WebSocket protocol of the web server: bounded messages, fragments and control frames.
 
 What a client sends is parsed in small slices. Control frames and fragments, which carry no message by themselves, are
-paced; what exceeds the pace waits in the client's socket.
+paced; what exceeds the pace waits in the client's socket. A message states when it arrived, or an earlier time if it
+may have waited there, because a frame from before a STOP must not be shown after it.
 """
 
 import asyncio
@@ -11,7 +12,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, ServerState
 
 MESSAGE_MAX_BYTES = 262_144
 FRAGMENTS_MAX = 64
@@ -22,6 +23,8 @@ READ_BYTES = 16_384
 FRAMES_PER_S, FRAMES_BURST = 50.0, 100.0
 """Pace of control frames and fragments."""
 TOO_BIG = 1009
+EMPTY_S = 0.05
+"""A socket that has had no input for this time while it was read is empty: what comes later arrives then."""
 
 
 class BoundedWebSocket(WebSocketsSansIOProtocol):
@@ -33,6 +36,9 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         super().__init__(server_state=server_state, **options)
         self._state = server_state
         self._unparsed = bytearray()
+        self._arrived_s = self.loop.time()
+        self._unread_since_s: float | None = None
+        self._empty_handle: asyncio.TimerHandle | None = None
         self._allowance = FRAMES_BURST
         self._allowance_s = self.loop.time()
 
@@ -45,8 +51,9 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     def connection_lost(self, exc: Exception | None) -> None:
         """Remove the connection."""
         self._state.forget(self.transport)
-        if self._pump_handle is not None:
-            self._pump_handle.cancel()
+        for handle in (self._pump_handle, self._empty_handle):
+            if handle is not None:
+                handle.cancel()
         super().connection_lost(exc)
 
     def get_phase(self) -> PhaseOfRequest:
@@ -63,13 +70,30 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         if not self.handshake_initiated:
             super().data_received(data)
             return
+        self._arrived_s = self._state.pop_arrival_s(self.transport)
+        if self._unread_since_s is not None:
+            self._arrived_s = min(self._arrived_s, self._unread_since_s)
+        # Input that filled the buffer, or arrived while nothing was read, may be as old as the last empty socket.
+        self._unread_since_s = self._arrived_s if len(data) >= READ_BYTES else self.loop.time()
+        if self._empty_handle is not None:
+            self._empty_handle.cancel()
         self._unparsed += data
         self.transport.pause_reading()
         self._pump()
 
+    def _resume_reading(self) -> None:
+        self.transport.resume_reading()
+        if self._empty_handle is not None:
+            self._empty_handle.cancel()
+        self._empty_handle = self.loop.call_later(EMPTY_S, self._on_empty)
+
+    def _on_empty(self) -> None:
+        self._unread_since_s = self._empty_handle = None
+
     async def receive(self) -> Any:
         """Return the next message, and continue to parse once the application has taken all."""
-        message = await self.queue.get()
+        message: Any = await self.queue.get()
+        message[ARRIVED_S] = self._arrived_s
         if self.read_paused and self.queue.empty():
             self.read_paused = False
             self._pump()
@@ -84,7 +108,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
             if self.read_paused or not self.writable.is_set() or self.transport.is_closing():
                 return
             if not self._unparsed:
-                self.transport.resume_reading()
+                self._resume_reading()
                 return
             wait_s = self._compute_wait_s()
             if wait_s > 0.0:

@@ -7,6 +7,9 @@ import uvicorn.server
 from optodrive.daemon.web.connections import Connections
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
 
+ARRIVED_S = "arrived_s"
+"""Key in the state of an ASGI scope, and in a WebSocket's message, of the monotonic time at which it arrived."""
+
 
 class ServerState(uvicorn.server.ServerState):
     """uvicorn's state with the table of open connections."""
@@ -15,6 +18,10 @@ class ServerState(uvicorn.server.ServerState):
         super().__init__()
         self.clients = clients
         self.selector = selector
+
+    def pop_arrival_s(self, transport: asyncio.BaseTransport) -> float:
+        """Return the monotonic time at which the input of a connection arrived that is read now."""
+        return self.selector.pop_arrival_s(transport.get_extra_info("socket").fileno())
 
     def forget(self, transport: asyncio.Transport) -> None:
         """Remove a connection that is about to be closed."""

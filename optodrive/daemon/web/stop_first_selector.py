@@ -6,10 +6,19 @@ takes a tenth of a second, for which a STOP that has just arrived would wait.
 
 import selectors
 import socket
+import time
 from collections.abc import Iterable
 
 CLIENTS_PER_TURN = 6
 STOP_LINE = b"POST /v1/stop"
+
+
+def has_input(sock: socket.socket) -> bool:
+    """Return whether bytes wait in a socket."""
+    try:
+        return bool(sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
+    except OSError:
+        return False
 
 
 def is_stop(sock: socket.socket) -> bool:
@@ -27,14 +36,22 @@ class StopFirstSelector(selectors.EpollSelector):
         super().__init__()
         self._clients: dict[int, socket.socket] = {}
         self._deferred: dict[int, None] = {}
+        self._arrived_s: dict[int, float] = {}
 
-    def add_client(self, sock: socket.socket) -> None:
-        """Defer the input of a socket if too many clients are ready."""
+    def add_client(self, sock: socket.socket, arrived_s: float | None = None) -> None:
+        """Defer the input of a socket if too many clients are ready. arrived_s: when input arrived, if there is any."""
         self._clients[sock.fileno()] = sock
+        if arrived_s is not None:
+            self._arrived_s[sock.fileno()] = arrived_s
 
     def remove_client(self, fileno: int) -> None:
         """Forget a socket that is about to be closed."""
         self._clients.pop(fileno, None)
+        self._arrived_s.pop(fileno, None)
+
+    def pop_arrival_s(self, fileno: int) -> float:
+        """Return the monotonic time at which the input of a client arrived that is read now."""
+        return self._arrived_s.pop(fileno, None) or time.monotonic()
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         """Return what is ready: everything but clients, STOP first, then the clients that have waited longest."""
@@ -55,4 +72,7 @@ class StopFirstSelector(selectors.EpollSelector):
         stops = dict.fromkeys(fd for fd in queue if is_stop(self._clients[fd]))
         chosen = list(stops | queue)[:CLIENTS_PER_TURN]
         self._deferred = {fd: None for fd in queue if fd not in chosen}
+        now_s = time.monotonic()
+        for fd in self._deferred:
+            self._arrived_s.setdefault(fd, now_s)
         return chosen

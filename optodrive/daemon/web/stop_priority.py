@@ -1,16 +1,11 @@
 """Measures that keep STOP's response time short under load.
 
-Requests start one at a time, none starts while STOP is being answered, and long responses are encoded in pieces.
+Requests start one at a time, and none starts while STOP is being answered.
 """
 
 import asyncio
 from contextlib import suppress
 
-from fastapi.responses import Response
-from pydantic import BaseModel
-from starlette.concurrency import run_in_threadpool
-
-from optodrive.core.json_model import iterate_json
 from optodrive.daemon.web.request_limits import App, Receive, Scope, Send
 
 STOP_PATH = "/v1/stop"
@@ -58,12 +53,3 @@ class StopPriorityMiddleware:
             self._stops_in_progress -= 1
             if not self._stops_in_progress:
                 self._stop_done.set()
-
-
-async def build_json_response(model: BaseModel, status: int = 200) -> Response:
-    """Encode a model, which may list thousands of pulses, outside the web server's loop.
-
-    The encoder holds the interpreter lock for one column of pulses at a time, less than a millisecond.
-    """
-    body = await run_in_threadpool(lambda: b"".join(iterate_json(model)))
-    return Response(body, status, media_type="application/json")

@@ -1,19 +1,19 @@
-"""Application on an engine that is not started, for tests of routes."""
+"""Application without the other processes of the daemon, for tests of routes."""
 
 import asyncio
+from pathlib import Path
 
 import httpx
 import pytest
 
-from optodrive.core.clock import MonotonicClock
-from optodrive.daemon.one_process.engine import Engine
+from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.roles import ROLES
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
 from optodrive.device.config_file import load_config
-from optodrive.link.transport.simulated import SimulatedBoard
 from optodrive.planning.display_model import DisplayModel
 
 
@@ -21,10 +21,9 @@ from optodrive.planning.display_model import DisplayModel
 def app():
     """Application of the smallest display, with one token per role, whose secret is the role's name."""
     display = DisplayModel.from_config(load_config("display-16"))
-    engine = Engine(display, SimulatedBoard("", 1_000_000), MonotonicClock())
+    folder = RuntimeFolder(Path("nowhere"), Path("nowhere/link.sock"), 0o600, Path("nowhere"))
     policy = AccessPolicy(Tokens(Token(role, role, role) for role in ROLES), DaemonSection())
-    yield build_app(engine, policy)
-    engine.close()
+    return build_app(DaemonClient(display, folder), policy)
 
 
 @pytest.fixture

@@ -1,0 +1,242 @@
+"""The daemon's other processes as the web process sees them: link, planner and preview.
+
+Every call to a process that does not run raises LinkError at once, which is answered with 503.
+"""
+
+import asyncio
+import time
+from bisect import bisect_right
+from collections import OrderedDict, deque
+from typing import Any, NamedTuple
+
+from optodrive.core.ipc import Message
+from optodrive.core.types.policy import Policy
+from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.state import PlannerState, StateReport
+from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.daemon.web.peer import Peer
+from optodrive.daemon.web.state_merge import merge_state
+from optodrive.daemon.web.telemetry_hub import TelemetryHub
+from optodrive.link.service.results import build_error
+from optodrive.planning.display_model import DisplayModel
+from optodrive.planning.feasibility.report import FitMode
+
+EPOCHS_MAX = 1000
+ENDED_MAX = 1000
+NO_EPOCH = 0
+"""Epoch without a link process."""
+
+
+class PushFields(NamedTuple):
+    """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token."""
+
+    name: str
+    policy: Policy
+    fit: FitMode
+    streamed: bool
+    arrived_s: float
+    epoch: int
+    caller: str
+
+
+class LinkClient:
+    """The link process: its status, epochs, and commands to the board."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.status: dict[str, Any] | None = None
+        self.peer = peer
+        self._epochs: deque[tuple[float, int]] = deque([(0.0, NO_EPOCH)], EPOCHS_MAX)
+        peer.on_connected = lambda: peer.send(Message("hello", {"role": "web"}))
+
+    def on_message(self, message: Message) -> None:
+        """Take a status or a result."""
+        if message.kind == "status":
+            self.status = message.fields
+        elif message.kind == "result" and self.status is not None and "board" in message.fields:
+            self.status = {**self.status, "board": message.fields["board"]}
+        if "epoch" in message.fields:
+            self._record_epoch(message.fields["epoch"])
+
+    def on_lost(self) -> None:
+        """Take the end of the process."""
+        self.status = None
+        self._record_epoch(NO_EPOCH)
+
+    def _record_epoch(self, epoch: int) -> None:
+        if epoch != self._epochs[-1][1]:
+            self._epochs.append((time.monotonic(), epoch))
+
+    def require_epoch_at(self, arrived_s: float) -> int:
+        """Return the epoch at a monotonic time, or an older one; raise LinkError while there is none."""
+        if self._epochs[-1][1] == NO_EPOCH:
+            raise self.peer.build_loss_error()
+        position = bisect_right(self._epochs, arrived_s, key=lambda entry: entry[0])
+        return self._epochs[max(0, position - 1)][1]
+
+    def beat(self) -> None:
+        """Prove that the event loop runs."""
+        self.peer.send(Message("beat", {"alive": True}))
+
+    async def command(self, kind: str) -> None:
+        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal."""
+        call = asyncio.ensure_future(self.peer.call(Message(kind, {})))
+        call.add_done_callback(lambda done: done.cancelled() or done.exception())  # retrieved if the caller has left
+        result = await asyncio.shield(call)
+        if result.fields["error"] is not None:
+            raise build_error(result.fields["error"])
+
+
+class PlannerClient:
+    """The planner process: its state, plans and telemetry."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.state: PlannerState | None = None
+        self.peer = peer
+        self._ended: OrderedDict[str, PlanReport] = OrderedDict()
+        self._waiting: dict[str, asyncio.Future[PlanReport]] = {}
+
+    def on_message(self, message: Message) -> None:
+        """Take the state or the end of a streamed plan."""
+        if message.kind == "state":
+            self.state = PlannerState.model_validate(message.fields)
+        elif message.kind == "ended":
+            plan, report = message.fields["plan"], PlanReport.model_validate_json(message.payload)
+            future = self._waiting.pop(plan, None)
+            if future is not None and not future.done():
+                future.set_result(report)
+                return
+            self._ended[plan] = report
+            while len(self._ended) > ENDED_MAX:
+                self._ended.popitem(last=False)
+
+    def on_lost(self) -> None:
+        """Take the end of the process, and of all its plans."""
+        self.state = None
+        self._ended.clear()
+        for future in self._waiting.values():
+            if not future.done():
+                future.set_exception(self.peer.build_loss_error())
+        self._waiting.clear()
+
+    async def submit(self, sequence: bytes, push: PushFields) -> Message:
+        """Plan an encoded sequence and return the result."""
+        return await self.peer.call(Message("submit", push._asdict(), sequence))
+
+    async def wait_for_end(self, plan: str) -> PlanReport:
+        """Return the report of a streamed plan once it has ended."""
+        report = self._ended.pop(plan, None)
+        if report is not None:
+            return report
+        future = self._waiting.setdefault(plan, asyncio.get_running_loop().create_future())
+        try:
+            return await future
+        finally:
+            self._waiting.pop(plan, None)
+
+    async def call(self, kind: str, **fields: object) -> Message:
+        """Send a request without payload and return the result."""
+        return await self.peer.call(Message(kind, fields))
+
+    def end_stream(self, epoch: int, caller: str) -> None:
+        """Drop the unsent rest of a stream's last plan."""
+        self.peer.send(Message("end_stream", {"epoch": epoch, "caller": caller}))
+
+
+class DaemonClient:
+    """The three processes, and the state of the daemon."""
+
+    def __init__(self, display: DisplayModel, folder: RuntimeFolder) -> None:
+        self.display = display
+        self.link = LinkClient(Peer("link", folder.link_socket, drops=False))
+        self.planner = PlannerClient(Peer("planner", folder.planner_socket))
+        self.preview = Peer("preview", folder.preview_socket)
+        self.hub = TelemetryHub()
+        self._state: StateReport | None = None
+        link, planner = self.link.peer, self.planner.peer
+        link.on_message, planner.on_message = self._on_link_message, self._on_planner_message
+        link.on_lost, planner.on_lost = self._on_link_lost, self._on_planner_lost
+        planner.on_connected = self._send_readers
+        self.hub.on_readers = lambda readers, rate_hz: self._send_readers()
+
+    def start(self) -> None:
+        """Connect to all, in the running event loop."""
+        for peer in (self.link.peer, self.planner.peer, self.preview):
+            peer.start()
+
+    def close(self) -> None:
+        """End all event streams and connections."""
+        self.hub.close()
+        for peer in (self.link.peer, self.planner.peer, self.preview):
+            peer.close()
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether both processes have reported their state."""
+        return self.link.status is not None and self.planner.state is not None
+
+    def build_state(self) -> StateReport:
+        """Report the state as last known; it is built once per change."""
+        if self._state is None:
+            config = self.display.config
+            self._state = merge_state(
+                config.name,
+                len(self.display.layout),
+                config.board.port or config.board.transport,
+                self.link.status,
+                self.planner.state,
+            )
+        return self._state
+
+    async def build(self, source: str, name: str, body: bytes, caller: str) -> Message:
+        """Build the sequence of a body in the preview process; return its result."""
+        return await self.preview.call(Message("build", {"source": source, "name": name, "caller": caller}, body))
+
+    async def plan_dry_run(self, source: str, body: bytes, push: PushFields) -> Message:
+        """Plan a body in the preview process from the planner's present state; return the result."""
+        snapshot = await self.planner.call("snapshot")
+        if snapshot.fields["status"] != 200:
+            return snapshot
+        fields = {
+            "source": source,
+            "name": push.name,
+            "policy": push.policy,
+            "fit": push.fit,
+            "caller": push.caller,
+            "snapshot_bytes": len(snapshot.payload),
+        }
+        return await self.preview.call(Message("dry_run", fields, snapshot.payload + body))
+
+    async def push(self, source: str, body: bytes, push: PushFields) -> Message:
+        """Build the sequence of a body, then plan it; return the result of the step that refuses it, or of the plan."""
+        built = await self.build(source, push.name, body, push.caller)
+        if built.fields["status"] != 200:
+            return built
+        return await self.planner.submit(built.payload, push)
+
+    def _send_readers(self) -> None:
+        readers, rate_hz = self.hub.readers
+        self.planner.peer.send(Message("telemetry", {"readers": readers, "rate_hz": rate_hz}))
+
+    def _on_link_message(self, message: Message) -> None:
+        self.link.on_message(message)
+        self._publish_state()
+
+    def _on_planner_message(self, message: Message) -> None:
+        if message.kind in ("telemetry", "pulses"):
+            self.hub.receive(message)
+            return
+        self.planner.on_message(message)
+        if message.kind == "state":
+            self._publish_state()
+
+    def _on_link_lost(self) -> None:
+        self.link.on_lost()
+        self._publish_state()
+
+    def _on_planner_lost(self) -> None:
+        self.planner.on_lost()
+        self._publish_state()
+
+    def _publish_state(self) -> None:
+        self._state = None
+        self.hub.publish_state(self.build_state())

@@ -1,0 +1,65 @@
+"""The state of the daemon, merged from the last reports of the link and planner processes."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from optodrive.daemon.responses.state import (
+    BoardReport,
+    LinkReport,
+    PlannerReport,
+    PlannerState,
+    PulseTotals,
+    QueueReport,
+    StateReport,
+)
+from optodrive.link.session.board_view import BoardView
+
+NO_LINK_PROCESS = "the link process does not run; it is being restarted"
+NO_STATS: Mapping[str, Any] = {
+    "round_trip_ms": None,
+    "host_bad_frames": 0,
+    "retransmitted": 0,
+    "naks": 0,
+    "board_bad_frames": 0,
+    "underruns": 0,
+    "longest_stall_ms": 0.0,
+    "likely_cause": None,
+    "likely_cause_age_s": None,
+}
+NO_PLANNER = PlannerState(
+    queue=QueueReport(waiting=0, running=None, active=[], plans=[]),
+    totals=PulseTotals(planned=0, sent=0, executed=0, timing_error=None),
+    planner=PlannerReport(busy=False, alive=False),
+)
+UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": ""}
+"""A board without a link: its last state would be a claim."""
+
+
+def merge_state(
+    display: str, pixels: int, port: str, status: Mapping[str, Any] | None, planner: PlannerState | None
+) -> StateReport:
+    """Merge the states of the processes; None for a process that does not run.
+
+    display, pixels: name and size of the display; port: as configured; status: of the link process
+    """
+    if status is None:
+        link = LinkReport(port=port, state="down", error=NO_LINK_PROCESS, **NO_STATS)
+        board = BoardView().to_dict()
+    else:
+        link = LinkReport(
+            port=status["port"],
+            state="up" if status["connected"] else "down",
+            error=status["link_error"],
+            **status["stats"],
+        )
+        board = status["board"] if status["connected"] else {**status["board"], **UNKNOWN_BOARD}
+    planner = planner or NO_PLANNER
+    return StateReport(
+        display=display,
+        pixels=pixels,
+        link=link,
+        board=BoardReport(**board),
+        queue=planner.queue,
+        totals=planner.totals,
+        planner=planner.planner,
+    )

@@ -1,0 +1,130 @@
+"""Main function of the web process."""
+
+import asyncio
+import signal
+import socket
+import time
+from collections.abc import AsyncIterator
+from contextlib import ExitStack, asynccontextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+
+from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.daemon.log import open_daemon_log
+from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.api import build_app
+from optodrive.daemon.web.audit import AuditLog
+from optodrive.daemon.web.daemon_client import DaemonClient
+from optodrive.daemon.web.listeners import describe_exposure
+from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.daemon.web.web_server import Server
+from optodrive.device.config import DaemonSection
+from optodrive.planning.display_model import DisplayModel
+
+BEAT_INTERVAL_S = 0.05
+READY_TIMEOUT_S = 1.0
+"""Time after which the server counts as ready, even if link or planner have not reported their state."""
+
+
+def run_web(
+    display: DisplayModel,
+    folder: RuntimeFolder,
+    beat: BeatWriter,
+    listeners: list[socket.socket],
+    tokens: Tokens,
+    daemon: DaemonSection,
+) -> None:
+    """Serve the API until SIGTERM or the end of the supervisor.
+
+    listeners: sockets that listen already; daemon: settings, whose reloaded keys may differ from the display's
+    """
+    with ExitStack() as exit_stack:
+        log = open_daemon_log()
+        exit_stack.callback(log.close)
+        log.attach_to_root_logger()
+        exposure = describe_exposure(daemon.host)
+        if exposure is not None:
+            log.warn(exposure)
+        audit = AuditLog(Path(daemon.audit), log.warn) if daemon.audit else None
+        if audit is not None:
+            exit_stack.callback(audit.close)
+        policy = AccessPolicy(tokens, daemon, audit)
+        exit_stack.callback(policy.refusals.flush)
+        process = WebProcess(DaemonClient(display, folder), policy, beat, daemon)
+        exit_stack.callback(process.receive_control)  # the last entries of the audit log
+        signal.signal(signal.SIGTERM, lambda number, frame: process.end())
+        process.server.run(sockets=listeners)
+
+
+class WebProcess:
+    """The server with its connections to the other processes and to the supervisor."""
+
+    def __init__(self, client: DaemonClient, policy: AccessPolicy, beat: BeatWriter, daemon: DaemonSection) -> None:
+        self._client = client
+        self._policy = policy
+        self._beat = beat
+        self._daemon = daemon
+        app = build_app(client, policy)
+        app.router.lifespan_context = self._run_connections
+        self.server = Server(app)
+
+    def end(self) -> None:
+        """End all streams and let the server finish."""
+        self._client.hub.close()
+        self.server.should_exit = True
+
+    @asynccontextmanager
+    async def _run_connections(self, _app: FastAPI) -> AsyncIterator[None]:
+        """Keep the connections and the beats while the server runs."""
+        self._client.start()
+        loop = asyncio.get_running_loop()
+        loop.add_reader(self._beat.fileno(), self.receive_control)
+        beats = loop.create_task(self._send_beats())
+        try:
+            yield
+        finally:
+            beats.cancel()
+            loop.remove_reader(self._beat.fileno())
+            self._client.close()
+
+    async def _send_beats(self) -> None:
+        deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False
+        while True:
+            self._client.link.beat()
+            self._beat.beat()
+            if not is_ready and self.server.started and (self._client.is_complete or time.monotonic() > deadline_s):
+                is_ready = True
+                self._beat.report_ready()
+            await asyncio.sleep(BEAT_INTERVAL_S)
+
+    def receive_control(self) -> None:
+        """Carry out the supervisor's messages. End without a supervisor."""
+        try:
+            messages = self._beat.receive()
+        except SupervisorGoneError:
+            with suppress(RuntimeError):  # outside of the loop, at the end
+                asyncio.get_running_loop().remove_reader(self._beat.fileno())
+            self.end()
+            return
+        for fields in messages:
+            self._carry_out(fields)
+
+    def _carry_out(self, fields: dict[str, Any]) -> None:
+        if fields["kind"] == "audit":
+            self._record(fields["fields"])
+        elif fields["kind"] == "reload":
+            self._daemon = self._daemon.model_copy(
+                update=fields["daemon"] | {"hosts": tuple(fields["daemon"]["hosts"])}
+            )
+            self._policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), self._daemon)
+            self._record(fields["fields"])
+            self._beat.send({"kind": "reloaded", "id": fields["id"]})
+        elif fields["kind"] == "end":
+            self.end()
+
+    def _record(self, fields: dict[str, Any]) -> None:
+        if self._policy.audit is not None:
+            self._policy.audit.record(fields)

@@ -1,0 +1,42 @@
+import pytest
+
+from optodrive.daemon.responses.state import PlannerState, StateReport
+from optodrive.daemon.web.state_merge import NO_PLANNER, NO_STATS, merge_state
+from optodrive.link.session.board_view import BoardView
+
+STATUS = {
+    "connected": True,
+    "port": "/dev/ttyACM0",
+    "link_error": None,
+    "stats": {**NO_STATS, "naks": 3},
+    "board": BoardView(state="RUNNING", uid="b1").to_dict(),
+}
+
+
+def merge(status=STATUS, planner=NO_PLANNER):
+    state = merge_state("display-16", 16, "/dev/ttyACM0", status, planner)
+    assert StateReport.model_validate_json(state.model_dump_json()) == state
+    return state
+
+
+def test_the_parts_of_both_processes_are_reported():
+    planner = PlannerState.model_validate({**NO_PLANNER.model_dump(), "planner": {"busy": True, "alive": True}})
+    state = merge(planner=planner)
+    assert (state.board.state, state.board.uid, state.link.naks, state.link.state) == ("RUNNING", "b1", 3, "up")
+    assert state.planner.busy
+
+
+def test_a_board_without_a_link_has_no_known_state():
+    fault = BoardView(state="FAULT", fault="LINK").to_dict()
+    state = merge({**STATUS, "connected": False, "link_error": "the cable is out", "board": fault})
+    assert (state.board.state, state.board.fault, state.board.hint) == ("UNKNOWN", None, "")
+    assert (state.link.state, state.link.error) == ("down", "the cable is out")
+
+
+@pytest.mark.parametrize(("status", "planner"), [(None, NO_PLANNER), (STATUS, None), (None, None)])
+def test_a_process_that_does_not_run_is_reported(status, planner):
+    state = merge(status, planner)
+    assert state.planner.alive is False
+    if status is None:
+        assert (state.board.state, state.link.state) == ("UNKNOWN", "down")
+        assert "link process does not run" in state.link.error
