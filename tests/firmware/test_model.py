@@ -1,4 +1,4 @@
-"""Exhaustive search of the SPIN model of link, gate and failing host; each removed rule is detected."""
+"""Exhaustive search of the SPIN models of link and gate, and of epochs; each removed rule is detected."""
 
 import re
 import subprocess
@@ -7,14 +7,14 @@ import pytest
 
 from optodrive.device.config_file import locate_shipped
 
-MODEL = locate_shipped().parent / "firmware_protocol" / "model" / "board.pml"
+MODELS = locate_shipped().parent / "firmware_protocol" / "model"
 MUTANTS = range(1, 7)
 
 
-def explored(folder, mutant):
+def explored(folder, mutant, name="board.pml"):
     """Run pan; return the numbers of errors and of states, and its output."""
     for command in (
-        ["spin", f"-DMUTANT={mutant}", "-a", MODEL],
+        ["spin", f"-DMUTANT={mutant}", "-a", MODELS / name],
         ["gcc", "-O2", "-DSAFETY", "-DNOFAIR", "-o", "pan", "pan.c"],
     ):
         subprocess.run(command, cwd=folder, check=True, capture_output=True)
@@ -39,3 +39,16 @@ def test_a_removed_rule_is_detected(tmp_path, mutant):
     errors, _, reported = explored(tmp_path, mutant)
     assert errors == 1
     assert "assertion violated" in reported
+
+
+def test_no_interleaving_emits_what_was_accepted_in_an_older_epoch(tmp_path):
+    errors, states, reported = explored(tmp_path, 0, "epochs.pml")
+    assert errors == 0, reported
+    assert states > 900_000
+
+
+@pytest.mark.parametrize("gate", [1, 2])
+def test_a_removed_gate_is_detected(tmp_path, gate):
+    errors, _, reported = explored(tmp_path, gate, "epochs.pml")
+    assert errors == 1
+    assert "assertion violated (accepted" in reported

@@ -355,8 +355,9 @@ class BoardSession:
         self._send_hello()
 
     def hold_points(self) -> None:
-        """Send nothing of the points handed over so far. Arming drops them."""
+        """Send nothing of the points handed over so far, and do not confirm an arming. The next arming drops them."""
         self._points_held = True
+        self._arm_nonce = None
 
     def _drop_held_points(self) -> None:
         self._points.clear()
