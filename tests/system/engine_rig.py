@@ -100,9 +100,12 @@ class RiggedEngine(Engine):
             future.set_exception(error)
         return future
 
-    def stop_all(self):
+    def stop_loop(self):
         self._ending.set()
         self._thread.join()
+
+    def stop_all(self):
+        self.stop_loop()
         self.close()
         self.web.close()
         self.link.stop()
