@@ -35,8 +35,8 @@ def serve(
         typer.Option("--record-session", metavar="FILE.h5", help="Record requests, plans and executed pulses."),
     ] = None,
 ) -> None:
-    """Run the daemon: the engine that drives the board, the REST API and the live page."""
-    from optodrive.daemon.server import run
+    """Run the daemon: the processes that drive the board, plan, and serve the REST API and the live page."""
+    from optodrive.daemon.supervisor.daemon import run
 
     def load() -> "Config":
         loaded = load_run_config(config, model, field, mirrors, pixel_map)

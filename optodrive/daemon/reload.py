@@ -1,19 +1,14 @@
 """Reload of the configuration of a running daemon: some keys apply at once, the others after a restart."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from optodrive.core.errors import NotReadyError, OptodriveError
-from optodrive.daemon.log import DaemonLog
-from optodrive.daemon.notify import Notifier
-from optodrive.daemon.one_process.engine import Engine
-from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.tokens import read_private_tokens
-from optodrive.daemon.web.web_server import Server
-from optodrive.device.config import Config
+from optodrive.core.errors import NotReadyError
+from optodrive.daemon.web.tokens import Tokens, read_private_tokens
+from optodrive.device.config import Config, DaemonSection
 from optodrive.link.protocol.states import LEASED_STATES
-from optodrive.planning.display_model import DisplayModel
 
 RELOADABLE_KEYS = ("hosts", "body_max_bytes", "requests_per_s", "requests_burst")
 """Keys of [daemon] that apply at once. The tokens file is also read again."""
@@ -59,52 +54,48 @@ def _find_differences(old: dict[str, Any], new: dict[str, Any], prefix: str) -> 
     return keys
 
 
+@dataclass(frozen=True)
+class ReloadResult:
+    """What a reload changed: the section of the web process, its tokens, the keys and the line for the log."""
+
+    daemon: DaemonSection
+    tokens: Tokens
+    reloaded: list[str]
+    waiting: list[str]
+    line: str
+
+    def build_web_message(self, number: int) -> dict[str, Any]:
+        """Return the control message for the web process, which answers with its number."""
+        return {
+            "kind": "reload",
+            "id": number,
+            "daemon": {name: getattr(self.daemon, name) for name in RELOADABLE_KEYS},
+            "tokens": [[token.name, token.role, token.secret] for token in self.tokens.all],
+            "fields": {"event": "reloaded", "applied": self.reloaded, "waiting": self.waiting},
+        }
+
+
 class ConfigReloader:
-    """Handler of SIGHUP from a service manager: reads, validates and applies the configuration."""
+    """Reads and validates the configuration again.
 
-    def __init__(
-        self,
-        config: Config,
-        read_config: Callable[[], Config] | None,
-        engine: Engine,
-        access_policy: AccessPolicy,
-        server: Server,
-        notifier: Notifier,
-        log: DaemonLog,
-    ) -> None:
-        self._running = config
+    config, tokens: those in use; read_config: reads the configuration
+    """
+
+    def __init__(self, config: Config, tokens: Tokens, read_config: Callable[[], Config]) -> None:
+        self.config = config
+        self.tokens = tokens
         self._read_config = read_config
-        self._engine = engine
-        self._access_policy = access_policy
-        self._server = server
-        self._notifier = notifier
-        self._log = log
 
-    def request_reload(self, *_: object) -> None:
-        """Schedule a reload in the web server's loop. Do nothing before that loop runs."""
-        if self._server.loop is not None:
-            self._server.loop.call_soon_threadsafe(self._reload)
+    def reload(self, board_state: str) -> ReloadResult:
+        """Return what changes, and use it from now on. Raise an OptodriveError and change nothing if it must not."""
+        from optodrive.planning.display_model import DisplayModel
 
-    def _reload(self) -> None:
-        self._notifier.notify_reloading()
-        try:
-            self._log.write(self._apply(), "notice", EVENT="reloaded")
-        except OptodriveError as error:
-            self._log.write(f"not reloaded, nothing changed: {error}", "err", EVENT="reload-refused")
-        finally:
-            self._notifier.send("READY=1")
-
-    def _apply(self) -> str:
-        assert self._read_config is not None  # noqa: S101 - without it the signal ends the daemon
-        require_disarmed(self._engine.board_state)
+        require_disarmed(board_state)
         new = self._read_config()
         DisplayModel.from_config(new)  # validates the sections against each other, as at startup
-        reloaded, waiting = split_changed_keys(self._running, new)
-        self._running = merge_reloadable(self._running, new)
-        daemon = self._running.daemon
-        file = Path(daemon.tokens) if daemon.tokens else None
-        tokens = self._access_policy.tokens if file is None else read_private_tokens(file)
-        self._access_policy.update(tokens, daemon)
-        if self._access_policy.audit is not None:
-            self._access_policy.audit.record({"event": "reloaded", "applied": reloaded, "waiting": waiting})
-        return describe_reload(reloaded, waiting, file)
+        reloaded, waiting = split_changed_keys(self.config, new)
+        running = merge_reloadable(self.config, new)
+        file = Path(running.daemon.tokens) if running.daemon.tokens else None
+        tokens = self.tokens if file is None else read_private_tokens(file)
+        self.config, self.tokens = running, tokens
+        return ReloadResult(running.daemon, tokens, reloaded, waiting, describe_reload(reloaded, waiting, file))

@@ -136,7 +136,7 @@ class Command:
 class Daemon:
     """Process of `optodrive serve` on a board's port."""
 
-    def __init__(self, folder, port, name="display-437", replace=(), options=(), lease_s=PATIENT_LEASE_S):
+    def __init__(self, folder, port, name="display-437", replace=(), options=(), lease_s=PATIENT_LEASE_S, runtime=None):
         text = config_text(port, name, lease_s=lease_s)
         for old, new in replace:
             assert old in text
@@ -144,7 +144,7 @@ class Daemon:
         self.config = folder / "config.toml"
         self.config.write_text(text)
         self.errors = folder / "daemon.err"
-        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(folder)}
+        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(runtime or folder)}
         with self.errors.open("a") as errors:
             self.process = subprocess.Popen(
                 [OPTODRIVE, "serve", "--config", self.config, "--port", "0", *options],

@@ -8,15 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
-import threading
-import time
 from pathlib import Path
 
 import pytest
 
-from optodrive.core.clock import MonotonicClock
 from optodrive.core.kernels import code_folder
-from optodrive.daemon.notify import Notifier
 from optodrive.device.config_file import locate_shipped
 from rig import OPTODRIVE, TOKEN, Daemon, long_train, wait_for
 from sandbox import build_sandboxed, find_obstacle
@@ -107,25 +103,6 @@ def test_ready_then_watchdog_then_stopping(manager, board, make_daemon):
     daemon.stop()
     assert "STOPPING=1" in manager.listen()
     assert daemon.process.returncode == 0
-
-
-def test_a_stalled_loop_does_not_feed_the_watchdog(manager, engine):
-    """Only the engine's loop feeds the watchdog, although the web server's thread still runs."""
-    notifier = Notifier(MonotonicClock())
-    engine.on_loop = notifier.feed_watchdog
-    wait_for(lambda: "WATCHDOG=1" in manager.listen(), "the watchdog to be fed")
-    go_on = threading.Event()
-    blocked = engine._commands.submit(lambda: go_on.wait(30))
-    try:
-        time.sleep(0.1)
-        before = len(manager.listen())
-        time.sleep(0.5)
-        assert len(manager.listen()) == before
-    finally:
-        go_on.set()
-        blocked.result(10)
-    wait_for(lambda: len(manager.listen()) > before, "the watchdog to be fed again")
-    notifier.close()
 
 
 def test_a_restarted_service_is_not_armed(manager, board, make_daemon):
@@ -255,7 +232,8 @@ def test_the_daemon_works_in_the_sandbox(board, tmp_path, monkeypatch):
     (state / "tokens.toml").write_text(HEAD + ENTRY.format("rig", TOKEN))
     (state / "tokens.toml").chmod(0o600)
     text = f'socket = "{state}/s"\ntokens = "{state}/tokens.toml"\naudit = "{state}/audit.jsonl"'
-    daemon = Daemon(tmp_path, board.port, replace=[("lease_s = 1.0", f"lease_s = 1.0\n[daemon]\n{text}\n#")])
+    replace = [("lease_s = 1.0", f"lease_s = 1.0\n[daemon]\n{text}\n#")]
+    daemon = Daemon(tmp_path, board.port, replace=replace, runtime=state)
     try:
         status = innermost_status(daemon.process.pid)
         assert (status["Seccomp"], status["NoNewPrivs"]) == ("2", "1")

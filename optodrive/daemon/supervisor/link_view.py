@@ -13,7 +13,7 @@ CONNECT_INTERVAL_S = 0.02
 class LinkView:
     """Client of the link process, which connects again when it is due.
 
-    status: fields of the last status, empty without a connection; is_stopped: whether the link has confirmed STOP
+    status: fields of the last status, empty without a connection; is_stopped: whether the link has answered STOP
     """
 
     def __init__(self, path: Path, clock: Clock) -> None:
@@ -47,7 +47,7 @@ class LinkView:
             for message in [] if self._connection is None else self._connection.receive():
                 if message.kind == "status":
                     self.status = message.fields
-                elif message.kind == "result" and message.fields.get("error") is None:
+                elif message.kind == "result":
                     self.is_stopped = True
         except IpcError:
             self.close()
@@ -64,7 +64,7 @@ class LinkView:
         self._connection.send(Message("hello", {"role": "supervisor"}))
 
     def stop(self) -> None:
-        """Send STOP. `is_stopped` tells when the board has confirmed it."""
+        """Send STOP. It is answered when the board has confirmed it, or at once if there is no board."""
         try:
             if self._connection is not None:
                 self._connection.send(Message("stop", {"id": 1}))

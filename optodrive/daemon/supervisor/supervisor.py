@@ -167,7 +167,9 @@ class Supervisor:
         self._handle_signals()
         for child in self._children:
             for fields in child.receive():
-                if child is self.web:
+                if fields.get("kind") == "warning":
+                    self._log.warn(str(fields.get("message")))
+                elif child is self.web:
                     self.on_web_message(fields)
         self.link_view.receive()
         for child in self._children:
@@ -196,6 +198,7 @@ class Supervisor:
         if ended is not None:
             if child is self._link:
                 self.link_view.close()
+                self._was_connected = False
             if not self._is_serving:
                 raise _build_start_error(child, ended)
             self._report_end(child, ended)
@@ -225,14 +228,14 @@ class Supervisor:
 
     def _publish(self) -> None:
         """Feed the watchdog while all beats are fresh, and tell the service manager about processes and board."""
-        if all(child.is_ready and not child.killed_because for child in self._children):
-            self._notifier.feed_watchdog()
-        missing = [child.name for child in self._children if not child.is_ready]
+        missing = [child.name for child in self._children if not child.is_ready or child.killed_because]
         board = f"board at {self.link_view.status.get('port', '')}, {self.link_view.board_state}"
         text = f"waiting for {', '.join(missing)}" if missing else board
-        if text != self._status_text:
+        if text != self._status_text and (missing or self.link_view.status):
             self._status_text = text
             self._notifier.send(f"STATUS={text}")
+        if not missing:
+            self._notifier.feed_watchdog()
         if self._is_serving and not self._was_announced_connected and self.link_view.status.get("connected"):
             self._announce_board()
         self._report_link_error()

@@ -1,12 +1,14 @@
 import pytest
 
-from optodrive.core.errors import NotReadyError
+from optodrive.core.errors import InputError, NotReadyError
 from optodrive.daemon.reload import (
+    ConfigReloader,
     describe_reload,
     merge_reloadable,
     require_disarmed,
     split_changed_keys,
 )
+from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
 from optodrive.link.protocol.states import LEASED_STATES
 
@@ -49,3 +51,28 @@ def test_an_armed_board_prevents_a_reload(state):
 @pytest.mark.parametrize("state", ["DISARMED", "FAULT", "BOOT", "no link"])
 def test_an_unarmed_board_permits_a_reload(state):
     require_disarmed(state)
+
+
+TOKENS = Tokens([Token("ann", "armer", "a-secret-of-ann")])
+
+
+def test_a_reload_is_kept_for_a_web_process_that_starts_later(config):
+    new = with_(config, "daemon", hosts=("lab",), port=9000)
+    reloader = ConfigReloader(config, TOKENS, lambda: new)
+    message = reloader.reload("DISARMED").build_web_message(7)
+    assert (message["kind"], message["id"], message["daemon"]["hosts"]) == ("reload", 7, ("lab",))
+    assert message["tokens"] == [["ann", "armer", "a-secret-of-ann"]]
+    assert message["fields"] == {"event": "reloaded", "applied": ["daemon.hosts"], "waiting": ["daemon.port"]}
+    assert reloader.config.daemon.hosts == ("lab",)
+    assert reloader.config.daemon.port == config.daemon.port
+
+
+def test_a_refused_reload_changes_nothing(config, tmp_path):
+    unreadable = with_(config, "daemon", hosts=("lab",), tokens=str(tmp_path / "missing.toml"))
+    reloader = ConfigReloader(config, TOKENS, lambda: unreadable)
+    with pytest.raises(NotReadyError):
+        reloader.reload("ARMED")
+    reloader = ConfigReloader(unreadable, TOKENS, lambda: with_(unreadable, "daemon", hosts=("other",)))
+    with pytest.raises(InputError, match=r"missing\.toml"):
+        reloader.reload("DISARMED")
+    assert (reloader.config, reloader.tokens) == (unreadable, TOKENS)

@@ -3,9 +3,11 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
 
@@ -150,6 +152,30 @@ def test_a_child_that_cannot_serve_at_the_start_ends_the_daemon_with_its_reason(
     assert tiny.process.returncode == 1  # the command line turns it into the reported status
     assert errors.splitlines()[-1].endswith("StartError: capture: got 'x.jsonl', expected a new file")
     assert tiny.notes("serves") == []
+
+
+def test_the_watchdog_is_fed_only_while_all_children_serve(start, tmp_path, monkeypatch):
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
+        monkeypatch.setenv("WATCHDOG_USEC", "200000")
+        tiny = start(planner="die,die,die,serve")
+        heard = []
+        until = time.monotonic() + PATIENCE_S
+        while heard.count("STATUS=board at tty, DISARMED") < 4:
+            assert time.monotonic() < until, heard
+            with suppress(BlockingIOError):
+                heard += manager.recv(4096).decode().split("\n")
+        tiny.end()
+    assert heard.count("READY=1") == 1
+    assert "STATUS=waiting for planner" in heard
+    is_waiting = False
+    for line in heard:
+        if line.startswith("STATUS="):
+            is_waiting = line == "STATUS=waiting for planner"
+        assert not (is_waiting and line == "WATCHDOG=1"), heard
+    assert heard.count("WATCHDOG=1") > 3
 
 
 def test_every_child_dies_with_a_killed_supervisor(start):

@@ -1,1 +1,0 @@
-"""Engine of the daemon in one process, until its parts have moved to processes of their own."""

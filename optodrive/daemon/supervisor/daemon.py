@@ -1,0 +1,166 @@
+"""Main function of the daemon: opens the sockets, tokens and runtime folder, and runs the supervisor."""
+
+import gc
+import socket
+import sys
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from optodrive.core.clock import MonotonicClock
+from optodrive.daemon.log import open_daemon_log
+from optodrive.daemon.notify import Notifier
+from optodrive.daemon.reload import ConfigReloader
+from optodrive.daemon.runtime_folder import RuntimeFolder, open_runtime_folder
+from optodrive.daemon.supervisor.child import Child
+from optodrive.daemon.supervisor.forking import execute_module, fork_with_beat
+from optodrive.daemon.supervisor.link_view import LinkView
+from optodrive.daemon.supervisor.reload_handler import ReloadHandler
+from optodrive.daemon.supervisor.supervisor import Supervisor
+from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
+from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
+from optodrive.device.config import Config
+from optodrive.link.board_setup import build_port_settings
+from optodrive.link.service.link_settings_builder import build_link_settings
+from optodrive.link.transport.registry import find_transport_factory
+
+if TYPE_CHECKING:
+    from optodrive.planning.display_model import DisplayModel
+
+LINK_MODULE = "optodrive.link.service.process"
+
+
+def run(
+    config: Config,
+    capture_path: Path | None = None,
+    read_config: Callable[[], Config] | None = None,
+    session_path: Path | None = None,
+) -> None:
+    """Serve until a signal arrives, then stop the board and end every process.
+
+    capture_path: new file for a capture of the link
+    read_config: reads the configuration again on SIGHUP of a service manager; any other SIGHUP ends the daemon, because
+    its terminal has closed
+    session_path: new HDF5 file for a recording of every plan, instead of the configured one
+    """
+    with ExitStack() as exit_stack:  # closes in reverse order: the processes first
+        log = open_daemon_log()
+        exit_stack.callback(log.close)
+        find_transport_factory(build_port_settings(config.board))  # refuses a Helios
+        clock = MonotonicClock()
+        notifier = Notifier(clock)
+        exit_stack.callback(notifier.close)
+        listeners = [open_tcp_listener(config.daemon.host, config.daemon.port)]
+        exit_stack.callback(listeners[0].close)
+        port = listeners[0].getsockname()[1]
+        unix = Path(config.daemon.socket) if config.daemon.socket else None
+        folder = open_runtime_folder(port, unix)
+        exit_stack.callback(folder.remove)
+        if unix is not None:
+            listeners.append(open_unix_listener(unix))
+            exit_stack.callback(_unlink, unix)
+            exit_stack.callback(listeners[1].close)
+        tokens, tokens_path = load_daemon_tokens(config.daemon.tokens, port)
+        if not config.daemon.tokens:  # generated for this run
+            exit_stack.callback(_unlink, tokens_path)
+        link_view = LinkView(folder.link_socket, clock)
+        link = Child("link", _build_link_start(config, folder, capture_path), clock)
+        supervisor = Supervisor(link, link_view, notifier, log, clock)
+        exit_stack.callback(supervisor.close)
+        supervisor.install_signal_handlers()
+        supervisor.start_link()  # it connects to the board while this process loads what the others need
+        reloader = ConfigReloader(config, tokens, config.model_copy if read_config is None else read_config)
+        starts = _build_starts(_load_display(config), folder, listeners, reloader, session_path)
+        if notifier.is_enabled and read_config is not None:
+            handler = ReloadHandler(reloader, supervisor, notifier, log)
+            supervisor.on_reload, supervisor.on_web_message = handler.request, handler.on_web_message
+        *others, web = (Child(name, start, clock) for name, start in starts.items())
+        if supervisor.start_others(others, web):
+            _announce(config, port, unix, tokens, tokens_path)
+            supervisor.on_board_seen = _announce_board
+            supervisor.record_audit({"event": "started", "display": config.name})
+            supervisor.serve()
+
+
+def _build_link_start(
+    config: Config, folder: RuntimeFolder, capture_path: Path | None
+) -> Callable[[socket.socket, int], int]:
+    def start(channel: socket.socket, number: int) -> int:
+        capture = None if capture_path is None else number_path(capture_path, number)
+        settings = build_link_settings(config, folder.link_socket, folder.link_socket_mode, capture)
+        folder.link_settings.write_text(settings.to_json(), encoding="utf-8")
+        descriptor = str(channel.fileno())
+        arguments = ("--settings", str(folder.link_settings), "--supervisor", descriptor)
+        return execute_module(LINK_MODULE, arguments, [channel.fileno()])
+
+    return start
+
+
+def _load_display(config: Config) -> "DisplayModel":
+    """Load what the other processes need, so that they share its memory."""
+    from optodrive.planning.display_model import DisplayModel
+    from optodrive.planning.pipeline import warm_up
+
+    display = DisplayModel.from_config(config)
+    warm_up(display)
+    gc.collect()
+    gc.freeze()  # a collection in a child would copy every page that it visits
+    return display
+
+
+def _build_starts(
+    display: "DisplayModel",
+    folder: RuntimeFolder,
+    listeners: list[socket.socket],
+    reloader: ConfigReloader,
+    session_path: Path | None,
+) -> dict[str, Callable[[socket.socket, int], int]]:
+    """Return how each forked process starts, by its name."""
+    from optodrive.daemon.engine.planner_process import run_planner
+    from optodrive.daemon.preview.process import run_preview
+    from optodrive.daemon.web.web_process import run_web
+
+    def start_planner(channel: socket.socket, number: int) -> int:
+        path = None if session_path is None else number_path(session_path, number)
+        return fork_with_beat(lambda beat: run_planner(display, folder, beat, path), "opto-planner", channel.fileno())
+
+    def start_preview(channel: socket.socket, number: int) -> int:
+        return fork_with_beat(lambda beat: run_preview(display, folder, beat), "opto-preview", channel.fileno())
+
+    def start_web(channel: socket.socket, number: int) -> int:
+        return fork_with_beat(
+            lambda beat: run_web(display, folder, beat, listeners, reloader.tokens, reloader.config.daemon),
+            "opto-web",
+            channel.fileno(),
+            [listener.fileno() for listener in listeners],
+        )
+
+    return {"planner": start_planner, "preview": start_preview, "web": start_web}
+
+
+def number_path(path: Path, number: int) -> Path:
+    """Return the path of a recording for a start of its process, because a recording never replaces a file."""
+    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+
+
+def _announce(config: Config, port: int, unix: Path | None, tokens: Tokens, tokens_path: Path) -> None:
+    socket_text = f" and {unix}" if unix else ""
+    address = f"http://{config.daemon.host}:{port}"
+    print(f"optodrive: {config.name} on {address}{socket_text}, token in {tokens_path}", flush=True)
+    if sys.stdout.isatty():  # a secret: only on a terminal, never in a log
+        print(f"optodrive: personal link to the page: {address}/#token={tokens.highest_role.secret}", flush=True)
+
+
+def _announce_board(link_view: LinkView) -> None:
+    """Print the state of the board, or that it is awaited."""
+    port = link_view.status.get("port", "")
+    if link_view.status.get("connected"):
+        print(f"optodrive: board at {port}, {link_view.board_state}; arm with `optodrive arm`", flush=True)
+    else:
+        print(f"optodrive: waiting for the board at {port}", flush=True)
+
+
+def _unlink(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()

@@ -1,0 +1,45 @@
+"""Reaction to SIGHUP of a service manager: the reload, its application by the web process, and the line about it."""
+
+from typing import Any
+
+from optodrive.core.errors import OptodriveError
+from optodrive.daemon.log import DaemonLog
+from optodrive.daemon.notify import Notifier
+from optodrive.daemon.reload import ConfigReloader, ReloadResult
+from optodrive.daemon.supervisor.supervisor import Supervisor
+
+
+class ReloadHandler:
+    """Handles one reload after the other."""
+
+    def __init__(self, reloader: ConfigReloader, supervisor: Supervisor, notifier: Notifier, log: DaemonLog) -> None:
+        self._reloader = reloader
+        self._supervisor = supervisor
+        self._notifier = notifier
+        self._log = log
+        self._number = 0
+        self._applied: ReloadResult | None = None
+
+    def request(self) -> None:
+        """Read the configuration and send what changed to the web process."""
+        self._notifier.notify_reloading()
+        try:
+            result = self._reloader.reload(self._supervisor.link_view.board_state)
+        except OptodriveError as error:
+            self._log.write(f"not reloaded, nothing changed: {error}", "err", EVENT="reload-refused")
+            self._notifier.send("READY=1")
+            return
+        self._number += 1
+        self._applied = result
+        if not self._supervisor.send_to_web(result.build_web_message(self._number)):
+            self._finish(result)  # the web process gets it when it starts
+
+    def on_web_message(self, fields: dict[str, Any]) -> None:
+        """End the reload when the web process has applied it."""
+        if fields.get("kind") == "reloaded" and fields.get("id") == self._number and self._applied is not None:
+            self._finish(self._applied)
+
+    def _finish(self, result: ReloadResult) -> None:
+        self._applied = None
+        self._log.write(result.line, "notice", EVENT="reloaded")
+        self._notifier.send("READY=1")

@@ -1,0 +1,267 @@
+"""Every process of the daemon dies, is stopped or is told to end, in every state of the board, by the board's log.
+
+docs/reference/limits.md states the bounds.
+"""
+
+import json
+import os
+import signal
+import time
+from collections import Counter
+from pathlib import Path
+
+import httpx
+import pytest
+
+from optodrive.daemon.supervisor.child import HANG_S
+from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
+
+PROCESSES = ("link", "planner", "preview", "web", "supervisor")
+SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM)
+SITUATIONS = ("idle", "armed", "streaming")
+RESTART_S = 3.0
+RESTARTS_MAX = 3
+AT_ONCE_S = 0.1
+"""Aim for an end that the link process notices by the end of a connection."""
+BEAT_TIMEOUT_S = 1.0
+"""Age of a beat from which the link process no longer renews the lease."""
+LATENESS_S = 0.03
+"""Maximum scheduling delay of the board process and of this test. The gate times in the log are exact."""
+DARK_S = {
+    ("link", signal.SIGKILL): PATIENT_LEASE_S,
+    ("link", signal.SIGSTOP): PATIENT_LEASE_S,
+    ("link", signal.SIGTERM): AT_ONCE_S,
+    ("planner", signal.SIGKILL): AT_ONCE_S,
+    ("planner", signal.SIGSTOP): BEAT_TIMEOUT_S + PATIENT_LEASE_S,
+    ("planner", signal.SIGTERM): AT_ONCE_S,
+    ("web", signal.SIGKILL): AT_ONCE_S,
+    ("web", signal.SIGSTOP): BEAT_TIMEOUT_S + PATIENT_LEASE_S,
+    ("web", signal.SIGTERM): AT_ONCE_S,
+    ("supervisor", signal.SIGKILL): AT_ONCE_S,
+    ("supervisor", signal.SIGTERM): AT_ONCE_S,
+}
+"""Time from a signal to a process until the gate stays off, s. What is missing does not end a running plan."""
+
+
+def matrix(processes):
+    """Return all cases, of which a third runs every time: each process with each signal, in one situation."""
+    cases = []
+    for row, process in enumerate(processes):
+        for column, number in enumerate(SIGNALS):
+            for place, situation in enumerate(SITUATIONS):
+                marks = [] if (row + column + place) % 3 == 2 else [pytest.mark.slow]
+                name = f"{process}-{number.name}-{situation}"
+                cases.append(pytest.param(process, number, situation, marks=marks, id=name))
+    return cases
+
+
+class Rig:
+    """A board, a daemon with an audit file, and the processes of the daemon."""
+
+    def __init__(self, folder, daemon_keys=""):
+        self.board = Board(folder)
+        self.audit = folder / "audit.jsonl"
+        text = f'lease_s = {PATIENT_LEASE_S}\n[daemon]\naudit = "{self.audit}"\n{daemon_keys}#'
+        self.daemon = Daemon(folder, self.board.port, replace=[(f"lease_s = {PATIENT_LEASE_S}", text)])
+
+    def find(self, name):
+        """Return the process id of a process of the daemon."""
+        pid = self.daemon.process.pid
+        if name == "supervisor":
+            return pid
+        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
+            is_link = "link.service" in read_proc(child, "cmdline")
+            if is_link if name == "link" else read_proc(child, "comm").strip() == f"opto-{name}":
+                return int(child)
+        return None
+
+    def bring_to(self, situation):
+        """Bring the board to a situation, from any other."""
+        wait_for(lambda: ask(self.daemon)["link"]["state"] == "up", "the link")
+        self.daemon.call("POST", "/v1/stop")
+        if self.daemon.board_state() == "FAULT":
+            self.daemon.call("POST", "/v1/disarm")
+        if situation != "idle":
+            self.daemon.arm()
+        self.board.forget()
+        if situation == "streaming":
+            self.daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
+            wait_for(lambda: len(self.board.of("pulse")) > 20, "pulses")
+
+    def restarts(self):
+        """Return the audit entries and the log lines about processes that started again."""
+        entries = [json.loads(line) for line in self.audit.read_text().splitlines()] if self.audit.exists() else []
+        lines = self.daemon.errors.read_text().splitlines()
+        return [e for e in entries if e["event"] == "restarted"], [e for e in lines if "starts again" in e]
+
+    def stop(self):
+        try:
+            self.daemon.stop()
+        finally:
+            self.board.stop()
+
+
+def read_proc(pid, name):
+    try:
+        return Path(f"/proc/{pid}/{name}").read_text()
+    except OSError:
+        return ""
+
+
+def board_now_us(board):
+    """Return the time of the last event in the board's log, which in a running plan is as good as now."""
+    events = board.events()
+    return events[-1]["t_us"] if events else 0
+
+
+def assert_dark_within(board, since_us, bound_s):
+    """Assert that the gate is off for good after a time; the lateness covers the reading of the log."""
+    gates = board.of("gate")
+    assert not gates or gates[-1]["on"] is False
+    late = [gate for gate in gates if gate["on"] and gate["t_us"] > since_us + (bound_s + LATENESS_S) * 1e6]
+    assert not late, (since_us, gates[-3:])
+    assert not gates or gates[-1]["t_us"] <= since_us + (bound_s + LATENESS_S) * 1e6
+
+
+def ask(daemon):
+    """Return the state over a connection of its own; it is accepted at any time, and answered by the next process."""
+    return httpx.get(f"{daemon.url}/v1/state", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=10.0).json()
+
+
+@pytest.fixture(scope="module")
+def rigs(tmp_path_factory):
+    """Return a list of the rigs, of which the last one runs."""
+    started = [Rig(tmp_path_factory.mktemp("shared"))]
+    yield started
+    started[-1].stop()
+
+
+@pytest.fixture
+def shared(rigs, tmp_path_factory):
+    """Return a rig for several tests, a new one before the supervisor delays the restart of a process noticeably."""
+    if max(Counter(entry["process"] for entry in rigs[-1].restarts()[0]).values(), default=0) >= RESTARTS_MAX:
+        rigs[-1].stop()
+        rigs.append(Rig(tmp_path_factory.mktemp("shared")))
+    return rigs[-1]
+
+
+@pytest.fixture
+def own(tmp_path):
+    rig = Rig(tmp_path)
+    yield rig
+    rig.stop()
+
+
+@pytest.mark.parametrize(("process", "number", "situation"), matrix(PROCESSES[:-1]))
+def test_a_child_that_ends_leaves_the_board_dark_and_starts_again_disarmed(shared, process, number, situation):
+    rig, daemon, board = shared, shared.daemon, shared.board
+    rig.bring_to(situation)
+    first, (entries, lines) = rig.find(process), rig.restarts()
+    since_us, since_s = board_now_us(board), time.monotonic()
+    os.kill(first, number)
+    patience_s = RESTART_S + (HANG_S if number == signal.SIGSTOP else 0.0)
+    wait_for(lambda: rig.find(process) not in (None, first), f"another {process} process", patience_s)
+    bound_s = DARK_S.get((process, number))
+    state = wait_for(
+        lambda: (
+            (s := ask(daemon))["link"]["state"] == "up"
+            and (bound_s is None or s["board"]["state"] not in EMITTING_STATES)
+            and s
+        ),
+        "the daemon to serve again",
+        since_s + patience_s + LATENESS_S - time.monotonic(),
+    )
+    wait_for(lambda: len(rig.restarts()[0]) > len(entries), "the audit entry")
+    if bound_s is None:
+        expected = {"idle": "DISARMED", "armed": "ARMED", "streaming": "RUNNING"}[situation]
+        assert state["board"]["state"] == expected
+        assert situation != "streaming" or board.of("gate")[-1]["t_us"] > since_us + 1e6 * HANG_S / 4
+    else:
+        assert state["board"]["state"] in ("DISARMED", "FAULT")
+        assert_dark_within(board, since_us, bound_s)
+        pulses = len(board.of("pulse"))
+        daemon.call("POST", "/v1/plans", status=409, json=long_train(seconds=0.1))
+        assert len(board.of("pulse")) == pulses
+    now_entries, now_lines = rig.restarts()
+    assert [entry["process"] for entry in now_entries[len(entries) :]] == [process]
+    assert len(now_lines) == len(lines) + 1
+    assert process in now_lines[-1]
+
+
+EMITTING_STATES = ("ARMED", "RUNNING", "ARMING")
+
+
+@pytest.mark.parametrize(("process", "number", "situation"), matrix(PROCESSES)[-9:])
+def test_the_end_of_the_supervisor_leaves_the_board_dark_and_no_process(own, process, number, situation):
+    rig, daemon, board = own, own.daemon, own.board
+    rig.bring_to(situation)
+    pids = [rig.find(name) for name in PROCESSES[:-1]]
+    since_us = board_now_us(board)
+    os.kill(daemon.process.pid, number)
+    if number == signal.SIGSTOP:
+        assert (
+            ask(daemon)["board"]["state"] == {"idle": "DISARMED", "armed": "ARMED", "streaming": "RUNNING"}[situation]
+        )
+        time.sleep(HANG_S * 1.5)
+        since_us = board_now_us(board)
+        daemon.call("POST", "/v1/stop")
+        assert_dark_within(board, since_us, AT_ONCE_S)
+        os.kill(daemon.process.pid, signal.SIGCONT)
+        time.sleep(0.5)
+        assert [rig.find(name) for name in PROCESSES[:-1]] == pids  # the beats of the meantime were not lost
+        return
+    assert daemon.process.wait(15) == (0 if number == signal.SIGTERM else -number)
+    wait_for(lambda: not any(is_alive(pid) for pid in pids), "the end of the children", 1.0)
+    wait_for(
+        lambda: not board.of("state") or board.of("state")[-1]["state"] not in EMITTING_STATES, "the board to disarm"
+    )
+    assert_dark_within(board, since_us, DARK_S[process, number])
+    assert "Traceback" not in daemon.errors.read_text()
+
+
+def is_alive(pid):
+    return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
+def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path, number):
+    rig = Rig(tmp_path, 'on_web_loss = "finish"\n')
+    try:
+        rig.bring_to("armed")
+        plan = rig.daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
+        wait_for(lambda: len(rig.board.of("pulse")) > 20, "pulses")
+        first = rig.find("web")
+        os.kill(first, number)
+        wait_for(lambda: rig.find("web") not in (None, first), "another web process")
+        wait_for(lambda: len(rig.board.of("pulse")) == plan["planned"], "the plan's last pulse")
+        assert rig.board.of("fault") == []
+    finally:
+        rig.stop()
+
+
+def test_callers_are_not_refused_while_the_web_process_is_away(shared):
+    rig = shared
+    first = rig.find("web")
+    os.kill(first, signal.SIGKILL)
+    assert ask(rig.daemon)["display"]
+    assert rig.find("web") != first
+
+
+def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):
+    pid = shared.find("supervisor")
+    assert len(list(Path(f"/proc/{pid}/task").iterdir())) == 1
+    port = int(shared.daemon.url.rsplit(":")[-1])
+    assert {name for name in PROCESSES if listens(shared.find(name), port)} == {"supervisor", "web"}
+
+
+def listens(pid, port):
+    """Return whether a process holds the socket that listens on a TCP port."""
+    rows = [line.split() for line in Path(f"/proc/{pid}/net/tcp").read_text().splitlines()[1:]]
+    inodes = {row[9] for row in rows if row[3] == "0A" and int(row[1].split(":")[1], 16) == port}
+    held = set()
+    for descriptor in Path(f"/proc/{pid}/fd").iterdir():
+        try:
+            held.add(str(descriptor.readlink()))
+        except OSError:
+            continue
+    return bool(held & {f"socket:[{inode}]" for inode in inodes})
