@@ -138,9 +138,10 @@ def push_frames(url):
 
 def measure_full_frames():
     """Stream full frames with a travelling wave at up to 16 per second, without other clients, from the cold state."""
+    from optodrive.daemon.one_process.engine import Engine
+
     from optodrive.core.clock import MonotonicClock
     from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-    from optodrive.daemon.one_process.engine import Engine
     from optodrive.device.config_file import load_config
     from optodrive.link.transport.simulated import SimulatedBoard
     from optodrive.planning.display_model import DisplayModel

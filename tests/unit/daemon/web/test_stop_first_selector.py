@@ -1,5 +1,6 @@
 import selectors
 import socket
+import time
 from contextlib import ExitStack
 
 import pytest
@@ -78,3 +79,25 @@ def test_the_request_stays_in_the_socket_and_a_removed_client_is_forgotten(selec
         selector.remove_client(own.fileno())
         selector.unregister(own)
     assert select_read(selector) == []
+
+
+def test_a_deferred_request_arrived_when_it_was_deferred(selector, make_pair):
+    filenos = [add_client(selector, make_pair(), b"GET") for _ in range(CLIENTS)]
+    begin_s = time.monotonic()
+    chosen = select_read(selector)
+    time.sleep(0.05)
+    read_s = time.monotonic()
+    for fileno in filenos:
+        arrived_s = selector.pop_arrival_s(fileno)
+        if fileno in chosen:
+            assert arrived_s >= read_s
+        else:
+            assert begin_s <= arrived_s < read_s - 0.04
+        assert selector.pop_arrival_s(fileno) >= read_s  # the next request of the client
+
+
+def test_a_connection_that_waited_with_a_request_keeps_its_arrival(selector, make_pair):
+    own, peer = make_pair()
+    peer.sendall(b"GET")
+    selector.add_client(own, 123.0)
+    assert selector.pop_arrival_s(own.fileno()) == 123.0

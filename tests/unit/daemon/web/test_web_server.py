@@ -12,6 +12,7 @@ from websockets.sync.client import connect
 
 from optodrive.daemon.web import bounded_websocket, connections
 from optodrive.daemon.web.listeners import open_tcp_listener
+from optodrive.daemon.web.server_state import ARRIVED_S
 from optodrive.daemon.web.web_server import Server
 
 GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -23,6 +24,8 @@ class Application:
 
     def __init__(self):
         self.calls = []
+        self.ages_s = []
+        self.message_ages_s = []
         self.release = asyncio.Event()
 
     async def __call__(self, scope, receive, send):
@@ -33,12 +36,16 @@ class Application:
         elif scope["type"] == "websocket":
             await self.echo(receive, send)
         else:
+            self.ages_s.append(time.monotonic() - scope["state"][ARRIVED_S])
             await self.answer(scope["path"], receive, send)
 
     async def echo(self, receive, send):
         await receive()
         await send({"type": "websocket.accept"})
         while (message := await receive())["type"] == "websocket.receive":
+            self.message_ages_s.append(time.monotonic() - message[ARRIVED_S])
+            if message.get("text") == "block":
+                await asyncio.sleep(0.5)
             await send({"type": "websocket.send", "text": str(len(message.get("text") or message["bytes"]))})
 
     async def answer(self, path, receive, send):
@@ -285,3 +292,34 @@ def test_messages_wait_for_the_pings_before_them(open_client, monkeypatch):
     while received.count(ECHO) < 2:
         received += stream.receive()
     assert received.count(PONG) >= 900
+
+
+def test_a_request_that_waited_for_its_turn_states_when_it_arrived(open_client, application):
+    blocking, others = [open_client() for _ in range(4)], [open_client() for _ in range(30)]
+    assert all(client.ask(GET) for client in (*blocking, *others))
+    application.ages_s.clear()
+    for client in others:
+        client.send(GET)
+    for client in blocking:  # each holds the loop for half a second, while some of the others wait
+        client.send(GET.replace(b"/v1/state", b"/block"))
+    assert all(client.receive_answer() for client in (*others, *blocking))
+    assert max(application.ages_s) > 0.4
+    application.ages_s.clear()
+    assert others[0].ask(GET)
+    assert application.ages_s[0] < 0.4
+
+
+def test_a_message_that_waited_in_the_socket_is_not_taken_for_new(port, application):
+    with open_websocket(port) as stream:
+        stream.send("first")
+        stream.recv(20)
+        stream.send("block")
+        time.sleep(0.1)
+        stream.send("waits")  # read half a second later
+        assert [stream.recv(20), stream.recv(20)] == ["5", "5"]
+        time.sleep(0.3)
+        stream.send("new")
+        stream.recv(20)
+    assert application.message_ages_s[0] < 0.3
+    assert application.message_ages_s[2] > 0.35
+    assert application.message_ages_s[3] < 0.25
