@@ -1,14 +1,20 @@
 """`optodrive status | arm | disarm | stop`: control a running daemon."""
 
-from typing import TYPE_CHECKING
+import sys
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from optodrive.cli.options import DEFAULT_URL, JsonOption, UrlOption
 from optodrive.cli.output import print_json
+from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
     from optodrive.daemon.responses.state import StateReport
+
+
+STATE_TIMEOUT_S = 2.0
+"""Longest wait for the daemon's state after a STOP that the link process has confirmed."""
 
 
 def register(app: typer.Typer) -> None:
@@ -42,11 +48,32 @@ def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Switch the gate off, drop everything queued, disarm the board."""
-    from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import STOP
+    """Switch the gate off, drop everything queued, disarm the board; on the daemon's computer even if it hangs."""
+    from optodrive.cli.direct_stop import stop_directly
 
-    _print_state(DaemonClient(url).call(STOP), json)
+    result = stop_directly(url)
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import READ_STATE, STOP
+
+    if result is None:
+        _print_state(DaemonClient(url).call(STOP), json)
+        return
+    try:
+        state = DaemonClient(url, timeout_s=STATE_TIMEOUT_S).call(READ_STATE)
+    except OptodriveError as error:
+        _print_stopped(result, error, json)
+    else:
+        _print_state(state, json)
+
+
+def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool) -> None:
+    """Print the result of the link process; error: why the daemon's state is not known."""
+    board = result["board"]
+    if as_json:
+        print_json({"board": board})
+    else:
+        print(f"board     {board['state']}" + (f", fault {board['fault']}: {board['hint']}" if board["fault"] else ""))
+    print(f"optodrive: the board was stopped; the state of the daemon is not known: {error}", file=sys.stderr)
 
 
 def _print_state(state: "StateReport", as_json: bool) -> None:

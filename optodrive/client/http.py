@@ -16,11 +16,13 @@ STOP_TIMEOUT_S = 3.0
 
 
 class DaemonClient:
-    """A blocking client; `policy` states the retries."""
+    """A blocking client; `policy` states the retries. timeout_s: longest wait for a part of an answer."""
 
-    def __init__(self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0) -> None:
+    def __init__(
+        self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0, timeout_s: float = TIMEOUT_S
+    ) -> None:
         self.policy = ExchangePolicy(Endpoint(url, token), reconnect_timeout_s)
-        self._client = self.policy.endpoint.open_client(TIMEOUT_S)
+        self._client = self.policy.endpoint.open_client(timeout_s)
 
     def close(self) -> None:
         """Close the connections."""

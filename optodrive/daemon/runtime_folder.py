@@ -76,6 +76,8 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
         else:  # a socket does not fit there
             path = Path(tempfile.mkdtemp(prefix=PREFIX))
             known_as.symlink_to(path)
+        if unix is not None:  # a command that knows only the TCP port finds it here
+            (path / "link.sock").symlink_to(find_link_socket(None, unix.absolute()))
     except OSError as error:
         raise InputError(str(known_as), error.strerror, "a folder that can be created") from None
     if unix is None:

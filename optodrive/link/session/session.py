@@ -140,6 +140,7 @@ class BoardSession:
 
     def _handshake(self) -> Iterator[float]:
         """Send what is due in each step of the handshake, and yield how long to wait for bytes."""
+        self.hold_points()
         self._reset()
         self._send_hello()
         deadline_s = self._clock.now_s() + CONNECT_TIMEOUT_S
@@ -162,7 +163,6 @@ class BoardSession:
 
     def _send_hello(self) -> None:
         """Begin a session. The board ends its previous activity and goes to DISARMED."""
-        self.hold_points()
         self._hello_sent_s = self._clock.now_s()
         self._connection.send_hello(secrets.randbits(32))
 
@@ -350,6 +350,7 @@ class BoardSession:
     def abort(self) -> None:
         """Turn the gate off, drop the queue and disarm, before all other queued messages."""
         self._refusal = None
+        self.hold_points()
         self.abort_confirmed = False
         self._connection.abort()
         self._send_hello()

@@ -1,0 +1,106 @@
+"""The sockets at which `optodrive stop` looks for the link process."""
+
+import json
+import os
+import socket
+import threading
+
+import pytest
+
+from optodrive.cli.direct_stop import list_link_sockets, stop_directly
+from optodrive.cli.main import run
+from optodrive.core.ipc import Message, MessageDecoder, encode_message
+from optodrive.daemon.runtime_folder import open_runtime_folder
+
+BOARD = {"state": "DISARMED", "fault": None, "hint": ""}
+
+
+@pytest.fixture
+def runtime(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    monkeypatch.setenv("OPTODRIVE_TOKEN", "a-token-for-tests")
+    return tmp_path
+
+
+def serve_once(path, answer):
+    """Answer one STOP in place of the link process; return the thread and the list of kinds received."""
+    listener = socket.socket(socket.AF_UNIX)
+    listener.bind(str(path))
+    listener.listen()
+    kinds = []
+
+    def serve():
+        connection, _ = listener.accept()
+        decoder = MessageDecoder()
+        with connection, listener:
+            while "stop" not in kinds:
+                kinds.extend(message.kind for message in decoder.feed(connection.recv(4096)))
+            connection.sendall(encode_message(answer))
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    return thread, kinds
+
+
+def find_free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("url", "names"),
+    [
+        ("http://127.0.0.1:9000", ["optodrive/daemon-9000/link.sock"]),
+        ("http://localhost:8450", ["optodrive/daemon-8450/link.sock", "/run/optodrive/optodrive-link.sock"]),
+        ("unix:/run/optodrive/optodrive.sock", ["/run/optodrive/optodrive-link.sock"]),
+        ("http://laser-room:8450", []),
+    ],
+)
+def test_only_sockets_of_the_daemon_at_the_url_are_tried(runtime, url, names):
+    assert list_link_sockets(url) == [runtime / name for name in names]
+
+
+def test_a_shared_socket_is_found_by_the_tcp_port_too(runtime):
+    unix = runtime / "shared.sock"
+    folder = open_runtime_folder(9000, unix)
+    thread, kinds = serve_once(folder.link_socket, Message("result", {"id": 1, "error": None, "board": BOARD}))
+    assert stop_directly("http://127.0.0.1:9000")["board"] == BOARD
+    thread.join()
+    assert kinds == ["hello", "stop"]
+    folder.remove()
+    assert not os.path.lexists(folder.path)
+
+
+def test_without_a_daemon_nothing_is_stopped(runtime):
+    assert stop_directly("http://127.0.0.1:9000") is None
+
+
+def test_the_command_stops_although_no_web_process_answers(runtime, capsys):
+    port = find_free_port()
+    folder = open_runtime_folder(port, None)
+    thread, _ = serve_once(folder.link_socket, Message("result", {"id": 1, "error": None, "board": BOARD}))
+    assert run(["stop", "--url", f"http://127.0.0.1:{port}", "--json"]) == 0
+    thread.join()
+    printed = capsys.readouterr()
+    assert json.loads(printed.out) == {"board": BOARD}
+    assert "the board was stopped" in printed.err
+
+
+def test_an_error_of_the_link_process_is_the_commands_error(runtime, capsys):
+    port = find_free_port()
+    folder = open_runtime_folder(port, None)
+    error = {"code": "link", "message": "no link to the board", "type": "LinkError"}
+    thread, _ = serve_once(folder.link_socket, Message("result", {"id": 1, "error": error, "board": BOARD}))
+    assert run(["stop", "--url", f"http://127.0.0.1:{port}"]) == 1
+    thread.join()
+    assert capsys.readouterr().err == "optodrive: no link to the board\n"
+
+
+def test_a_link_process_that_ends_instead_of_answering_is_an_error(runtime, capsys):
+    port = find_free_port()
+    folder = open_runtime_folder(port, None)
+    thread, _ = serve_once(folder.link_socket, Message("status", {}))
+    assert run(["stop", "--url", f"http://127.0.0.1:{port}"]) == 1
+    thread.join()
+    assert "use the emergency stop or the key" in capsys.readouterr().err
