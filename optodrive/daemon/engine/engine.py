@@ -40,6 +40,8 @@ from optodrive.planning.feasibility.report import FitMode
 LOOP_WAIT_S = 0.05
 SWITCH_INTERVAL_S = 2e-4
 QUEUE_MAX = 50
+QUEUED_PULSES_MAX = 2_000_000
+"""Pulses of all running and waiting plans: about 400 MB."""
 LOOP_TIMEOUT_S = 5.0
 T = TypeVar("T")
 
@@ -50,6 +52,7 @@ class Engine:
     message_loop: loop over the connections of the engine's thread, also for its clients
     commands: actions that the engine's thread carries out
     on_loop: called in every loop iteration; must return quickly
+    on_beat: called in every loop iteration, and during long computations in the loop's thread
     on_warning: called with one line for the log when the link fails
     """
 
@@ -58,6 +61,7 @@ class Engine:
         self.message_loop = MessageLoop()
         self.commands = LoopCommands()
         self.on_loop: Callable[[], None] = lambda: None
+        self.on_beat: Callable[[], None] = lambda: None
         self.on_warning: Callable[[str], None] = lambda line: None
         self._clock = clock
         self._session = session
@@ -77,6 +81,7 @@ class Engine:
             self._run_in_loop,
             self._require_armed,
         )
+        self._plan_queue.on_progress = self._beat
         self._epoch = session.epoch
         self._published_cause: LinkCause | None = None
         self.message_loop.watch(self.commands, lambda: None)
@@ -104,7 +109,7 @@ class Engine:
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
         self._plan_queue.start_next()
-        self._connection.beat(self._planner.is_alive)
+        self._beat()
         self._publish_cause()
 
     def _follow_link(self) -> None:
@@ -115,6 +120,11 @@ class Engine:
             self._plan_queue.fail_all(self._session.epoch_reason, clock_shift_s or 0.0)
         if clock_shift_s is not None:
             self._plan_queue.on_board_restarted(clock_shift_s)
+
+    def _beat(self) -> None:
+        """Prove to the link process and to the supervisor that the loop runs."""
+        self._connection.beat(self._planner.is_alive)
+        self.on_beat()
 
     def _publish_cause(self) -> None:
         cause = self._session.likely_cause
@@ -177,6 +187,10 @@ class Engine:
             raise NotReadyError(f"the board is {board.state}{fault}; arm it first (POST /v1/arm, or `optodrive arm`)")
         if len(self._plan_queue.waiting) >= QUEUE_MAX:
             raise NotReadyError(f"{QUEUE_MAX} plans are already waiting; wait for one to end, or cancel one")
+        if self._plan_queue.count_pulses() >= QUEUED_PULSES_MAX:
+            raise NotReadyError(
+                f"{QUEUED_PULSES_MAX} pulses are already waiting; wait for a plan to end, or cancel one"
+            )
 
     def end_stream(self, epoch: int | None = None, caller: str = "") -> "Future[PlanReport]":
         """Drop the unsent rest of a stream's last plan after its client has disconnected."""

@@ -61,7 +61,7 @@ def make_record(
     on_progress(1.0)
     payload = points.encode_payload()
     decoded = decode(payload, scale)
-    verify(planned.plan, points.row[decoded.index], decoded, snapshot.budget, display.budget)
+    verify(planned.plan, points.row[decoded.index], decoded, snapshot.budget, display.budget, lambda: on_progress(1.0))
     on_progress(1.0)
     return PlanRecord(
         plan_id=plan_id,

@@ -5,6 +5,7 @@ The points of a streamed plan are sent shortly before they are due, so that a ne
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import Executor
 from math import inf
 
@@ -42,6 +43,7 @@ class PlanQueue:
 
     Any thread may call make_snapshot() and read is_busy and must_preempt. Everything else belongs to the loop that owns
     the session.
+    on_progress: called during long computations in the loop's thread
     events: executed pulses and clock shifts, newest last, for one reader in another thread that removes them
     """
 
@@ -49,6 +51,7 @@ class PlanQueue:
         self, display: DisplayModel, session: RemoteSession, plan_store: PlanStore, executor: Executor
     ) -> None:
         self.lock = threading.RLock()
+        self.on_progress: Callable[[], None] = lambda: None
         self.running: deque[PlanRun] = deque()
         self.waiting: deque[PlanRecord] = deque()
         self.totals = {"planned": 0, "sent": 0, "executed": 0}
@@ -66,6 +69,11 @@ class PlanQueue:
     def is_busy(self) -> bool:
         """Whether a plan runs or waits."""
         return bool(self.running or self.waiting)
+
+    def count_pulses(self) -> int:
+        """Count the pulses of all running and waiting plans."""
+        running = [run.record for run in self.running.copy()]
+        return sum(len(record.planned.plan) for record in (*running, *self.waiting.copy()))
 
     # --- planning snapshots -------------------------------------------------------------------------------------
 
@@ -293,7 +301,7 @@ class PlanQueue:
 
     def _rewind_thermal_state(self, ended: list[PlanRecord], clock_shift_s: float) -> None:
         gate_off_s = self._session.board_s() - clock_shift_s + self._display.config.board.lease_s
-        self._thermal = rewind_estimate(ended, gate_off_s, self._display.budget)
+        self._thermal = rewind_estimate(ended, gate_off_s, self._display.budget, self.on_progress)
         self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
 
     def fail_all(self, reason: str, clock_shift_s: float = 0.0) -> None:

@@ -38,11 +38,7 @@ def run_planner(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter, 
         server = PlannerServer(engine, folder.planner_socket, clock)
         exit_stack.callback(server.close)
 
-        def on_loop() -> None:
-            beat.beat()
-            server.publish_state()
-
-        engine.on_loop = on_loop
+        engine.on_loop, engine.on_beat = server.publish_state, beat.beat
         engine.message_loop.watch(beat, beat.receive)
         beat.report_ready()
         try:

@@ -1,6 +1,6 @@
 """Thermal state and budget state on the board's time line, as estimated by the daemon."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
 
@@ -41,7 +41,9 @@ def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalSta
     return heat
 
 
-def rewind_estimate(ended: Sequence[PlanRecord], gate_off_s: float, budget: Budget) -> ThermalEstimate:
+def rewind_estimate(
+    ended: Sequence[PlanRecord], gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
+) -> ThermalEstimate:
     """Build the estimate after plans that ended early, without their dropped pulses.
 
     The heat counts only executed pulses. The budget counts every pulse that may have started before board time
@@ -56,7 +58,7 @@ def rewind_estimate(ended: Sequence[PlanRecord], gate_off_s: float, budget: Budg
         kept_pulses = len(plan) - record.dropped
         if kept_pulses:
             until_s = min(gate_off_s - record.start_s, float(np.nextafter(plan.start_s[kept_pulses - 1], inf)))
-            state = commit_until(plan, until_s, state, budget)
+            state = commit_until(plan, until_s, state, budget, on_progress)
         if record.executed is not None:
             heat = apply_executed(heat, record.executed)
     return ThermalEstimate.from_plan(heat, state, zero_s)

@@ -5,6 +5,7 @@ allowed above the temperature at which the touch surface would reach its cap in 
 to check each pulse up to its end; accepted pulses cannot exceed a cap at any later time.
 """
 
+from collections.abc import Callable
 from dataclasses import fields, replace
 from math import inf
 from typing import NamedTuple, Protocol
@@ -25,6 +26,13 @@ from optodrive.planning.limiter.pulse_application import (
     apply_pulses,
 )
 from optodrive.planning.limiter.workspace import LimiterWorkspace, PixelBudgets, close_workspace, open_workspace
+
+CHUNK_PULSES = 20_000
+"""Pulses between two progress reports, about a tenth of a second."""
+
+
+def _ignore_progress() -> None:
+    """Do nothing."""
 
 
 class _EncodedPulses(NamedTuple):
@@ -184,13 +192,18 @@ def concatenate(batches: list[LimitedPlan], state: BudgetState, budget: Budget) 
     return LimitedPlan(**columns)
 
 
-def commit_until(plan: LimitedPlan, until_s: float, state: BudgetState, budget: Budget) -> BudgetState:
+def commit_until(
+    plan: LimitedPlan,
+    until_s: float,
+    state: BudgetState,
+    budget: Budget,
+    on_progress: Callable[[], None] = _ignore_progress,
+) -> BudgetState:
     """Return the state after the pulses of a plan that start before `until_s`, which count in full."""
     count = int(np.searchsorted(plan.start_s, until_s))
     columns = {item.name: getattr(plan, item.name)[:count] for item in fields(PulsePlan)}
-    return close_workspace(
-        _apply_plan(plan.pixel[:count], PulsePlan(**columns), 0.0, state, budget, COUNT_ONLY)[3], budget
-    )
+    applied = _apply_plan(plan.pixel[:count], PulsePlan(**columns), 0.0, state, budget, COUNT_ONLY, on_progress)
+    return close_workspace(applied[3], budget)
 
 
 def commit_executed(pixel: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget) -> BudgetState:
@@ -198,7 +211,14 @@ def commit_executed(pixel: IntArray, pulses: TimedPulses, state: BudgetState, bu
     return close_workspace(_apply_plan(pixel, pulses, 0.0, state, budget, COUNT_ONLY)[3], budget)
 
 
-def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetState, budget: Budget) -> None:
+def verify(
+    plan: PulsePlan,
+    row: IntArray,
+    pulses: TimedPulses,
+    state: BudgetState,
+    budget: Budget,
+    on_progress: Callable[[], None] = _ignore_progress,
+) -> None:
     """Check pulses [n], decoded from the bytes that are about to be sent, against the caps.
 
     row: [n] row of the plan to which each pulse belongs. Raises LocalProtocolError if a pulse exceeds a cap.
@@ -215,7 +235,7 @@ def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetSta
     encoded = _EncodedPulses(*(column[order] for column in (*columns, power_w)))
     pixel = np.concatenate([plan.pixel[row], plan.pixel[omitted]])[order]
     exact = budget._replace(galvo=budget.galvo._replace(rad_per_code=0.0, timing_slack_s=0.0))
-    stop_row, allowed_w, cause, _ = _apply_plan(pixel, encoded, 0.0, state, exact, STOP)
+    stop_row, allowed_w, cause, _ = _apply_plan(pixel, encoded, 0.0, state, exact, STOP, on_progress)
     if stop_row < len(pixel):
         raise LocalProtocolError(
             f"encoded pulse {order[stop_row]} on pixel {pixel[stop_row]} passes a cap ({REASONS[cause[stop_row]]}): "
@@ -224,25 +244,41 @@ def verify(plan: PulsePlan, row: IntArray, pulses: TimedPulses, state: BudgetSta
 
 
 def _apply_plan(
-    pixel: IntArray, pulses: TimedPulses, delay_s: float, state: BudgetState, budget: Budget, policy: int
+    pixel: IntArray,
+    pulses: TimedPulses,
+    delay_s: float,
+    state: BudgetState,
+    budget: Budget,
+    policy: int,
+    on_progress: Callable[[], None] = _ignore_progress,
 ) -> tuple[int, FloatArray, IntArray, LimiterWorkspace]:
-    count = len(pixel)
+    """Apply pulses [n] in chunks, between which nothing but the workspace is carried over."""
+    count, applied = len(pixel), 0
     workspace = open_workspace(state, count)
     power_w, cause = np.zeros(count), np.zeros(count, dtype=np.int64)
     # Copies are contiguous: a kernel is compiled for one memory layout.
-    applied = apply_pulses(
-        budget,
-        workspace,
-        pixel.copy(),
-        pulses.start_s + delay_s,
-        pulses.width_s.copy(),
-        pulses.x_rad.copy(),
-        pulses.y_rad.copy(),
-        pulses.power_w.copy(),
-        policy,
-        power_w,
-        cause,
-    )
+    pixel = pixel.copy()
+    start_s, width_s, requested_w = pulses.start_s + delay_s, pulses.width_s.copy(), pulses.power_w.copy()
+    x_rad, y_rad = pulses.x_rad.copy(), pulses.y_rad.copy()
+    while applied < count:
+        end = min(applied + CHUNK_PULSES, count)
+        chunk = slice(applied, end)
+        applied += apply_pulses(
+            budget,
+            workspace,
+            pixel[chunk],
+            start_s[chunk],
+            width_s[chunk],
+            x_rad[chunk],
+            y_rad[chunk],
+            requested_w[chunk],
+            policy,
+            power_w[chunk],
+            cause[chunk],
+        )
+        if applied < end:
+            break
+        on_progress()
     return applied, power_w, cause, workspace
 
 
