@@ -1,9 +1,16 @@
 // Arming in two steps: one button requests it, another confirms it within five seconds. The page never arms by itself.
 
 import { call } from "./api.js";
-import { ARMED_STATES, BoardState } from "./board_states.js";
+import { BoardState } from "./board_states.js";
 
 const CONFIRM_S = 5;
+const TEXTS = {
+  [BoardState.ARMING]: "The indicator is on; the laser can emit after two seconds.",
+  [BoardState.ARMED]: "Armed: the laser emits as soon as a plan plays.",
+  [BoardState.RUNNING]: "The laser emits. STOP ends everything; End ends what plays.",
+  [BoardState.HOLD]: "The board waits for points, and may emit again at any time.",
+  [BoardState.FAULT]: "Acknowledge the fault before you arm.",
+};
 
 export class ArmControl {
   constructor(find, announce, onError) {
@@ -25,12 +32,7 @@ export class ArmControl {
     if (state !== this.state) {
       this.state = state;
       this.#setEnabled(state === BoardState.DISARMED);
-      this.status.textContent =
-        state === BoardState.ARMING
-          ? "The indicator is on; the laser can emit after two seconds."
-          : ARMED_STATES.includes(state)
-            ? "ARMED: the laser emits when a plan plays."
-            : this.idleText;
+      this.status.textContent = TEXTS[state] ?? this.idleText;
       if (state !== BoardState.DISARMED) {
         this.#closeConfirmation();
       }

@@ -3,8 +3,6 @@
 import { buildColourMap, readThemeColour } from "./colours.js";
 
 const SIZE = 680;
-const SCALE_STEPS = [10, 20, 50, 100, 200, 500, 1000];
-const SHRINK_MS = 3000;
 const GAP = 0.12;
 
 export class DisplayView {
@@ -17,8 +15,8 @@ export class DisplayView {
     this.beamPath = [];
     this.values = { height: new Float32Array(grid.pixels), absorber: new Float32Array(grid.pixels), preview: new Float32Array(grid.pixels) };
     this.ambient = 20;
-    this.scaleRange = { height: 10, absorber: 10, preview: 10 };
-    this.lastFilled = new Map();
+    this.maxUm = 200;
+    this.maxC = 100;
     this.frames = 0;
     this.cell = SIZE / Math.max(grid.rows, grid.columns);
     canvas.width = Math.round(this.cell * grid.columns);
@@ -31,7 +29,6 @@ export class DisplayView {
     this.marks = new OffscreenCanvas(canvas.width, canvas.height);
     this.setColourMap("viridis");
     this.paintRequested = false;
-    this.onScaleChange = () => {};
   }
 
   setColourMap(name) {
@@ -65,15 +62,16 @@ export class DisplayView {
     return this.quantity === "absorber" ? this.ambient : 0;
   }
 
+  // The scale is fixed: a colour means the same height all the time.
   get scaleMax() {
-    return this.scaleMin + this.scaleRange[this.quantity];
+    return this.quantity === "absorber" ? this.maxC : this.maxUm;
   }
 
   paint() {
     this.paintRequested = false;
     const { grid, context, picture, colours } = this;
     const values = this.values[this.quantity];
-    const range = this.#updateScale(values);
+    const range = this.scaleMax - this.scaleMin;
     const bytes = picture.data;
     for (let pixel = 0; pixel < grid.pixels; pixel++) {
       const position = grid.positions[pixel];
@@ -90,25 +88,6 @@ export class DisplayView {
     this.#paintCursor();
     this.frames++;
     this.canvas.dataset.frames = this.frames;
-  }
-
-  // Return the range of the scale: a round number above all values, which decreases only after a delay.
-  #updateScale(values) {
-    let max = 0;
-    for (const value of values) {
-      max = Math.max(max, value - this.scaleMin);
-    }
-    const previous = this.scaleRange[this.quantity];
-    const needed = SCALE_STEPS.find((step) => step >= max) ?? SCALE_STEPS.at(-1);
-    const now = performance.now();
-    if (needed >= previous) {
-      this.lastFilled.set(this.quantity, now);
-    }
-    if (needed > previous || now - (this.lastFilled.get(this.quantity) ?? now) > SHRINK_MS) {
-      this.scaleRange[this.quantity] = needed;
-      this.onScaleChange();
-    }
-    return this.scaleRange[this.quantity];
   }
 
   #corner(pixel) {

@@ -50,6 +50,6 @@ export class Freshness {
 
 function createMark(panel) {
   const mark = Object.assign(document.createElement("p"), { className: "stale-mark", hidden: true });
-  panel.querySelector("h2").after(mark);
+  panel.append(mark);
   return { panel, mark };
 }

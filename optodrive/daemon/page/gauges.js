@@ -2,6 +2,11 @@
 
 import { labelCap } from "./caps.js";
 
+const LEVELS = [
+  { fraction: 0.95, kind: "bad" },
+  { fraction: 0.8, kind: "warn" },
+];
+
 export class Gauges {
   constructor(container) {
     this.container = container;
@@ -18,7 +23,9 @@ export class Gauges {
       const text = `${(cap.value / divisor).toFixed(digits)} of ${limit.toFixed(digits)} ${prefix}${cap.unit}${place}`;
       gauge.text.textContent = text;
       gauge.bar.style.setProperty("--fraction", Math.min(1, Math.max(0, cap.fraction)));
-      gauge.item.dataset.kind = cap.fraction > 0.95 ? "bad" : cap.fraction > 0.8 ? "warn" : "";
+      const level = LEVELS.find(({ fraction }) => cap.fraction >= fraction);
+      gauge.item.dataset.kind = level?.kind ?? "";
+      gauge.level.textContent = level ? `▲ ≥ ${100 * level.fraction} %` : "";
       gauge.bar.setAttribute("aria-valuenow", Math.round(100 * Math.max(0, Math.min(1, cap.fraction))));
       gauge.bar.setAttribute("aria-valuetext", text);
     }
@@ -27,14 +34,15 @@ export class Gauges {
   #create(cap) {
     const item = Object.assign(document.createElement("div"), { className: "gauge" });
     const name = Object.assign(document.createElement("b"), { textContent: labelCap(cap.cap) });
+    const level = document.createElement("em");
     const text = document.createElement("span");
     const bar = document.createElement("i");
     for (const [key, value] of Object.entries({ role: "meter", "aria-valuemin": 0, "aria-valuemax": 100, "aria-label": name.textContent })) {
       bar.setAttribute(key, value);
     }
-    item.append(name, text, bar);
+    item.append(name, level, text, bar);
     this.container.append(item);
-    const gauge = { item, text, bar };
+    const gauge = { item, level, text, bar };
     this.gauges.set(cap.cap, gauge);
     return gauge;
   }

@@ -61,6 +61,7 @@ setCapLabels(config.limits.caps);
 const grid = new Grid(config);
 const view = new DisplayView(find("display"), grid);
 view.ambient = config.ambient_c;
+view.maxC = config.limits.absorber_max_c;
 const drawing = new Drawing(view);
 const timeline = new Timeline(find("timeline"), find("timeline-text"), config.laser.max_power_w);
 const trace = new Trace(find("trace"));
@@ -159,10 +160,16 @@ function showQuantity(quantity) {
   updateLegend();
 }
 
+function applyScale() {
+  view.maxUm = Number(readChoice("scale"));
+  view.requestPaint();
+  updateLegend();
+}
+
 function updateLegend() {
   const unit = view.quantity === "absorber" ? "°C" : "µm";
   find("legend-low").textContent = `${Math.round(view.scaleMin)} ${unit}`;
-  find("legend-high").textContent = `${Math.round(view.scaleMax)} ${unit}`;
+  find("legend-high").textContent = `≥ ${Math.round(view.scaleMax)} ${unit}`;
 }
 
 function applyColourMap() {
@@ -189,7 +196,8 @@ function describeDisplay() {
   const text = raised
     ? `${raised} pixels above 1 µm, highest ${height[highest].toFixed(1)} µm at ${highest}; hottest absorber ${absorber[hottest].toFixed(0)} °C at ${hottest}.`
     : "No pixel is above 1 µm.";
-  find("summary").textContent = `${text} ${view.rate ? `${view.rate} frames/s.` : ""}`;
+  find("summary").textContent = text;
+  find("frame-rate").textContent = `${view.rate} frames/s`;
 }
 
 for (const radio of document.querySelectorAll('input[name="show"]')) {
@@ -203,8 +211,14 @@ bindThemeButton(find("theme"), () => {
   timeline.applyTheme();
   trace.applyTheme();
 });
-view.onScaleChange = updateLegend;
-updateLegend();
+for (const radio of document.querySelectorAll('input[name="scale"]')) {
+  radio.checked = radio.value === (localStorage.getItem("scale") ?? "200");
+  radio.addEventListener("change", () => {
+    localStorage.setItem("scale", radio.value);
+    applyScale();
+  });
+}
+applyScale();
 find("beam").checked = !reducedMotion;
 applyColourMap();
 onStimulusChange();

@@ -19,7 +19,7 @@ export class Status {
       Underruns: board.underruns,
       "Laser on": `${board.laser_on_s.toFixed(2)} s`,
       "Pulses executed": totals.executed,
-      Temperature: board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
+      "Board temperature": board.temperature_c === null ? "–" : `${board.temperature_c.toFixed(1)} °C`,
     };
     this.stats.replaceChildren(...Object.entries(rows).flatMap(([name, value]) => [createElement("dt", name), createElement("dd", value)]));
   }
