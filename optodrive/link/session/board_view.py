@@ -1,6 +1,6 @@
 """Latest state of the board as reported to the host."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from optodrive.link.protocol import messages as m
@@ -46,4 +46,4 @@ class BoardView:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the fields of the REST response, with a hint on the fault's likely cause."""
-        return {**asdict(self), "fault": self.fault or None, "hint": get_fault_hint(self.fault)}
+        return {**vars(self), "fault": self.fault or None, "hint": get_fault_hint(self.fault)}
