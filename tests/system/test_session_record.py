@@ -15,9 +15,15 @@ from rig import long_train, wait_for
 OPTODRIVE = Path(sys.executable).with_name("optodrive")
 
 
+def list_descendants(pid):
+    threads = Path(f"/proc/{pid}/task").iterdir()  # the recorder may have been started by any thread
+    children = [int(child) for thread in threads for child in (thread / "children").read_text().split()]
+    return children + [found for child in children for found in list_descendants(child)]
+
+
 def writer_of(daemon):
-    children = Path(f"/proc/{daemon.process.pid}/task/{daemon.process.pid}/children").read_text().split()
-    found = [int(pid) for pid in children if b"session_writer" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    processes = list_descendants(daemon.process.pid)
+    found = [pid for pid in processes if b"session_writer" in Path(f"/proc/{pid}/cmdline").read_bytes()]
     assert len(found) == 1
     return found[0]
 
