@@ -182,6 +182,11 @@ class Daemon:
     def board_state(self):
         return self.state()["board"]["state"]
 
+    def list_children(self):
+        """Return the process ids of the daemon's processes besides the supervisor."""
+        pid = self.process.pid
+        return [int(text) for text in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
     def finished(self, plan):
         def ended():
             answer = self.call("GET", f"/v1/plans/{plan}")

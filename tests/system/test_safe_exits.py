@@ -52,7 +52,9 @@ def test_kill_9_while_pulses_run(board, make_daemon):
 def test_sigstop_while_pulses_run(board, make_daemon, lease_s):
     daemon, lease_us = make_daemon(board, lease_s=lease_s), round(lease_s * 1e6)
     plan = start_pulses(board, daemon)
-    os.kill(daemon.process.pid, signal.SIGSTOP)
+    pids = [daemon.process.pid, *daemon.list_children()]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
     stopped_us = board.events()[-1]["t_us"]
     wait_for(lambda: board.of("fault"), "the board's fault")
     assert board.of("fault") == [{"t_us": board.of("fault")[0]["t_us"], "event": "fault", "fault": "LINK"}]
@@ -61,7 +63,8 @@ def test_sigstop_while_pulses_run(board, make_daemon, lease_s):
     time.sleep(0.3)
     assert board.of("pulse")[-1]["t_us"] <= stopped_us + lease_us + LATENESS_US
 
-    os.kill(daemon.process.pid, signal.SIGCONT)
+    for pid in pids:
+        os.kill(pid, signal.SIGCONT)
     answer = daemon.finished(plan)
     assert answer["status"] == "failed"
     assert "LINK" in answer["error"]

@@ -157,6 +157,12 @@ class Child:
             return False
         return True
 
+    def excuse(self) -> None:
+        """Count from now on: the supervisor itself did not run, and the process may not have run either."""
+        if not self.is_ready:
+            self._started_s = self._clock.now_s()
+        self._beaten_s = self._clock.now_s()
+
     def find_hang(self) -> str | None:
         """Return why the process counts as hung, None if it does not. Call it after receive()."""
         if not self.is_running or self.killed_because:

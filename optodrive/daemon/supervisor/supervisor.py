@@ -16,6 +16,8 @@ from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.link_view import LinkView
 
 TICK_S = 0.1
+STALL_S = 1.0
+"""A loop that takes longer was stalled itself, and judges nobody by the time that has passed."""
 STOP_CONFIRMATION_S = 0.5
 END_GRACE_S = 3.0
 """Time for a child to end after SIGTERM. The web server gives slow clients two seconds."""
@@ -63,6 +65,7 @@ class Supervisor:
         self._signals: set[int] = set()
         self._wakeup_read, self._wakeup_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._is_loading, self._is_serving, self._is_ending = True, False, False
+        self._stepped_s = clock.now_s()
         self._status_text = ""
         self._reported_link_error = ""
         self._was_connected = self._was_announced_connected = False
@@ -162,6 +165,11 @@ class Supervisor:
         descriptors = [descriptor for child in self._children for descriptor in child.descriptors]
         awaited = [] if self._is_serving else self.link_view.descriptors  # later it is read at every tick
         self._wait([self._wakeup_read, *descriptors, *awaited], TICK_S)
+        now_s = self._clock.now_s()
+        if now_s - self._stepped_s > STALL_S:  # as after Ctrl-Z and fg, which stop and continue all processes
+            for child in self._children:
+                child.excuse()
+        self._stepped_s = now_s
         with suppress(BlockingIOError):
             os.read(self._wakeup_read, 4096)
         self._handle_signals()

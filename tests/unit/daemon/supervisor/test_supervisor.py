@@ -121,6 +121,22 @@ def test_a_stopped_child_is_killed_and_starts_again(start):
     assert "the web process killed: no beat" in tiny.end()
 
 
+def test_processes_that_were_stopped_together_continue_together(start):
+    """Ctrl-Z and fg: the supervisor may run first again, and finds no beats of the meantime."""
+    tiny = start()
+    tiny.wait_for("serves")
+    planner = tiny.notes("planner starts")[0]["pid"]
+    for pid in (tiny.process.pid, planner):
+        os.kill(pid, signal.SIGSTOP)
+    time.sleep(HANG_S + 0.5)
+    os.kill(tiny.process.pid, signal.SIGCONT)
+    time.sleep(HANG_S / 4)
+    os.kill(planner, signal.SIGCONT)
+    time.sleep(HANG_S)
+    assert is_alive(planner)
+    assert tiny.end() == ""
+
+
 def test_a_child_that_keeps_dying_starts_again_less_and_less_often(start):
     tiny = start(planner="die")
     times_s = [tiny.wait_for("planner starts", count)["s"] for count in (1, 2, 3, 4)]
