@@ -1,0 +1,62 @@
+"""`optodrive stop` while every other process of the daemon is stopped, with the real daemon and board process."""
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from rig import OPTODRIVE, long_train, wait_for
+
+STATE_TIMEOUT_S = 2.0
+PATIENCE_S = 10.0
+
+
+def find_others(daemon):
+    """Return the process ids of the daemon without its link process, the supervisor first, so that it restarts none."""
+    pid = daemon.process.pid
+    children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    link = [child for child in children if "link.service" in Path(f"/proc/{child}/cmdline").read_text()]
+    assert len(link) == 1
+    return [pid, *(int(child) for child in children if child not in link)]
+
+
+@pytest.fixture
+def suspended():
+    """Return a function that suspends processes until the end of the test."""
+    pids = []
+
+    def suspend(found):
+        pids.extend(found)
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+
+    yield suspend
+    for pid in reversed(pids):
+        os.kill(pid, signal.SIGCONT)
+
+
+def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
+    daemon.arm()
+    daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
+    wait_for(lambda: len(board.of("pulse")) > 20, "pulses")
+    others = find_others(daemon)
+    assert len(others) == 4
+    suspended(others)
+    environment = {name: value for name, value in os.environ.items() if name != "OPTODRIVE_TOKEN"}  # none is needed
+    begin_s = time.monotonic()
+    ended = subprocess.run(
+        [OPTODRIVE, "stop", "--url", daemon.url],
+        env=environment | {"XDG_RUNTIME_DIR": str(tmp_path), "OPTODRIVE_TOKENS": str(tmp_path / "none")},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+    )
+    print(f"\noptodrive stop took {time.monotonic() - begin_s:.2f} s")
+    assert ended.returncode == 0, ended.stderr
+    assert "the board was stopped" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    assert board.of("gate")[-1]["on"] is False
+    assert board.of("state")[-1]["state"] in ("DISARMED", "FAULT")
