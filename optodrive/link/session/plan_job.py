@@ -1,6 +1,6 @@
 """Points of one plan on their way through the board, with the board's report of their execution."""
 
-from math import inf
+from math import floor, inf
 from typing import NamedTuple
 
 import numpy as np
@@ -72,10 +72,9 @@ class PlanJob:
         position = self.next_to_send - self.first_index
         if self._send_ahead_ticks == inf:
             return self._count - position
-        # A point starts at the end of its predecessor.
-        due_count = (
-            int(np.searchsorted(self._end_tick[: self._count], now_tick + self._send_ahead_ticks, side="right")) + 1
-        )
+        # A point starts at the end of its predecessor. With a float, numpy would convert all ticks at every call.
+        due_tick = floor(now_tick + self._send_ahead_ticks)
+        due_count = int(np.searchsorted(self._end_tick[: self._count], due_tick, side="right")) + 1
         return max(0, min(due_count, self._count) - position)
 
     @property

@@ -34,7 +34,8 @@ CLOCK_INITIAL_SAMPLES = 8
 SILENCE_TIMEOUT_S = 2.0
 """The link counts as lost after this time without a message from the board."""
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
-RETRANSMISSION_WAIT_S = 0.002
+RETRANSMISSION_WAIT_S = BATCH_WAIT_S = 0.002
+"""Shortest wait for a retransmission, and for further points to become due, so that frames hold several."""
 SPLICE_LEAD_S = 0.01
 """Minimum time between a splice and the end of the points before it."""
 
@@ -422,7 +423,7 @@ class BoardSession:
         if not self._points_held and self.board.state in ARMED_STATES:
             due_tick = self._points.find_due_tick()
             if due_tick is not None:
-                wait_s = min(wait_s, due_tick * self.scale.tick_s - self.board_s())
+                wait_s = min(wait_s, max(due_tick * self.scale.tick_s - self.board_s(), BATCH_WAIT_S))
         return max(wait_s, WAIT_MIN_S)
 
     # --- statistics ---------------------------------------------------------------------------------------------

@@ -51,7 +51,8 @@ class SerialPort:
         """Return the bytes that have arrived. Wait at most timeout_s for the first."""
         port = self._require_open()
         try:
-            port.timeout = timeout_s
+            if port.timeout != timeout_s:  # setting it costs system calls
+                port.timeout = timeout_s
             first: bytes = port.read(1)
             return first + port.read(port.in_waiting) if first else b""
         except (OSError, TypeError) as error:  # pyserial raises TypeError when the port is closed under a read
