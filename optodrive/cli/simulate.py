@@ -45,7 +45,9 @@ def simulate(
     out: Annotated[Path | None, typer.Option("--out", metavar="recording.h5", help="Write the recording.")] = None,
     pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to record, or all.")] = None,
     dt: Annotated[float, typer.Option("--dt", metavar="SECONDS", help="Time between samples.")] = 1e-3,
-    noise: Annotated[float, typer.Option("--noise", help="Instrument noise as a factor of the stated noise.")] = 0.0,
+    noise: Annotated[
+        float, typer.Option("--noise", help="Noise of the recording as a factor of the instruments'; 0: none.")
+    ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
     config: ConfigOption = None,
     model: ModelOption = None,
@@ -73,6 +75,8 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and simulate the measurement of the pixels."""
+    from optodrive.core.files import check_output
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
     from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
@@ -86,6 +90,7 @@ def simulate(
         raise InputError("--noise", noise, "a factor between 0 and 1000")
     if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
         raise InputError("--post-pulse", post_pulse_s, "a time between 0.001 and 10 s")
+    check_output("--out", out, *HDF5_SUFFIXES, folder=True)
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None
@@ -113,6 +118,7 @@ def simulate(
     if out is not None:
         _write_recording(out, display, executed, traces, noise, seed)
     report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
+    report["noise"] = None if out is None else noise
     if json:
         print_json(report)
         return
@@ -125,7 +131,18 @@ def simulate(
             f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
         )
     if out is not None:
+        print(f"noise            {_describe_noise(noise)}")
         print(f"written          {out}")
+
+
+def _describe_noise(noise: float) -> str:
+    from optodrive.core.units import m_to_um
+    from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA
+
+    if noise == 0.0:
+        return "none: the recording is exact, as no instrument's is"
+    kelvin, metre, newton = (noise * sigma for sigma in INSTRUMENT_SIGMA.values())
+    return f"{kelvin:.3g} K, {m_to_um(metre):.3g} µm, {newton * 1e3:.3g} mN rms added to the recording; --noise 0: none"
 
 
 def _build_true_display(config: "Config", sampled_pixels: "GroundTruthPixels | None") -> "ThermalState":
