@@ -5,6 +5,8 @@ import numpy as np
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.term import SignalDelays
+from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15
@@ -24,6 +26,8 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
     noise: factor on noise and jitters; 0 gives repeats that are equal to the last digit, without missing samples
     """
     rng = np.random.default_rng(seed)
+    parts = [SignalDelays(), *(discover_terms()[key].signal_delays(values) for key, values in terms.items())]
+    delays = SignalDelays(*(sum(column) for column in zip(*parts, strict=True)))
     runs = []
     for name in groups:
         pulses = np.array(GROUPS[name])
@@ -34,7 +38,10 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
             real[:, 2] *= np.exp(noise * 0.005 * rng.standard_normal())
             real[:, 0] += noise * 2e-5 * rng.standard_normal()
             readings = simulate_signals(
-                PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values(terms)
+                PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))),
+                PIXEL,
+                ActiveTerms.from_values(terms),
+                (delays.temperature, delays.displacement, delays.force),
             )
             signals = {}
             for (signal, white), value in zip(SIGNALS, readings[:2], strict=True):

@@ -53,6 +53,27 @@ def test_a_hidden_cause_is_named_measured_and_gains(droop):
     assert "Ruled out" in text
 
 
+@pytest.mark.parametrize("time_s", [3e-4, 1e-3])
+def test_a_laser_that_is_slow_at_both_edges_is_no_late_clock(time_s):
+    found = diagnose(lab(24, {"laser_lag": {"time": time_s}}))
+    assert (found.verdict, found.causes) == ("cause", ("laser_lag",))
+    assert found.parameters["laser_lag.time"].value == pytest.approx(time_s, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        {"laser_turn_on": {"time": 8e-4}},
+        {"clock_offset": dict.fromkeys(("temperature", "displacement", "force", "mirrors"), 4e-4)},
+    ],
+    ids=lambda terms: "".join(terms),
+)
+def test_what_acts_at_one_edge_or_late_as_a_whole_is_no_slow_laser(terms):
+    found = diagnose(lab(25, terms))
+    assert found.verdict != "unexplained"
+    assert set(terms) <= set(found.causes)
+
+
 def test_two_hidden_causes_are_named_together():
     found = diagnose(lab(13, TWO))
     assert found.verdict == "cause"
