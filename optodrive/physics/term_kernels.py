@@ -30,7 +30,7 @@ class HookChains(NamedTuple):
     """
 
     optical_power: HookChain
-    afterglow: HookChain
+    decaying_power: HookChain
     heat_capacity: HookChain
     bridge_resistance: HookChain
     heat_loss: HookChain

@@ -33,7 +33,7 @@ def optical_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float)
 
 
 @kernel
-def afterglow(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
+def decaying_power(v: FloatArray, y: FloatArray, s: int, c: FloatArray, x: float) -> float:
     """Add the power that is still emitted, W."""
     return float(x + y[s])
 
@@ -47,7 +47,7 @@ class LaserLag(Term):
         TermParameter("time", "s", 5e-4, 1e-4, 4e-3, "drivers with a filter, 0.1 to 3 ms", starts=(2e-4, 6e-4, 2e-3)),
     )
     followers = ("emitted_w",)
-    kernels = Kernels(rates=rates, optical_power=optical_power, afterglow=afterglow)
+    kernels = Kernels(rates=rates, optical_power=optical_power, decaying_power=decaying_power)
     is_fast = True
     signature = "the first milliseconds after either edge of a pulse"
 
