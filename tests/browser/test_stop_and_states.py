@@ -65,6 +65,8 @@ def test_stop_finds_a_connection_beside_six_visible_windows(visit, daemon):
     expect(pages[0].locator("#board-state")).to_have_text("DISARMED")
     expect(pages[-1].locator("#stopping")).to_be_hidden()
     assert (len(stops), failed) == (1, [])
+    expect(pages[-1].locator("#link")).to_have_text("live")
+    expect(pages[-1].locator("#fault-history")).to_have_text("None.")  # the pause of the telemetry is no fault
 
 
 ESTOP_AND_KEY = """

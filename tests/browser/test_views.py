@@ -22,6 +22,10 @@ def test_pulses_and_board_are_in_view_on_a_desktop(visit, daemon):
     expect(page.locator("#figures dt")).not_to_have_count(0)
     expect(page.locator(".gauge")).not_to_have_count(0)
     assert is_in_view(page, *panels, page.get_by_role("button", name="Play", exact=True))
+    page.locator("#display").focus()
+    page.keyboard.press("Space")
+    page.get_by_role("button", name="Preview").click()
+    expect(page.locator("#picked")).to_contain_text("drawn 100 µm, predicted 100")
     daemon.arm()
     for seconds in (6.0, 2.0):
         play_for(daemon, seconds)

@@ -244,11 +244,14 @@ telemetry.addEventListener("up", () => {
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {
-  header.showConnection("no daemon, trying again", "bad");
   freshness.lose();
-  showNothingKnown("no daemon");
-  status.showNoDaemon();
-  if (!document.hidden) {
+  if (telemetry.paused) {
+    header.showConnection("paused", "bad");
+    showNothingKnown("telemetry is paused");
+  } else {
+    header.showConnection("no daemon, trying again", "bad");
+    showNothingKnown("no daemon");
+    status.showNoDaemon();
     pastEvents.addNoDaemon();
   }
   find("stale").hidden = false;
