@@ -12,6 +12,7 @@ from pydantic_core import PydanticUndefined
 from rest_reference import build_rest_reference
 
 from optodrive.device.config import VERSION, Config
+from optodrive.physics.term_reference import build_example, describe_term
 from optodrive.physics.terms import discover_terms
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "reference"
@@ -23,9 +24,14 @@ default and derived number. Quantities are in SI units, named by the suffix of t
 """
 TERMS_HEAD = """# Terms
 
-Generated from `optodrive/physics/terms` by `scripts/reference`. A term is a physical effect beyond the nominal pixel. A
-parameter set may hold its parameters, `optodrive diagnose` looks for it in recordings, and the limiter bounds the heat
-that it can add.
+Generated from `optodrive/physics/terms` by `scripts/reference`; `optodrive terms` prints the same. A term is a physical
+effect beyond the nominal pixel. A parameter set may hold its parameters, `optodrive diagnose` looks for it in
+recordings, and the limiter bounds the heat that it can add.
+
+A [parameter set](formats/parameter-sets.md) (`model.toml`) states a term by the lines below its table. A parameter with
+a value under "if omitted" need not be stated: the value has no effect, or is the usual shape. `planner_terms` names the
+terms that heights are planned with. `simulate --truth model.toml` simulates these and every term that the file itself
+states; those of its base count only if `planner_terms` names them. "Start" is where a diagnosis begins its search.
 """
 
 
@@ -80,17 +86,30 @@ def build_configuration_reference() -> str:
     return "\n".join(parts)
 
 
+def format_omitted(value: float | None) -> str:
+    """Return a parameter's value where it is omitted."""
+    return "required" if value is None else f"{value:g}"
+
+
 def build_terms_reference() -> str:
     """Return Markdown with one section per term."""
     parts = [TERMS_HEAD]
     for key, term in sorted(discover_terms().items()):
+        about = describe_term(term)
         rows = [
-            f"| `{item.name}` | {item.unit} | {item.default:g} | {item.low:g} to {item.high:g} | {item.source} |"
-            for item in term.parameters
+            f"| `{item['name']}` | {item['unit']} | {format_omitted(item['if_omitted'])} | {item['start']:g} |"
+            f" {item['low']:g} to {item['high']:g} | {item['source']} |"
+            for item in about["parameters"]
         ]
-        summary = " ".join((type(term).__doc__ or "").split())
-        head = ["| parameter | unit | start | range | source |", "|---|---|---|---|---|"]
-        parts.append("\n".join([f"## `{key}`", "", summary, "", *head, *rows, ""]))
+        notes = [f"Needs {', '.join(f'`{name}`' for name in term.requires)}."] if term.requires else []
+        if not term.in_pixel:
+            notes.append("Only the limiter accounts for it; heights are not planned with it.")
+        if term.signature:
+            notes.append(f"Visible in {term.signature}.")
+        head = ["| parameter | unit | if omitted | start | range | source |", "|---|---|---|---|---|---|"]
+        example = ["", *(f"    {line}" for line in build_example(term))]
+        text = [about["label"][:1].upper() + about["label"][1:] + ".", "", about["equation"], *notes]
+        parts.append("\n".join([f"## `{key}`", "", *text, "", *head, *rows, *example, ""]))
     return "\n".join(parts)
 
 

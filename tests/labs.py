@@ -5,6 +5,8 @@ import numpy as np
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.term import SignalDelays
+from optodrive.physics.terms import discover_terms
 
 PIXEL = Pixel(180.0, 100e-6, 0.66, 3e-3, 4e-6, 2.3e-4)
 AMBIENT_K = 293.15
@@ -18,9 +20,14 @@ GROUPS = {
 SIGNALS = (("absorber_temperature_K", 0.3), ("displacement_m", 2e-6))
 
 
-def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
-    """Return a recording of these groups with white and coloured noise, jitters and a few missing samples."""
+def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0, noise=1.0):
+    """Return a recording of these groups with white and coloured noise, jitters and a few missing samples.
+
+    noise: factor on noise and jitters; 0 gives repeats that are equal to the last digit, without missing samples
+    """
     rng = np.random.default_rng(seed)
+    parts = [SignalDelays(), *(discover_terms()[key].signal_delays(values) for key, values in terms.items())]
+    delays = SignalDelays(*(sum(column) for column in zip(*parts, strict=True)))
     runs = []
     for name in groups:
         pulses = np.array(GROUPS[name])
@@ -28,10 +35,13 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
         t_s = np.arange(0.0, until_s, 1.0 / rate) + 0.5 / rate
         for _ in range(repeats):
             real = pulses.copy()
-            real[:, 2] *= np.exp(0.005 * rng.standard_normal())
-            real[:, 0] += 2e-5 * rng.standard_normal()
+            real[:, 2] *= np.exp(noise * 0.005 * rng.standard_normal())
+            real[:, 0] += noise * 2e-5 * rng.standard_normal()
             readings = simulate_signals(
-                PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))), PIXEL, ActiveTerms.from_values(terms)
+                PixelExperiment(real, 0, AMBIENT_K, (t_s, t_s, np.zeros(0))),
+                PIXEL,
+                ActiveTerms.from_values(terms),
+                (delays.temperature, delays.displacement, delays.force),
             )
             signals = {}
             for (signal, white), value in zip(SIGNALS, readings[:2], strict=True):
@@ -39,8 +49,8 @@ def lab(seed, terms, groups=tuple(GROUPS), repeats=3, rate=1000.0):
                 for row in range(1, len(t_s)):
                     kick = 0.4 * white * np.sqrt(1 - keep**2) * rng.standard_normal()
                     coloured[row] = keep * coloured[row - 1] + kick
-                noisy = value + coloured + white * rng.standard_normal(len(t_s))
-                noisy[rng.random(len(t_s)) < 0.01] = np.nan
+                noisy = value + noise * (coloured + white * rng.standard_normal(len(t_s)))
+                noisy[rng.random(len(t_s)) < 0.01 * (noise > 0)] = np.nan
                 signals[signal] = Signal(0, t_s, noisy + (AMBIENT_K if signal.endswith("_K") else 0.0))
             runs.append(Run(f"run{len(runs):03d}", AMBIENT_K, pulses, signals, {"group": name}))
     return Measurement(tuple(runs))

@@ -150,11 +150,12 @@ def _require_scipy() -> None:
 
 
 def _check_output_paths(json: str | None, out: Path | None) -> None:
-    """Reject outputs that would overwrite a recording or a file."""
-    if json is not None and json != STDOUT and (Path(json).suffix in (".h5", ".hdf5") or Path(json).is_dir()):
-        raise InputError("--json", json, "a file other than a recording, or - for stdout")
-    if out is not None and out.exists() and not out.is_dir():
-        raise InputError("--out", str(out), "a folder")
+    """Reject outputs that cannot be written, or that would overwrite a recording."""
+    from optodrive.core.files import check_output
+
+    if json is not None and json != STDOUT:
+        check_output("--json", Path(json), ".json")
+    check_output("--out", out, folder=True)
 
 
 def _read_recordings(paths: list[Path]) -> "Measurement":

@@ -47,6 +47,10 @@ def field(
     json: JsonOption = False,
 ) -> None:
     """Convert display metres to DAC codes and back, or a field to a correction grid and back."""
+    from optodrive.core.files import check_output
+
+    check_output("--export", export_path)
+    check_output("--out", out, ".csv" if import_path is None else ".toml")
     if import_path is not None:
         result = _import(import_path, _require_option("--out", out), config)
     else:

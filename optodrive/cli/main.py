@@ -23,6 +23,7 @@ from optodrive.cli import (
     serve,
     service,
     simulate,
+    terms,
     validate,
     wire,
 )
@@ -53,6 +54,7 @@ for module in (
     helios,
     recording,
     diagnose,
+    terms,
     validate,
     config,
     wire,

@@ -42,12 +42,14 @@ def plan(
     json: JsonOption = False,
 ) -> None:
     """Plan and limit frames; report feasibility, pulses, beam time, trimmed pulses and predicted displacement."""
+    from optodrive.core.files import check_output
     from optodrive.planning.display_model import DisplayModel
     from optodrive.planning.feasibility.check import check_feasibility
     from optodrive.planning.pipeline import resolve_policy
     from optodrive.planning.plan_summary import summarize_plan, write_plan_csv
     from optodrive.planning.stimuli.sequence_file import load_sequence
 
+    check_output("--out", out, ".csv")
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sequence = load_sequence(frames, display.config)
     announce_compilation()

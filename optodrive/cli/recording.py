@@ -33,8 +33,11 @@ def convert(
     json: JsonOption = False,
 ) -> None:
     """Convert an HDF5 recording to a folder of CSV files or back, without loss of precision."""
+    from optodrive.core.files import check_output
     from optodrive.lab.recording import convert_recording
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
 
+    check_output("OUT", target, *HDF5_SUFFIXES, folder=True)
     measurement = convert_recording(source, target)
     samples = sum(len(signal.t_s) for run in measurement.runs for signal in run.signals.values())
     if json:
@@ -53,9 +56,11 @@ def show(
     json: JsonOption = False,
 ) -> None:
     """Validate a recording, and list the signals of each run."""
+    from optodrive.core.files import check_output
     from optodrive.lab.recording import read_recording
     from optodrive.lab.recording.summary import build_summary
 
+    check_output("--out", out, ".png")
     measurement = read_recording(recording)
     runs = build_summary(measurement)
     plotted_runs = None if out is None else _draw_signals(out, measurement)
@@ -81,9 +86,12 @@ def merge(
     json: JsonOption = False,
 ) -> None:
     """Merge the executed pulses of a session with signals measured meanwhile into a recording for `diagnose`."""
+    from optodrive.core.files import check_output
     from optodrive.lab.recording import write_recording
     from optodrive.lab.recording.merge import merge_session
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
 
+    check_output("--out", out, *HDF5_SUFFIXES, folder=True)
     measurement = merge_session(session, measured, time_offset_s)
     write_recording(out, measurement)
     pulses = sum(len(run.pulses) for run in measurement.runs)

@@ -45,7 +45,9 @@ def simulate(
     out: Annotated[Path | None, typer.Option("--out", metavar="recording.h5", help="Write the recording.")] = None,
     pixels: Annotated[str | None, typer.Option("--pixels", metavar="0,1,…", help="Pixels to record, or all.")] = None,
     dt: Annotated[float, typer.Option("--dt", metavar="SECONDS", help="Time between samples.")] = 1e-3,
-    noise: Annotated[float, typer.Option("--noise", help="Instrument noise as a factor of the stated noise.")] = 0.0,
+    noise: Annotated[
+        float, typer.Option("--noise", help="Noise of the recording as a factor of the instruments'; 0: none.")
+    ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", help="Seed of the noise.")] = 0,
     config: ConfigOption = None,
     model: ModelOption = None,
@@ -73,6 +75,8 @@ def simulate(
     json: JsonOption = False,
 ) -> None:
     """Plan frames, run them on the simulated board, and simulate the measurement of the pixels."""
+    from optodrive.core.files import check_output
+    from optodrive.lab.recording.storage import HDF5_SUFFIXES
     from optodrive.link.simulator.traces import compute_pixel_trace, compute_traces
     from optodrive.link.simulator.true_pixels import GroundTruthPixels
     from optodrive.link.simulator.virtual_run import execute
@@ -86,13 +90,15 @@ def simulate(
         raise InputError("--noise", noise, "a factor between 0 and 1000")
     if post_pulse_s is not None and not 1e-3 <= post_pulse_s <= 10.0:
         raise InputError("--post-pulse", post_pulse_s, "a time between 0.001 and 10 s")
+    check_output("--out", out, *HDF5_SUFFIXES, folder=True)
     display = DisplayModel.from_config(load_run_config(config, model, field, mirrors, pixel_map))
     sampled_pixels = None if pixel_seed is None else GroundTruthPixels.sample(pixel_seed, display.config)
     is_nominal = truth is None and sampled_pixels is None
+    true_terms, ignored_terms = _select_true_terms(load_run_config(config, truth or model), truth)
     true_display = (
         display.build_cold_heat()
         if is_nominal
-        else _build_true_display(load_run_config(config, truth or model), sampled_pixels)
+        else _build_true_display(load_run_config(config, truth or model), sampled_pixels, true_terms)
     )
     selected = _parse_pixels(pixels, len(display.layout))
     sequence = load_sequence(frames, display.config)
@@ -113,11 +119,17 @@ def simulate(
     if out is not None:
         _write_recording(out, display, executed, traces, noise, seed)
     report = _build_report(display, planned_sequence, feasibility, incident, traces, true_display)
+    report["truth"] = {"terms": true_terms, "ignored_terms": ignored_terms}
+    report["noise"] = None if out is None else noise
     if json:
         print_json(report)
         return
     for line in format_plan_summary(report["summary"]):
         print(line)
+    if truth is not None:
+        print(f"truth            {', '.join(true_terms) or 'the nominal pixel, without terms'}")
+        if ignored_terms:
+            print(f"                 not simulated: {', '.join(ignored_terms)} of its base set (not in planner_terms)")
     print(f"executed         {report['executed']} of {report['planned']} planned")
     for item in report["pixels"]:
         print(
@@ -125,16 +137,49 @@ def simulate(
             f"predicted, absorber up to {item['absorber_max_c']:.1f} °C"
         )
     if out is not None:
+        print(f"noise            {_describe_noise(noise)}")
         print(f"written          {out}")
 
 
-def _build_true_display(config: "Config", sampled_pixels: "GroundTruthPixels | None") -> "ThermalState":
+def _describe_noise(noise: float) -> str:
+    from optodrive.core.units import m_to_um
+    from optodrive.link.simulator.instruments import INSTRUMENT_SIGMA
+
+    if noise == 0.0:
+        return "none: the recording is exact, as no instrument's is"
+    kelvin, metre, newton = (noise * sigma for sigma in INSTRUMENT_SIGMA.values())
+    return f"{kelvin:.3g} K, {m_to_um(metre):.3g} µm, {newton * 1e3:.3g} mN rms added to the recording; --noise 0: none"
+
+
+def _select_true_terms(config: "Config", truth: Path | None) -> tuple[list[str], list[str]]:
+    """Return the terms of the ground truth, and those of its parameter set that are left out.
+
+    The truth has the planner terms and every term that its file states. Raises InputError for a term that the file
+    states and that only the limiter accounts for.
+    """
+    from optodrive.physics.parameters import list_own_terms, load_parameters
+    from optodrive.physics.terms import discover_terms
+
+    parameters = load_parameters(config.pixel_model.parameters)
+    own = () if truth is None or truth.suffix != ".toml" else list_own_terms(truth)
+    for key in own:
+        if not discover_terms()[key].in_pixel:
+            expected = "terms that pixels are simulated with; only the limiter accounts for this one"
+            raise InputError(f"--truth {truth}: terms.{key}", key, expected)
+    selected = list(dict.fromkeys((*parameters.planner_terms, *own)))
+    return selected, [key for key in parameters.terms if key not in selected]
+
+
+def _build_true_display(
+    config: "Config", sampled_pixels: "GroundTruthPixels | None", true_terms: list[str]
+) -> "ThermalState":
     """Build the ground truth of the display: the configured model with sampled or equal pixels, without a pixel map."""
     from optodrive.device.pixel_map import remove_pixel_map
     from optodrive.physics.parameters import build_display_pixels, load_parameters
     from optodrive.physics.thermal_state import build_cold_state
 
     parameters = load_parameters(config.pixel_model.parameters)
+    parameters = parameters.model_copy(update={"planner_terms": tuple(true_terms)})
     nominal_pixels = build_display_pixels(remove_pixel_map(config), parameters)
     return build_cold_state(
         config, parameters, nominal_pixels if sampled_pixels is None else sampled_pixels.apply_to(nominal_pixels)

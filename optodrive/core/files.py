@@ -32,6 +32,33 @@ def atomic_write(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def check_output(option: str, path: Path | None, *suffixes: str, folder: bool = False) -> None:
+    """Raise InputError unless an output can be written at this path, before anything is computed for it.
+
+    suffixes: those that a file may have, lower case; none: any. folder: a folder may be written instead, or only a
+    folder where no suffixes are given; a name with the suffix of a file is none.
+    """
+    if path is None:
+        return
+    suffix = path.suffix.lower()
+    names_file = suffix in suffixes or not (suffixes or folder)
+    names_folder = folder and (not suffixes or path.is_dir() or not suffix[1:2].isalpha())
+    if not (names_file or names_folder):
+        expected = "a name that ends in " + " or ".join(suffixes)
+        raise InputError(option, str(path), expected + (", or the name of a new folder" if folder else ""))
+    if names_file and path.is_dir():
+        raise InputError(option, str(path), "a file; this is a folder")
+    if names_folder and not names_file and path.exists() and not path.is_dir():
+        raise InputError(option, str(path), "a folder; this is a file")
+    parent = path.absolute().parent
+    if names_folder and not names_file and not suffixes:  # created with its parents
+        parent = next(item for item in (path.absolute(), *path.absolute().parents) if item.exists())
+    if not parent.is_dir():
+        raise InputError(option, str(path), f"a path in a folder; {parent} is none")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise InputError(option, str(path), f"a path in a folder that can be written; {parent} cannot")
+
+
 def read_toml(path: Path) -> dict[str, Any]:
     """Return a TOML file as a table. Raise InputError if it cannot be read or parsed."""
     try:

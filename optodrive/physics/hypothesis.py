@@ -11,7 +11,7 @@ class TermParameter:
 
     starts: values from which a search begins, the default alone if empty; a time constant that vanishes together with
     its effect needs several. is_shape: the parameter shapes the effect and does not scale it, so that a fit may end at
-    either limit of the range.
+    either limit of the range. neutral: value without effect, which a parameter set need not state.
     """
 
     name: str
@@ -22,6 +22,12 @@ class TermParameter:
     source: str
     starts: tuple[float, ...] = ()
     is_shape: bool = False
+    neutral: float | None = None
+
+    @property
+    def if_omitted(self) -> float | None:
+        """Value where a parameter set states none: no effect, or the default of a shape; None if it must be stated."""
+        return self.default if self.neutral is None and self.is_shape else self.neutral
 
 
 @dataclass(frozen=True)

@@ -157,8 +157,8 @@ def load_parameters(name: str | Path) -> ParameterSet:
         parameters = ParameterSet.model_validate(table)
     except ValidationError as error:
         raise build_input_error(error, str(path), ParameterSet) from None
-    for key, values in parameters.terms.items():
-        _check_term(f"{path}: terms.{key}", key, values)
+    terms = {key: _complete_term(f"{path}: terms.{key}", key, values) for key, values in parameters.terms.items()}
+    parameters = parameters.model_copy(update={"terms": terms})
     check_requirements(f"{path}: terms", parameters.terms)
     for key in parameters.planner_terms:
         if key not in parameters.terms:
@@ -170,14 +170,28 @@ def load_parameters(name: str | Path) -> ParameterSet:
     return parameters
 
 
-def _check_term(where: str, key: str, values: dict[str, Parameter]) -> None:
-    """Raise InputError unless a term is known and has exactly its parameters, in unit and plausible range."""
+def list_own_terms(path: Path) -> tuple[str, ...]:
+    """Return the keys of the terms that a parameter file states itself, rather than its base."""
+    terms = read_toml(path).get("terms", {})
+    return tuple(terms) if isinstance(terms, dict) else ()
+
+
+def _complete_term(where: str, key: str, values: dict[str, Parameter]) -> dict[str, Parameter]:
+    """Return all parameters of a term, those that are omitted by their defaults.
+
+    Raises InputError unless the term is known and has only its parameters, in unit and plausible range.
+    """
+    completed = {}
     for item in find_term(where, key, values).parameters:
-        given = values[item.name]
+        if item.name not in values and item.if_omitted is not None:
+            completed[item.name] = Parameter(value=item.if_omitted, unit=item.unit, source="the default where omitted")
+            continue
+        given = completed[item.name] = values[item.name]
         if given.unit != item.unit:
             raise InputError(f"{where}.{item.name}.unit", given.unit, f"'{item.unit}'")
         if not item.low <= given.value <= item.high:
             raise InputError(f"{where}.{item.name}.value", given.value, f"{item.low:g} to {item.high:g} {item.unit}")
+    return completed
 
 
 def _merge_base(path: Path, table: dict[str, Any]) -> dict[str, Any]:

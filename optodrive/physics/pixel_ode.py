@@ -49,6 +49,7 @@ MAX_STEP_S = 6e-3
 
 (
     optical_power,
+    decaying_power,
     heat_capacity,
     bridge_resistance,
     heat_loss,
@@ -153,7 +154,7 @@ def evaluate_rates(
 ) -> None:
     """Write dy/dt [STATE_COUNT] for the context's command; is_target: the light is on this pixel, not beside it."""
     on, v = active.on, active.values
-    light_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else 0.0
+    light_w = optical_power(on, v, y, c, c[POWER_W]) if c[POWER_W] > 0.0 else decaying_power(on, v, y, c, 0.0)
     wall_k = wall_rise(on, v, y, c, y[WALL])
     c[FAR_END_K] = wall_k
     c[BRIDGE_FLOW_W] = (y[ABSORBER] - wall_k) / bridge_resistance(on, v, y, c, pixel.r_k_per_w)

@@ -44,13 +44,15 @@ class Kernels(NamedTuple):
     Each function takes (v, y, s, c, x): v the term's parameters in order, y the states, s the row of the term's first
     follower, c the context, x the value without the term. It returns the value with the term; `rates` writes to x.
 
-    optical_power: W on the absorber; heat_capacity: J/K of the absorber; bridge_resistance: K/W; heat_loss: W from the
-    absorber to ambient; wall_rise: rise of the bridge's far end, K; rates: dy/dt; membrane_drive, force_drive: gas rise
-    that lifts the membrane and that pushes against a finger, K; displacement: m; force: N; sensor_reading: rise that
-    the thermometer shows, K; sensor_lag: time constant of the thermometer, s
+    optical_power: W on the absorber; decaying_power: W on it after the gate has closed; heat_capacity: J/K of the
+    absorber; bridge_resistance: K/W; heat_loss: W from the absorber to ambient; wall_rise: rise of the bridge's far
+    end, K; rates: dy/dt; membrane_drive, force_drive: gas rise that lifts the membrane and that pushes against a
+    finger, K; displacement: m; force: N; sensor_reading: rise that the thermometer shows, K; sensor_lag: time constant
+    of the thermometer, s
     """
 
     optical_power: Modifier | None = None
+    decaying_power: Modifier | None = None
     heat_capacity: Modifier | None = None
     bridge_resistance: Modifier | None = None
     heat_loss: Modifier | None = None

@@ -30,6 +30,7 @@ class HookChains(NamedTuple):
     """
 
     optical_power: HookChain
+    decaying_power: HookChain
     heat_capacity: HookChain
     bridge_resistance: HookChain
     heat_loss: HookChain

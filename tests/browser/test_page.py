@@ -8,21 +8,7 @@ from PIL import Image
 from playwright.sync_api import expect
 
 from rig import TOKEN, long_train, wait_for
-from window import PHONE, WIDE
-
-INTERLOCK = """
-[[step]]
-from = "light"
-at_s = 1.0
-set = "interlock"
-value = false
-
-[[step]]
-from = "light"
-at_s = 4.0
-set = "interlock"
-value = true
-"""
+from window import INTERLOCK, PHONE, WIDE, arm
 
 
 def canvas_point(page, across, up):
@@ -38,12 +24,6 @@ def draw_line(page):
     page.mouse.move(*canvas_point(page, 0.69, 0.52), steps=10)
     page.mouse.up()
     expect(page.locator("#drawn")).to_have_text("9 drawn")
-
-
-def arm(page):
-    page.get_by_role("button", name="Arm …").click()
-    page.get_by_role("button", name="Confirm: arm the laser").click()
-    expect(page.locator("#board-state")).to_have_text("ARMED")
 
 
 def preview(page):

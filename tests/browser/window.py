@@ -4,7 +4,7 @@ import os
 import shutil
 from contextlib import contextmanager
 
-from rig import TOKEN
+from rig import TOKEN, long_train
 
 CHROMIUM = os.environ.get("CHROMIUM") or shutil.which("chromium")
 FLAGS = (
@@ -18,6 +18,20 @@ FLAGS = (
 )
 TIMEOUT_MS = 30_000
 WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
+INTERLOCK = """
+[[step]]
+from = "light"
+at_s = 1.0
+set = "interlock"
+value = false
+
+[[step]]
+from = "light"
+at_s = 4.0
+set = "interlock"
+value = true
+"""
+"""Script of a board whose interlock opens during light, and closes three seconds later."""
 
 
 @contextmanager
@@ -63,3 +77,22 @@ class PageVisit:
         """Return the console errors except the expected ones; the 401 of the login is always expected."""
         expected = ("401", *expected)
         return [line for line in self.console_errors if not any(part in line for part in expected)]
+
+
+def arm(page):
+    """Arm with the two buttons."""
+    page.get_by_role("button", name="Arm …").click()
+    page.get_by_role("button", name="Confirm: arm the laser").click()
+    page.locator("#board-state").get_by_text("ARMED", exact=True).wait_for()
+
+
+def press_escape(page):
+    """Press Escape and wait until STOP, which it must send, has been answered."""
+    with page.expect_response("**/v1/stop", timeout=5_000):
+        page.keyboard.press("Escape")
+    page.locator("#stopping").wait_for(state="hidden")
+
+
+def play_for(daemon, seconds):
+    """Submit a train of pulses and return its plan."""
+    return daemon.call("POST", "/v1/plans", json=long_train(seconds=seconds))["plan"]

@@ -10,7 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from optodrive.cli.calibrate.board_progress import print_status, show_measurement_progress
-from optodrive.cli.calibrate.field_report import FieldCalibration, ReportOption, write_calibration
+from optodrive.cli.calibrate.field_report import (
+    FieldCalibration,
+    ReportOption,
+    check_calibration_outputs,
+    write_calibration,
+)
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.core.errors import InputError
 from optodrive.core.units import m_to_um, um_to_m
@@ -62,6 +67,7 @@ def board(
     json: JsonOption = False,
 ) -> None:
     """Measure spots on the board with a sensor or by eye, and fit the field to them."""
+    check_calibration_outputs(out, report)
     request = BoardCalibrationRequest(manual, target_rms_um, spots_max, readings, spot_power_mw)
     write_calibration(calibrate_on_board(config, out, request), out, report, json)
     delete_session(out)
@@ -101,8 +107,6 @@ def measure_on_board(config: str | None, out: Path, request: BoardCalibrationReq
     from optodrive.lab.commissioning.spot_locator import ManualLocator, SensorLocator
     from optodrive.lab.commissioning.worker_process import WorkerProcess
 
-    if not out.absolute().parent.is_dir():
-        raise InputError("--out", str(out), "a file in a folder that exists")
     power_w, target_rms_m = request.spot_power_mw * 1e-3, um_to_m(request.target_rms_um)
     # The board closes first on exit: it receives ABORT before the worker process is joined.
     with WorkerProcess() as worker, open_board(config) as (exclusive_board, spot_reader):

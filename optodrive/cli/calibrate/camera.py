@@ -6,7 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.calibrate.field_report import FieldCalibration, FieldOutOption, ReportOption, write_calibration
+from optodrive.cli.calibrate.field_report import (
+    FieldCalibration,
+    FieldOutOption,
+    ReportOption,
+    check_calibration_outputs,
+    write_calibration,
+)
 from optodrive.cli.options import ConfigOption, JsonOption
 from optodrive.core.errors import InputError
 from optodrive.core.units import m_to_um
@@ -28,6 +34,7 @@ def camera(
     json: JsonOption = False,
 ) -> None:
     """Measure spots in pictures from a camera, and fit the field to them."""
+    check_calibration_outputs(out, report)
     write_calibration(calibrate_by_camera(folder, config), out, report, json)
 
 

@@ -5,7 +5,13 @@ from typing import Annotated
 
 import typer
 
-from optodrive.cli.calibrate.field_report import FieldCalibration, FieldOutOption, ReportOption, write_calibration
+from optodrive.cli.calibrate.field_report import (
+    FieldCalibration,
+    FieldOutOption,
+    ReportOption,
+    check_calibration_outputs,
+    write_calibration,
+)
 from optodrive.cli.options import ConfigOption, JsonOption
 
 
@@ -23,6 +29,7 @@ def field(
     from optodrive.lab.calibration.spot_checks import check_fit, check_spots
     from optodrive.lab.calibration.spots import read_spots
 
+    check_calibration_outputs(out, report)
     prior, measured = FieldPrior.from_config(load_config(config)), read_spots(spots)
     check_spots(str(spots), measured, prior)
     fit = fit_field(measured, prior)

@@ -32,6 +32,14 @@ class FieldCalibration:
     report_lines: tuple[str, ...] = ()
 
 
+def check_calibration_outputs(out: Path | None, report: Path | None) -> None:
+    """Raise InputError unless the field and the report can be written; to be called before the measurement."""
+    from optodrive.core.files import check_output
+
+    check_output("--out", out, ".toml")
+    check_output("--report", report, ".html")
+
+
 def write_calibration(calibration: FieldCalibration, out: Path | None, report: Path | None, json: bool) -> None:
     """Write the field and the report where requested, and print the fit's statistics."""
     from optodrive.lab.calibration.field_writer import write_field

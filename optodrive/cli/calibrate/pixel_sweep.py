@@ -21,13 +21,14 @@ def write_sweep(folder: Path, config: str | None, json: bool) -> None:
     """
     from json import dumps
 
-    from optodrive.core.files import atomic_write
+    from optodrive.core.files import atomic_write, check_output
     from optodrive.core.types.stimuli import FrameSequence
     from optodrive.device.config import build_pixel_layout
     from optodrive.device.pixel_map import PixelMap, max_aim_offset_m, remove_pixel_map, write_pixel_map
     from optodrive.lab.calibration.pixels.sweep import build_sweep, compute_pulse, list_aims
     from optodrive.planning.stimuli.sequence_file import sequence_to_json
 
+    check_output("--sweep", folder, folder=True)
     loaded = remove_pixel_map(load_run_config(config, None))
     offset_max_m, pixel_count = max_aim_offset_m(loaded), len(build_pixel_layout(loaded.display))
     aims = list_aims(loaded)

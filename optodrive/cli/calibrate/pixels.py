@@ -41,6 +41,7 @@ def pixels(
 
 def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, model: Path | None, json: bool) -> None:
     """Fit the gain and offset of every pixel, write pixels.toml where requested, and print the statistics."""
+    from optodrive.core.files import check_output
     from optodrive.device.field_file import strip_toml_specials
     from optodrive.device.pixel_map import remove_pixel_map, write_pixel_map
     from optodrive.lab.calibration.pixels.map_fit import PixelMapFitter, compute_stats
@@ -48,6 +49,7 @@ def fit_pixel_map(recordings: list[Path], out: Path | None, config: str | None, 
     from optodrive.physics.parameters import load_parameters
     from optodrive.physics.thermal_state import build_cold_state
 
+    check_output("--out", out, ".toml")
     # Gains are relative to the model without a map, also where the configuration names one.
     loaded = remove_pixel_map(load_run_config(config, model))
     parameters = load_parameters(loaded.pixel_model.parameters)

@@ -20,6 +20,7 @@ def servo(
     """Identify both mirror servos from a recording of steps, and compare them with the configuration."""
     if find_spec("scipy") is None:
         raise InputError("scipy", None, "the extra: pip install 'optodrive[analysis]'", "missing_extra")
+    from optodrive.core.files import check_output
     from optodrive.device.config_file import load_config
     from optodrive.lab.recording import read_recording
     from optodrive.lab.servo_identification.common_servo import find_common_servo
@@ -27,6 +28,7 @@ def servo(
     from optodrive.lab.servo_identification.report import build_report, format_report_lines, write_mirrors
     from optodrive.lab.servo_identification.step_trace import extract_trace
 
+    check_output("--out", out, ".toml")
     # Servos measured before are not loaded: an invalid mirrors.toml must not prevent a new identification.
     loaded, source = load_config(config, measured_servo=False), str(recording)
     measurement = read_recording(recording)

@@ -7,27 +7,31 @@ from optodrive.core.types.arrays import FloatArray
 
 @dataclass(frozen=True)
 class Estimate:
-    """Fitted value with its unit and 95 % interval."""
+    """Fitted value with its unit and 95 % interval, which contains it.
+
+    at_limit: the fit ended at a limit of the plausible range, which is the value here and no estimate
+    """
 
     value: float
     unit: str
     low: float
     high: float
+    at_limit: bool = False
 
 
 @dataclass(frozen=True)
 class HeldOutGain:
     """RMSE on held-out runs by signal, SI, and the share of the avoidable error that the extended model removes.
 
-    reduction: (nominal − extended) / (nominal − noise floor), with its 95 % interval low to high
+    reduction: (nominal − extended) / (nominal − noise floor); interval: its 95 % interval, None with fewer than two
+    held-out groups, over which it is computed
     """
 
     nominal: dict[str, float]
     extended: dict[str, float]
     noise_floor: dict[str, float]
     reduction: float
-    low: float
-    high: float
+    interval: tuple[float, float] | None
 
 
 @dataclass(frozen=True)

@@ -54,7 +54,7 @@ export class Header {
   showState({ board, link }) {
     const look = LOOKS[board.state];
     if (link.state !== "up" || !look) {
-      this.showUnknown("no link to the board");
+      this.showUnknown(link.state === "up" ? "no data yet" : "no link to the board");
       return;
     }
     this.#show(look[0], board.state, board.fault ?? look[1]);

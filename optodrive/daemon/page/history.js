@@ -81,7 +81,11 @@ export class History {
       return row;
     });
     this.lists[name].replaceChildren(...(rows.length ? rows : [Object.assign(document.createElement("li"), { textContent: "None." })]));
-    sessionStorage.setItem(STORE, JSON.stringify({ ...this.entries, planned: this.planned }));
+    try {
+      sessionStorage.setItem(STORE, JSON.stringify({ ...this.entries, planned: this.planned }));
+    } catch {
+      // The browser keeps nothing: a reload starts with an empty history.
+    }
   }
 
   #restore() {

@@ -194,7 +194,7 @@ function describeDisplay() {
   const [highest, hottest] = [argmax(height), argmax(absorber)];
   const raised = height.reduce((sum, value) => sum + (value > 1), 0);
   const text = raised
-    ? `${raised} pixels above 1 µm, highest ${height[highest].toFixed(1)} µm at ${highest}; hottest absorber ${absorber[hottest].toFixed(0)} °C at ${hottest}.`
+    ? `${raised} ${raised === 1 ? "pixel" : "pixels"} above 1 µm, highest ${height[highest].toFixed(1)} µm at ${highest}; hottest absorber ${absorber[hottest].toFixed(0)} °C at ${hottest}.`
     : "No pixel is above 1 µm.";
   find("summary").textContent = text;
   find("frame-rate").textContent = `${view.rate} frames/s`;
@@ -244,11 +244,14 @@ telemetry.addEventListener("up", () => {
   timeline.clear();
 });
 telemetry.addEventListener("down", () => {
-  header.showConnection("no daemon, trying again", "bad");
   freshness.lose();
-  showNothingKnown("no daemon");
-  status.showNoDaemon();
-  if (!document.hidden) {
+  if (telemetry.paused) {
+    header.showConnection("paused", "bad");
+    showNothingKnown("telemetry is paused");
+  } else {
+    header.showConnection("no daemon, trying again", "bad");
+    showNothingKnown("no daemon");
+    status.showNoDaemon();
     pastEvents.addNoDaemon();
   }
   find("stale").hidden = false;
@@ -265,6 +268,9 @@ telemetry.addEventListener("state", ({ detail }) => {
   }
   header.showConnection("live", "good");
   header.showState(detail);
+  if (isOff) {
+    timeline.dropPlanned();
+  }
   showTitle();
   status.showState(detail);
   queue.show(detail.queue);

@@ -7,6 +7,7 @@ export class Permissions {
   constructor(find) {
     this.label = find("caller");
     this.caller = null;
+    this.reasons = new WeakMap();
     addEventListener("refused", () => this.load());
   }
 
@@ -29,12 +30,17 @@ export class Permissions {
     for (const controls of document.querySelectorAll("[data-route]")) {
       const required = caller?.refused[controls.dataset.route];
       controls.disabled = required !== undefined;
-      if (controls.nextElementSibling?.className !== "reason") {
-        controls.after(Object.assign(document.createElement("p"), { className: "reason" }));
-      }
-      const reason = controls.nextElementSibling;
+      const reason = this.reasons.get(controls) ?? this.#createReason(controls);
       reason.hidden = !controls.disabled;
       reason.textContent = required ? `${controls.dataset.action} needs the role ${required}; token “${caller.name}” has the role ${caller.role}.` : "";
     }
+  }
+
+  // The reason stands below the row of its controls.
+  #createReason(controls) {
+    const reason = Object.assign(document.createElement("p"), { className: "reason" });
+    controls.parentElement.append(reason);
+    this.reasons.set(controls, reason);
+    return reason;
   }
 }

@@ -81,7 +81,8 @@ export class PlanControl extends EventTarget {
     const message = summary.feasibility?.message ?? (fits ? "all of it fits" : "not all of it fits");
     lines.push([fits ? "good" : "warn", `${message[0].toUpperCase()}${message.slice(1)}.`]);
     lines.push(["", `${summary.pulses} pulses in ${summary.duration_s.toFixed(2)} s, ${(summary.energy_j * 1e3).toFixed(0)} mJ of light.`]);
-    lines.push(["", `Highest predicted: ${summary.predicted_max_um.toFixed(1)} µm of ${summary.target_max_um.toFixed(1)} µm requested.`]);
+    const requested = summary.target_max_um > 0 ? ` of ${summary.target_max_um.toFixed(1)} µm requested` : ""; // a train requests power
+    lines.push(["", `Highest predicted: ${summary.predicted_max_um.toFixed(1)} µm${requested}.`]);
     if (summary.trimmed.pulses) {
       const caps = Object.entries(summary.trimmed.by_reason).map(([cap, count]) => `${count} by ${labelCap(cap)}`);
       lines.push(["warn", `Trimmed: ${summary.trimmed.pulses} pulses (${caps.join(", ")}), ${(summary.trimmed.energy_j * 1e3).toFixed(1)} mJ.`]);

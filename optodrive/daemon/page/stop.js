@@ -6,13 +6,14 @@ import { request } from "./api.js";
 
 const TIMEOUT_MS = 1200;
 const RETRY_MS = 300;
+const FREE_MS = 100; // without an answer by then, the connections of other windows may be in the way
 
 export class StopControl {
-  // beforeRetry: closes connections that may block the request; onAnswered: the daemon has answered
+  // freeConnection: closes connections that may block the request; onAnswered: the daemon has answered
   // mayEmit(): returns whether the laser may emit; true if that is unknown
-  constructor(button, status, beforeRetry, onAnswered, mayEmit) {
+  constructor(button, status, freeConnection, onAnswered, mayEmit) {
     this.status = status;
-    this.beforeRetry = beforeRetry;
+    this.freeConnection = freeConnection;
     this.onAnswered = onAnswered;
     this.running = false;
     button.addEventListener("click", () => this.stop());
@@ -38,7 +39,6 @@ export class StopControl {
     this.#show("STOP sent …");
     for (let attempts = 1; !(await this.#attempt()); attempts++) {
       this.#show(`STOP is not answered yet after ${attempts} attempts; it is sent again. In doubt use the emergency stop or the key.`);
-      this.beforeRetry();
       await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
     }
     this.running = false;
@@ -47,6 +47,7 @@ export class StopControl {
 
   // Send STOP once; return whether the daemon has answered.
   async #attempt() {
+    const timer = setTimeout(this.freeConnection, FREE_MS);
     try {
       const response = await request("POST", "/v1/stop", { signal: AbortSignal.timeout(TIMEOUT_MS) });
       if (response.ok) {
@@ -63,6 +64,8 @@ export class StopControl {
       }
     } catch {
       // Not answered: retry.
+    } finally {
+      clearTimeout(timer);
     }
     return false;
   }

@@ -17,6 +17,10 @@ export class Telemetry extends EventTarget {
     document.addEventListener("visibilitychange", () => this.pause(document.hidden));
   }
 
+  get paused() {
+    return this.#paused;
+  }
+
   async run() {
     for (;;) {
       if (!this.#paused) {

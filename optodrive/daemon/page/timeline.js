@@ -70,6 +70,15 @@ export class Timeline {
     this.beamPulses = [];
   }
 
+  // Remove the pulses that were planned and will not come.
+  dropPlanned() {
+    for (const [key, pulse] of this.pulses) {
+      if (!pulse.isExecuted) {
+        this.pulses.delete(key);
+      }
+    }
+  }
+
   // Return the pixels of the latest executed pulses, the newest last.
   beamPath(seconds = 0.6, maxCount = 40) {
     const sinceS = this.nowS() - seconds;

@@ -16,6 +16,8 @@ SIGNALS = ("absorber_temperature_K", "displacement_m", "force_N", "mirror_x_rad"
 BoolArray = NDArray[np.bool_]
 PIXEL_KINDS, MIRROR_KINDS = (0, 1, 2), (3, 4)
 FULL_POWER_W = 2.45
+COMMAND_DIGITS = 6
+"""Digits of mirror commands, s and rad, within which they are equal."""
 EDGE_EXCLUSION_S = 6e-5
 """Temperature samples closer to a gate edge are excluded: timing jitter acts nonlinearly on the kink there."""
 
@@ -33,13 +35,17 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class RunInfo:
-    """Properties of a run other than its samples; runs that repeat one experiment share a group."""
+    """Properties of a run other than its samples; runs that repeat one experiment share a group.
+
+    has_stated_group: whether the recording states the group, rather than equal pulses
+    """
 
     name: str
     group: str
     ambient_k: float
     pulses: FloatArray
     commands: FloatArray | None
+    has_stated_group: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,7 +184,7 @@ def build_dataset(measurement: Measurement) -> Dataset:
     if not blocks:
         raise InputError("recording", "no finite sample", "signals to compare with the model")
     return Dataset(
-        tuple(_build_run_info(run) for run in runs),
+        _build_run_infos(runs),
         tuple(blocks),
         tuple(experiments),
         _group_by_drive(experiments),
@@ -209,9 +215,24 @@ def _is_off_edges(t_s: FloatArray, pulses: FloatArray) -> BoolArray:
     return np.asarray(np.minimum(t_s - edges_s[row - 1], edges_s[row] - t_s) > EDGE_EXCLUSION_S)
 
 
-def _build_run_info(run: Run) -> RunInfo:
-    group = str(run.attributes.get("group", run.name))
-    return RunInfo(run.name, group, run.ambient_k, run.pulses, run.commands)
+def _build_run_infos(runs: tuple[Run, ...]) -> tuple[RunInfo, ...]:
+    """Return the properties of the runs; runs without a group but with the same drive and pixels share one."""
+    first: dict[tuple[object, ...], str] = {}
+    infos = []
+    for run in runs:
+        pixels = tuple(sorted((name, signal.pixel) for name, signal in run.signals.items()))
+        commands = None if run.commands is None else np.round(run.commands, COMMAND_DIGITS).tobytes()
+        key = (_round_pulses(run.pulses).tobytes(), commands, pixels)
+        stated = run.attributes.get("group")
+        group = first.setdefault(key, run.name) if stated is None else str(stated)
+        infos.append(RunInfo(run.name, group, run.ambient_k, run.pulses, run.commands, stated is not None))
+    return tuple(infos)
+
+
+def _round_pulses(pulses: FloatArray) -> FloatArray:
+    """Return pulses rounded to 1 µs and 0.1 mW, within which they are equal, in order of time."""
+    rounded = np.round(pulses * [1e6, 1e6, 1e4, 1.0]) + 0.0
+    return np.asarray(rounded[np.argsort(rounded[:, 0], kind="stable")])
 
 
 def _compute_start_times_s(runs: tuple[Run, ...]) -> FloatArray:

@@ -21,6 +21,8 @@ from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, ParameterPoint, 
 from optodrive.physics.hypothesis import Hypothesis
 
 DRAWS = 4000
+ROUNDING_FRACTION = 1e-12
+"""An effect with a smaller share orthogonal to the fitted parameters is known only by rounding errors, and unseen."""
 NOISE_PRIOR_DEGREES, NOISE_KNOWN_DEGREES = 6, 10_000
 """Degrees of freedom of the prior knowledge of noise; degrees of freedom where the noise model counts as known."""
 
@@ -124,7 +126,9 @@ def _compute_scores(
     gram, right = projected[:-1, :-1], projected[:-1, -1]
     best: dict[str, Score] = {}
     for item, start, indices in column_sets:
-        ratio, amplitude = _compute_likelihood_ratio(gram, right, list(indices), item.is_linear)
+        ratio, amplitude = 0.0, np.zeros(len(indices))
+        if independent[list(indices)].min() > ROUNDING_FRACTION:
+            ratio, amplitude = _compute_likelihood_ratio(gram, right, list(indices), item.is_linear)
         last = indices[-1]
         start_ratio = float(gram[last, last] * scale[last] ** 2)
         amplitudes = tuple((amplitude / scale[list(indices)]).tolist())
@@ -139,6 +143,8 @@ def _compute_scores(
     max_surprisal = np.zeros(DRAWS)
     for item, _, indices in column_sets:
         rows = list(indices)
+        if independent[rows].min() <= ROUNDING_FRACTION:
+            continue
         solved = solve(gram[np.ix_(rows, rows)], draws[rows])
         ratio_drawn = (draws[rows] * solved).sum(axis=0)
         if not item.is_linear:

@@ -39,7 +39,7 @@ from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
 from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, predict
-from optodrive.physics.hypothesis import Hypothesis
+from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 from optodrive.physics.terms import discover_terms
 
 DETECTABLE_RATIO = 30.0
@@ -47,6 +47,8 @@ DETECTABLE_RATIO = 30.0
 MIN_INDEPENDENT_FRACTION = 1e-4
 """Minimum share of an effect that is orthogonal to the base parameters for the effect to be observable."""
 TRACE_POINTS = 300
+LIMIT_SHARE = 1e-3
+"""A fitted number within this share of a limit of its range counts as at the limit."""
 
 ProgressCallback = Callable[[str], None]
 
@@ -221,9 +223,11 @@ def _compute_estimates(subsystem: _SubsystemFit) -> dict[str, Estimate]:
         number, width = free.read_value(final.point.terms), t_quantile * float(min(sigma[row], 50.0))
         ends = (number - width, number + width)
         value, low, high = (exp(min(x, 300.0)) if free.logarithmic else x for x in (number, *ends))
-        low, high = max(low, free.parameter.low), min(high, free.parameter.high)
+        at_limit = _is_at_limit(final, free)
+        if not at_limit:
+            low, high = max(low, free.parameter.low), min(high, free.parameter.high)
         for name in free.names:
-            out[f"{free.key}.{name}"] = Estimate(value, free.parameter.unit, low, high)
+            out[f"{free.key}.{name}"] = Estimate(value, free.parameter.unit, low, high, at_limit)
     return out
 
 
@@ -320,7 +324,17 @@ def _build_remarks(subsystems: list[_SubsystemFit]) -> tuple[str, ...]:
         if subsystem.problem.noise.intra_pulse_power_excess > MAX_INTRA_PULSE_POWER_EXCESS:
             out.append("Repeats differ more during pulses: the power fluctuates within pulses.")
         if not subsystem.problem.noise.from_replicates:
-            out.append("No run repeats another: the noise is only guessed, so no cause is certain.")
+            out.append(
+                "No run repeats another: the noise is only guessed, so no cause is certain. Play every experiment two "
+                "or three times and give its runs one `group`."
+            )
+        elif any(not run.has_stated_group for run in subsystem.data.runs):
+            out.append("Runs without a `group` whose pulses are equal were taken as repeats of one experiment.")
+        if not subsystem.problem.noise.has_noise:
+            out.append(
+                "Repeats are equal to the last digit, as copies or simulations without noise are: the noise is taken "
+                "from the resolution of the data."
+            )
         if subsystem.verdict.chosen is not None and subsystem.verdict.residual_detection is not None:
             detection = subsystem.verdict.residual_detection
             if subsystem.verdict.verdict == "cause" and detection.p_omnibus < 1e-3:
@@ -337,8 +351,13 @@ def _describe_range_limits(final: ModelFit) -> list[str]:
     out = []
     for free in final.free:
         value = final.point.terms[free.key][free.names[0]]
-        if free.parameter.is_shape:
-            continue
-        if value >= 0.999 * free.parameter.high or (free.parameter.low > 0 and value <= 1.001 * free.parameter.low):
+        if _is_at_limit(final, free):
             out.append(f"{free.label} is at the limit of its plausible range, {value:g} {free.parameter.unit}.")
     return out
+
+
+def _is_at_limit(final: ModelFit, free: FreeParameter) -> bool:
+    """Return whether a fitted number that is no shape lies at a limit of its range other than zero."""
+    value, item = final.point.terms[free.key][free.names[0]], free.parameter
+    limits = [limit for limit in (item.low, item.high) if limit != 0.0]
+    return not item.is_shape and any(abs(value - limit) <= LIMIT_SHARE * abs(limit) for limit in limits)

@@ -81,17 +81,26 @@ def compute_held_out_gain(
             float(floor2[block.part].sum()),
         ]
     rmse = np.sqrt(sums[:, 1:] / sums[:, :1])
-    generator = np.random.default_rng(seed)
     chi2_pairs = np.stack([nominal_chi2, extended_chi2])[:, nominal_chi2[:, 1] > 0]
+    names = [SIGNALS[kind] for kind in kinds]
+    columns = [dict(zip(names, rmse[:, column].tolist(), strict=True)) for column in range(3)]
+    return HeldOutGain(
+        columns[0], columns[1], columns[2], _compute_reduction(chi2_pairs), _draw_interval(chi2_pairs, seed)
+    )
+
+
+def _draw_interval(chi2_pairs: FloatArray, seed: int) -> tuple[float, float] | None:
+    """Return the 95 % interval of the reduction over draws of the groups; None for one group, which cannot vary."""
     count = chi2_pairs.shape[1]
+    if count < 2:
+        return None
+    generator = np.random.default_rng(seed)
     reductions = [
         max(-1.0, _compute_reduction(chi2_pairs[:, generator.integers(0, count, count)]))
         for _ in range(BOOTSTRAP_DRAWS)
     ]
-    low, high = np.quantile(reductions, [0.025, 0.975])
-    names = [SIGNALS[kind] for kind in kinds]
-    columns = [dict(zip(names, rmse[:, column].tolist(), strict=True)) for column in range(3)]
-    return HeldOutGain(columns[0], columns[1], columns[2], _compute_reduction(chi2_pairs), float(low), float(high))
+    low, high = np.quantile(reductions, [0.025, 0.975]).tolist()
+    return low, high
 
 
 def _compute_reduction(chi2_pairs: FloatArray) -> float:

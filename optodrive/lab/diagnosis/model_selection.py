@@ -168,7 +168,8 @@ def _build_start(point: ParameterPoint, score: Score) -> ParameterPoint:
     if item.is_linear and item.degrees > 1:
         values = dict.fromkeys(score.start, 0.0)
         for free, amplitude, start in zip(item.free, score.amplitude, item.starts, strict=True):
-            values[free.names[0]] = amplitude * start[free.names[0]]
+            number = amplitude * start[free.names[0]]
+            values[free.names[0]] = min(max(number, free.parameter.low), free.parameter.high)
         return ParameterPoint(point.base, {**point.terms, item.key: values})
     free = item.free[0]
     scale = score.amplitude[0] if not free.logarithmic else float(np.clip(score.amplitude[0], 0.2, 5.0))

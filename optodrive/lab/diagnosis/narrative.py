@@ -23,6 +23,8 @@ def format_quantity(value: float, unit: str) -> str:
 
 
 def _format_interval(item: Estimate) -> str:
+    if item.at_limit:
+        return f"no estimate: beyond its plausible range, which ends at {format_quantity(item.value, item.unit)}"
     value, low, high = (format_quantity(number, item.unit) for number in (item.value, item.low, item.high))
     return f"{value} (95 %: {low} to {high})"
 
@@ -56,7 +58,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         not_observable = [item.label for item in discrepancy.candidates if item.verdict == "not observable"]
         if not_observable:
             lines.append(f"Not observable in this data: {', '.join(not_observable)}.")
-    if discrepancy.verdict == "ambiguous" and discrepancy.next_experiment is None:
+    if discrepancy.verdict == "ambiguous" and len(discrepancy.causes) > 1 and discrepancy.next_experiment is None:
         lines.append("No pulse or train on a pixel, repeated up to 30 times, would separate them at this noise.")
     if discrepancy.next_experiment is not None:
         experiment = discrepancy.next_experiment
@@ -75,6 +77,11 @@ def _build_headline(discrepancy: Discrepancy) -> str:
         return "No error found: the refitted nominal model agrees with this recording within its noise."
     if discrepancy.verdict == "cause":
         return f"The nominal model is wrong because {' and '.join(names)}."
+    if discrepancy.verdict == "ambiguous" and len(names) == 1:
+        return (
+            f"The nominal model is wrong, perhaps because {names[0]}: not certain, because no run repeats another "
+            "(`group` is missing, or every group has one run)."
+        )
     if discrepancy.verdict == "ambiguous" and names:
         return f"The nominal model is wrong; this data cannot separate these causes: {'; or '.join(names)}."
     return "The nominal model is wrong, and no known cause explains it."
@@ -103,9 +110,13 @@ def _describe_gain(discrepancy: Discrepancy) -> list[str]:
         if discrepancy.verdict in ("cause", "ambiguous"):
             return ["The gain cannot be measured: no held-out run shows the effect."]
         return []
+    if gain.interval is None:
+        interval = "one experiment was held out, so there is no interval"
+    else:
+        interval = f"95 %: {gain.interval[0]:.0%} to {gain.interval[1]:.0%}"
     lines = [
         f"On {len(discrepancy.held_out_runs)} runs held out of the selection, the extended model removes "
-        f"{gain.reduction:.0%} of the avoidable error (95 %: {gain.low:.0%} to {gain.high:.0%})."
+        f"{gain.reduction:.0%} of the avoidable error ({interval})."
     ]
     for name, nominal in gain.nominal.items():
         unit = name.rsplit("_", 1)[1]
@@ -132,7 +143,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
         "verdict": discrepancy.verdict,
         "causes": list(discrepancy.causes),
         "parameters": {
-            name: {"value": item.value, "unit": item.unit, "ci95": [item.low, item.high]}
+            name: {"value": item.value, "unit": item.unit, "ci95": None if item.at_limit else [item.low, item.high]}
             for name, item in discrepancy.parameters.items()
         },
         "explained_fraction": discrepancy.explained_fraction,
@@ -143,7 +154,7 @@ def build_answer(discrepancy: Discrepancy) -> dict[str, Any]:
             "heldout_rmse_extended": gain.extended,
             "noise_floor": gain.noise_floor,
             "reduction": gain.reduction,
-            "ci95": [gain.low, gain.high],
+            "ci95": None if gain.interval is None else list(gain.interval),
         },
         "candidates": [
             {

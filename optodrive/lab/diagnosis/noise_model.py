@@ -18,6 +18,15 @@ from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
 from optodrive.lab.diagnosis.replicate_contrasts import Contrast, build_residual_contrasts, compute_contrasts
 
 EPS = 1e-12
+RESOLUTION_SHARE = 5e-5
+"""Smallest noise relative to a signal's range: a 16-bit converter resolves 1.5e-5, and the closed form of the pixel and
+its integrator agree to 2e-5."""
+ROUNDING_SHARE = 1e-6
+"""Steps between samples below this share of the largest value are rounding errors, not quantisation."""
+ROUNDING_S = 0.02
+"""Duration for which the rounding error of a settled signal without noise persists."""
+MIN_QUANTA = 8
+"""Minimum number of steps between distinct samples for quantisation to be recognised."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +48,8 @@ class NoiseModel:
 
     coloured, baseline_sigma: by signal kind; power_sigma: relative; from_replicates: estimated from repeats;
     replicate_excess: largest excess of χ² of a contrast over its expectation, in σ; intra_pulse_power_excess:
-    significance, in σ, of contrasts that look like power changes within pulses
+    significance, in σ, of contrasts that look like power changes within pulses; has_noise: False if all repeats are
+    equal to the last digit
     """
 
     coloured: dict[int, ColouredNoise]
@@ -49,6 +59,7 @@ class NoiseModel:
     from_replicates: bool
     replicate_excess: float = 0.0
     intra_pulse_power_excess: float = 0.0
+    has_noise: bool = True
 
 
 @kernel
@@ -129,15 +140,26 @@ def estimate_noise_model(data: Dataset, residual: FloatArray, power: FloatArray,
     """
     contrasts = compute_contrasts(data, residual, power, timing)
     coloured: dict[int, ColouredNoise] = {}
+    quanta: dict[int, float] = {}
+    repeats_differ = any(item.value.any() for item in contrasts)
     for kind in data.kinds:
         members = [item for item in contrasts if item.kind == kind]
         if not members:
             members = build_residual_contrasts(data, residual, power, timing, kind)
-        coloured[kind] = _fit_coloured(members)
+        quantum, span = _measure_steps(data, data.value - residual, kind)
+        quanta[kind] = quantum
+        coloured[kind] = _fit_coloured(members, max(quantum / sqrt(12.0), RESOLUTION_SHARE * span, EPS))
     if not contrasts:
         return NoiseModel(coloured, 0.005, 2e-5, {kind: 3.0 * item.white for kind, item in coloured.items()}, False)
     power_sigma, timing_sigma_s, baseline_sigma = _fit_jitter(contrasts, coloured, data.kinds)
-    model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True)
+    if not repeats_differ:
+        for kind, quantum in quanta.items():
+            # Without noise the rounding errors are slow, and equal in all runs: they do not average out.
+            error, item = quantum * sqrt(len(data.runs) / 12.0), coloured[kind]
+            sigma, tau_s = (max(item.sigma[0], error), item.sigma[1]), (max(item.tau_s[0], ROUNDING_S), item.tau_s[1])
+            coloured[kind] = replace(item, white=max(item.white, error), sigma=sigma, tau_s=tau_s)
+            baseline_sigma[kind] = max(baseline_sigma[kind], error)
+    model = NoiseModel(coloured, power_sigma, timing_sigma_s, baseline_sigma, True, has_noise=repeats_differ)
     return replace(
         model,
         replicate_excess=max(
@@ -162,11 +184,31 @@ def _minimize(function: Callable[[FloatArray], float], start: FloatArray, step: 
     return np.asarray(minimize(function, start, method="Nelder-Mead", options=options).x)
 
 
-def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
-    """Fit the noise of one signal kind with the jitters of each contrast projected out."""
+def _measure_steps(data: Dataset, prediction: FloatArray, kind: int) -> tuple[float, float]:
+    """Return the quantisation step of the samples of one kind, 0 for none, and the range of data and prediction."""
+    parts = [block.part for block in data.blocks if block.kind == kind]
+    values = np.unique(np.concatenate([data.value[part] for part in parts]))
+    span = max(float(np.ptp(values)), float(np.ptp(np.concatenate([prediction[part] for part in parts]))))
+    return _find_quantum(values), span
+
+
+def _find_quantum(values: FloatArray) -> float:
+    """Return the step of which all sorted distinct values are multiples, or 0 if there is none."""
+    steps = np.diff(values)
+    steps = steps[steps > ROUNDING_SHARE * float(np.abs(values).max())]
+    if len(steps) < MIN_QUANTA:
+        return 0.0
+    count = (values - values[0]) / steps.min()
+    return float(steps.min()) if float(np.abs(count - np.round(count)).max()) < 0.05 else 0.0
+
+
+def _fit_coloured(contrasts: list[Contrast], resolution: float) -> ColouredNoise:
+    """Fit the noise of one signal kind, white noise of at least the resolution, with the jitters projected out."""
     differences = np.concatenate([np.diff(item.value) for item in contrasts])
     std = float(np.sqrt(np.mean(np.concatenate([item.value - item.value.mean() for item in contrasts]) ** 2))) + EPS
+    std = max(std, resolution)
     white = min(std, float(1.4826 * np.median(np.abs(differences)) / sqrt(2.0)) + 1e-3 * std)
+    white = max(white, resolution)
     dt_s = float(np.median(np.concatenate([np.diff(item.t_s) for item in contrasts])))
     stacked = [(item.t_s, np.column_stack([item.value, _normalize_columns(item.jitter)])) for item in contrasts]
 
@@ -174,7 +216,7 @@ def _fit_coloured(contrasts: list[Contrast]) -> ColouredNoise:
         first, second = dt_s * exp(x[3]), dt_s * exp(x[4])
         omega_rad_per_s = exp(x[5]) if len(x) > 5 else 0.0
         return ColouredNoise(
-            white * exp(x[0]), (white * exp(x[1]), white * exp(x[2])), (first, second), omega_rad_per_s
+            max(white * exp(x[0]), resolution), (white * exp(x[1]), white * exp(x[2])), (first, second), omega_rad_per_s
         )
 
     def cost(x: FloatArray) -> float:

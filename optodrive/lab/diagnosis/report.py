@@ -110,7 +110,9 @@ def _draw_bars(discrepancy: Discrepancy) -> str:
 
 def _build_parameter_table(discrepancy: Discrepancy) -> str:
     rows = (
-        (escape(name), *(format_quantity(value, item.unit) for value in (item.value, item.low, item.high)))
+        (escape(name), format_quantity(item.value, item.unit), "limit of the range, no estimate", "")
+        if item.at_limit
+        else (escape(name), *(format_quantity(value, item.unit) for value in (item.value, item.low, item.high)))
         for name, item in discrepancy.parameters.items()
     )
     return render_table(("parameter", "value", "95 % from", "to"), rows, frozenset({1, 2, 3}))

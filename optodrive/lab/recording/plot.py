@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optodrive.core.errors import InputError
-from optodrive.core.files import atomic_write
+from optodrive.core.files import atomic_write, check_output
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording.storage import SIGNALS
@@ -30,8 +29,7 @@ BACKGROUND_COLOUR, TEXT_COLOUR, FRAME_COLOUR, PULSE_COLOUR, CURVE_COLOUR, MISSIN
 
 def write_plot(path: Path, measurement: Measurement) -> int:
     """Write the plot as a PNG file atomically; return the number of plotted runs, which is at most `RUNS_MAX`."""
-    if path.suffix.lower() != ".png":
-        raise InputError(str(path), path.suffix, "a name that ends in .png")
+    check_output(str(path), path, ".png")
     with np.errstate(over="ignore"):  # a pulse may end beyond the largest finite number
         image, count = _draw(measurement)
     with atomic_write(path) as temporary, temporary.open("wb") as file:

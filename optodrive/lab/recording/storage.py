@@ -34,6 +34,8 @@ SAMPLE_COLUMNS = ("t_s", "value")
 """Columns of a signal."""
 RUN_MEMBERS = (*TABLE_COLUMNS, *SIGNALS)
 
+HDF5_SUFFIXES = (".h5", ".hdf5")
+"""Suffixes of recordings that are one file; any other name is that of a folder."""
 NUMBERS_MAX = 2**27
 """Maximum of numbers read into memory per call: 1 GiB."""
 TEXT_BYTES_MAX = 2**20
@@ -178,4 +180,4 @@ def normalize_attributes(values: dict[str, Any]) -> Attributes:
 
 def is_hdf5(path: Path) -> bool:
     """Return whether a recording of this name is an HDF5 file rather than a folder."""
-    return path.suffix.lower() in (".h5", ".hdf5")
+    return path.suffix.lower() in HDF5_SUFFIXES

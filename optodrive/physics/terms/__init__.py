@@ -21,15 +21,16 @@ def find_term(where: str, key: str, given: Collection[str]) -> Term:
     """Return the term of a key whose parameters are given by name.
 
     where: place of the term in its file, for the message. Raises InputError for an unknown term, an unknown parameter
-    and a missing parameter.
+    and a missing parameter that has no value of its own.
     """
     if key not in discover_terms():
         raise InputError(where, key, f"a known term, {suggest_nearest(key, sorted(discover_terms()))}")
     term, names = discover_terms()[key], set(given)
     expected = [item.name for item in term.parameters]
+    required = [item.name for item in term.parameters if item.if_omitted is None]
     for name in sorted(names.difference(expected)):
         raise InputError(f"{where}.{name}", name, f"a parameter of the term, {suggest_nearest(name, sorted(expected))}")
-    for name in expected:
+    for name in required or ([] if names else expected[:1]):
         if name not in names:
             raise InputError(f"{where}.{name}", None, "a value for this parameter")
     return term

@@ -22,10 +22,10 @@ class AmbientDrift(Term):
     key = "ambient_drift"
     label = "the ambient temperature differs from the stated one"
     parameters = (
-        TermParameter("offset", "K", 0.5, -10.0, 10.0, "ambient against stated temperature, within 5 K"),
-        TermParameter("ramp", "K", 0.5, -10.0, 10.0, "over the recording, within 5 K"),
-        TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording"),
-        TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run"),
+        TermParameter("offset", "K", 0.5, -10.0, 10.0, "ambient against stated temperature, within 5 K", neutral=0.0),
+        TermParameter("ramp", "K", 0.5, -10.0, 10.0, "over the recording, within 5 K", neutral=0.0),
+        TermParameter("bend", "K", 0.2, -10.0, 10.0, "a parabola over the recording", neutral=0.0),
+        TermParameter("rate", "K/s", 0.05, -10.0, 10.0, "within a run", neutral=0.0),
     )
     kernels = Kernels(sensor_reading=sensor_reading)
     varies_between_runs = True

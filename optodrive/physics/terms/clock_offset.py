@@ -12,10 +12,10 @@ class ClockOffset(Term):
     key = "clock_offset"
     label = "an instrument's clock is offset"
     parameters = (
-        TermParameter("temperature", "s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms in either direction"),
-        TermParameter("displacement", "s", 1e-4, -5e-3, 5e-3, "as above"),
-        TermParameter("force", "s", 1e-4, -5e-3, 5e-3, "as above"),
-        TermParameter("mirrors", "s", 1e-4, -5e-3, 5e-3, "as above"),
+        TermParameter("temperature", "s", 1e-4, -5e-3, 5e-3, "0.05 to 3 ms in either direction", neutral=0.0),
+        TermParameter("displacement", "s", 1e-4, -5e-3, 5e-3, "as above", neutral=0.0),
+        TermParameter("force", "s", 1e-4, -5e-3, 5e-3, "as above", neutral=0.0),
+        TermParameter("mirrors", "s", 1e-4, -5e-3, 5e-3, "as above", neutral=0.0),
     )
     cannot_add_heat = True
     subsystems = ("pixels", "mirrors")

@@ -24,8 +24,10 @@ class PowerNonlinearity(Term):
     key = "power_nonlinearity"
     label = "the laser's power is not proportional to its command"
     parameters = (
-        TermParameter("threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command"),
-        TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept"),
+        TermParameter(
+            "threshold", "W", 0.05, 0.0, 0.5, "duty at which the diode begins to lase, in watts of command", neutral=0.0
+        ),
+        TermParameter("curvature", "1", 0.05, -0.3, 0.3, "bend of power against command, full power kept", neutral=0.0),
     )
     kernels = Kernels(optical_power=optical_power)
     signature = "a series of powers with unchanged pulse shapes"

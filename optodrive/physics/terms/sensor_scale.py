@@ -18,8 +18,8 @@ class SensorScale(Term):
     key = "sensor_scale"
     label = "the thermometer's scale is wrong"
     parameters = (
-        TermParameter("gain", "1", 1.03, 0.85, 1.15, "emissivity taken wrongly by 10 %"),
-        TermParameter("offset", "K", 0.0, -20.0, 20.0, "reading at ambient"),
+        TermParameter("gain", "1", 1.03, 0.85, 1.15, "emissivity taken wrongly by 10 %", neutral=1.0),
+        TermParameter("offset", "K", 0.0, -20.0, 20.0, "reading at ambient", neutral=0.0),
     )
     kernels = Kernels(sensor_reading=sensor_reading)
     cannot_add_heat = True

@@ -104,6 +104,11 @@ def with_turn_on(t, y):
     return nominal(t, y, light_w=power(t) * (1 - np.exp(-since(t) / 5e-4)))
 
 
+def with_laser_lag(t, y):
+    commanded_w, on_target = power(t) + power(t, 1), t < PULSES[2, 0]
+    return [*nominal(t, y, light_w=y[2] if on_target else 0.0), (commanded_w - y[2]) / 6e-4]
+
+
 def with_droop(t, y):
     commanded = power(t) + power(t, 1)
     return [
@@ -159,6 +164,7 @@ CASES = {
     ),
     "neighbour_crosstalk": ({"neighbour_crosstalk": {"share": 0.05, "lag": 0.02}}, with_neighbour, 4, plain),
     "laser_turn_on": ({"laser_turn_on": {"time": 5e-4}}, with_turn_on, 2, plain),
+    "laser_lag": ({"laser_lag": {"time": 6e-4}}, with_laser_lag, 3, plain),
     "laser_droop": ({"laser_droop": {"share": 0.1, "time": 0.03, "spread": 4.0}}, with_droop, 4, plain),
     "beam_misalignment": (
         {"beam_misalignment": {"share": 0.2, "pixel": 0.0, "resistance": 5.0, "time": 0.5}},

@@ -1,11 +1,13 @@
 """Diagnosis of a small recording: verdict, narrative, JSON, model file, held-out runs."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from labs import lab
+from optodrive.core.types.measurements import Measurement
 from optodrive.lab.diagnosis.dataset import build_dataset
 from optodrive.lab.diagnosis.diagnose import diagnose
 from optodrive.lab.diagnosis.held_out_gain import split_runs
@@ -14,6 +16,7 @@ from optodrive.lab.diagnosis.narrative import build_answer, build_narrative, for
 from optodrive.lab.diagnosis.omnibus_test import assign_bins
 from optodrive.lab.diagnosis.report import build_report
 from optodrive.physics.parameters import load_parameters
+from optodrive.physics.terms import discover_terms
 
 DROOP = {"laser_droop": {"share": 0.08, "time": 0.05, "spread": 1.0}}
 TWO = {"gas_leak": {"rate": 4.0}, "heat_capacity": {"slope": 2e-3}}
@@ -50,6 +53,27 @@ def test_a_hidden_cause_is_named_measured_and_gains(droop):
     assert "Ruled out" in text
 
 
+@pytest.mark.parametrize("time_s", [3e-4, 1e-3])
+def test_a_laser_that_is_slow_at_both_edges_is_no_late_clock(time_s):
+    found = diagnose(lab(24, {"laser_lag": {"time": time_s}}))
+    assert (found.verdict, found.causes) == ("cause", ("laser_lag",))
+    assert found.parameters["laser_lag.time"].value == pytest.approx(time_s, rel=0.15)
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [
+        {"laser_turn_on": {"time": 8e-4}},
+        {"clock_offset": dict.fromkeys(("temperature", "displacement", "force", "mirrors"), 4e-4)},
+    ],
+    ids=lambda terms: "".join(terms),
+)
+def test_what_acts_at_one_edge_or_late_as_a_whole_is_no_slow_laser(terms):
+    found = diagnose(lab(25, terms))
+    assert found.verdict != "unexplained"
+    assert set(terms) <= set(found.causes)
+
+
 def test_two_hidden_causes_are_named_together():
     found = diagnose(lab(13, TWO))
     assert found.verdict == "cause"
@@ -60,6 +84,78 @@ def test_without_repeats_nothing_is_named_for_certain():
     found = diagnose(lab(14, DROOP, repeats=1))
     assert found.verdict != "cause"
     assert any("No run repeats another" in line for line in build_narrative(found))
+
+
+@pytest.mark.parametrize(
+    "terms", [{}, DROOP, {"wall_heating": {"resistance": 20.0, "capacity": 0.06}}], ids=lambda terms: "".join(terms)
+)
+@pytest.mark.parametrize("quantum_k", [0.0, 0.1])
+def test_data_without_noise_are_diagnosed_by_their_resolution(terms, quantum_k):
+    runs = []
+    for item in lab(17, terms, noise=0.0).runs:
+        absorber = item.signals["absorber_temperature_K"]
+        value = np.round(absorber.value / quantum_k) * quantum_k if quantum_k else absorber.value
+        runs.append(replace(item, signals=item.signals | {"absorber_temperature_K": replace(absorber, value=value)}))
+    found = diagnose(Measurement(tuple(runs)))
+    assert (found.verdict, found.causes) == ("cause" if terms else "none", tuple(terms))
+    assert any("equal to the last digit" in line for line in found.remarks)
+    assert all(item.low <= item.value <= item.high for item in found.parameters.values())
+
+
+def test_one_held_out_experiment_gives_no_interval_of_the_gain():
+    found = diagnose(lab(18, DROOP, groups=("short", "middle", "strong")))
+    assert found.verdict == "cause"
+    assert found.gain is not None
+    assert found.gain.interval is None
+    assert build_answer(found)["gain"]["ci95"] is None
+    assert any("no interval" in line for line in build_narrative(found))
+
+
+def test_a_limit_of_a_range_is_no_estimate():
+    high_k = next(item.high for item in discover_terms()["ambient_drift"].parameters if item.name == "offset")
+    clean = lab(19, {})
+    runs = []
+    for run in clean.runs:
+        absorber = run.signals["absorber_temperature_K"]
+        warmer = replace(absorber, value=absorber.value + 3.0 * high_k)
+        runs.append(replace(run, signals=run.signals | {"absorber_temperature_K": warmer}))
+    found = diagnose(Measurement(tuple(runs)))
+    assert all(item.low <= item.value <= item.high for item in found.parameters.values())
+    offset = found.parameters.get("ambient_drift.offset")
+    if offset is not None:
+        assert offset.at_limit
+        assert build_answer(found)["parameters"]["ambient_drift.offset"]["ci95"] is None
+        assert any("no estimate" in line for line in build_narrative(found))
+
+
+def _without_groups(measurement):
+    return Measurement(tuple(replace(run, attributes={}) for run in measurement.runs))
+
+
+def test_equal_pulses_are_repeats_where_no_group_is_stated(droop):
+    found = diagnose(_without_groups(lab(12, DROOP)))
+    assert (found.verdict, found.causes) == ("cause", ("laser_droop",))
+    assert found.parameters == droop.parameters
+    assert any("without a `group`" in line for line in found.remarks)
+    assert not any("without a `group`" in line for line in droop.remarks)
+
+
+def test_equal_pulses_of_other_pixels_or_stated_groups_are_no_repeats():
+    runs = _without_groups(lab(12, DROOP, groups=("strong",), repeats=2)).runs
+    signals = {name: replace(signal, pixel=1) for name, signal in runs[1].signals.items()}
+    assert build_dataset(Measurement((runs[0], replace(runs[1], signals=signals)))).contrast_count == 0
+    early, late = (replace(run, attributes={"group": name}) for run, name in zip(runs, ("early", "late"), strict=True))
+    assert build_dataset(Measurement((early, late))).contrast_count == 0
+    assert build_dataset(Measurement(runs)).contrast_count == 1
+
+
+def test_an_ambiguity_of_one_says_what_is_missing():
+    found = diagnose(_without_groups(lab(14, DROOP, repeats=1)))
+    assert (found.verdict, found.causes) == ("ambiguous", ("laser_droop",))
+    headline = build_narrative(found)[0]
+    assert "`group`" in headline
+    assert "cannot separate" not in headline
+    assert not any("would separate them" in line for line in build_narrative(found))
 
 
 def test_the_same_seed_gives_the_same_answer(droop):

@@ -1,0 +1,45 @@
+"""`optodrive terms`: list the physical effects beyond the nominal pixel, and how a parameter set states them."""
+
+from typing import Annotated
+
+import typer
+
+from optodrive.cli.options import JsonOption
+from optodrive.cli.output import print_json
+from optodrive.core.errors import InputError, suggest_nearest
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command."""
+    app.command("terms")(terms)
+
+
+def terms(
+    name: Annotated[str | None, typer.Argument(metavar="[TERM]", help="Show this term with its parameters.")] = None,
+    json: JsonOption = False,
+) -> None:
+    """List the terms of model.toml, or show one: equation, parameters, ranges, and the lines that state it."""
+    from optodrive.physics.term_reference import build_example, describe_term
+    from optodrive.physics.terms import discover_terms
+
+    known = discover_terms()
+    if name is not None and name not in known:
+        raise InputError("TERM", name, f"a known term, {suggest_nearest(name, sorted(known))}")
+    if json:
+        selected = [known[key] for key in sorted(known) if name in (None, key)]
+        print_json({"terms": [describe_term(term) for term in selected]})
+        return
+    if name is None:
+        for key in sorted(known):
+            print(f"{key:<22}{known[key].label}")
+        print("\n`optodrive terms TERM` shows the parameters of one.")
+        return
+    term = known[name]
+    about = describe_term(term)
+    print(f"{name}: {about['label']}\n\n{about['equation']}\n")
+    for item in about["parameters"]:
+        omitted = "required" if item["if_omitted"] is None else f"{item['if_omitted']:g} if omitted"
+        print(f"{item['name']:<18}{item['low']:g} to {item['high']:g} {item['unit']}, {omitted}; {item['source']}")
+    if term.requires:
+        print(f"\nneeds {', '.join(term.requires)}")
+    print("\nin model.toml:\n\n    " + "\n    ".join(build_example(term)))
