@@ -1,6 +1,7 @@
 """Access control of every route, with every reason for refusal."""
 
 import asyncio
+import fcntl
 import json
 import os
 import resource
@@ -254,10 +255,11 @@ def test_a_stuck_audit_pipe_does_not_keep_the_daemon_from_ending(make_daemon, bo
     pipe = tmp_path / "audit.pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    fcntl.fcntl(reader, fcntl.F_SETPIPE_SZ, 4096)
     try:
         daemon = make_daemon(board, replace=build_daemon_replacement(f'audit = "{pipe}"'))
-        for _ in range(1000):  # more than a pipe holds
-            httpx.post(f"{daemon.url}/v1/disarm", headers=build_bearer_header(TOKEN))
+        for _ in range(50):  # more than the pipe holds
+            daemon.call("POST", "/v1/disarm")
         begin_s = time.monotonic()
         daemon.process.terminate()
         assert daemon.process.wait(timeout=20) == 0
@@ -333,7 +335,8 @@ def test_without_an_audit_file_arming_fails_and_stop_works(make_board, tmp_path)
         daemon.arm()
         plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
         wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
-        full = partial(resource.prlimit, daemon.process.pid, resource.RLIMIT_FSIZE)
+        (web,) = (pid for pid in daemon.list_children() if Path(f"/proc/{pid}/comm").read_text() == "opto-web\n")
+        full = partial(resource.prlimit, web, resource.RLIMIT_FSIZE)
         before = full()
         full((audit.stat().st_size, before[1]))
         # The running plan continues until STOP.

@@ -7,7 +7,7 @@ from itertools import count
 from typing import Protocol, TypeVar
 
 from optodrive.core.clock import Clock
-from optodrive.core.errors import BusyError, StoppedError
+from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_record
 from optodrive.daemon.engine.plan_queue import PlanQueue
@@ -23,6 +23,8 @@ PLANNING_TIME_FACTOR = 1.5
 """Planning time reserved for a streamed plan, as a multiple of the last one."""
 SPLICE_TRIES = 2
 """Number of late attempts to splice a streamed plan, after which the running stream is truncated."""
+PLANNING_MAX_S = 60.0
+"""Longest planning time of a request, s, the limit of a dry run; meanwhile all others wait."""
 REQUESTS_MAX = 16
 """Requests that wait for the planner at most."""
 T = TypeVar("T")
@@ -97,9 +99,14 @@ class Planner:
             self._pending_count -= 1
 
     def _process(self, request: PlanningRequest) -> PlanReport:
+        began_s = self._clock.now_s()
+
         def check(_fraction: float) -> None:
-            """Record progress, and end the work on a request that nobody waits for."""
-            self._progress_at_s = self._clock.now_s()
+            """Record progress, and end the work on a request that nobody waits for or that takes too long."""
+            now_s = self._progress_at_s = self._clock.now_s()
+            if now_s - began_s > PLANNING_MAX_S:
+                expected = f"a sequence that is planned within {PLANNING_MAX_S:g} s; send it in parts"
+                raise InputError("body", "a longer computation", expected, "too_slow")
             self._plan_queue.require_epoch(request.epoch)
             if request.caller_left.is_set():
                 raise StoppedError("the caller has left")

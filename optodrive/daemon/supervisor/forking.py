@@ -13,8 +13,11 @@ from optodrive.core.beat import BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15
-IGNORED_SIGNALS = (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE)
-"""A terminal sends SIGINT and SIGHUP to every process of its group. The supervisor alone decides what they mean."""
+IGNORED_SIGNALS = (signal.SIGINT, signal.SIGHUP, signal.SIGPIPE, signal.SIGXFSZ)
+"""A terminal sends SIGINT and SIGHUP to every process of its group. The supervisor alone decides what they mean.
+
+A write to a closed pipe or beyond the size limit of files is an error of that write, as in every Python program.
+"""
 _libc = ctypes.CDLL(None, use_errno=True)
 
 

@@ -30,8 +30,9 @@ CALLER = "optodrive.caller"
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
 STREAMS = ("GET /v1/telemetry", "WEBSOCKET /v1/stream")
-STREAMS_PER_CALLER_MAX = 16
-"""Streams that the same token may have open from the same address."""
+STREAMS_PER_CALLER_MAX, REQUESTS_PER_CALLER_MAX = 16, 64
+"""Streams, and requests in progress, of the same token and address: a part of the server's connections."""
+Caller = tuple[str, str]
 
 
 class AccessMiddleware:
@@ -41,7 +42,7 @@ class AccessMiddleware:
         self._app = app
         self._policy = policy
         self._table = table
-        self._streams = StreamCounter()
+        self._load = CallerLoad()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send a refusal, or forward the request."""
@@ -53,7 +54,7 @@ class AccessMiddleware:
         if problem is None and request.route is not None and request.route.key == ARM:
             problem = await self._record_intent(request)
         if problem is None:
-            with self._streams.count(request) as problem:
+            with self._load.count(request) as problem:
                 if problem is None:
                     await self._forward(request, scope, receive, send)
                     return
@@ -103,30 +104,37 @@ class AccessMiddleware:
             self._policy.audit.record(request.audit_fields | fields)
 
 
-class StreamCounter:
-    """Bounds the streams, which have no end of their own, that one caller has open."""
+class CallerLoad:
+    """Bounds the requests in progress of each caller, and the streams among them, which have no end of their own."""
 
     def __init__(self) -> None:
-        self._open: Counter[tuple[str, str]] = Counter()
+        self._requests: Counter[Caller] = Counter()
+        self._streams: Counter[Caller] = Counter()
 
     @contextmanager
     def count(self, request: RequestContext) -> Iterator[Problem | None]:
-        """Count a request while it is served, if it is a stream. Yield why it is refused."""
-        if request.route is None or request.route.key not in STREAMS:
+        """Count a request while it is served. Yield why it is refused. STOP is not counted."""
+        if request.route is None or request.route.key == STOP:
             yield None
             return
         caller = request.token.name, request.address
-        if self._open[caller] >= STREAMS_PER_CALLER_MAX:
+        if request.route.key in STREAMS and self._streams[caller] >= STREAMS_PER_CALLER_MAX:
             detail = f"this caller has {STREAMS_PER_CALLER_MAX} streams open; close one"
             yield build_problem(429, "too_many_streams", "Too many streams", detail, retry_after_s=1.0)
-            return
-        self._open[caller] += 1
-        try:
-            yield None
-        finally:
-            self._open[caller] -= 1
-            if not self._open[caller]:
-                del self._open[caller]
+        elif self._requests[caller] >= REQUESTS_PER_CALLER_MAX:
+            detail = f"this caller has {REQUESTS_PER_CALLER_MAX} requests in progress; wait for one to end"
+            yield build_problem(429, "too_many_requests", "Too many requests", detail, retry_after_s=1.0)
+        else:
+            counters = [self._requests, self._streams] if request.route.key in STREAMS else [self._requests]
+            for counter in counters:
+                counter[caller] += 1
+            try:
+                yield None
+            finally:
+                for counter in counters:
+                    counter[caller] -= 1
+                    if not counter[caller]:
+                        del counter[caller]
 
 
 class _StatusRecorder:

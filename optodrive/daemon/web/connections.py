@@ -13,7 +13,8 @@ PHASE_MAX_S: dict[Phase, float] = {"headers": 5.0, "idle": 15.0, "drain": 5.0, "
 """The longest time of a phase: a request's header, between requests, the rest of a body that nobody reads, a body, a
 client that does not read its answer. An answer and a stream have no limit."""
 IDLE_PHASES: tuple[Phase, ...] = ("headers", "idle", "drain")
-"""A connection in one of these phases may be closed in favour of a new one."""
+SLOW_BODY_S = 5.0
+"""A connection in one of these phases may be closed in favour of a new one; within a body after this time."""
 
 
 class PhaseOfRequest(NamedTuple):
@@ -72,8 +73,8 @@ class Connections:
 
     def close_longest_idle(self) -> bool:
         """Close the connection that has been idle longest. Return whether there is one."""
-        self._update_phases()
-        idle = [item for item in self._entries.items() if item[1].phase.phase in IDLE_PHASES]
+        now_s = self._update_phases()
+        idle = [item for item in self._entries.items() if _is_replaceable(item[1], now_s)]
         if not idle:
             return False
         self._abort(min(idle, key=lambda item: item[1].since_s)[0])
@@ -98,3 +99,8 @@ class Connections:
     def _abort(self, transport: asyncio.Transport) -> None:
         self.remove(transport)
         transport.abort()
+
+
+def _is_replaceable(entry: _Entry, now_s: float) -> bool:
+    is_slow_body = entry.phase.phase == "body" and now_s - entry.since_s > SLOW_BODY_S
+    return is_slow_body or entry.phase.phase in IDLE_PHASES

@@ -109,11 +109,6 @@ class LinkService:
         """Number of the planner, None without one."""
         return self._clients.planner
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether the link to the board is up."""
-        return self._session.connected
-
     def list_observers(self) -> tuple[int, ...]:
         """Return the clients that must stay connected: all but operators."""
         return self._clients.list_observers()

@@ -26,10 +26,9 @@ from optodrive.link.transport.base import Transport
 from optodrive.link.transport.capturing_transport import CapturingTransport
 from optodrive.link.transport.link_capture import LinkCaptureWriter
 from optodrive.link.transport.registry import find_transport_factory
+from optodrive.link.transport.threaded_transport import ThreadedTransport
 
 PR_SET_PDEATHSIG = 1
-POLL_TRANSPORT_S = 0.001
-"""Interval at which a port without a descriptor is read."""
 OPENING_WAIT_S = 0.002
 CAPTURES_MAX = 1000
 
@@ -110,9 +109,7 @@ class LinkProcess:
         if port is not None:
             poll.register(port, select.POLLIN)
         self._clients.register(poll)
-        is_polled = port is None and self._service.is_connected
-        wait_s = 0.0 if is_polled else self._service.compute_wait_s()
-        ready = {descriptor for descriptor, _ in poll.poll(wait_s * 1e3)}
+        ready = {descriptor for descriptor, _ in poll.poll(self._service.compute_wait_s() * 1e3)}
         if self._wakeup.fileno() in ready:
             with suppress(BlockingIOError):
                 self._wakeup.recv(4096)
@@ -120,7 +117,7 @@ class LinkProcess:
             self._stop_requested = False
             self._service.go_dark("ended by SIGUSR1")
         self._clients.process(ready)
-        self._service.step(POLL_TRANSPORT_S if is_polled else 0.0)
+        self._service.step()
         self._clients.deliver()
         self._supervisor.beat()
         if self._supervisor.fileno() in ready:
@@ -173,7 +170,7 @@ def main(arguments: list[str] | None = None) -> int:
         exit_stack.callback(supervisor.close)
         try:
             settings, clock = read_settings(options.settings), MonotonicClock()
-            transport = find_transport_factory(settings.port)()
+            transport: Transport = ThreadedTransport(find_transport_factory(settings.port)())
             if settings.capture_path is not None:
                 capture = open_capture(settings.capture_path, clock, supervisor)
                 transport = CapturingTransport(transport, capture, clock)

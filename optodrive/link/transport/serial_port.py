@@ -1,5 +1,7 @@
 """Transport over a serial port, with pyserial."""
 
+import os
+import time
 from contextlib import suppress
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.link.transport.base import TransportKind
 
 WRITE_TIMEOUT_S = 0.5
+WRITE_RETRY_S = 0.001
 
 
 class SerialPort:
@@ -59,11 +62,21 @@ class SerialPort:
             raise self._build_lost_error(error) from None
 
     def write(self, data: bytes) -> None:
-        """Write all of data. Raise LinkError if the device does not accept it within half a second."""
-        try:
-            self._require_open().write(data)
-        except OSError as error:
-            raise self._build_lost_error(error) from None
+        """Write all of data. Raise LinkError if the device does not accept it within half a second.
+
+        pyserial would poll the device after each write, which waits for a worker of the kernel.
+        """
+        port, rest, deadline_s = self._require_open(), memoryview(data), None
+        while rest:
+            try:
+                rest = rest[os.write(port.fileno(), rest) :]
+            except BlockingIOError as error:
+                deadline_s = deadline_s or time.monotonic() + WRITE_TIMEOUT_S
+                if time.monotonic() > deadline_s:
+                    raise self._build_lost_error(error) from None
+                time.sleep(WRITE_RETRY_S)
+            except OSError as error:
+                raise self._build_lost_error(error) from None
 
     def _build_lost_error(self, error: Exception) -> LinkError:
         detail = "" if Path(self.name).exists() else f"; {self.name} is missing: unplugged, or its power is off"

@@ -5,10 +5,10 @@ import threading
 import pytest
 
 from link_service_rig import OPERATOR, PLANNER, WEB, ServiceRig
-from optodrive.core.errors import BusyError, StoppedError
+from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.planner import REQUESTS_MAX
+from optodrive.daemon.engine.planner import PLANNING_MAX_S, REQUESTS_MAX
 from planner_rig import PlannerRig, build_frame, build_train
 
 
@@ -133,6 +133,16 @@ def test_a_request_whose_caller_left_is_not_committed(rig):
     request = PlanningRequest(build_frame, "push", epoch=rig.remote.epoch, caller_left=left)
     with pytest.raises(StoppedError, match="left"):
         rig.planner.submit(request).result()
+    assert not rig.queue.is_busy
+
+
+def test_a_request_that_is_planned_for_too_long_is_refused(rig):
+    def build_slowly():
+        rig.clock.sleep(PLANNING_MAX_S + 1.0)
+        return build_frame()
+
+    with pytest.raises(InputError, match="planned within 60 s"):
+        rig.planner.submit(PlanningRequest(build_slowly, "push", epoch=rig.remote.epoch)).result()
     assert not rig.queue.is_busy
 
 

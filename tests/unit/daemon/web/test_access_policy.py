@@ -10,10 +10,11 @@ import pytest
 from starlette.requests import ClientDisconnect
 
 from optodrive.daemon.web.access_middleware import (
+    REQUESTS_PER_CALLER_MAX,
     STREAMS,
     STREAMS_PER_CALLER_MAX,
     AccessMiddleware,
-    StreamCounter,
+    CallerLoad,
 )
 from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
 from optodrive.daemon.web.audit import AuditLog
@@ -179,24 +180,38 @@ def test_a_client_that_hangs_up_during_its_body_is_no_error(audited, caplog):
     assert (entry["event"], entry["hung_up"], entry["status"]) == ("answered", True, None)
 
 
+def build_request(token, key, address="127.0.0.1"):
+    method, _, path = key.partition(" ")
+    return RequestContext(method, path, {}, address, token, Route(key, "viewer", method, re.compile(path)))
+
+
 def test_the_streams_of_one_caller_are_bounded():
-    counter = StreamCounter()
-
-    def ask(token, key, address="127.0.0.1"):
-        method, _, path = key.partition(" ")
-        return RequestContext(method, path, {}, address, token, Route(key, "viewer", method, re.compile(path)))
-
+    load = CallerLoad()
+    ask = build_request
     eve, bob = TOKENS.all
     with ExitStack() as stack:
         for _ in range(STREAMS_PER_CALLER_MAX):
-            assert stack.enter_context(counter.count(ask(eve, "GET /v1/telemetry"))) is None
+            assert stack.enter_context(load.count(ask(eve, "GET /v1/telemetry"))) is None
         for key in STREAMS:
-            assert stack.enter_context(counter.count(ask(eve, key))).code == "too_many_streams"
+            assert stack.enter_context(load.count(ask(eve, key))).code == "too_many_streams"
         for request in (
             ask(bob, "GET /v1/telemetry"),
             ask(eve, "GET /v1/telemetry", "10.0.0.1"),
             ask(eve, "GET /v1/state"),
         ):
-            assert stack.enter_context(counter.count(request)) is None
-    with counter.count(ask(eve, "WEBSOCKET /v1/stream")) as problem:
+            assert stack.enter_context(load.count(request)) is None
+    with load.count(ask(eve, "WEBSOCKET /v1/stream")) as problem:
+        assert problem is None
+
+
+def test_the_requests_in_progress_of_one_caller_are_bounded_but_for_stop():
+    load = CallerLoad()
+    eve, bob = TOKENS.all
+    with ExitStack() as stack:
+        for _ in range(REQUESTS_PER_CALLER_MAX):
+            assert stack.enter_context(load.count(build_request(eve, "POST /v1/plans"))) is None
+        assert stack.enter_context(load.count(build_request(eve, "GET /v1/state"))).code == "too_many_requests"
+        assert stack.enter_context(load.count(build_request(eve, "POST /v1/stop"))) is None
+        assert stack.enter_context(load.count(build_request(bob, "POST /v1/arm"))) is None
+    with load.count(build_request(eve, "POST /v1/plans")) as problem:
         assert problem is None

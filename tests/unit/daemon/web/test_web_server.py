@@ -208,6 +208,17 @@ def test_only_stop_enters_while_every_connection_is_busy(open_client, applicatio
     assert refused.receive() == b""
 
 
+def test_a_slow_body_gives_way_to_a_new_connection(open_client, monkeypatch):
+    monkeypatch.setattr(connections, "CONNECTIONS_MAX", 5)
+    monkeypatch.setattr(connections, "SLOW_BODY_S", 0.3)
+    slow = [open_client() for _ in range(5)]
+    for client in slow:
+        client.send(HALVES["body"][0])
+    time.sleep(0.5)
+    assert open_client().ask(GET)
+    assert sum(client.is_closed() for client in slow) == 1
+
+
 def test_stop_precedes_requests_that_arrived_before_it(open_client, application):
     blocking, stop = open_client(), open_client()
     others = [open_client() for _ in range(60)]
