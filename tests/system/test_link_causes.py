@@ -1,6 +1,7 @@
 """Link failures on a board process: reports of the state, the failed plan and the log, and link captures."""
 
 import json
+import os
 import signal
 import subprocess
 
@@ -79,9 +80,12 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
     capture = tmp_path / "capture"
     daemon = make_daemon(board, options=("--capture", str(capture)))
     plan = play(daemon)
-    daemon.process.send_signal(signal.SIGSTOP)
+    pids = [daemon.process.pid, *daemon.list_children()]
+    for pid in pids:
+        os.kill(pid, signal.SIGSTOP)
     wait_for(lambda: board.of("fault"), "the lease to expire")
-    daemon.process.send_signal(signal.SIGCONT)
+    for pid in pids:
+        os.kill(pid, signal.SIGCONT)
     cause = wait_for_cause(daemon, "this computer stalled")
     failed = daemon.finished(plan)
     assert cause in failed["error"]
@@ -160,7 +164,7 @@ def test_the_doctor_does_not_disturb_a_daemon_and_checks_a_free_board(board, dae
     plan = play(daemon, 4.0)
     findings = doctor(daemon.config)
     assert findings["holder"]["status"] == "warning"
-    assert f"process {daemon.process.pid}" in findings["holder"]["observation"]
+    assert any(f"process {pid}:" in findings["holder"]["observation"] for pid in daemon.list_children())
     assert "board" not in findings
     assert daemon.finished(plan)["status"] == "done"
     assert daemon.board_state() == "ARMED"

@@ -247,13 +247,6 @@ def test_a_picture_that_is_no_picture(armed, tmp_path):
     assert unchanged(armed) == before
 
 
-def test_a_missing_serial_port(tmp_path):
-    text = locate_shipped("display-437.toml").read_text()
-    path = tmp_path / "config.toml"
-    path.write_text(text.replace('transport = "simulated"', 'transport = "serial"\nport = "/dev/ttyNOWHERE"'))
-    assert_one_line(["serve", "--config", path, "--port", "0"], "/dev/ttyNOWHERE", {"XDG_RUNTIME_DIR": str(tmp_path)})
-
-
 def test_a_port_in_use(armed, tmp_path):
     port = armed.url.rpartition(":")[2]
     assert_one_line(["serve", "--port", port], "daemon.port", {"XDG_RUNTIME_DIR": str(tmp_path)})

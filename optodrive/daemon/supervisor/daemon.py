@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from optodrive.core.clock import MonotonicClock
+from optodrive.core.errors import InputError
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader
@@ -48,6 +49,8 @@ def run(
         log = open_daemon_log()
         exit_stack.callback(log.close)
         find_transport_factory(build_port_settings(config.board))  # refuses a Helios
+        if capture_path is not None and capture_path.exists():
+            raise InputError("--capture", str(capture_path), "a name that is free: nothing is overwritten")
         clock = MonotonicClock()
         notifier = Notifier(clock)
         exit_stack.callback(notifier.close)
@@ -87,8 +90,7 @@ def _build_link_start(
     config: Config, folder: RuntimeFolder, capture_path: Path | None
 ) -> Callable[[socket.socket, int], int]:
     def start(channel: socket.socket, number: int) -> int:
-        capture = None if capture_path is None else number_path(capture_path, number)
-        settings = build_link_settings(config, folder.link_socket, folder.link_socket_mode, capture)
+        settings = build_link_settings(config, folder.link_socket, folder.link_socket_mode, capture_path)
         folder.link_settings.write_text(settings.to_json(), encoding="utf-8")
         descriptor = str(channel.fileno())
         arguments = ("--settings", str(folder.link_settings), "--supervisor", descriptor)

@@ -6,6 +6,7 @@ from typing import Any
 
 from optodrive.core.clock import Clock
 from optodrive.core.ipc import IpcError, Message, MessageSocket
+from optodrive.link.service.link_service import CONNECTING
 
 CONNECT_INTERVAL_S = 0.02
 
@@ -37,7 +38,9 @@ class LinkView:
     @property
     def link_error(self) -> str:
         """Why the board is not connected, '' while it is or nothing is known yet."""
-        return "" if self.status.get("connected") else str(self.status.get("link_error") or "")
+        if self.status.get("connected") or self.status.get("link_error_code") == CONNECTING:
+            return ""
+        return str(self.status.get("link_error") or "")
 
     def receive(self) -> None:
         """Process what has arrived, and connect if there is no connection."""

@@ -255,12 +255,13 @@ class Supervisor:
     def _report_link_error(self) -> None:
         """Log why the board is absent, before its first connection or if it contradicts the configuration.
 
-        The planner process reports the loss of a link, with its likely cause.
+        The planner process reports the likely cause of a failure, if there is one.
         """
         status, error = self.link_view.status, self.link_view.link_error
         self._was_connected |= bool(status.get("connected"))
         if not status or error == self._reported_link_error:
             return
         self._reported_link_error = error
-        if error and (not self._was_connected or status.get("link_error_code") == "board"):
+        is_unexplained = not self._was_connected and status.get("cause") is None
+        if error and (is_unexplained or status.get("link_error_code") == "board"):
             self._log.warn(f"waiting for the board at {status.get('port', '')}: {error}")

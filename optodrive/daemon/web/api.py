@@ -76,10 +76,10 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Return whether the daemon runs; needs no token."""
         return HealthReport(version=__version__)
 
-    @routes.get("/v1/state", "viewer")
-    async def get_state() -> StateReport:
+    @routes.get("/v1/state", "viewer", response_model=StateReport)
+    async def get_state() -> Response:
         """Return the state of board, link, queue and planner."""
-        return daemon.build_state()
+        return _send_state(daemon)
 
     @routes.get("/v1/me", "viewer")
     async def get_me(request: Request) -> CallerReport:
@@ -97,23 +97,23 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Return the effective configuration, as `optodrive config show --json`."""
         return build_effective_config(daemon.display)
 
-    @routes.post("/v1/arm", "armer")
-    async def arm() -> StateReport:
+    @routes.post("/v1/arm", "armer", response_model=StateReport)
+    async def arm() -> Response:
         """Arm the board; its indicator is on for at least two seconds before it emits."""
         await daemon.link.command("arm")
-        return daemon.build_state()
+        return _send_state(daemon)
 
-    @routes.post("/v1/disarm", "operator")
-    async def disarm() -> StateReport:
+    @routes.post("/v1/disarm", "operator", response_model=StateReport)
+    async def disarm() -> Response:
         """Disarm the board; this also acknowledges a fault whose cause is gone."""
         await daemon.link.command("disarm")
-        return daemon.build_state()
+        return _send_state(daemon)
 
-    @routes.post("/v1/stop", "viewer")
-    async def stop() -> StateReport:
+    @routes.post("/v1/stop", "viewer", response_model=StateReport)
+    async def stop() -> Response:
         """Switch the gate off, drop everything queued, disarm the board."""
         await daemon.link.command("stop")
-        return daemon.build_state()
+        return _send_state(daemon)
 
     @routes.post(
         "/v1/plans",
@@ -230,6 +230,10 @@ async def _finish_unless_left(request: Request, work: Coroutine[Any, Any, Messag
 async def _wait_until_left(request: Request) -> None:
     while (await request.receive())["type"] != "http.disconnect":
         pass
+
+
+def _send_state(daemon: DaemonClient) -> Response:
+    return Response(daemon.encode_state(), media_type="application/json")
 
 
 def _relay(result: Message, media_type: str = "application/json") -> Response:

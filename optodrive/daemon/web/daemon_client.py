@@ -152,6 +152,7 @@ class DaemonClient:
         self.preview = Peer("preview", folder.preview_socket)
         self.hub = TelemetryHub()
         self._state: StateReport | None = None
+        self._state_json = b""
         link, planner = self.link.peer, self.planner.peer
         link.on_message, planner.on_message = self._on_link_message, self._on_planner_message
         link.on_lost, planner.on_lost = self._on_link_lost, self._on_planner_lost
@@ -186,6 +187,12 @@ class DaemonClient:
                 self.planner.state,
             )
         return self._state
+
+    def encode_state(self) -> bytes:
+        """Encode the state as JSON, once per change."""
+        if not self._state_json:
+            self._state_json = self.build_state().model_dump_json().encode()
+        return self._state_json
 
     async def build(self, source: str, name: str, body: bytes, caller: str) -> Message:
         """Build the sequence of a body in the preview process; return its result."""
@@ -238,5 +245,5 @@ class DaemonClient:
         self._publish_state()
 
     def _publish_state(self) -> None:
-        self._state = None
+        self._state, self._state_json = None, b""
         self.hub.publish_state(self.build_state())

@@ -25,12 +25,12 @@ ERROR_RESPONSES: dict[int | str, dict[str, Any]] = {
         403: "the Origin is not allowed, or the token's role is insufficient",
         404: "not found",
         405: "method not allowed",
-        409: "refused, or not possible in this state",
+        409: "refused, ended by a stop, or not possible in this state",
         413: "body too large",
         421: "the Host is not allowed",
         422: "invalid input",
         429: "request rate exceeded",
-        503: "no link to the board",
+        503: "no link to the board, a process of the daemon restarts, or too many requests wait",
     }.items()
 }
 ERROR_RESPONSES[429]["headers"] = {

@@ -24,6 +24,8 @@ from optodrive.link.session.fault_hints import get_fault_hint
 from optodrive.link.session.session import BoardSession
 
 RETRY_INTERVAL_S = 1.0
+CONNECTING = "connecting"
+"""Code of link_error until the first connection has succeeded or failed."""
 WAIT_MAX_S = 0.02
 """Longest wait of the loop, so that status and beats are in time."""
 
@@ -53,6 +55,7 @@ class LinkService:
     ) -> None:
         self.epoch = Epoch(first_epoch)
         self.link_error: OptodriveError | None = LinkError("the board is not reached yet")
+        self.link_error.code = CONNECTING
         self._session = session
         self._clock = clock
         self._open_port = open_port
