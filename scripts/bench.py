@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from bench_field import bench_field
+from bench_memory import bench_memory
 from bench_stream import bench_stream
 from rich.console import Console
 from rich.table import Table
@@ -367,6 +368,7 @@ BENCHMARKS = {
     "display": bench_display,
     "field": bench_field,
     "stream": bench_stream,
+    "memory": bench_memory,
     "order": bench_order,
     "page": bench_page,
 }

@@ -5,25 +5,32 @@ as fast as they can. A bare FastAPI application in another process receives the 
 same load; its latency is the part that the web framework causes.
 """
 
+import argparse
 import json
 import os
 import statistics
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from pathlib import Path
 
 import httpx
 import numpy as np
+from bench_full_frames import measure_full_frames
+
+sys.path[:0] = [str(Path(__file__).resolve().parent.parent / "tests" / "system")]
+from rig import TOKEN, Board, Daemon, read_role_tokens  # noqa: E402 - of the tests
+from stop_rig import FloodProcess  # noqa: E402
 
 RUNS = 50
-MINUTE_S, FULL_HZ = 60.0, 16.0
+MINUTE_S = 60.0
 PIXELS, ACTIVE, RATE_HZ, SECONDS, CLIENTS = 1511, 200, 20.0, 15.0, 4
-TOKEN = "a-token-for-a-benchmark"
-CONFIG = Path(__file__).parents[1] / "configs" / "display-1511.toml"
-UNLIMITED_RATES = "\n[daemon]\nrequests_per_s = 100000\nrequests_burst = 100000\n"
+LEASE_S = 0.1
+LOAD = "kept alive GETs"
+UNLIMITED_RATES = (
+    (f"lease_s = {LEASE_S}", f"lease_s = {LEASE_S}\n[daemon]\nrequests_per_s = 1e5\nrequests_burst = 100000\n#"),
+)
 """The daemon must serve the load; its rate limit must not reject it."""
 
 BARE_SERVER = """
@@ -84,32 +91,6 @@ def measure_planning():
     return rows
 
 
-class RequestLoad:
-    """Clients that request the state continuously."""
-
-    def __init__(self, url):
-        self._url = url
-        self._stop = threading.Event()
-        self._threads = [threading.Thread(target=self._send_requests, daemon=True) for _ in range(CLIENTS)]
-        self.answered = 0
-
-    def _send_requests(self):
-        with httpx.Client(base_url=self._url, headers={"Authorization": f"Bearer {TOKEN}"}) as client:
-            while not self._stop.is_set():
-                client.get("/v1/state")
-                self.answered += 1
-
-    def __enter__(self):
-        for thread in self._threads:
-            thread.start()
-        return self
-
-    def __exit__(self, *_):
-        self._stop.set()
-        for thread in self._threads:
-            thread.join()
-
-
 def push_frames(url):
     """Push frames; return round trips, s, the answers, the final state, and the plans of the last frames."""
     rng = np.random.default_rng(7)
@@ -136,84 +117,28 @@ def push_frames(url):
         )
 
 
-def measure_full_frames():
-    """Stream full frames with a travelling wave at up to 16 per second, without other clients, from the cold state."""
-    from optodrive.daemon.one_process.engine import Engine
+def start_bare_server(folder, port):
+    """Start the bare FastAPI application; return its process and its URL."""
+    script, url = Path(folder) / "bare.py", f"http://127.0.0.1:{port}"
+    script.write_text(BARE_SERVER)
+    process = subprocess.Popen([sys.executable, script, str(port)])
+    while True:
+        try:
+            httpx.get(f"{url}/v1/state")
+            return process, url
+        except httpx.ConnectError:
+            time.sleep(0.05)
 
-    from optodrive.core.clock import MonotonicClock
-    from optodrive.core.types.stimuli import FrameSequence, TactileFrame
-    from optodrive.device.config_file import load_config
-    from optodrive.link.transport.simulated import SimulatedBoard
-    from optodrive.planning.display_model import DisplayModel
 
-    display = DisplayModel.from_config(load_config("display-1511"))
-    board = SimulatedBoard("", 1_000_000)
-    engine = Engine(display, board, MonotonicClock())
-    engine.start()
-    engine.arm().result(10)
-    plans, errors, first_light_s, open_plans = [], [], [], []
-
-    def collect(plan):
-        engine.get_end_future(plan).result(20)
-        record = engine.get_plan(plan)
-        if record.executed:
-            target_um = dict(zip(record.pulses.pixel, record.pulses.target_um, strict=True))
-            done = record.executed_pulses
-            errors.extend(um / target_um[pixel] - 1 for pixel, um in zip(done.pixel, done.simulated_um, strict=True))
-            first_light_s.append(record.latency.first_light_s)
-            plans.append(set(done.pixel))
-
+def push_frames_under_load(url, tokens):
+    """Push frames while other clients request the state; return what push_frames does, and the answers per second."""
+    load, begin_s = FloodProcess(LOAD, url, tokens, PIXELS, CLIENTS), time.monotonic()
     try:
-        begin_s = time.monotonic()
-        for k in range(int(MINUTE_S * FULL_HZ)):
-            target = 60e-6 * (1 + np.sin(0.3 * k + display.layout.column / 4))
-            target[target < 5e-6] = 0
-            sequence = FrameSequence((TactileFrame(str(k), 0.0, 3600.0, target),))
-            open_plans.append(engine.submit(lambda s=sequence: s, "frame", streamed=True).result(20).plan)
-            if len(open_plans) > 5:
-                collect(open_plans.pop(0))
-            time.sleep(max(0.0, begin_s + (k + 1) / FULL_HZ - time.monotonic()))
-        engine.end_stream().result(10)
-        time.sleep(1.0)
-        for plan in open_plans:
-            collect(plan)
-        underruns = engine.snapshot().board.underruns
+        results = push_frames(url)
     finally:
-        engine.close()
-        board.release()
-    name = f"full frames, {FULL_HZ:g} per second for {MINUTE_S:g} s, no other clients"
-    return [
-        (f"{name}: arrival to first light, median", 1e3 * statistics.median(first_light_s), "ms"),
-        (f"{name}: arrival to first light, maximum", 1e3 * max(first_light_s), "ms"),
-        (f"{name}: pixels driven", len(set().union(*plans)), "1"),
-        (f"{name}: maximum relative error of a height", float(np.abs(errors).max()), "1"),
-        (f"{name}: underruns", underruns, "1"),
-    ]
-
-
-def start_process(arguments, environment, ready):
-    """Start a process; return it and the URL that `ready` reads or waits for."""
-    process = subprocess.Popen(arguments, env=environment, stdout=subprocess.PIPE, text=True)
-    return process, ready(process)
-
-
-def make_bare_url_reader(port):
-    """Return a function that waits for the bare server and returns its URL."""
-
-    def ready(_):
-        while True:
-            try:
-                httpx.get(f"http://127.0.0.1:{port}/v1/state")
-                return f"http://127.0.0.1:{port}"
-            except httpx.ConnectError:
-                time.sleep(0.05)
-
-    return ready
-
-
-def read_daemon_url(process):
-    """Read the daemon's URL from its first line of output."""
-    return process.stdout.readline().split(" on ")[1].split(",")[0]
+        duration_s = time.monotonic() - begin_s
+        counts = load.finish()
+    return results, counts["200"] / duration_s
 
 
 def format_percentiles(name, values, unit="ms"):
@@ -224,51 +149,74 @@ def format_percentiles(name, values, unit="ms"):
     ]
 
 
-def bench_stream():
-    """Return the rows of the table."""
-    rows = measure_planning()
+def measure_latency():
+    """Measure frames over REST under load, at the daemon and at a bare FastAPI; return the rows of the table."""
     with tempfile.TemporaryDirectory() as folder:
-        environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": folder}
-        script = Path(folder) / "bare.py"
-        script.write_text(BARE_SERVER)
-        bare_server, url = start_process([sys.executable, script, "8459"], environment, make_bare_url_reader(8459))
+        bare_server, url = start_bare_server(folder, 8459)
         try:
-            with RequestLoad(url):
-                bare_trips, *_ = push_frames(url)
+            (bare_trips, *_), bare_rate = push_frames_under_load(url, {"viewer": TOKEN})
         finally:
             bare_server.terminate()
-        optodrive = Path(sys.executable).with_name("optodrive")
-        config = Path(folder) / "config.toml"
-        config.write_text(CONFIG.read_text() + UNLIMITED_RATES)
-        command = [optodrive, "serve", "--config", config, "--port", "0"]
-        daemon, url = start_process(command, environment, read_daemon_url)
+            bare_server.wait()
+        board = Board(Path(folder), limits=f"lease_ms = {LEASE_S * 1e3:.0f}\n")
         try:
-            httpx.post(f"{url}/v1/arm", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=10).raise_for_status()
-            with RequestLoad(url) as load:
-                trips, _, state, plans = push_frames(url)
+            daemon = Daemon(Path(folder), board.port, "display-1511", UNLIMITED_RATES, lease_s=LEASE_S)
+            try:
+                daemon.arm()
+                (trips, _, state, plans), rate = push_frames_under_load(daemon.url, read_role_tokens(daemon))
+            finally:
+                daemon.stop()
         finally:
-            daemon.terminate()
-    finished = [plan for plan in plans if plan["latency"]["first_light_s"] is not None]
-    rows += [("other clients, requests answered per second", load.answered / SECONDS, "1/s")]
-    rows += format_percentiles("round trip of a frame over REST", trips)
-    rows += format_percentiles("round trip of a frame to a bare FastAPI", bare_trips)
+            board.stop()
+    finished = [plan["latency"] for plan in plans if plan["latency"]["first_light_s"] is not None]
+    first_byte_s = [latency["first_byte_s"] for latency in finished]
+    rows = [
+        ("other clients, requests answered per second", rate, "1/s"),
+        ("other clients of a bare FastAPI, requests answered per second", bare_rate, "1/s"),
+        *format_percentiles("round trip of a frame over REST", trips),
+        *format_percentiles("round trip of a frame to a bare FastAPI", bare_trips),
+    ]
     for key, name in (
         ("planned_s", "arrival to plan accepted"),
         ("first_byte_s", "arrival to first byte to the board"),
         ("first_light_s", "arrival to first light"),
     ):
-        rows += format_percentiles(name, [plan["latency"][key] for plan in finished])
-    rows += [
-        (
-            "p99 round trip to a bare FastAPI over p99 to the first byte",
-            float(np.percentile(bare_trips, 99) / np.percentile([p["latency"]["first_byte_s"] for p in finished], 99)),
-            "1",
-        ),
-        (
-            "fraction of frames superseded by a newer one",
-            sum(p["status"] == "superseded" for p in plans) / len(plans),
-            "1",
-        ),
+        rows += format_percentiles(name, [latency[key] for latency in finished])
+    lead_s = [latency["first_light_s"] - latency["first_byte_s"] for latency in finished]
+    ratio = float(np.percentile(first_byte_s, 99) / np.percentile(bare_trips, 99))
+    superseded = sum(plan["status"] == "superseded" for plan in plans)
+    return [
+        *rows,
+        ("lead of first byte over light, median", 1e3 * statistics.median(lead_s), "ms"),
+        ("p99 to the first byte over p99 round trip to a bare FastAPI", ratio, "1"),
+        ("fraction of frames superseded by a newer one", superseded / len(plans), "1"),
         ("underruns", state["board"]["underruns"], "1"),
+        ("load average, including this benchmark", os.getloadavg()[0], "1"),
     ]
-    return rows + measure_full_frames()
+
+
+def bench_stream(duration_s=MINUTE_S):
+    """Return the rows of the table. duration_s: time of the full frames."""
+    return measure_planning() + measure_latency() + measure_full_frames(duration_s)
+
+
+def main():
+    parser = argparse.ArgumentParser(prog="scripts/bench stream", description=__doc__)
+    parser.add_argument("--minutes", type=float, default=1.0, help="time of the full frames beside busy loops")
+    parser.add_argument("--hours", type=float, help="the same in hours")
+    parser.add_argument("--only", choices=("planning", "latency", "frames"), help="one part")
+    options = parser.parse_args()
+    duration_s = MINUTE_S * (options.minutes if options.hours is None else 60 * options.hours)
+    parts = {
+        "planning": measure_planning,
+        "latency": measure_latency,
+        "frames": lambda: measure_full_frames(duration_s),
+    }
+    for name, measure in parts.items():
+        for what, value, unit in measure() if options.only in (None, name) else ():
+            print(f"{value:12,.3f} {unit:4} {what}", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,26 @@
+"""Simulated board whose indicator lasts 0.1 s before it emits, for tests that arm it a hundred times.
+
+It writes the host's monotonic time at the zero of its log's clock, s, next to the link to its port.
+"""
+
+import sys
+from pathlib import Path
+
+from optodrive.link.simulator import board_machine, board_process
+from optodrive.link.simulator.pty_board import PtyBoard
+
+INDICATOR_US = 100_000
+
+
+class ClockedBoard(PtyBoard):
+    """Board that states its clock."""
+
+    def __init__(self, link, *arguments):
+        super().__init__(link, *arguments)
+        Path(f"{link}.clock").write_text(f"{self._started_s!r}\n")
+
+
+if __name__ == "__main__":
+    board_machine.INDICATOR_US = INDICATOR_US
+    board_process.PtyBoard = ClockedBoard
+    sys.exit(board_process.main())
