@@ -62,7 +62,7 @@ class LinkService:
         self._clients = Clients(on_web_loss, clock)
         self._waiters = StateWaiters()
         self._status = StatusPublisher(session, clock)
-        self._handover = PointHandover(session, self.epoch, self._send_to_planner)
+        self._handover = PointHandover(session, clock, self.epoch, self._send_to_planner)
         self._connecting: Iterator[float] | None = None
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf

@@ -4,10 +4,11 @@ import struct
 import zlib
 from collections.abc import Callable
 from math import inf
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from optodrive.core.clock import Clock
 from optodrive.core.errors import NotReadyError, OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.link.protocol import messages as m
@@ -21,6 +22,20 @@ from optodrive.link.session.session import BoardSession
 EXECUTED = struct.Struct("<QIH")
 """Executed point in a message: tick of gate on, gate-on time in ticks, duty."""
 POINT_COLUMNS = 5
+REPORT_INTERVAL_S = 0.005
+"""Interval of the reports to the planner, so that it need not process a message per pulse."""
+
+
+class _ExecutedReport(NamedTuple):
+    """Executed points of a job, from first_point on."""
+
+    number: int
+    first_point: int
+    records: bytearray
+
+    @property
+    def end_point(self) -> int:
+        return self.first_point + len(self.records) // EXECUTED.size
 
 
 class PointHandover:
@@ -29,17 +44,21 @@ class PointHandover:
     send: sends a message to the planner; commands: number of commands since the planner connected
     """
 
-    def __init__(self, session: BoardSession, epoch: Epoch, send: Callable[[Message], None]) -> None:
+    def __init__(self, session: BoardSession, clock: Clock, epoch: Epoch, send: Callable[[Message], None]) -> None:
         self.commands = 0
         self._session = session
+        self._clock = clock
         self._epoch = epoch
         self._send = send
         self._jobs: dict[int, PlanJob] = {}
         self._progress: dict[int, tuple[int, float | None, bool]] = {}
+        self._executed: list[_ExecutedReport] = []
+        self._reported_s = -inf
         session.on_executed = self._forward_executed
 
     def clear(self) -> None:
-        """Forget all jobs."""
+        """Report what was executed, and forget all jobs."""
+        self._send_executed()
         self._jobs.clear()
         self._progress.clear()
 
@@ -109,11 +128,27 @@ class PointHandover:
             first = message.first_index - job.first_index
             begin, end = max(0, -first), min(len(message.records), job.end_index - message.first_index)
             if begin < end:
-                payload = b"".join(EXECUTED.pack(*record) for record in message.records[begin:end])
-                self._send(Message("executed", {"job": number, "first_point": first + begin}, payload))
+                records = b"".join(EXECUTED.pack(*record) for record in message.records[begin:end])
+                last = self._executed[-1] if self._executed else None
+                if last is None or last.number != number or last.end_point != first + begin:
+                    last = _ExecutedReport(number, first + begin, bytearray())
+                    self._executed.append(last)
+                last.records.extend(records)
+
+    def _send_executed(self) -> None:
+        for report in self._executed:
+            fields = {"job": report.number, "first_point": report.first_point}
+            self._send(Message("executed", fields, bytes(report.records)))
+        self._executed.clear()
 
     def report_progress(self) -> None:
-        """Send what has changed since the last call, and forget finished jobs."""
+        """Send what has changed since the last report if one is due, and forget finished jobs."""
+        now_s = self._clock.now_s()
+        is_finished = any(job.is_finished for job in self._jobs.values())
+        if not is_finished and now_s - self._reported_s < REPORT_INTERVAL_S:
+            return
+        self._reported_s = now_s
+        self._send_executed()
         for number, job in list(self._jobs.items()):
             progress = job.next_to_send - job.first_index, job.first_sent_tick, job.is_finished
             if self._progress.get(number) == progress:

@@ -117,15 +117,17 @@ class RemoteSession:
         return self._socket is not None and self._socket.wants_write
 
     def receive(self) -> None:
-        """Process the messages that have arrived and send what waits. Never wait; a lost connection is no error."""
+        """Process messages that have arrived, a bounded number, and send what waits.
+
+        Never wait; a lost connection is no error.
+        """
         if self._socket is None:
             return
         try:
             if self._socket.wants_write:
                 self._socket.flush()
-            while messages := self._socket.receive():
-                for message in messages:
-                    self._on_message(message)
+            for message in self._socket.receive():
+                self._on_message(message)
         except IpcError as error:
             self._on_lost(f"the link process has ended: {error}")
 

@@ -45,7 +45,7 @@ def test_plans_are_executed_in_order_with_the_points_that_were_proven(rig):
 
 def test_a_streamed_plan_replaces_the_unsent_rest_without_a_pause(rig):
     first = submit(rig, build_frame(60.0, duration_s=9.0), streamed=True)
-    rig.until(lambda: first.executed_count >= 3)
+    rig.until(lambda: first.executed_count >= 1)
     second = submit(rig, build_frame(80.0, duration_s=9.0), streamed=True)
     finish(rig, second)
     assert (first.status, second.status) == ("superseded", "done")
