@@ -37,6 +37,11 @@ say descriptors "$(show LimitNOFILE)"
 say board "$(board)"
 systemctl reload optodrive
 say reloaded $?
+main=$(show MainPID)
+kill -9 $(pgrep -P $main opto-planner)
+for i in $(seq 100); do grep -q restarted /var/lib/optodrive/audit.jsonl && break; sleep 0.1; done
+say replaced "$(grep -o '"process": "[a-z]*"' /var/lib/optodrive/audit.jsonl)"
+say same_supervisor "$([ $main = $(show MainPID) ]; echo $?)"
 sed -i 's/^damping =/dampin =/' /etc/optodrive/config.toml
 systemctl reload optodrive
 say reloaded_wrong $?
@@ -77,6 +82,8 @@ def test_the_service_starts_reloads_restarts_and_stops(tmp_path):
         "descriptors": "16384",
         "board": "DISARMED",
         "reloaded": "0",
+        "replaced": '"process": "planner"',
+        "same_supervisor": "0",
         "reloaded_wrong": "1",
         "active_after_wrong": "active",
         "restarts": "1",

@@ -92,7 +92,8 @@ def execute_module(module: str, arguments: Sequence[str], inherited: Iterable[in
     """Start a module in a fresh interpreter; return its process id. inherited: descriptors that it receives."""
     actions = [(os.POSIX_SPAWN_DUP2, descriptor, descriptor) for descriptor in inherited]  # clears close-on-exec
     command = [sys.executable, "-P", "-m", module, *arguments]
-    return os.posix_spawn(sys.executable, command, os.environ, file_actions=actions, setsigmask=())
+    environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}  # threads that nothing here needs
+    return os.posix_spawn(sys.executable, command, environment, file_actions=actions, setsigmask=())
 
 
 def describe_end(wait_status: int) -> str:

@@ -194,14 +194,47 @@ def test_the_watchdog_is_fed_only_while_all_children_serve(start, tmp_path, monk
     assert heard.count("WATCHDOG=1") > 3
 
 
-def test_every_child_dies_with_a_killed_supervisor(start):
+def stops_the_board_before_its_end(start):
+    tiny = start()
+    tiny.wait_for("serves")
+    tiny.end()
+    return bool(tiny.notes("link stops"))
+
+
+def replaces_a_hung_child(start):
+    tiny = start(planner="hang,serve")
+    tiny.wait_for("planner starts")
+    time.sleep(0.3 + HANG_S + NOTICE_S)
+    return len(tiny.notes("planner starts")) == 2
+
+
+def takes_a_hung_child_with_it(start):
+    """Neither the end of the channel nor anything else reaches a child that hangs, except the kernel's signal."""
     tiny = start(planner="hang")
     tiny.wait_for("serves")
+    time.sleep(0.5)
     tiny.process.kill()
-    until = time.monotonic() + NOTICE_S
+    time.sleep(NOTICE_S)
     pids = [note["pid"] for note in tiny.notes() if note["event"].endswith("starts")]
-    while any(is_alive(pid) for pid in pids):
-        assert time.monotonic() < until, [pid for pid in pids if is_alive(pid)]
+    alive = [pid for pid in pids if is_alive(pid)]
+    for pid in alive:
+        os.kill(pid, signal.SIGKILL)
+    return not alive
+
+
+@pytest.mark.parametrize(
+    ("holds", "mutant"),
+    [
+        (stops_the_board_before_its_end, "no STOP before the end"),
+        (replaces_a_hung_child, "no death of a hung child"),
+        (takes_a_hung_child_with_it, "no death with the supervisor"),
+    ],
+)
+def test_each_check_is_there_and_its_absence_is_noticed(start, monkeypatch, tmp_path, holds, mutant):
+    assert holds(start)
+    (tmp_path / "notes.jsonl").unlink()
+    monkeypatch.setenv("MUTANT", mutant)
+    assert not holds(start)
 
 
 def is_alive(pid):

@@ -1,6 +1,7 @@
 """A supervisor over children of a few lines, each of which serves, hangs, dies, fails or is deaf, start by start.
 
 arguments: FOLDER NAME=BEHAVIOUR[,BEHAVIOUR…]…, one behaviour per start of the child, of which the last one repeats
+$MUTANT: one of MUTANTS, a check that the supervisor then lacks
 """
 
 import json
@@ -19,12 +20,19 @@ from optodrive.core.errors import InputError
 from optodrive.core.ipc import IpcError, Message, MessageSocket
 from optodrive.daemon.log import DaemonLog
 from optodrive.daemon.notify import Notifier
+from optodrive.daemon.supervisor import forking
 from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.forking import fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import Supervisor
 
 STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
+
+MUTANTS = {
+    "no STOP before the end": lambda: setattr(Supervisor, "_stop_board", lambda self: None),
+    "no death of a hung child": lambda: setattr(Child, "find_hang", lambda self: None),
+    "no death with the supervisor": lambda: setattr(forking, "PR_SET_PDEATHSIG", 0),
+}
 
 
 def behave(behaviour, name, folder, beat):
@@ -85,6 +93,7 @@ def note(folder, event, **fields):
 
 
 def main():
+    MUTANTS.get(os.environ.get("MUTANT"), lambda: None)()
     folder = Path(sys.argv[1])
     clock = MonotonicClock()
     children = {}
