@@ -89,8 +89,10 @@ class Acceptor:
 
     def _open_waiting(self) -> None:
         """Open connections as far as there is room; keep the others, which may yet request STOP, for a while."""
-        stops = [waiting for waiting in self._waiting if is_stop(waiting.sock)]
-        others = [waiting for waiting in self._waiting if waiting not in stops]
+        stops: list[_Waiting] = []
+        others: list[_Waiting] = []
+        for waiting in self._waiting:
+            (stops if is_stop(waiting.sock) else others).append(waiting)
         opened = [waiting for waiting in stops[:OPENED_PER_TURN] if self._open(waiting, True)]
         for waiting in others[:OPENED_PER_TURN]:
             if not self._open(waiting, False):

@@ -21,7 +21,7 @@ from optodrive.daemon.responses.problem import MEDIA_TYPE
 from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, CALLER, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.daemon_client import DaemonClient, PushFields
+from optodrive.daemon.web.daemon_client import NO_EPOCH, DaemonClient, PushFields
 from optodrive.daemon.web.error_handlers import add_error_handlers
 from optodrive.daemon.web.live_stream import LiveStream
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
@@ -132,8 +132,8 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         fit: FitQuery = "as_is",
     ) -> Response:
         """Plan frames and trains, and show them."""
-        push = _read_push(daemon, request, "push", resolve_policy(policy, strict), fit, newest)
-        return await _plan_body(daemon, request, "sequence", push, dry_run)
+        fields = ("push", resolve_policy(policy, strict), fit, newest)
+        return await _plan_body(daemon, request, "sequence", _read_push(daemon, request, *fields, dry_run), dry_run)
 
     @routes.websocket("/v1/stream", "operator")
     async def stream_frames(socket: WebSocket, policy: PolicyQuery = "trim") -> None:
@@ -178,8 +178,8 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         fit: FitQuery = "as_is",
     ) -> Response:
         """Build a named pattern, plan it, and show it."""
-        push = _read_push(daemon, request, name, resolve_policy(policy, strict), fit, False)
-        return await _plan_body(daemon, request, "pattern", push, dry_run)
+        fields = (name, resolve_policy(policy, strict), fit, False)
+        return await _plan_body(daemon, request, "pattern", _read_push(daemon, request, *fields, dry_run), dry_run)
 
     @routes.get("/openapi.json", "viewer", include_in_schema=False)
     async def get_openapi() -> JSONResponse:
@@ -195,11 +195,14 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
 
 
 def _read_push(
-    daemon: DaemonClient, request: Request, name: str, policy: Policy, fit: FitMode, streamed: bool
+    daemon: DaemonClient, request: Request, name: str, policy: Policy, fit: FitMode, streamed: bool, is_dry_run: bool
 ) -> PushFields:
-    """Read the fields of a push before its body. Its epoch is that of the arrival: a STOP since then ends it."""
+    """Read the fields of a push before its body. Its epoch is that of the arrival: a STOP since then ends it.
+
+    Raise LinkError without a link process, which a dry run does not need.
+    """
     arrived_s = request.scope.get("state", {}).get(ARRIVED_S) or time.monotonic()
-    epoch = daemon.link.require_epoch_at(arrived_s)
+    epoch = NO_EPOCH if is_dry_run else daemon.link.require_epoch_at(arrived_s)
     return PushFields(name, policy, fit, streamed, arrived_s, epoch, request.scope[CALLER].name)
 
 
