@@ -6,8 +6,7 @@ from contextlib import contextmanager
 from time import perf_counter
 from typing import TYPE_CHECKING
 
-from optodrive.core.errors import InputError
-from optodrive.lab.recording.storage import Unquoted
+from optodrive.core.errors import InputError, Unquoted
 
 if TYPE_CHECKING:
     from optodrive.device.config import Config

@@ -106,3 +106,13 @@ def suggest_nearest(name: str, known: list[str]) -> str:
     """Return a phrase with the known name nearest to `name`, or with all known names if none is near."""
     match = get_close_matches(name, known, n=1, cutoff=0.5)
     return f"nearest is '{match[0]}'" if match else "one of " + ", ".join(known)
+
+
+class Unquoted:
+    """Text that an error message shows without quotes."""
+
+    def __init__(self, text: str) -> None:
+        self._text = text
+
+    def __repr__(self) -> str:
+        return self._text

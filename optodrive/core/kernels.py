@@ -36,6 +36,8 @@ def _is_writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
+CACHE_VERSION = "2"
+"""Changes with what cached machine code refers to; 1 named generated modules by their content."""
 _FOLDER = _cache_dir()
 CACHED = _is_writable(_FOLDER)
 """False where the cache folder is not writable: every process then compiles its kernels anew."""
@@ -48,7 +50,7 @@ def code_folder() -> Path | None:
 
 def code_stamp(function: FunctionType) -> str:
     """Return the digest of a function's bytecode and of everything that the bytecode refers to, as hexadecimal."""
-    parts: list[str] = []
+    parts: list[str] = [CACHE_VERSION]
     _collect_function(function, parts, set())
     return sha256("\n".join(parts).encode()).hexdigest()
 

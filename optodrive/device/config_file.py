@@ -10,6 +10,7 @@ from optodrive.core.errors import InputError
 from optodrive.core.files import read_toml
 from optodrive.core.toml_model import Section, build_input_error, check_format
 from optodrive.device.config import FORMAT, VERSION, Config, ServoSection
+from optodrive.device.plausible_config import check_servo_units, check_units
 
 RENAMED_KEYS = {"scanner.codes_a_side": "half_range_codes", "limits.pulse_rest_min_s": "pulse_gap_min_s"}
 """Keys that version 4 renamed, with their new names."""
@@ -46,6 +47,7 @@ def load_config(source: str | Path | None = None, measured_servo: bool = True) -
         renamed = ", ".join(f"{old} is now {new}" for old, new in RENAMED_KEYS.items())
         raise InputError(f"{path}: version", 3, f"{VERSION}: {renamed}")
     check_format(path, table, FORMAT, VERSION)
+    check_units(path, table)
     _resolve_paths(path, table.get("scanner"), ("field", "mirrors"))
     _resolve_paths(path, table.get("display"), ("pixel_map",))
     try:
@@ -85,6 +87,7 @@ def apply_measured_servo(config: Config, path: Path) -> Config:
     """Return the configuration with measured servos and the galvo cap that they leave. Raise InputError."""
     table = read_toml(path)
     check_format(path, table, MIRRORS_FORMAT, MIRRORS_VERSION)
+    check_servo_units(path, table)
     try:
         measured = MirrorsFile.model_validate(table)
     except ValidationError as error:

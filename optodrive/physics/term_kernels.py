@@ -51,6 +51,9 @@ TERM_ROW = {term.key: row for row, term in enumerate(TERMS)}
 STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
 """Row of each term's first follower in the state vector."""
+MODULE_NAME = "optodrive_chains"
+"""Name of the generated module, whatever its terms: cached machine code of the callers, which refers to the module by
+name, outlives a change of the terms that leaves the called chain as it is."""
 
 
 def _generate_source() -> str:
@@ -72,17 +75,16 @@ def _generate_source() -> str:
 
 def _load_generated_module() -> Any:
     source = _generate_source()
-    name = f"optodrive_chains_{sha256(source.encode()).hexdigest()[:16]}"
     folder = code_folder() or Path(mkdtemp())
-    path = folder / f"{name}.py"
+    path = folder / f"{MODULE_NAME}_{sha256(source.encode()).hexdigest()[:16]}.py"
     if not path.exists():
         with atomic_write(path) as temporary:
             temporary.write_text(source)
-    spec = spec_from_file_location(name, path)
+    spec = spec_from_file_location(MODULE_NAME, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{path} cannot be loaded")
     module = module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[MODULE_NAME] = module
     spec.loader.exec_module(module)
     return module
 

@@ -37,8 +37,9 @@ from optodrive.lab.diagnosis.model_selection import (
 )
 from optodrive.lab.diagnosis.next_experiment import propose_experiment
 from optodrive.lab.diagnosis.nominal_fit import BROAD_PRIOR, DEFAULT_EPSILON, fit_nominal, update_noise
+from optodrive.lab.diagnosis.plausible_units import check_recording_units
 from optodrive.lab.diagnosis.power_fluctuation import compute_intra_pulse_power_excess
-from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, predict
+from optodrive.lab.diagnosis.prediction import BASE_PARAMETERS, BASE_UNITS, ParameterPoint, predict
 from optodrive.physics.hypothesis import FreeParameter, Hypothesis
 from optodrive.physics.terms import discover_terms
 
@@ -76,8 +77,12 @@ def diagnose(
     epsilon: float = DEFAULT_EPSILON,
     on_progress: ProgressCallback = lambda stage: None,
 ) -> Discrepancy:
-    """Diagnose a recording; raises InputError if it has no data to compare with the model."""
+    """Diagnose a recording.
+
+    Raises InputError if it has no data to compare with the model, or a quantity that is probably in a wrong unit.
+    """
     began_s = perf_counter()
+    check_recording_units(measurement, ParameterPoint(prior.mean, {}).pixel(epsilon))
     subsystems: list[_SubsystemFit] = []
     for part in build_dataset(measurement).split_subsystems():
         timing_s = max((item.problem.noise.timing_sigma_s for item in subsystems), default=0.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.recording.storage import (
     COMMANDS,
@@ -15,12 +15,13 @@ from optodrive.lab.recording.storage import (
     UNITS,
     VERSION,
     Attributes,
-    Unquoted,
     format_name,
 )
 
 AMBIENT_MIN_K, AMBIENT_MAX_K = 150.0, 600.0
 PIXEL_MAX = 10**6
+LONG_PULSE_S = 0.1
+"""Overlapping pulses above this width, s, that would not overlap a thousand times shorter, are taken to be in ms."""
 OVERLAP_MAX_S = 1e-9
 """Tolerated overlap of consecutive pulses: the rounding error of their times."""
 MODEL_PARAMETER_COUNT = 6
@@ -44,9 +45,9 @@ def pop_ambient_k(place: str, attributes: Attributes) -> float:
         hint = f" (there is {format_name(near[0])!r})" if near else ""
         raise InputError(f"{place}: ambient_K", None, f"the ambient temperature in K{hint}")
     if isinstance(value, str) or not AMBIENT_MIN_K <= value <= AMBIENT_MAX_K:
-        raise InputError(
-            f"{place}: ambient_K", value, f"a temperature between {AMBIENT_MIN_K:g} and {AMBIENT_MAX_K:g} K"
-        )
+        likely = "" if isinstance(value, str) or not -100.0 < value < AMBIENT_MIN_K else "; this value is likely in °C"
+        expected = f"a temperature between {AMBIENT_MIN_K:g} and {AMBIENT_MAX_K:g} K{likely}"
+        raise InputError(f"{place}: ambient_K", value, expected)
     return float(value)
 
 
@@ -90,6 +91,11 @@ def _check_no_overlap(place: str, pulses: FloatArray) -> None:
     end_s = np.maximum.accumulate(start_s + pulses[order, 1])
     overlapping = np.flatnonzero(start_s[1:] < end_s[:-1] - OVERLAP_MAX_S)
     if overlapping.size:
+        apart = np.all(np.diff(start_s) >= 1e-3 * pulses[order[:-1], 1])
+        if apart and float(pulses[:, 1].min()) > LONG_PULSE_S:
+            longest = int(np.argmax(pulses[:, 1]))
+            expected = "pulses in s that do not overlap; these widths are likely in ms"
+            raise InputError(f"{place}[{longest}]: width_s", float(pulses[longest, 1]), expected, "unit")
         first = int(overlapping[0])
         raise InputError(
             f"{place}[{order[first + 1]}]: start_s",

@@ -13,7 +13,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run, Signal
 from optodrive.lab.recording.storage import (
@@ -27,7 +27,6 @@ from optodrive.lab.recording.storage import (
     VERSION,
     Attributes,
     MemoryBudget,
-    Unquoted,
     convert_errors,
     normalize_attributes,
 )

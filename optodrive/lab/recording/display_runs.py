@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.types.measurements import Measurement, Run
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.index import RecordingIndex
 from optodrive.lab.recording.reader import read_runs
-from optodrive.lab.recording.storage import MIRROR_SIGNALS, Unquoted
+from optodrive.lab.recording.storage import MIRROR_SIGNALS
 
 FileStamp = tuple[int, int]
 

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Run
 from optodrive.lab.recording.storage import (
@@ -22,7 +22,6 @@ from optodrive.lab.recording.storage import (
     VERSION,
     Attributes,
     MemoryBudget,
-    Unquoted,
     convert_errors,
     normalize_attributes,
 )

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.reader import open_tree, read_header, read_pulses, read_recording
-from optodrive.lab.recording.storage import PULSES, Unquoted, convert_errors
+from optodrive.lab.recording.storage import PULSES, convert_errors
 
 
 def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measurement:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
@@ -15,7 +15,6 @@ from optodrive.lab.recording.storage import (
     COMMANDS,
     PULSES,
     RecordingTree,
-    Unquoted,
     check_run_name,
     convert_errors,
     natural_sort_key,

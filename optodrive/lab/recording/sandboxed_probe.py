@@ -13,9 +13,9 @@ from math import ceil
 from pathlib import Path
 from time import process_time
 
-from optodrive.core.errors import InputError
+from optodrive.core.errors import InputError, Unquoted
 from optodrive.lab.recording.hdf5 import Hdf5Tree
-from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS, Unquoted
+from optodrive.lab.recording.storage import SIGNALS, TABLE_COLUMNS
 
 CPU_LIMIT_S = 5
 RUN_BYTES_PER_CPU_S = 20_000_000

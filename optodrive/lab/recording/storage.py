@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError, abbreviate
+from optodrive.core.errors import InputError, Unquoted, abbreviate
 from optodrive.core.types.arrays import FloatArray
 
 Attributes = dict[str, str | float]
@@ -104,16 +104,6 @@ def convert_errors(place: str, expected: str) -> Iterator[None]:
     except Exception as error:
         # h5py raises almost any type on damage: OSError, RuntimeError, KeyError, ValueError, TypeError, …
         raise InputError(place, Unquoted(_describe_error(error)), expected) from None
-
-
-class Unquoted:
-    """Text that an error message shows without quotes."""
-
-    def __init__(self, text: str) -> None:
-        self._text = text
-
-    def __repr__(self) -> str:
-        return self._text
 
 
 def _describe_error(error: Exception) -> str:

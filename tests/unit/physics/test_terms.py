@@ -9,6 +9,7 @@ import pytest
 from optodrive.core.errors import InputError
 from optodrive.physics.pixel import Pixel, advance
 from optodrive.physics.pixel_ode import ActiveTerms, PixelExperiment, simulate_signals
+from optodrive.physics.term_kernels import CHAINS
 from optodrive.physics.terms import check_requirements, discover_terms, find_term
 from optodrive.physics.terms.gas_membrane import equilibrium_height_m
 
@@ -106,6 +107,10 @@ def test_every_module_of_the_package_is_a_term():
             assert parameter.low <= parameter.default <= parameter.high
             assert all(parameter.low <= start <= parameter.high for start in parameter.starts)
             assert parameter.source
+
+
+def test_the_generated_module_keeps_its_name_whatever_its_terms():
+    assert {getattr(chain, "__module__", None) for chain in CHAINS} == {"optodrive_chains"}
 
 
 LEAK = """
