@@ -52,7 +52,7 @@ STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
 """Row of each term's first follower in the state vector."""
 MODULE_NAME = "optodrive_chains"
-"""Name of the generated module, whatever its terms: cached machine code of the callers, which refers to the module by
+"""Name of the generated module, the same for every set of terms: cached machine code of the callers, which refers to the module by
 name, outlives a change of the terms that leaves the called chain as it is."""
 
 

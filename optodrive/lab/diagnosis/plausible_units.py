@@ -1,6 +1,6 @@
 """Plausible units of a recording: each signal and drive against the response of a pixel, before anything is fitted.
 
-The times are judged by the shape of a signal, whatever its size: a time axis in ms beside pulses in s shows a response
+The times are judged by the shape of a signal and not by its size: a time axis in ms beside pulses in s shows a response
 where there is no drive. The values are judged by their size once the shape agrees, within a factor of `MAX_RATIO`,
 which no pixel of the kind reaches and no wrong unit stays below. A signal without a response, such as that of a dead
 pixel, is judged by absolute limits alone.
