@@ -52,8 +52,11 @@ STATE_COUNT = FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS)
 FOLLOWER_ROW = tuple(FIRST_FOLLOWER + sum(len(term.followers) for term in TERMS[:row]) for row in range(len(TERMS)))
 """Row of each term's first follower in the state vector."""
 MODULE_NAME = "optodrive_chains"
-"""Name of the generated module, the same for every set of terms: cached machine code of the callers, which refers to the module by
-name, outlives a change of the terms that leaves the called chain as it is."""
+"""Name of the generated module, the same for every set of terms.
+
+Cached machine code of the callers refers to the module by name, and outlives a change of the terms that leaves the
+called chain as it is.
+"""
 
 
 def _generate_source() -> str:
