@@ -74,12 +74,16 @@ class Clients:
     def find_stalled(self) -> str:
         """Return the role that withholds the lease, '' if it may be renewed."""
         roles = ("planner",) if self._on_web_loss == "finish" else ("planner", "web")
-        now_s = self._clock.now_s()
-        for role in roles:
-            beat_s, alive = self._beats.get(role, (-inf, False))
-            if not alive or now_s - beat_s > BEAT_AGE_MAX_S:
-                return role
-        return ""
+        return next((role for role in roles if not self._is_alive(role)), "")
+
+    def _is_alive(self, role: str) -> bool:
+        beat_s, alive = self._beats.get(role, (-inf, False))
+        return alive and self._clock.now_s() - beat_s <= BEAT_AGE_MAX_S
+
+    @property
+    def is_attended(self) -> bool:
+        """Whether a web process is there through which a person could disarm."""
+        return self._is_alive("web")
 
     def require_lease(self) -> None:
         """Raise NotReadyError if the lease could not be renewed after arming."""

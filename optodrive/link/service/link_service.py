@@ -26,6 +26,8 @@ from optodrive.link.session.session import BoardSession
 RETRY_INTERVAL_S = 1.0
 CONNECTING = "connecting"
 """Code of link_error until the first connection has succeeded or failed."""
+UNATTENDED_MAX_S = 5.0
+"""Time for which an armed board without points may be without a web process, which starts again within 3 s."""
 WAIT_MAX_S = 0.02
 """Longest wait of the loop, so that status and beats are in time."""
 
@@ -67,6 +69,7 @@ class LinkService:
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf
         self._arm_requested = self._was_armed = False
+        self._attended_s = 0.0
         self._seen_fault = ""
         self._outgoing: list[Outgoing] = []
 
@@ -200,6 +203,7 @@ class LinkService:
         try:
             self._session.step(wait_s, renew_lease=not stalled, stalled=stalled)
             self._watch_board()
+            self._end_unattended()
         except (LinkError, InputError) as error:
             message = self._session.on_lost(error)
             self.link_error = LinkError(message) if isinstance(error, LinkError) else error
@@ -218,6 +222,14 @@ class LinkService:
                 reason = f"{board.fault}: {get_fault_hint(board.fault) if cause is None else cause.message}"
             self._end_epoch(f"the board went to {board.state} ({reason})")
         self._seen_fault = board.fault
+
+    def _end_unattended(self) -> None:
+        """Go dark when a plan that was allowed to finish without the web process has ended, and none has come back."""
+        now_s = self._clock.now_s()
+        if not self._was_armed or self._session.has_points or self._clients.is_attended:
+            self._attended_s = now_s
+        elif now_s - self._attended_s > UNATTENDED_MAX_S:
+            self.go_dark("nobody could disarm: the web process has ended")
 
     def _step_connecting(self, wait_s: float) -> None:
         if self._connecting is None:

@@ -160,8 +160,30 @@ def test_a_plan_may_finish_without_web_if_so_configured():
     before = rig.epoch
     rig.leave(WEB)
     rig.until(lambda: len(rig.list_emitted()) == 500)
+    rig.run(4.0)
     assert rig.epoch == before
     assert rig.core.state == BoardState.ARMED
+    rig.run(1.5)  # nobody could disarm
+    assert rig.epoch == before + 1
+    assert rig.core.state == BoardState.DISARMED
+
+
+def test_a_web_process_that_comes_back_keeps_the_board_armed():
+    rig = ServiceRig(on_web_loss="finish").hello_all().connect().arm()
+    rig.leave(WEB)
+    rig.run(3.0)
+    rig.hello(WEB, "web")
+    rig.run(8.0)
+    assert rig.core.state == BoardState.ARMED
+
+
+def test_a_board_that_disarms_by_itself_ends_the_epoch_once(rig):
+    rig.arm()
+    before = rig.epoch
+    rig.core.on_link_lost(round(rig.clock.now_s() * 1e6))
+    rig.run(0.5)
+    assert rig.epoch == before + 1
+    assert rig.of_kind(WEB, "status")[-1].fields["epoch_reason"] == "the board went to DISARMED (link lost)"
 
 
 @pytest.mark.parametrize(("client", "says"), [(PLANNER, "planner made no progress"), (WEB, "web process did not")])
