@@ -1,12 +1,15 @@
 """The REST API, version 1, over the daemon's other processes."""
 
 import asyncio
+import json
 import time
 from collections.abc import Coroutine
+from functools import cache
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Path, Query, Request, WebSocket
-from fastapi.responses import JSONResponse, PlainTextResponse, Response
+from fastapi.responses import PlainTextResponse, Response
+from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect
 
 from optodrive import __version__
@@ -58,6 +61,8 @@ RateQuery = Annotated[float, Query(ge=1, le=60, description="display events per 
 
 def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     """Build the daemon's web application."""
+    config_json = build_effective_config(daemon.display).model_dump_json().encode()
+    patterns_json = PatternList(patterns=describe_patterns()).model_dump_json().encode()
     app = FastAPI(
         generate_unique_id_function=lambda route: route.name,
         title="optodrive",
@@ -92,10 +97,10 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Return metrics for Prometheus."""
         return _relay(await daemon.planner.call("metrics"), CONTENT_TYPE)
 
-    @routes.get("/v1/config", "viewer")
-    async def get_config() -> EffectiveConfig:
+    @routes.get("/v1/config", "viewer", response_model=EffectiveConfig)
+    async def get_config() -> Response:
         """Return the effective configuration, as `optodrive config show --json`."""
-        return build_effective_config(daemon.display)
+        return Response(config_json, media_type="application/json")
 
     @routes.post("/v1/arm", "armer", response_model=StateReport)
     async def arm() -> Response:
@@ -156,10 +161,10 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         """Remove a plan from the queue, or end it if it runs; the board stays armed."""
         return _relay(await daemon.planner.call("cancel", plan=plan_id))
 
-    @routes.get("/v1/patterns", "viewer")
-    async def list_patterns() -> PatternList:
+    @routes.get("/v1/patterns", "viewer", response_model=PatternList)
+    async def list_patterns() -> Response:
         """Return the named patterns and their parameters."""
-        return PatternList(patterns=describe_patterns())
+        return Response(patterns_json, media_type="application/json")
 
     @routes.post(
         "/v1/patterns/{name}",
@@ -181,10 +186,15 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         fields = (name, resolve_policy(policy, strict), fit, False)
         return await _plan_body(daemon, request, "pattern", _read_push(daemon, request, *fields, dry_run), dry_run)
 
+    @cache
+    def encode_openapi() -> bytes:
+        return json.dumps(app.openapi(), ensure_ascii=False).encode()
+
     @routes.get("/openapi.json", "viewer", include_in_schema=False)
-    async def get_openapi() -> JSONResponse:
+    async def get_openapi() -> Response:
         """Return the OpenAPI document."""
-        return JSONResponse(app.openapi())
+        # Its first encoding takes a tenth of a second, for which STOP must not wait.
+        return Response(await run_in_threadpool(encode_openapi), media_type="application/json")
 
     table = RouteTable(app.routes)
     extend_openapi(app, table)
