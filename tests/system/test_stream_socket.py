@@ -60,7 +60,7 @@ def test_a_frame_is_planned_then_done_with_its_latency(daemon):
 def test_frames_faster_than_their_emission_are_superseded(daemon):
     with socket(daemon) as stream:
         for number in range(60):
-            stream.send(binary(number, range(100)))
+            stream.send(binary(number, range(400)))  # takes 2.5 s
         stream.send(binary(60, range(5)))
         answers = until(stream, {"frame": 60, "status": "done"})
         ends = {}
