@@ -56,12 +56,15 @@ def show(
     json: JsonOption = False,
 ) -> None:
     """Validate a recording, and list the signals of each run."""
+    from optodrive.core.errors import InputError
     from optodrive.core.files import check_output
-    from optodrive.lab.recording import read_recording
+    from optodrive.lab.recording.merge import read_recording_or_session
     from optodrive.lab.recording.summary import build_summary
 
     check_output("--out", out, ".png")
-    measurement = read_recording(recording)
+    measurement, is_session = read_recording_or_session(recording)
+    if is_session and out is not None:
+        raise InputError("--out", str(out), "a recording with signals; this is a session, which has pulses alone")
     runs = build_summary(measurement)
     plotted_runs = None if out is None else _draw_signals(out, measurement)
     if json:
@@ -69,6 +72,8 @@ def show(
         print_json({"recording": str(recording), "runs": runs, "picture": picture})
         return
     _print_table(runs)
+    if is_session:
+        print("a session of the daemon: pulses without signals; `recording merge` adds what was measured meanwhile")
     if out is not None:
         part = "" if plotted_runs == len(runs) else f", the first {plotted_runs} of {len(runs)} runs"
         print(f"written          {out}{part}")
@@ -128,7 +133,7 @@ def _print_table(runs: list[dict[str, Any]]) -> None:
 def _format_rows(run: dict[str, Any]) -> list[list[str]]:
     energy = "" if run["energy_J"] is None else f"{run['energy_J']:.4g} J"
     first = [run["run"], " ".join((run["group"] or "").split()), str(run["pulses"]), energy]
-    rows = []
+    rows = [] if run["signals"] else [[*first, "none", "", "", "", ""]]
     for name, signal in run["signals"].items():
         span = f"{signal['start_s']:g} to {signal['end_s']:g} s"
         pixel = "" if name.startswith("mirror") else str(signal["pixel"])

@@ -9,7 +9,7 @@ from optodrive.core.errors import InputError, Unquoted, suggest_nearest
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import checks
 from optodrive.lab.recording.reader import open_tree, read_header, read_pulses, read_recording
-from optodrive.lab.recording.storage import PULSES, convert_errors
+from optodrive.lab.recording.storage import PULSES, SIGNALS, convert_errors
 
 
 def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measurement:
@@ -21,6 +21,16 @@ def merge_session(session: Path, measured: Path, shift_s: float = 0.0) -> Measur
     session_runs = _read_session_runs(session)
     measurement = read_recording(measured)
     return Measurement(tuple(_merge_run(run, session_runs, session, measured, shift_s) for run in measurement.runs))
+
+
+def read_recording_or_session(path: Path) -> tuple[Measurement, bool]:
+    """Read a recording, or a session's runs, which have pulses and no signals; return also whether it is a session."""
+    with open_tree(path) as tree, convert_errors(str(path), "a readable recording"):
+        names, _ = read_header(tree)
+        is_session = not any(name in SIGNALS for run in names for name in tree.list_members(run))
+    if not is_session:
+        return read_recording(path), False
+    return Measurement(tuple(_read_session_runs(path).values())), True
 
 
 def _read_session_runs(session: Path) -> dict[str, Run]:

@@ -12,6 +12,8 @@ from optodrive.planning.stimuli.json_values import require_number, require_objec
 
 ID_MAX = 100
 """Largest length of a frame's identifier, characters."""
+HEIGHT_MIN_UM = 0.01
+"""Smallest height other than 0, µm, far below what a finger feels; smaller numbers are metres."""
 OVERLAP_TOLERANCE_S = 1e-9
 """Overlap of two frames that the rounding of their times may cause, s."""
 
@@ -89,12 +91,16 @@ def _parse_heights_m(values: list[object], pixels: list[int] | range, where: str
     if set(map(type, values)) <= {int, float}:
         try:
             heights_um = np.array(values, dtype=np.float64)
-            if bool(np.all(np.isfinite(heights_um) & (heights_um >= 0))):
+            if bool(np.all(np.isfinite(heights_um) & ((heights_um >= HEIGHT_MIN_UM) | (heights_um == 0)))):
                 return um_to_m(heights_um)
         except OverflowError:
             pass
     for pixel, value in zip(pixels, values, strict=True):
         place, expected = f"{where}.{pixel}", "a height ≥ 0 in µm"
-        if require_number(value, place, expected, "bad_target") < 0:
+        height_um = require_number(value, place, expected, "bad_target")
+        if height_um < 0:
+            raise InputError(place, value, expected, code="bad_target")
+        if 0 < height_um < HEIGHT_MIN_UM:
+            expected = f"0 or at least {HEIGHT_MIN_UM:g} µm; this value is likely in m"
             raise InputError(place, value, expected, code="bad_target")
     raise AssertionError("no invalid height found after validation failed")

@@ -45,6 +45,7 @@ def build_image(
     """
     lattice = Lattice.from_config(config)
     with _open_image(file, f"{where}: file") as image:
+        _check_opaque([_is_transparent(image)], f"{where}: file")
         target_m = height_m * compute_lattice_brightness(image, lattice, invert)
     return FrameSequence(frames=tuple(hold_picture(BeamTimeEstimator(config), target_m, seconds, "image")))
 
@@ -59,14 +60,30 @@ def build_animation(
     """
     beam, start_s = BeamTimeEstimator(config), 0.0
     frames: list[TactileFrame] = []
+    is_transparent: list[bool] = []
     with _open_image(file, f"{where}: file") as image:
         for position in _select_positions(image, f"{where}: file"):
             image.seek(position)
+            is_transparent.append(_is_transparent(image))
             target_m = height_m * compute_lattice_brightness(image, beam.lattice, invert)
             duration_s = 1.0 / rate_hz if rate_hz else max(_duration_s(image), beam.beam_time_s(target_m))
             frames.append(TactileFrame(f"animation-{len(frames)}", start_s, duration_s, target_m))
             start_s += duration_s
+    _check_opaque(is_transparent, f"{where}: file")
     return FrameSequence(frames=tuple(frames))
+
+
+def _check_opaque(is_transparent: list[bool], where: str) -> None:
+    """Raise InputError (bad_picture) for pictures all of which are wholly transparent, so that nothing is shown."""
+    if all(is_transparent):
+        raise InputError(where, "a wholly transparent picture", "an opaque pixel", code="bad_picture")
+
+
+def _is_transparent(image: "Image") -> bool:
+    """Return whether every pixel of an image is wholly transparent."""
+    if image.mode not in ("RGBA", "LA", "PA") and "transparency" not in image.info:
+        return False
+    return image.convert("RGBA").getchannel("A").getextrema()[1] == 0
 
 
 def compute_lattice_brightness(image: "Image", lattice: Lattice, invert: bool) -> FloatArray:

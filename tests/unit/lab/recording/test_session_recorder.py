@@ -1,5 +1,6 @@
 """The file of a session and its writer process, without a board."""
 
+import json
 import os
 import resource
 import signal
@@ -9,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from optodrive.cli.main import run
 from optodrive.core.errors import InputError
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
@@ -62,6 +64,21 @@ def test_plans_are_kept_and_a_rest_begins_a_new_run(tmp_path):
         assert (file["plans/p3"].attrs["status"], file["plans/p3"].attrs["error"]) == ("cancelled", "why")
         assert "run" not in file["plans/p3"].attrs
         np.testing.assert_allclose(file["plans/p1/simulated_m"], 1e-5)
+
+
+def test_recording_show_lists_a_session(tmp_path, capsys):
+    path = tmp_path / "a.h5"
+    recorder = SessionRecorder(path, ABOUT, [].append)
+    recorder.record(lambda: note("p1", 0.0))
+    recorder.close()
+    assert run(["recording", "show", str(path)]) == 0
+    output = capsys.readouterr().out
+    assert "run1" in output
+    assert "a session of the daemon" in output
+    assert run(["recording", "show", str(path), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["runs"][0]["pulses"] == 3
+    assert run(["recording", "show", str(path), "--out", str(tmp_path / "p.png")]) == 2
+    assert "a session" in capsys.readouterr().err
 
 
 def test_a_full_disk_is_told_in_one_line_and_what_was_written_stays(tmp_path):

@@ -1,0 +1,39 @@
+"""Stimuli that would show nothing by mistake are refused: transparent pictures, and heights in metres."""
+
+from io import BytesIO
+
+import pytest
+from PIL import Image
+
+from optodrive.core.errors import InputError
+from optodrive.device.config_file import load_config
+from optodrive.planning.stimuli.frame_json import parse_targets_m
+from optodrive.planning.stimuli.images import build_animation, build_image
+
+CONFIG = load_config("display-16")
+
+
+def _encode(*pictures, kind="PNG"):
+    buffer = BytesIO()
+    pictures[0].save(buffer, kind, save_all=len(pictures) > 1, append_images=pictures[1:])
+    return buffer.getvalue()
+
+
+@pytest.mark.parametrize("invert", [False, True])
+def test_a_wholly_transparent_picture_is_refused_and_a_dark_one_is_not(invert):
+    clear, white = Image.new("RGBA", (8, 8), (255, 255, 255, 0)), Image.new("RGBA", (8, 8), (255, 255, 255, 255))
+    black = Image.new("RGBA", (8, 8), (0, 0, 0, 255))
+    for build, more in ((build_image, (1.0, invert)), (build_animation, (None, invert))):
+        with pytest.raises(InputError, match="transparent") as caught:
+            build(CONFIG, "t", _encode(clear), 1e-4, *more)
+        assert caught.value.code == "bad_picture"
+        for picture in (black, white):
+            assert build(CONFIG, "t", _encode(picture), 1e-4, *more).frames
+    assert build_animation(CONFIG, "t", _encode(clear, white, black), 1e-4, None, invert).frames
+
+
+@pytest.mark.parametrize("value", [5e-5, 3e-4, 0.0099])
+def test_heights_in_metres_are_refused(value):
+    with pytest.raises(InputError, match="likely in m"):
+        parse_targets_m({"1": 50, "3": value}, "f", {"1": 0, "3": 1})
+    assert parse_targets_m([0, 0.01], "f", {"1": 0, "3": 1}).tolist() == [0.0, 1e-8]
