@@ -228,7 +228,7 @@ def test_the_daemon_works_in_the_sandbox(board, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(state))
     kernels = code_folder()
     if kernels is not None:  # otherwise they would be compiled in the sandbox, which takes a minute
-        shutil.copytree(kernels, state / "optodrive" / "kernels" / kernels.name)
+        shutil.copytree(kernels, state / "optodrive" / "kernels")
     (state / "tokens.toml").write_text(HEAD + ENTRY.format("rig", TOKEN))
     (state / "tokens.toml").chmod(0o600)
     text = f'socket = "{state}/s"\ntokens = "{state}/tokens.toml"\naudit = "{state}/audit.jsonl"'
