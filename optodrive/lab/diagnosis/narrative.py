@@ -59,7 +59,7 @@ def build_narrative(discrepancy: Discrepancy) -> list[str]:
         if not_observable:
             lines.append(f"Not observable in this data: {', '.join(not_observable)}.")
     if discrepancy.verdict == "ambiguous" and len(discrepancy.causes) > 1 and discrepancy.next_experiment is None:
-        lines.append("No pulse or train on a pixel, repeated up to 30 times, would separate them at this noise.")
+        lines.append("No pulse or train, repeated up to 30 times, would separate them in any signal at this noise.")
     if discrepancy.next_experiment is not None:
         experiment = discrepancy.next_experiment
         lines += [

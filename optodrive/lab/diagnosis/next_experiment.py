@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from math import ceil
 
 import numpy as np
@@ -10,6 +11,7 @@ from optodrive.core.types.arrays import FloatArray
 from optodrive.core.types.discrepancy import NextExperiment
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, SIGNALS, Block, Dataset, DriveGroup, RunInfo
 from optodrive.lab.diagnosis.fitting import FitProblem, ModelFit, compute_jacobian, compute_jitter_sensitivity
+from optodrive.lab.diagnosis.noise_model import ColouredNoise
 from optodrive.lab.diagnosis.normal_equations import compute_normal_equations, solve
 from optodrive.lab.diagnosis.prediction import predict
 from optodrive.physics.pixel_ode import PixelExperiment
@@ -21,16 +23,48 @@ CHI2_SEPARATED = 24.0
 SETUP_S = 2.0
 """Time between two runs."""
 SAMPLES = 400
+ASSUMED_NOISE = {
+    0: ColouredNoise(1.0, (0.3, 0.3), (1e-2, 1.0)),
+    1: ColouredNoise(0.5e-6, (0.2e-6, 0.2e-6), (1e-2, 1.0)),
+    2: ColouredNoise(0.2e-3, (0.1e-3, 0.1e-3), (1e-2, 1.0)),
+}
+"""Noise of a signal that was not measured yet, by kind: a thermal camera, an interferometer, a load cell."""
+ASSUMED_TEXT = {0: "1 K", 1: "0.5 µm", 2: "0.2 mN"}
 
 
 def propose_experiment(
     problem: FitProblem, first: ModelFit, second: ModelFit, labels: tuple[str, str]
 ) -> NextExperiment | None:
-    """Return the cheapest experiment of the grid that separates two fits, or None if none does."""
-    data = problem.data
-    kinds = tuple(kind for kind in data.kinds if kind in PIXEL_KINDS)
-    if not kinds:
+    """Return the cheapest experiment of the grid that separates two fits, or None if none does.
+
+    Signals that were not measured are proposed in addition, with `ASSUMED_NOISE`, only if the measured ones do not do.
+    """
+    measured = tuple(kind for kind in problem.data.kinds if kind in PIXEL_KINDS)
+    if not measured:
         return None
+    best = _search_grid(problem, first, second, labels, measured)
+    if best is not None:
+        return best
+    proposals = []
+    for extra in sorted(set(PIXEL_KINDS).difference(measured)):
+        noise = replace(
+            problem.noise,
+            coloured={**problem.noise.coloured, extra: ASSUMED_NOISE[extra]},
+            baseline_sigma={**problem.noise.baseline_sigma, extra: ASSUMED_NOISE[extra].white},
+        )
+        kinds = tuple(sorted((*measured, extra)))
+        proposal = _search_grid(replace(problem, noise=noise), first, second, labels, kinds)
+        if proposal is not None:
+            assumed = f"; needs {SIGNALS[extra]}, measured to {ASSUMED_TEXT[extra]}"
+            proposals.append(replace(proposal, description=proposal.description + assumed))
+    return min(proposals, key=lambda item: item.lab_time_s, default=None)
+
+
+def _search_grid(
+    problem: FitProblem, first: ModelFit, second: ModelFit, labels: tuple[str, str], kinds: tuple[int, ...]
+) -> NextExperiment | None:
+    """Return the cheapest experiment of the grid, measured in these kinds of signals, that separates two fits."""
+    data = problem.data
     pixel = Counter(block.pixel for block in data.blocks if block.kind in PIXEL_KINDS).most_common(1)[0][0]
     best: NextExperiment | None = None
     for description, pulses, span_s in _generate_grid(data, pixel):

@@ -158,6 +158,17 @@ def test_an_ambiguity_of_one_says_what_is_missing():
     assert not any("would separate them" in line for line in build_narrative(found))
 
 
+def test_a_signal_that_was_not_measured_is_proposed_where_it_would_tell():
+    creep = {"membrane_creep": {"share": 0.12, "time": 0.25, "spread": 1.5}}
+    runs = lab(32, creep, groups=("strong", "train")).runs
+    lifted = [replace(run, signals={"displacement_m": run.signals["displacement_m"]}) for run in runs]
+    found = diagnose(Measurement(tuple(lifted)))
+    assert (found.verdict, set(found.causes)) == ("ambiguous", {"membrane_creep", "wall_heating"})
+    assert found.next_experiment is not None
+    assert found.next_experiment.signals == ("absorber_temperature_K", "displacement_m")
+    assert any("needs absorber_temperature_K" in line for line in build_narrative(found))
+
+
 def test_the_same_seed_gives_the_same_answer(droop):
     again = build_answer(diagnose(lab(12, DROOP)))
     first = build_answer(droop)
