@@ -463,6 +463,7 @@ async def abandoned_dry_runs_of_8_MB(target: Target, number: int) -> None:
 async def valid_previews(target: Target, number: int) -> None:
     """A dry run of 750 full frames, and its answer is awaited."""
     body = build_full_frames(750, target.pixels)
+    target.counts["sent"] += 1
     await target.exchange(target.build_head("POST", "/v1/plans?dry_run=true", length=len(body)), body)
 
 

@@ -34,6 +34,9 @@ def read_memory_mib(pid):
 
 
 def read_peak_mib(pid):
-    """Return the peak resident memory of a process so far, MiB."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    return next(int(line.split()[1]) for line in status.splitlines() if line.startswith("VmHWM")) / 1024
+    """Return the peak resident memory of a process so far, MiB; 0 if it has ended."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0.0
+    return next((int(line.split()[1]) for line in lines if line.startswith("VmHWM")), 0) / 1024

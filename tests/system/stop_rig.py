@@ -23,12 +23,18 @@ SHORT_INDICATOR_BOARD = (sys.executable, HERE / "short_indicator_board.py")
 PIXELS = 437
 DESCRIPTORS = 1024
 """Soft limit of open files that systemd gives a service by default."""
+FLOOD_LEASE_S = 0.3
+"""Lease under a flood. Bytes to a board on a pseudo-terminal pass a thread of the kernel without real-time priority,
+which a full computer delays by up to 0.15 s; those to a board on USB do not.
+"""
 ANSWER_MAX_S = 60.0
 """A STOP without an answer for this time counts as one."""
 CALL_MAX_S = 15.0
 """Longest wait for the other answers of the show's own caller."""
+FRAME_S = 1.6
+"""Time of a frame of the show: 437 pixels of 3.5 ms each keep the beam busy for most of it."""
 SHOW_PERIOD_S = 8.0
-"""Time between two pushes of a show that is kept running; each takes about eighteen seconds, so the queue grows."""
+"""Time between two pushes of a show that is kept running; each takes nineteen seconds, so the queue grows."""
 
 
 @contextmanager
@@ -171,10 +177,10 @@ def send_stop_over_socket(daemon):
 class StopRig:
     """A board with a short indicator, a daemon on it, and shows of full frames.
 
-    show_frames: frames of one show, of which each takes about three seconds
+    show_frames: frames of one show, each of FRAME_S
     """
 
-    def __init__(self, folder, lease_s=PATIENT_LEASE_S, options="", show_frames=6):
+    def __init__(self, folder, lease_s=PATIENT_LEASE_S, options="", show_frames=12):
         self.board = Board(folder, program=SHORT_INDICATOR_BOARD, limits=f"lease_ms = {lease_s * 1e3:.0f}\n")
         self.tail = LogTail(self.board.log)
         try:
@@ -190,7 +196,9 @@ class StopRig:
             base_url=self.daemon.url, headers={"Authorization": f"Bearer {TOKEN}"}, timeout=CALL_MAX_S
         )
         heights = ",".join(["60"] * PIXELS)
-        frames = [f'{{"show_at_s":{3 * k},"duration_s":3,"target_um":[{heights}]}}' for k in range(show_frames)]
+        frames = [
+            f'{{"show_at_s":{FRAME_S * k},"duration_s":{FRAME_S},"target_um":[{heights}]}}' for k in range(show_frames)
+        ]
         self._show = f'{{"frames":[{",".join(frames)}]}}'
         self._scheduling = os.sched_getscheduler(0), os.sched_getparam(0)
         with suppress(OSError):  # the time of STOP must not include the wait of this process for a core
