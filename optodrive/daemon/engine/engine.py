@@ -26,6 +26,7 @@ from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
 from optodrive.daemon.engine.session_connection import SessionConnection
 from optodrive.daemon.engine.state_report import build_planner_state, build_state_report
+from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.message_loop import MessageLoop
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.state import PlannerState, StateReport
@@ -54,9 +55,17 @@ class Engine:
     on_loop: called in every loop iteration; must return quickly
     on_beat: called in every loop iteration, and during long computations in the loop's thread
     on_warning: called with one line for the log when the link fails
+    memory: shared with earlier and later planner processes, None without any
     """
 
-    def __init__(self, display: DisplayModel, session: RemoteSession, link_socket: Path, clock: Clock) -> None:
+    def __init__(
+        self,
+        display: DisplayModel,
+        session: RemoteSession,
+        link_socket: Path,
+        clock: Clock,
+        memory: ThermalMemory | None = None,
+    ) -> None:
         self.display = display
         self.message_loop = MessageLoop()
         self.commands = LoopCommands()
@@ -83,6 +92,9 @@ class Engine:
         )
         self._plan_queue.on_progress = self._beat
         self._epoch = session.epoch
+        self._memory = ThermalMemory() if memory is None else memory
+        self._restored = False
+        self._saved_key: object = None
         self._published_cause: LinkCause | None = None
         self.message_loop.watch(self.commands, lambda: None)
 
@@ -108,6 +120,7 @@ class Engine:
         self._connection.exchange(wait_s)
         self._follow_link()
         self._plan_queue.update_jobs(self._session.pop_refusal())
+        self._save_thermal_state()  # before a plan starts, so that a successor of this process knows its heat
         self._plan_queue.start_next()
         self._beat()
         self._publish_cause()
@@ -120,6 +133,20 @@ class Engine:
             self._plan_queue.fail_all(self._session.epoch_reason, clock_shift_s or 0.0)
         if clock_shift_s is not None:
             self._plan_queue.on_board_restarted(clock_shift_s)
+
+    def _save_thermal_state(self) -> None:
+        """Continue from the state of an earlier planner once the board's time is known, then save every new state."""
+        if not self._session.connected:
+            return
+        if not self._restored:
+            self._restored = True
+            saved = self._memory.load()
+            if saved is not None:
+                self._plan_queue.restore(saved, self._clock.now_s())
+        key = self._plan_queue.saved_key
+        if key != self._saved_key:
+            self._saved_key = key
+            self._memory.save(self._plan_queue.build_saved_state(self._clock.now_s()))
 
     def _beat(self) -> None:
         """Prove to the link process and to the supervisor that the loop runs."""

@@ -19,7 +19,8 @@ from optodrive.daemon.engine.planning_snapshot import (
     mark_refreshed,
 )
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
-from optodrive.daemon.engine.thermal_estimate import ThermalEstimate, rewind_estimate
+from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate, rewind_estimate
+from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
@@ -34,6 +35,8 @@ STREAM_LEAD_S = 0.015
 STREAM_SEND_AHEAD_S = 0.02
 """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
 MIN_DELAY_S = 1e-5
+HOLD_MAX_S = 1.0
+"""Longest time for which the board waits for points before it ends a plan."""
 EVENTS_MAX = 20_000
 """Maximum number of events without a reader, several minutes. Events are references and cost little."""
 
@@ -301,7 +304,8 @@ class PlanQueue:
 
     def _rewind_thermal_state(self, ended: list[PlanRecord], clock_shift_s: float) -> None:
         gate_off_s = self._session.board_s() - clock_shift_s + self._display.config.board.lease_s
-        self._thermal = rewind_estimate(ended, gate_off_s, self._display.budget, self.on_progress)
+        plans = [EndedPlan.from_record(record) for record in ended]
+        self._thermal = rewind_estimate(plans, gate_off_s, self._display.budget, self.on_progress)
         self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
 
     def fail_all(self, reason: str, clock_shift_s: float = 0.0) -> None:
@@ -325,3 +329,34 @@ class PlanQueue:
         with self.lock:
             self._thermal = self._thermal.with_delay(delay_s)
             self._queue_end_s = 0.0
+
+    # --- restarts of the planner --------------------------------------------------------------------------------
+
+    def build_saved_state(self, host_s: float) -> SavedThermalState:
+        """Return the state from which a successor of this process continues. host_s: present host time."""
+        with self.lock:
+            records = [run.record for run in self.running] or list(self.waiting)[:1]
+            plans = tuple(EndedPlan.from_record(record) for record in records)
+            return SavedThermalState(host_s, self._session.board_s(), self._thermal, plans)
+
+    @property
+    def saved_key(self) -> object:
+        """A value that changes whenever build_saved_state() would return another state."""
+        records = [run.record for run in self.running] or list(self.waiting)[:1]
+        return id(self._thermal), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
+
+    def restore(self, saved: SavedThermalState, host_s: float) -> None:
+        """Continue from the state of an earlier planner, whose plans the link process has ended.
+
+        Every pulse that may have started before now counts, up to the longest time late that the board permits. The
+        board's clock may have restarted meanwhile.
+        """
+        board_s = self._session.board_s()
+        expected_s = saved.board_s + host_s - saved.host_s
+        gate_off_s = expected_s + self._display.config.board.lease_s
+        estimate = saved.estimate
+        if saved.plans:
+            estimate = rewind_estimate(saved.plans, gate_off_s, self._display.budget, self.on_progress)
+        with self.lock:
+            self._thermal = estimate.with_delay(board_s - expected_s + HOLD_MAX_S)
+            self._queue_end_s = self._thermal.budget.at_s

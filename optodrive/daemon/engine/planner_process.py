@@ -9,6 +9,7 @@ from optodrive.core.clock import MonotonicClock
 from optodrive.daemon.engine.engine import Engine
 from optodrive.daemon.engine.planner_server import PlannerServer
 from optodrive.daemon.engine.session_recording import start_session_recorder
+from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.link.board_setup import build_board_requirements
@@ -16,11 +17,17 @@ from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
 
 
-def run_planner(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter, session_path: Path | None) -> None:
+def run_planner(
+    display: DisplayModel,
+    folder: RuntimeFolder,
+    beat: BeatWriter,
+    session_path: Path | None,
+    memory: ThermalMemory,
+) -> None:
     """Plan and hand over until SIGTERM or the end of the supervisor.
 
     display: warm, see `warm_up`; session_path: new HDF5 file for a recording of every plan, instead of the configured
-    one. Raise InputError if the recording cannot be started.
+    one; memory: shared with earlier and later planner processes. Raise InputError if the recording cannot be started.
     """
     ending: list[int] = []
     signal.signal(signal.SIGTERM, lambda number, frame: ending.append(number))
@@ -29,7 +36,7 @@ def run_planner(display: DisplayModel, folder: RuntimeFolder, beat: BeatWriter, 
         log = open_daemon_log()
         exit_stack.callback(log.close)
         session = RemoteSession(build_board_requirements(display.config).scale, clock)
-        engine = Engine(display, session, folder.link_socket, clock)
+        engine = Engine(display, session, folder.link_socket, clock, memory)
         engine.on_warning = log.warn
         recorder = start_session_recorder(engine, session_path, log)
         if recorder is not None:

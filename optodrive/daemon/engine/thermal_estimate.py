@@ -3,10 +3,11 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from optodrive.core.types.plans import BudgetState, ExecutedPulses
+from optodrive.core.types.plans import BudgetState, ExecutedPulses, LimitedPlan
 from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.limiter.budget import Budget
@@ -41,8 +42,35 @@ def apply_executed(before: ThermalState, executed: ExecutedPulses) -> ThermalSta
     return heat
 
 
+class EndedPlan(NamedTuple):
+    """What a plan that ended early leaves behind.
+
+    heat_before, budget_before: initial state, on the plan's own time line; start_s: board time of the plan's zero
+    dropped: number of pulses at the plan's end that the board will never get; executed: None without a report
+    """
+
+    heat_before: ThermalState
+    budget_before: BudgetState
+    start_s: float
+    plan: LimitedPlan
+    dropped: int
+    executed: ExecutedPulses | None
+
+    @classmethod
+    def from_record(cls, record: PlanRecord) -> Self:
+        """Build it from a record."""
+        return cls(
+            record.heat_before,
+            record.budget_before,
+            record.start_s,
+            record.planned.plan,
+            record.dropped,
+            record.executed,
+        )
+
+
 def rewind_estimate(
-    ended: Sequence[PlanRecord], gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
+    ended: Sequence[EndedPlan], gate_off_s: float, budget: Budget, on_progress: Callable[[], None]
 ) -> ThermalEstimate:
     """Build the estimate after plans that ended early, without their dropped pulses.
 
@@ -52,7 +80,7 @@ def rewind_estimate(
     first = ended[0]
     heat, state, zero_s = first.heat_before, first.budget_before, first.start_s
     for record in ended:
-        plan = record.planned.plan
+        plan = record.plan
         heat, state = heat.copy_shifted(zero_s - record.start_s), shift_state(state, zero_s - record.start_s)
         zero_s = record.start_s
         kept_pulses = len(plan) - record.dropped

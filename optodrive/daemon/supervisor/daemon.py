@@ -120,12 +120,17 @@ def _build_starts(
 ) -> dict[str, Callable[[socket.socket, int], int]]:
     """Return how each forked process starts, by its name."""
     from optodrive.daemon.engine.planner_process import run_planner
+    from optodrive.daemon.engine.thermal_memory import ThermalMemory
     from optodrive.daemon.preview.process import run_preview
     from optodrive.daemon.web.web_process import run_web
 
+    memory = ThermalMemory()
+
     def start_planner(channel: socket.socket, number: int) -> int:
         path = None if session_path is None else number_path(session_path, number)
-        return fork_with_beat(lambda beat: run_planner(display, folder, beat, path), "opto-planner", channel.fileno())
+        return fork_with_beat(
+            lambda beat: run_planner(display, folder, beat, path, memory), "opto-planner", channel.fileno()
+        )
 
     def start_preview(channel: socket.socket, number: int) -> int:
         return fork_with_beat(lambda beat: run_preview(display, folder, beat), "opto-preview", channel.fileno())
