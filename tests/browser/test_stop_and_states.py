@@ -200,6 +200,7 @@ def test_without_a_link_the_boards_figures_and_the_budgets_are_stale(visit, make
     board = make_board()
     page = visit(make_daemon(board)).open()
     expect(page.locator("#board-state")).to_have_text("DISARMED")
+    expect(page.locator("#gauges")).not_to_be_empty()
     board.stop()
     for name, is_stale in (("Board", True), ("Budgets", True), ("Playing", False)):
         mark = page.get_by_role("region", name=name, exact=True).locator(".stale-mark")

@@ -131,4 +131,4 @@ def test_a_killed_daemon_leaves_the_gate_off(board, make_daemon):
     daemon.process.wait()
     wait_for(lambda: board.of("state")[-1]["state"] in ("DISARMED", "FAULT"), "the board to leave RUNNING")
     assert board.of("gate")[-1]["on"] is False
-    assert board.of("state")[-1]["reason"] in ("link lost", "fault")
+    assert board.of("state")[-1]["reason"] in ("abort", "link lost", "fault")

@@ -165,6 +165,7 @@ def test_a_child_that_ends_leaves_the_board_dark_and_starts_again_disarmed(share
     state = wait_for(
         lambda: (
             (s := ask(daemon))["link"]["state"] == "up"
+            and s["planner"]["alive"]
             and (bound_s is None or s["board"]["state"] not in EMITTING_STATES)
             and s
         ),

@@ -31,8 +31,8 @@ from optodrive.planning.display_model import DisplayModel
 
 START_LEAD_S = 0.05
 """Minimum time from now, and from the end of the queue, to a plan's zero. Its first points must arrive in time."""
-STREAM_LEAD_S = 0.015
-STREAM_SEND_AHEAD_S = 0.02
+STREAM_LEAD_S = 0.02
+STREAM_SEND_AHEAD_S = 0.04
 """Time for which points of a streamed plan are sent ahead. A longer stall of the host causes an underrun."""
 MIN_DELAY_S = 1e-5
 HOLD_MAX_S = 1.0

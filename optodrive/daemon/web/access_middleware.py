@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from starlette.requests import ClientDisconnect
 
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
-from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
+from optodrive.daemon.web.access_policy import ANONYMOUS, AccessPolicy, RequestContext
 from optodrive.daemon.web.request_limits import (
     App,
     BoundedBody,
@@ -23,6 +23,7 @@ from optodrive.daemon.web.request_limits import (
     receive_empty_body,
 )
 from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
+from optodrive.daemon.web.server_state import TRUSTED
 from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
 
 CALLER = "optodrive.caller"
@@ -72,6 +73,7 @@ class AccessMiddleware:
         audit_fields: dict[str, object] = {}
         scope[AUDIT_FIELDS] = audit_fields
         scope[CALLER] = request.token
+        scope[TRUSTED] = request.token is not ANONYMOUS
         status_recorder = _StatusRecorder(send)
         try:
             await self._app(scope, body, status_recorder)

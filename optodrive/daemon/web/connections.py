@@ -30,6 +30,9 @@ class ClientProtocol(Protocol):
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""
 
+    def is_trusted(self) -> bool:
+        """Return whether the last request had a valid token."""
+
 
 @dataclass
 class _Entry:
@@ -72,12 +75,12 @@ class Connections:
         return len(self) < CONNECTIONS_MAX + (STOP_RESERVE if is_stop else 0)
 
     def close_longest_idle(self) -> bool:
-        """Close the connection that has been idle longest. Return whether there is one."""
+        """Close the connection that has been idle longest, one with a valid token last. Return whether there is one."""
         now_s = self._update_phases()
         idle = [item for item in self._entries.items() if _is_replaceable(item[1], now_s)]
         if not idle:
             return False
-        self._abort(min(idle, key=lambda item: item[1].since_s)[0])
+        self._abort(min(idle, key=lambda item: (item[1].client.is_trusted(), item[1].since_s))[0])
         return True
 
     def close_expired(self) -> None:

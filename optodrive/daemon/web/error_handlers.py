@@ -39,7 +39,9 @@ def add_error_handlers(app: FastAPI) -> None:
     @handles(BodyTooLargeError)
     async def handle_body_too_large(request: Request, error: BodyTooLargeError) -> Response:
         detail = "the body exceeds the maximum size"
-        return _build_response(build_problem(413, "body_too_large", "Body too large", detail))
+        response = _build_response(build_problem(413, "body_too_large", "Body too large", detail))
+        response.headers["Connection"] = "close"  # the rest of its body may follow
+        return response
 
 
 def _build_response(problem: Problem) -> Response:

@@ -32,9 +32,19 @@ class BoundedBody:
             chunk = message.get("body", b"")
             self.size_bytes += len(chunk)
             if self.size_bytes > self._max_bytes:
+                await self._discard_rest(message)
                 raise BodyTooLargeError
             self._digest.update(chunk)
         return message
+
+    async def _discard_rest(self, message: Message) -> None:
+        """Read and discard the rest of a body, up to its maximum size again.
+
+        A connection that is closed before its input was read is reset, which may take the answer from the client.
+        """
+        while message.get("more_body") and self.size_bytes <= 2 * self._max_bytes:
+            message = await self._receive()
+            self.size_bytes += len(message.get("body", b""))
 
     @property
     def audit_fields(self) -> dict[str, object]:

@@ -1,6 +1,7 @@
 """Main function of the web process."""
 
 import asyncio
+import os
 import signal
 import socket
 import time
@@ -25,6 +26,8 @@ from optodrive.device.config import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 BEAT_INTERVAL_S = 0.05
+NICE = -10
+"""Priority, so that STOP is read in time beside other work on the computer; less than real time, which the link has."""
 READY_TIMEOUT_S = 1.0
 """Time after which the server counts as ready, even if link or planner have not reported their state."""
 
@@ -41,6 +44,8 @@ def run_web(
 
     listeners: sockets that listen already; daemon: settings, whose reloaded keys may differ from the display's
     """
+    with suppress(OSError):  # not permitted to every user
+        os.setpriority(os.PRIO_PROCESS, 0, NICE)
     with ExitStack() as exit_stack:
         log = open_daemon_log()
         exit_stack.callback(log.close)

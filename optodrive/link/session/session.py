@@ -36,7 +36,7 @@ SILENCE_TIMEOUT_S = 2.0
 WAIT_MIN_S, WAIT_MAX_S = 0.001, 0.01
 RETRANSMISSION_WAIT_S = BATCH_WAIT_S = 0.002
 """Shortest wait for a retransmission, and for further points to become due, so that frames hold several."""
-SPLICE_LEAD_S = 0.005
+SPLICE_LEAD_S = 0.01
 """Minimum time between a splice and the end of the points before it."""
 
 

@@ -12,7 +12,7 @@ from websockets.sync.client import connect
 
 from optodrive.daemon.web import bounded_websocket, connections
 from optodrive.daemon.web.listeners import open_tcp_listener
-from optodrive.daemon.web.server_state import ARRIVED_S
+from optodrive.daemon.web.server_state import ARRIVED_S, TRUSTED
 from optodrive.daemon.web.web_server import Server
 
 GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -37,6 +37,7 @@ class Application:
             await self.echo(receive, send)
         else:
             self.ages_s.append(time.monotonic() - scope["state"][ARRIVED_S])
+            scope[TRUSTED] = scope["path"] == "/trusted"
             await self.answer(scope["path"], receive, send)
 
     async def echo(self, receive, send):
@@ -183,6 +184,18 @@ async def send_without_end(self, path, receive, send):
     await send({"type": "http.response.start", "status": 200, "headers": []})
     for _ in range(1_000_000):
         await send({"type": "http.response.body", "body": bytes(65_536), "more_body": True})
+
+
+def test_a_connection_with_a_valid_token_gives_way_last(open_client, monkeypatch):
+    monkeypatch.setattr(connections, "CONNECTIONS_MAX", 10)
+    trusted = open_client()
+    assert trusted.ask(GET.replace(b"/v1/state", b"/trusted"))
+    others = [open_client() for _ in range(9)]
+    assert all(other.ask(GET) for other in others)
+    newcomers = [open_client() for _ in range(9)]
+    assert all(newcomer.ask(GET) for newcomer in newcomers)
+    assert all(other.is_closed() for other in others)
+    assert trusted.ask(GET)
 
 
 def test_the_longest_idle_connection_gives_way_to_a_new_one(open_client, monkeypatch):
