@@ -47,9 +47,9 @@ def test_the_newest_frame_wins_without_a_pause(armed, board):
 def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
     """After two late splices the running stream is truncated, so the third plan has no deadline."""
     stream(armed, frame(range(30)))
-    first = stream(armed, frame(range(400)))
+    first = stream(armed, frame(range(437)))
     wait_for(lambda: armed.get_plan(first.plan).executed >= 4, "a part of the frame")
-    naps_s = iter([0.25, 1.0, 1.5, 1.5])  # longer than the time reserved from the plan before
+    naps_s = iter([0.15, 0.6, 1.5, 1.5])  # longer than the time reserved from the plan before
     tries = []
 
     def slowly(*arguments, **more):
