@@ -37,6 +37,7 @@ def post(rig, body, path="/v1/plans", role="operator", **params):
     return httpx.post(rig.daemon.url + path, params=params, content=body, headers=headers, timeout=60)
 
 
+@pytest.mark.slow  # the flood of valid previews does the same in every run
 def test_a_valid_preview_does_not_darken_a_show(rig):
     with rig.running_show() as begin:
         response = post(rig, build_full_frames(PREVIEW_FRAMES, PIXELS), dry_run=True)

@@ -78,6 +78,7 @@ class Rig:
     def bring_to(self, situation):
         """Bring the board to a situation, from any other."""
         wait_for(lambda: ask(self.daemon)["link"]["state"] == "up", "the link")
+        wait_for(lambda: ask(self.daemon)["planner"]["alive"], "the planner")
         self.daemon.call("POST", "/v1/stop")
         if self.daemon.board_state() == "FAULT":
             self.daemon.call("POST", "/v1/disarm")

@@ -73,7 +73,7 @@ def test_a_large_push_from_before_never_lights(rig, ending, attempt):
     assert (response.status_code, response.json()["code"]) == (409, "stopped")
 
 
-@pytest.mark.parametrize("ending", ["stop", "disarm"])
+@pytest.mark.parametrize("ending", ["stop", pytest.param("disarm", marks=pytest.mark.slow)])
 def test_a_small_push_behind_dry_runs_never_lights_afterwards(rig, ending):
     """It may have been planned and lit before the end."""
     rig.arm()
