@@ -12,11 +12,12 @@ from PIL import Image
 from optodrive.core.errors import InputError
 from optodrive.device.config_file import load_config
 from optodrive.planning.stimuli.braille import DIGITS, PUNCTUATION
+from optodrive.planning.stimuli.frame_json import HEIGHT_MIN_UM
 from optodrive.planning.stimuli.pattern_registry import build_pattern
 from optodrive.planning.stimuli.sequence_file import parse_sequence, sequence_to_json
 
 CONFIG = load_config("display-16")
-HEIGHTS = st.floats(0, 2000, allow_subnormal=False)
+HEIGHTS = st.just(0.0) | st.floats(HEIGHT_MIN_UM, 2000)
 JSON = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=8), inner, max_size=3),
