@@ -83,7 +83,7 @@ class Rig:
         if self.daemon.board_state() == "FAULT":
             self.daemon.call("POST", "/v1/disarm")
         if situation != "idle":
-            self.daemon.arm()
+            wait_for(lambda: self.daemon.client.post(f"{self.daemon.url}/v1/arm").is_success, "processes that may arm")
         self.board.forget()
         if situation == "streaming":
             self.daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
