@@ -1,13 +1,13 @@
 """Loop of one thread over message connections, and the server that accepts them on a Unix socket."""
 
 import selectors
-import socket
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from optodrive.core.ipc import IpcClosed, IpcError, Message, MessageSocket
+from optodrive.core.unix_listener import open_unix_listener
 
 BACKLOG = 64
 CLIENTS_MAX = 16
@@ -95,18 +95,13 @@ class MessageServer:
     """Listening socket on a loop, with its clients."""
 
     def __init__(self, loop: MessageLoop, path: Path, on_message: MessageHandler, on_lost: LossHandler) -> None:
-        """Listen on a path, in place of a socket that an ended process left there."""
+        """Listen on a path, in place of a socket that an ended process left there. Raise InputError if it is in use."""
         self.clients: list[MessageSocket] = []
         self._loop = loop
         self._path = path
         self._on_message = on_message
         self._on_lost = on_lost
-        with suppress(FileNotFoundError):
-            path.unlink()
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(path))
-        path.chmod(0o600)
-        self._listener.listen(BACKLOG)
+        self._listener = open_unix_listener(path, 0o600, BACKLOG, "socket of a process of the daemon")
         self._listener.setblocking(False)
         loop.watch(self._listener, self._accept)
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from rig import OPTODRIVE, long_train, wait_for
+from optodrive.daemon.runtime_folder import find_link_socket
+from optodrive.link.service.operator_client import stop_board
+from rig import OPTODRIVE, long_train, running, wait_for
 
 STATE_TIMEOUT_S = 2.0
 PATIENCE_S = 10.0
@@ -60,3 +62,24 @@ def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
     assert "Traceback" not in ended.stderr
     assert board.of("gate")[-1]["on"] is False
     assert board.of("state")[-1]["state"] in ("DISARMED", "FAULT")
+
+
+def test_a_second_daemon_on_the_same_socket_leaves_the_direct_stop_of_the_first(tmp_path):
+    unix = tmp_path / "s"
+    options = f'lease_s = 1.0\n[daemon]\nsocket = "{unix}"\n#'
+    with running(tmp_path, replace=[("lease_s = 1.0", options)]) as (board, daemon):
+        daemon.arm()
+        second = subprocess.run(
+            [OPTODRIVE, "serve", "--config", daemon.config, "--port", "0"],
+            env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE_S,
+        )
+        assert second.returncode == 2
+        assert "daemon.socket: got" in second.stderr
+        assert "Address already in use" in second.stderr
+        stopped = stop_board(find_link_socket(None, unix))
+        assert stopped is not None
+        assert board.of("state")[-1]["state"] == "DISARMED"
+        assert daemon.board_state() == "DISARMED"

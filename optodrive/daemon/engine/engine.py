@@ -226,10 +226,6 @@ class Engine:
             lambda: FrameSequence((blank_frame,)), "end of stream", streamed=True, epoch=epoch, caller=caller
         )
 
-    def get_end_future(self, plan_id: str) -> "Future[None]":
-        """Return a future that is done when a plan has ended. Raise InputError (plan_not_found) for an unknown plan."""
-        return self._plan_store.find(plan_id).end_future
-
     def get_plan(self, plan_id: str, pulses: bool = True) -> PlanReport:
         """Report a plan. Raise InputError (plan_not_found) for an unknown plan."""
         return self._plan_store.find(plan_id).build_report(self.board_s(), pulses)

@@ -40,11 +40,6 @@ class PreviewServer:
         self._server = MessageServer(loop, folder.preview_socket, self._on_request, self._on_client_lost)
         self._add_spare()
 
-    @property
-    def worker_pids(self) -> list[int]:
-        """Process ids of the workers."""
-        return [slot.worker.pid for slot in self._slots]
-
     def step(self) -> None:
         """Wait for messages for a short time, and end the jobs that have exceeded their time."""
         next_check_s = min((slot.worker.next_check_s for slot in self._slots), default=float("inf"))

@@ -10,16 +10,17 @@ from typing import TYPE_CHECKING
 
 from optodrive.core.clock import MonotonicClock
 from optodrive.core.errors import InputError
+from optodrive.core.unix_listener import open_unix_listener
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.notify import Notifier
 from optodrive.daemon.reload import ConfigReloader
-from optodrive.daemon.runtime_folder import RuntimeFolder, open_runtime_folder
+from optodrive.daemon.runtime_folder import SHARED_LINK_MODE, RuntimeFolder, open_runtime_folder
 from optodrive.daemon.supervisor.child import Child
 from optodrive.daemon.supervisor.forking import execute_module, fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor
-from optodrive.daemon.web.listeners import open_tcp_listener, open_unix_listener
+from optodrive.daemon.web.listeners import BACKLOG, open_tcp_listener
 from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
 from optodrive.device.config import Config
 from optodrive.link.board_setup import build_port_settings
@@ -58,12 +59,12 @@ def run(
         exit_stack.callback(listeners[0].close)
         port = listeners[0].getsockname()[1]
         unix = Path(config.daemon.socket) if config.daemon.socket else None
-        folder = open_runtime_folder(port, unix)
-        exit_stack.callback(folder.remove)
-        if unix is not None:
-            listeners.append(open_unix_listener(unix))
+        if unix is not None:  # before the runtime folder: who holds it owns the link socket beside it
+            listeners.append(open_unix_listener(unix, SHARED_LINK_MODE, BACKLOG, "daemon.socket"))
             exit_stack.callback(_unlink, unix)
             exit_stack.callback(listeners[1].close)
+        folder = open_runtime_folder(port, unix)
+        exit_stack.callback(folder.remove)
         tokens, tokens_path = load_daemon_tokens(config.daemon.tokens, port)
         if not config.daemon.tokens:  # generated for this run
             exit_stack.callback(_unlink, tokens_path)

@@ -1,15 +1,11 @@
-"""The listening sockets of the daemon: a TCP port, and a Unix socket if one is configured."""
+"""The listening TCP socket of the daemon, and a warning where other computers can reach it."""
 
-import os
 import socket
-import stat
 from contextlib import suppress
 from ipaddress import ip_address
-from pathlib import Path
 
 from optodrive.core.errors import InputError
 
-SOCKET_MODE = 0o660
 BACKLOG = 1024
 
 
@@ -39,41 +35,3 @@ def describe_exposure(host: str) -> str | None:
         f"listening on {host}: other computers can reach the daemon, and tokens travel unencrypted; "
         "a TLS proxy in front of loopback avoids both"
     )
-
-
-def open_unix_listener(path: Path) -> socket.socket:
-    """Open a socket that listens at a path, for its owner and group; replace the socket of a dead daemon.
-
-    InputError if the path is in use or cannot hold a socket.
-    """
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    try:
-        if _is_stale_socket(path):
-            path.unlink()
-        previous_umask = os.umask(
-            0o777 & ~SOCKET_MODE
-        )  # the socket is never accessible to others, not even before a chmod
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(previous_umask)
-        listener.listen(BACKLOG)
-    except OSError as error:
-        listener.close()
-        reason = error.strerror or error
-        raise InputError("daemon.socket", str(path), f"a path for a new socket ({reason})") from None
-    return listener
-
-
-def _is_stale_socket(path: Path) -> bool:
-    """Return whether the path holds a socket on which nobody listens."""
-    try:
-        if not stat.S_ISSOCK(path.stat().st_mode):
-            return False
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as caller:
-            caller.connect(str(path))
-    except ConnectionRefusedError:
-        return True
-    except FileNotFoundError:
-        pass
-    return False

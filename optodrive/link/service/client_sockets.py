@@ -8,8 +8,8 @@ import struct
 from contextlib import suppress
 from pathlib import Path
 
-from optodrive.core.errors import InputError
 from optodrive.core.ipc import MESSAGE_MAX_BYTES, IpcError, MessageSocket, encode_message
+from optodrive.core.unix_listener import open_unix_listener
 from optodrive.link.service.link_service import LinkService
 
 CLIENTS_MAX = 32
@@ -32,7 +32,8 @@ class ClientSockets:
         self._numbers = itertools.count(1)
         self._sockets: dict[int, MessageSocket] = {}
         self._trusted: set[int] = set()
-        self._listener = open_listener(path, mode)
+        self._listener = open_unix_listener(path, mode, BACKLOG, "link socket")
+        self._listener.setblocking(False)
 
     def register(self, poll: select.poll) -> None:
         """Register all descriptors for the loop's next wait."""
@@ -110,27 +111,6 @@ class ClientSockets:
         self._listener.close()
         for client in self._sockets.values():
             client.close()
-
-
-def open_listener(path: Path, mode: int) -> socket.socket:
-    """Open the listening socket with a mode, in place of one that a killed process left.
-
-    Raise InputError if it cannot be created.
-    """
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-    listener.setblocking(False)
-    try:
-        path.unlink(missing_ok=True)
-        previous_umask = os.umask(0o777 & ~mode)  # never accessible to others, not even before a chmod
-        try:
-            listener.bind(str(path))
-        finally:
-            os.umask(previous_umask)
-        listener.listen(BACKLOG)
-    except OSError as error:
-        listener.close()
-        raise InputError("link socket", str(path), f"a path for a new socket ({error.strerror or error})") from None
-    return listener
 
 
 def _read_user(connection: socket.socket) -> int:
