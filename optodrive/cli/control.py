@@ -11,6 +11,7 @@ from optodrive.core.errors import OptodriveError
 
 if TYPE_CHECKING:
     from optodrive.daemon.responses.state import StateReport
+    from optodrive.planning.effective_config import EffectiveLimits
 
 
 STATE_TIMEOUT_S = 2.0
@@ -24,11 +25,14 @@ def register(app: typer.Typer) -> None:
 
 
 def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Show the board, the link and the queue."""
+    """Show the board, the link with its error counters, the queue, and the limits in effect."""
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import READ_STATE
+    from optodrive.client.requests import READ_CONFIG, READ_STATE
 
-    _print_state(DaemonClient(url).call(READ_STATE), json)
+    client = DaemonClient(url)
+    _print_state(client.call(READ_STATE), json)
+    if not json:
+        print(f"limits    {_format_limits(client.call(READ_CONFIG).limits)}")
 
 
 def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -76,6 +80,11 @@ def _print_stopped(result: dict[str, Any], error: OptodriveError, as_json: bool)
     print(f"optodrive: the board was stopped; the state of the daemon is not known: {error}", file=sys.stderr)
 
 
+def _format_limits(limits: "EffectiveLimits") -> str:
+    values = limits.model_dump(exclude={"caps"})
+    return "; ".join(f"{cap.label} {values[cap.setting]:g} {cap.unit}" for cap in limits.caps.values())
+
+
 def _print_state(state: "StateReport", as_json: bool) -> None:
     if as_json:
         print_json(state)
@@ -86,6 +95,12 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
     print(f"board     {board.state}" + (f", fault {board.fault}: {board.hint}" if board.fault else ""))
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
+    if link.state == "up":
+        print(
+            f"counters  {link.retransmitted} frames retransmitted, {link.naks} refused, "
+            f"{link.host_bad_frames} damaged on arrival here, {link.board_bad_frames} at the board; "
+            f"{link.underruns} underruns; longest stall {link.longest_stall_ms:.0f} ms"
+        )
     if link.likely_cause:
         print(f"cause     {link.likely_cause_age_s:.0f} s ago: {link.likely_cause}")
     if link.error:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from optodrive.device.config import Config
     from optodrive.lab.recording import DisplayRuns
 
-RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING…", help="HDF5 files or CSV folders.")]
+RecordingsArgument = Annotated[list[Path], typer.Argument(metavar="RECORDING", help="HDF5 files or CSV folders.")]
 STDOUT = "-"
 DEFAULT_BRIDGE_WIDTH_M = 0.4e-3
 """Assumed where the recording states no width; R and C in model.toml then hold for displays of this width only."""

@@ -5,7 +5,8 @@ An error is one line on stderr. Exit status: 0 done, 1 failed, 2 bad input, 130 
 
 import os
 import sys
-from typing import Any
+from importlib.metadata import version
+from typing import Annotated, Any
 
 import typer
 
@@ -36,11 +37,27 @@ UsageError: Any = typer.BadParameter.__bases__[0]
 
 app = typer.Typer(
     name="optodrive",
-    help="Drive a tactile display with projected light.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+
+
+def _print_version(requested: bool) -> None:
+    if requested:
+        print(f"optodrive {version('optodrive')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _select(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Drive a tactile display with projected light."""
+
+
 for module in (
     serve,
     home,

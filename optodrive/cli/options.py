@@ -32,7 +32,9 @@ PixelMapOption = Annotated[
         "--pixel-map", metavar="pixels.toml", help="Plan with this pixel map, an output of `calibrate pixels`."
     ),
 ]
-UrlOption = Annotated[str, typer.Option("--url", help="URL of the daemon, or unix:PATH for its socket.")]
+UrlOption = Annotated[
+    str, typer.Option("--url", envvar="OPTODRIVE_URL", help="URL of the daemon, or unix:PATH for its socket.")
+]
 StrictOption = Annotated[bool, typer.Option("--strict", help="Same as --policy refuse.")]
 PolicyOption = Annotated[
     Literal["trim", "delay", "refuse"],

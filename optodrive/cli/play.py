@@ -15,6 +15,7 @@ from optodrive.core.errors import InputError
 if TYPE_CHECKING:
     from optodrive.client.http import DaemonClient
     from optodrive.client.plan import Plan
+    from optodrive.planning.stimuli.pattern import PatternParameter
 
 POLL_S = 0.1
 
@@ -52,7 +53,7 @@ def push(
 
 def play(
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="A name that `optodrive patterns` lists.")],
-    values: Annotated[list[str] | None, typer.Argument(metavar="[KEY=VALUE]…", help="Pattern parameters.")] = None,
+    values: Annotated[list[str] | None, typer.Argument(metavar="KEY=VALUE", help="Pattern parameters.")] = None,
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
@@ -82,8 +83,17 @@ def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     for item in descriptions:
         print(f"{item.name}: {item.summary}")
         for parameter in item.parameters:
-            choices = f" ({', '.join(parameter.choices)})" if parameter.choices else ""
-            print(f"    {parameter.name}={parameter.default}{choices}  {parameter.description}")
+            default = "" if parameter.default is None else f"={parameter.default}"
+            print(f"    {parameter.name}{default}{_format_bounds(parameter)}  {parameter.description}")
+
+
+def _format_bounds(parameter: "PatternParameter") -> str:
+    if parameter.choices:
+        return f" ({', '.join(parameter.choices)})"
+    unit = f" {parameter.unit}" if parameter.unit else ""
+    if parameter.min is None or parameter.max is None:
+        return f" ({parameter.kind})"
+    return f" ({parameter.min:g} to {parameter.max:g}{unit})"
 
 
 def _parse_parameters(pattern: str, values: list[str]) -> dict[str, str]:

@@ -15,7 +15,7 @@ def register(app: typer.Typer) -> None:
 
 
 def terms(
-    name: Annotated[str | None, typer.Argument(metavar="[TERM]", help="Show this term with its parameters.")] = None,
+    name: Annotated[str | None, typer.Argument(metavar="TERM", help="Show this term with its parameters.")] = None,
     json: JsonOption = False,
 ) -> None:
     """List the terms of model.toml, or show one: equation, parameters, ranges, and the lines that state it."""

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from optodrive.client.async_stream import AsyncStream
 from optodrive.client.display import RECONNECT_TIMEOUT_S
-from optodrive.client.endpoint import DEFAULT_URL
+from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.http import AsyncDaemonClient
 from optodrive.client.operations import DisplayOperations
@@ -25,9 +25,9 @@ class AsyncDisplay:
     """A display behind a running daemon, as an asynchronous context manager; see `Display`."""
 
     def __init__(
-        self, url: str = DEFAULT_URL, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
+        self, url: str | None = None, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
-        self._client = AsyncDaemonClient(url, token, reconnect_timeout_s)
+        self._client = AsyncDaemonClient(url or read_default_url(), token, reconnect_timeout_s)
         self._operations = DisplayOperations(self._client.policy)
         self._reconnect_timeout_s = reconnect_timeout_s
 

@@ -8,7 +8,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from optodrive.client.endpoint import DEFAULT_URL
+from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
 from optodrive.client.http import DaemonClient
 from optodrive.client.operations import DisplayOperations
@@ -28,6 +28,7 @@ RECONNECT_TIMEOUT_S = 5.0
 class Display:
     """A display behind a running daemon, as a context manager that stops what this client has started.
 
+    url: if None, OPTODRIVE_URL, else http://127.0.0.1:8450
     token: if None, OPTODRIVE_TOKEN, else the file that the daemon wrote
     reconnect_timeout_s: how long requests to a daemon that has responded before are repeated if it is unreachable
 
@@ -36,9 +37,9 @@ class Display:
     """
 
     def __init__(
-        self, url: str = DEFAULT_URL, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
+        self, url: str | None = None, token: str | None = None, reconnect_timeout_s: float = RECONNECT_TIMEOUT_S
     ) -> None:
-        self._client = DaemonClient(url, token, reconnect_timeout_s)
+        self._client = DaemonClient(url or read_default_url(), token, reconnect_timeout_s)
         self._operations = DisplayOperations(self._client.policy)
         self._reconnect_timeout_s = reconnect_timeout_s
 
@@ -65,7 +66,10 @@ class Display:
     # --- the board ----------------------------------------------------------------------------------------------
 
     def arm(self) -> StateReport:
-        """Arm the board; its indicator is on for two seconds first. Raises NotReadyError or BoardFaultError."""
+        """Arm the board unless it is armed; its indicator is on for two seconds first.
+
+        Raises NotReadyError or BoardFaultError.
+        """
         return self._client.run(self._operations.arm())
 
     def disarm(self) -> StateReport:

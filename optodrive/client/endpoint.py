@@ -1,5 +1,6 @@
 """Where the daemon is, and the token that it requires."""
 
+import os
 import socket
 from urllib.parse import urlsplit
 
@@ -9,9 +10,16 @@ from optodrive.core.errors import InputError, LinkError
 from optodrive.daemon.web.tokens import read_token
 
 DEFAULT_URL = "http://127.0.0.1:8450"
+URL_ENVIRONMENT_VARIABLE = "OPTODRIVE_URL"
+PROBE_TIMEOUT_S = 2.0
 STOP_UNANSWERED = (
     "stop was not answered by {url} ({error}): the running plan may go on to its end; use the emergency stop or the key"
 )
+
+
+def read_default_url() -> str:
+    """Return OPTODRIVE_URL, or the address of a daemon with the default port on this computer."""
+    return os.environ.get(URL_ENVIRONMENT_VARIABLE) or DEFAULT_URL
 
 
 class Endpoint:
@@ -29,7 +37,7 @@ class Endpoint:
         self.url = "http://localhost" if self.unix_path else self.address
         self._port = None if self.unix_path else parts.port or (443 if parts.scheme == "https" else 80)
         self._explicit_token = token
-        self._token = token or read_token(self._port)
+        self._token = token or self._read_token()
 
     @property
     def headers(self) -> dict[str, str]:
@@ -40,8 +48,29 @@ class Endpoint:
         """Read the token again after a refusal; return whether it changed: a restarted daemon has a new one."""
         if self._explicit_token is not None:
             return False
-        previous, self._token = self._token, read_token(self._port)
+        previous, self._token = self._token, self._read_token()
         return self._token != previous
+
+    def _read_token(self) -> str:
+        """Read the token. Raise InputError if none is readable, LinkError if that is because no daemon runs."""
+        try:
+            return read_token(self._port)
+        except InputError:
+            try:
+                self._probe()
+            except OSError as error:
+                raise self.build_unreachable_error(error) from None
+            raise
+
+    def _probe(self) -> None:
+        """Connect and close; OSError if nobody listens."""
+        if self.unix_path is not None:
+            with socket.socket(socket.AF_UNIX) as connection:
+                connection.settimeout(PROBE_TIMEOUT_S)
+                connection.connect(self.unix_path)
+        else:
+            host = str(urlsplit(self.address).hostname)
+            socket.create_connection((host, self._port), PROBE_TIMEOUT_S).close()
 
     def open_unix_socket(self) -> socket.socket | None:
         """Connect to the Unix socket; None for a TCP address, OSError if the connection is refused."""
@@ -67,7 +96,7 @@ class Endpoint:
 
     def build_unreachable_error(self, error: Exception) -> LinkError:
         """Build the error for a daemon that does not answer."""
-        cause = str(error) or type(error).__name__
+        cause = (isinstance(error, OSError) and error.strerror) or str(error) or type(error).__name__
         return LinkError(f"no daemon answers at {self.address} ({cause}); is `optodrive serve` running?")
 
     def build_stop_error(self, error: Exception) -> LinkError:

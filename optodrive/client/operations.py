@@ -19,6 +19,7 @@ from optodrive.client.requests import (
     build_push_request,
     build_read_request,
 )
+from optodrive.core.errors import NotReadyError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.state import StateReport
 from optodrive.device.config import PixelLayout, build_pixel_layout
@@ -43,9 +44,15 @@ class DisplayOperations:
         self._layout: PixelLayout | None = None
 
     def arm(self) -> Exchange[StateReport]:
-        """Arm the board."""
+        """Arm the board unless it is armed already."""
         self.may_emit = True
-        return (yield from self._policy.call(ARM))
+        try:
+            return (yield from self._policy.call(ARM))
+        except NotReadyError:
+            state = yield from self.read_state()
+            if not state.board.is_armed:
+                raise
+            return state
 
     def disarm(self) -> Exchange[StateReport]:
         """Disarm the board."""

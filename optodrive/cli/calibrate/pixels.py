@@ -16,7 +16,7 @@ PIXELS_LISTED_MAX = 20
 def pixels(
     recordings: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="[RECORDING]…", help="Recordings of the displacements under a sweep."),
+        typer.Argument(metavar="RECORDING", help="Recordings of the displacements under a sweep."),
     ] = None,
     sweep: Annotated[
         Path | None,

@@ -5,6 +5,7 @@ import socket
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,7 @@ from optodrive.daemon.supervisor.reload_handler import ReloadHandler
 from optodrive.daemon.supervisor.supervisor import Supervisor
 from optodrive.daemon.web.listeners import BACKLOG, open_tcp_listener
 from optodrive.daemon.web.tokens import Tokens, load_daemon_tokens
-from optodrive.device.config import Config
+from optodrive.device.config import Config, DaemonSection
 from optodrive.link.board_setup import build_port_settings
 from optodrive.link.service.link_settings_builder import build_link_settings
 from optodrive.link.transport.registry import find_transport_factory
@@ -82,7 +83,7 @@ def run(
         *others, web = (Child(name, start, clock) for name, start in starts.items())
         if supervisor.start_others(others, web):
             _announce(config, port, unix, tokens, tokens_path)
-            supervisor.on_board_seen = _announce_board
+            supervisor.on_board_seen = partial(_announce_board, tcp_port=port)
             supervisor.record_audit({"event": "started", "display": config.name})
             supervisor.serve()
 
@@ -160,11 +161,12 @@ def _announce(config: Config, port: int, unix: Path | None, tokens: Tokens, toke
         print(f"optodrive: personal link to the page: {address}/#token={tokens.highest_role.secret}", flush=True)
 
 
-def _announce_board(link_view: LinkView) -> None:
+def _announce_board(link_view: LinkView, tcp_port: int) -> None:
     """Print the state of the board, or that it is awaited."""
+    url = "" if tcp_port == DaemonSection.model_fields["port"].default else f" --url http://127.0.0.1:{tcp_port}"
     port = link_view.status.get("port", "")
     if link_view.status.get("connected"):
-        print(f"optodrive: board at {port}, {link_view.board_state}; arm with `optodrive arm`", flush=True)
+        print(f"optodrive: board at {port}, {link_view.board_state}; arm with `optodrive arm{url}`", flush=True)
     else:
         print(f"optodrive: waiting for the board at {port}", flush=True)
 

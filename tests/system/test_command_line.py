@@ -1,0 +1,52 @@
+"""Commands to a running daemon as a shell runs them, with the address in the environment."""
+
+import os
+import subprocess
+
+import pytest
+
+from optodrive.client import Display
+from rig import OPTODRIVE, TOKEN, long_train, running
+
+
+@pytest.fixture(scope="module")
+def rig(tmp_path_factory):
+    with running(tmp_path_factory.mktemp("commands")) as (board, daemon):
+        yield board, daemon
+
+
+@pytest.fixture(autouse=True)
+def disarmed(rig):
+    yield
+    rig[1].call("POST", "/v1/stop")
+
+
+def command(daemon, *arguments):
+    return subprocess.run(
+        [OPTODRIVE, *arguments],
+        env=os.environ | {"OPTODRIVE_URL": daemon.url, "OPTODRIVE_TOKEN": TOKEN},
+        capture_output=True,
+        text=True,
+        timeout=30,
+    )
+
+
+def test_status_shows_limits_and_the_counters_of_the_link(rig):
+    _, daemon = rig
+    ended = command(daemon, "status")
+    assert ended.returncode == 0, ended.stderr
+    lines = dict(line.split(maxsplit=1) for line in ended.stdout.splitlines())
+    assert lines["board"] == "DISARMED"
+    assert lines["counters"].startswith("0 frames retransmitted, 0 refused")
+    assert "absorber temperature 400 °C" in lines["limits"]
+    assert "energy of a pulse 0.125 J" in lines["limits"]
+
+
+def test_arming_an_armed_board_does_nothing(rig):
+    board, daemon = rig
+    assert command(daemon, "arm").returncode == 0
+    with Display(daemon.url, TOKEN) as display:
+        assert display.arm().board.state == "ARMED"
+        plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.1))["plan"]
+        assert daemon.finished(plan)["status"] == "done"
+    assert [entry["reason"] for entry in board.of("state")].count("armed") == 1
