@@ -5,10 +5,14 @@ docs/how-to/show-stimuli.md lists what the paper leaves open. Directions are as 
 (does_not_fit) if the display lacks a pixel at a required place.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from math import ceil
+
+import numpy as np
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain
-from optodrive.device.config import Config
+from optodrive.device.config import Config, PixelLayout
+from optodrive.device.gate_timing import build_servo, settling_s
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 DIRECTIONS = {"left": (0, -1), "right": (0, 1), "up": (1, 0), "down": (-1, 0)}
@@ -98,18 +102,20 @@ def build_temporal_pattern(
 def build_two_fingers(config: Config, where: str, digits: str, centre: int | None) -> FrameSequence:
     """Build experiment 6: squares of four pixels under two fingers, the fingers alternating.
 
-    40 pulses of 15 ms in five rounds.
+    40 pulses of 15 ms in five rounds. The paper's 600 ms leave the mirrors no time: here they have time to settle.
     """
     pitch_m = config.display.pitch_m
     pair = [compute_finger_places(int(digit), pitch_m) for digit in digits.split("-")]
     turns = [place for both in zip(*pair, strict=True) for place in both]
     requirement = "space for fingertips that spread over 58 × 22 mm around it"
-    pixels = Lattice.from_config(config).pixels_around(centre, turns, where, requirement)
-    width_s, period_s, rounds = 0.015, 0.015 * len(pixels), 5
+    lattice = Lattice.from_config(config)
+    pixels = lattice.pixels_around(centre, turns, where, requirement)
+    step_s = 0.015 + _longest_settling_s(config, lattice.layout, [*pixels, pixels[0]])
+    width_s, period_s, rounds = 0.015, step_s * len(pixels), 5
     return _build_sequence(
         PulseTrain(
             pixel=pixel,
-            start_s=k * width_s,
+            start_s=k * step_s,
             duration_s=(rounds - 1) * period_s + width_s,
             pulse_width_s=width_s,
             gap_s=period_s - width_s,
@@ -117,6 +123,15 @@ def build_two_fingers(config: Config, where: str, digits: str, centre: int | Non
         )
         for k, pixel in enumerate(pixels)
     )
+
+
+def _longest_settling_s(config: Config, layout: PixelLayout, path: Sequence[int]) -> float:
+    """Return the longest settling time of the moves along a path of pixels, in whole microseconds, s."""
+    order = list(path)
+    moves_m = np.maximum(*(np.abs(np.diff(at_m[order])) for at_m in (layout.x_m, layout.y_m)))
+    scanner = config.scanner
+    move_rad = float(moves_m.max()) / (2.0 * scanner.focal_length_m)
+    return ceil(1e6 * settling_s(build_servo(scanner), move_rad, min(config.tolerance_rad))) / 1e6
 
 
 def compute_finger_places(digit: int, pitch_m: float) -> list[tuple[int, int]]:

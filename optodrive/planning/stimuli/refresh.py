@@ -12,6 +12,8 @@ from optodrive.device.pixel_map import load_pixel_map, remove_pixel_map
 from optodrive.physics.parameters import load_parameters
 from optodrive.physics.pulse_for_height import DriveRange
 from optodrive.physics.thermal_state import build_cold_state
+from optodrive.planning.scheduler.visiting_path import compute_visiting_order
+from optodrive.planning.stimuli.galvo_time import GalvoTimeEstimator
 from optodrive.planning.stimuli.pixel_lattice import Lattice
 
 REFRESH_HZ = 10.0
@@ -25,7 +27,10 @@ BEAM_TIME_MARGIN = 1.05
 
 
 class BeamTimeEstimator:
-    """Estimates the beam time of a picture from the cold state: pulses in whole PWM periods, moves row by row."""
+    """Estimates the beam time of a picture from the cold state: pulses in whole PWM periods, moves on a short path.
+
+    The moves are spread over as much time as the galvo cap requires.
+    """
 
     def __init__(self, config: Config) -> None:
         self.lattice = Lattice.from_config(config)
@@ -36,6 +41,7 @@ class BeamTimeEstimator:
         self._drive = DriveRange.from_laser(laser.max_power_w, laser.pwm_hz, config.limits.pulse_width_max_s)
         known = load_pixel_map(config)
         self._lift = None if known is None else known.displacement_factor
+        self._galvo_time = GalvoTimeEstimator(config)
         self._cold_heat = build_cold_state(remove_pixel_map(config), load_parameters(config.pixel_model.parameters))
 
     def min_pulse_s(self, target_m: float) -> float:
@@ -46,7 +52,7 @@ class BeamTimeEstimator:
         pulse = self._cold_heat.solve_pulse(0, 0.0, target_m, self._drive)
         return self._drive.period_s * (1 if pulse is None else pulse[0])
 
-    def _settling_s(self, distance_m: float) -> float:
+    def settling_s(self, distance_m: float) -> float:
         """Return the settling time of a move between two absorbers, s."""
         return settling_s(self._servo, distance_m / (2.0 * self._scanner.focal_length_m), self._tolerance_rad)
 
@@ -58,17 +64,17 @@ class BeamTimeEstimator:
         heights_m, counts = np.unique(self._nominal_targets_m(target_m, driven), return_counts=True)
         pulses_s = sum(self.min_pulse_s(float(h)) * int(n) for h, n in zip(heights_m, counts, strict=True))
         layout = self.lattice.layout
-        is_reversed = layout.row[driven] % 2 == 1
-        order = driven[np.lexsort((np.where(is_reversed, -1, 1) * layout.column[driven], layout.row[driven]))]
-        distances_m = np.maximum(
-            *(np.abs(np.diff(at_m[order], append=at_m[order[0]])) for at_m in (layout.x_m, layout.y_m))
-        )
+        x_rad, y_rad = (at_m / (2.0 * self._scanner.focal_length_m) for at_m in (layout.x_m, layout.y_m))
+        order = compute_visiting_order(driven, layout.row, layout.column, x_rad, y_rad)
+        dx_rad, dy_rad = (np.abs(np.diff(at_rad[order], append=at_rad[order[0]])) for at_rad in (x_rad, y_rad))
+        distances_m = 2.0 * self._scanner.focal_length_m * np.maximum(dx_rad, dy_rad)
         # A single pixel still needs a move of at least one pitch.
         distances_unique_m, counts = np.unique(np.maximum(distances_m, self._pitch_m).round(9), return_counts=True)
         moves_s = sum(
-            self._settling_s(float(each_m)) * int(n) for each_m, n in zip(distances_unique_m, counts, strict=True)
+            self.settling_s(float(each_m)) * int(n) for each_m, n in zip(distances_unique_m, counts, strict=True)
         )
-        return ceil(BEAM_TIME_MARGIN * (pulses_s + moves_s) * 1e3) / 1e3
+        time_s = self._galvo_time.compute_time_s(dx_rad, dy_rad, pulses_s + moves_s)
+        return ceil(BEAM_TIME_MARGIN * time_s * 1e3) / 1e3
 
     def _nominal_targets_m(self, target_m: FloatArray, driven: IntArray) -> FloatArray:
         """Return targets of a nominal pixel whose pulses raise the mapped pixels to their own targets, m, [driven].

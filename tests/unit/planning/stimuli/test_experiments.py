@@ -119,7 +119,9 @@ def test_experiment_5_accepts_another_pause():
 @pytest.mark.parametrize("digits", ["2-3", "2-4", "2-5", "3-4", "3-5", "4-5"])
 def test_experiment_6_interleaves_two_fingers(digits):
     start_s, width_s, power_w, pixel = pulses(build_two_fingers(CONFIG, "e", digits, None))
-    assert start_s == pytest.approx(0.015 * np.arange(40))
+    step_s = start_s[1] - start_s[0]
+    assert 0.0155 < step_s < 0.017  # time to settle after a move from finger to finger
+    assert start_s == pytest.approx(step_s * np.arange(40))
     assert width_s == pytest.approx(0.015)
     assert power_w == pytest.approx(2.45)
     pixel = pixel.astype(int)
