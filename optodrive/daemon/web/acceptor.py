@@ -1,127 +1,87 @@
-"""Acceptance of connections: they are taken in small batches, those that begin with a request for STOP first."""
+"""Opening of connections: those that wait with a request get a protocol, a few at a time, STOP first."""
 
 import asyncio
-import socket
-from collections.abc import Callable, Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
 
 from optodrive.daemon.web.connections import Connections
-from optodrive.daemon.web.stop_first_selector import StopFirstSelector, has_input, is_stop
+from optodrive.daemon.web.request_head import Rank
+from optodrive.daemon.web.stop_first_selector import StopFirstSelector
+from optodrive.daemon.web.waiting_room import WaitingRoom
 
-ACCEPTS_PER_TURN = 32
-OPENED_PER_TURN = 3
-WAITING_MAX = 512
-WAIT_MAX_S = 1.0
-"""Connections that wait to be opened, and for how long; the oldest beyond that is closed."""
+OPENED_PER_TURN = {Rank.STOP: 3, Rank.TOKEN: 3, Rank.OTHER: 1}
 RETRY_S = 0.02
-"""Interval at which waiting connections are looked at while there is no room: has one requested STOP?"""
+"""Interval at which waiting connections are looked at while there is no room."""
 PAUSE_S = 0.05
 """Pause after a failed accept: the process has no descriptor left."""
 
 
-class _Waiting(NamedTuple):
-    sock: socket.socket
-    arrived_s: float
-
-
 class Acceptor:
-    """Accepts connections of listening sockets and opens them a few at a time."""
+    """Takes connections from the waiting room and opens them."""
 
     def __init__(
         self,
-        listeners: Sequence[socket.socket],
+        room: WaitingRoom,
         selector: StopFirstSelector,
         connections: Connections,
         create_protocol: Callable[[], asyncio.Protocol],
     ) -> None:
-        self._listeners = listeners
+        self._room = room
         self._selector = selector
         self._connections = connections
         self._create_protocol = create_protocol
         self._loop = asyncio.get_running_loop()
-        self._waiting: list[_Waiting] = []
         self._opening: set[asyncio.Task[object]] = set()
         self._scheduled: asyncio.Handle | None = None
+        room.on_failure = self._pause
 
     def start(self) -> None:
         """Begin to accept."""
-        for listener in self._listeners:
-            listener.setblocking(False)
-            self._loop.add_reader(listener, self._accept, listener)
+        self._loop.add_reader(self._room.fileno(), self._receive)
 
     def close(self) -> None:
         """Accept no more, and close what waits."""
-        for listener in self._listeners:
-            self._loop.remove_reader(listener)
+        self._loop.remove_reader(self._room.fileno())
         if self._scheduled is not None:
             self._scheduled.cancel()
-        for waiting in self._waiting:
-            waiting.sock.close()
-        self._waiting.clear()
+        self._room.close()
 
-    def _accept(self, listener: socket.socket) -> None:
-        for _ in range(ACCEPTS_PER_TURN):
-            try:
-                sock, _ = listener.accept()
-            except (BlockingIOError, ConnectionAbortedError):
-                break
-            except OSError:
-                self._pause(listener)
-                break
-            sock.setblocking(False)
-            self._waiting.append(_Waiting(sock, self._loop.time()))
-        self._schedule(0.0)
+    def _receive(self) -> None:
+        self._room.receive()
+        self._open_waiting()
 
-    def _pause(self, listener: socket.socket) -> None:
+    def _pause(self) -> None:
         self._connections.close_longest_idle()
-        self._loop.remove_reader(listener)
-        self._loop.call_later(PAUSE_S, partial(self._resume, listener))
-
-    def _resume(self, listener: socket.socket) -> None:
-        if listener.fileno() >= 0:
-            self._loop.add_reader(listener, self._accept, listener)
-
-    def _schedule(self, delay_s: float) -> None:
-        if self._scheduled is not None:
-            self._scheduled.cancel()
-        self._scheduled = self._loop.call_later(delay_s, self._open_waiting) if self._waiting else None
+        self._loop.remove_reader(self._room.fileno())
+        self._loop.call_later(PAUSE_S, self.start)
 
     def _open_waiting(self) -> None:
-        """Open connections as far as there is room; keep the others, which may yet request STOP, for a while."""
-        stops: list[_Waiting] = []
-        others: list[_Waiting] = []
-        for waiting in self._waiting:
-            (stops if is_stop(waiting.sock) else others).append(waiting)
-        opened = [waiting for waiting in stops[:OPENED_PER_TURN] if self._open(waiting, True)]
-        for waiting in others[:OPENED_PER_TURN]:
-            if not self._open(waiting, False):
+        """Open the connections of the highest rank that waits, as far as there is room."""
+        if self._scheduled is not None:
+            self._scheduled.cancel()
+            self._scheduled = None
+        rank = self._room.find_next()
+        if rank is None:
+            return
+        delay_s = 0.0
+        for _ in range(OPENED_PER_TURN[rank]):
+            if self._room.find_next() != rank:
                 break
-            opened.append(waiting)
-        oldest_s = self._loop.time() - WAIT_MAX_S
-        kept = [waiting for waiting in stops if waiting not in opened]
-        rest = [waiting for waiting in others if waiting not in opened]
-        first = max(0, len(kept) + len(rest) - WAITING_MAX)
-        for position, waiting in enumerate(rest):
-            if position < first or waiting.arrived_s < oldest_s:
-                waiting.sock.close()
-            else:
-                kept.append(waiting)
-        self._waiting = kept
-        self._schedule(0.0 if opened else RETRY_S)
+            if not self._connections.make_room(rank):
+                delay_s = RETRY_S
+                break
+            self._open()
+        if self._room.find_next() is not None:
+            self._scheduled = self._loop.call_later(delay_s, self._open_waiting)
 
-    def _open(self, waiting: _Waiting, for_stop: bool) -> bool:
-        if not self._connections.make_room(for_stop):
-            return False
-        sock = waiting.sock
-        self._selector.add_client(sock, waiting.arrived_s if has_input(sock) else None)
+    def _open(self) -> None:
+        waiting = self._room.take()
+        self._selector.add_client(waiting.sock, waiting.since_s)
         self._connections.opening += 1
         task: asyncio.Task[object] = self._loop.create_task(
-            self._loop.connect_accepted_socket(self._create_protocol, sock)
+            self._loop.connect_accepted_socket(self._create_protocol, waiting.sock)
         )
         self._opening.add(task)
         task.add_done_callback(self._on_opened)
-        return True
 
     def _on_opened(self, task: "asyncio.Task[object]") -> None:
         self._opening.discard(task)

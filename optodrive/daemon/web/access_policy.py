@@ -86,7 +86,7 @@ class AccessPolicy:
         route = table.find(request.method, request.path)
         is_stop = route is not None and route.key == STOP
         if route is None or route.min_role is not None:
-            token = self.tokens.find(_read_presented_token(request))
+            token = self.find_token(request)
             if token is None:
                 rate_problem = None if is_stop else self._check_rate(request)
                 return rate_problem or build_problem(
@@ -97,6 +97,10 @@ class AccessPolicy:
         if is_stop:
             return None
         return self._check_rate(request) or self._check_route(request, table) or self._check_size(request)
+
+    def find_token(self, request: RequestContext) -> Token | None:
+        """Return the valid token that a request presents, None if there is none."""
+        return self.tokens.find(_read_presented_token(request))
 
     def acquire_frame(self, request: RequestContext) -> float:
         """Count one streamed frame against the caller's rate; return the time to wait first, s."""

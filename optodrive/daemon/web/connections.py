@@ -5,9 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
+from optodrive.daemon.web.request_head import Rank
+
 CONNECTIONS_MAX = 256
 STOP_RESERVE = 64
-"""Connections beyond CONNECTIONS_MAX, only for those that begin with a request for STOP."""
+"""Connections beyond CONNECTIONS_MAX, only for those that begin with a request for STOP and a valid token."""
 Phase = Literal["headers", "idle", "drain", "body", "stalled", "answer", "stream"]
 PHASE_MAX_S: dict[Phase, float] = {"headers": 5.0, "idle": 15.0, "drain": 5.0, "body": 30.0, "stalled": 30.0}
 """The longest time of a phase: a request's header, between requests, the rest of a body that nobody reads, a body, a
@@ -68,16 +70,23 @@ class Connections:
         if entry is not None:
             entry.phase, entry.since_s = entry.client.get_phase(), self._now_s()
 
-    def make_room(self, is_stop: bool) -> bool:
-        """Return whether a new connection may be opened. Close those that have been idle longest if need be."""
-        while len(self) >= CONNECTIONS_MAX and self.close_longest_idle():
-            pass
-        return len(self) < CONNECTIONS_MAX + (STOP_RESERVE if is_stop else 0)
+    def make_room(self, rank: Rank) -> bool:
+        """Return whether a new connection may be opened. Close those that have been idle longest if need be.
 
-    def close_longest_idle(self) -> bool:
+        One without a token takes no place from one with a token.
+        """
+        while len(self) >= CONNECTIONS_MAX and self.close_longest_idle(spares_trusted=rank is Rank.OTHER):
+            pass
+        return len(self) < CONNECTIONS_MAX + (STOP_RESERVE if rank is Rank.STOP else 0)
+
+    def close_longest_idle(self, spares_trusted: bool = False) -> bool:
         """Close the connection that has been idle longest, one with a valid token last. Return whether there is one."""
         now_s = self._update_phases()
-        idle = [item for item in self._entries.items() if _is_replaceable(item[1], now_s)]
+        idle = [
+            item
+            for item in self._entries.items()
+            if _is_replaceable(item[1], now_s) and not (spares_trusted and item[1].client.is_trusted())
+        ]
         if not idle:
             return False
         self._abort(min(idle, key=lambda item: (item[1].client.is_trusted(), item[1].since_s))[0])

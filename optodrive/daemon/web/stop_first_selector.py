@@ -13,14 +13,6 @@ CLIENTS_PER_TURN = 6
 STOP_LINE = b"POST /v1/stop"
 
 
-def has_input(sock: socket.socket) -> bool:
-    """Return whether bytes wait in a socket."""
-    try:
-        return bool(sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT))
-    except OSError:
-        return False
-
-
 def is_stop(sock: socket.socket) -> bool:
     """Return whether the bytes that wait in a socket begin with a request for STOP. They stay there."""
     try:

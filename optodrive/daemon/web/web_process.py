@@ -20,6 +20,7 @@ from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.listeners import describe_exposure
+from optodrive.daemon.web.request_head import rank_head
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import DaemonSection
@@ -74,7 +75,7 @@ class WebProcess:
         self._daemon = daemon
         app = build_app(client, policy)
         app.router.lifespan_context = self._run_connections
-        self.server = Server(app)
+        self.server = Server(app, lambda head: rank_head(head, policy))
 
     def end(self) -> None:
         """End all streams and let the server finish."""

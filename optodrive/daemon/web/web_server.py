@@ -13,21 +13,26 @@ from optodrive.daemon.web.acceptor import Acceptor
 from optodrive.daemon.web.bounded_http import BoundedHttp
 from optodrive.daemon.web.bounded_websocket import MESSAGE_MAX_BYTES, BoundedWebSocket
 from optodrive.daemon.web.connections import PHASE_MAX_S, Connections
+from optodrive.daemon.web.request_head import Rank
 from optodrive.daemon.web.request_limits import App
 from optodrive.daemon.web.server_state import ServerState
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
+from optodrive.daemon.web.waiting_room import WaitingRoom
 
 SHUTDOWN_GRACE_S = 2
 DESCRIPTORS_MIN = 1024
 
 
 class Server(uvicorn.Server):
-    """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT."""
+    """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT.
+
+    rank_head: ranks the head of a new connection's first request
+    """
 
     on_ready: Callable[[], None] = staticmethod(lambda: None)
     loop: asyncio.AbstractEventLoop | None = None
 
-    def __init__(self, app: App) -> None:
+    def __init__(self, app: App, rank_head: Callable[[bytes], Rank]) -> None:
         super().__init__(
             uvicorn.Config(
                 app,
@@ -43,9 +48,11 @@ class Server(uvicorn.Server):
                 ws_per_message_deflate=False,  # a small frame could need any amount of memory
             )
         )
+        self._rank_head = rank_head
         self._selector = StopFirstSelector()
         self._connections = Connections(time.monotonic)
         self.server_state: ServerState = ServerState(self._connections, self._selector)
+        self._room: WaitingRoom | None = None
         self._acceptor: Acceptor | None = None
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
@@ -63,7 +70,8 @@ class Server(uvicorn.Server):
         """Start to accept requests."""
         await super().startup(sockets=[])
         self.loop = asyncio.get_running_loop()
-        self._acceptor = Acceptor(sockets or [], self._selector, self._connections, self._create_protocol)
+        self._room = WaitingRoom(sockets or [], self._rank_head, time.monotonic)
+        self._acceptor = Acceptor(self._room, self._selector, self._connections, self._create_protocol)
         self._acceptor.start()
         self.on_ready()
 
@@ -73,6 +81,8 @@ class Server(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Close connections that take too long. Return whether the server must end."""
         self._connections.close_expired()
+        if self._room is not None:
+            self._room.close_expired()
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:

@@ -11,12 +11,18 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from optodrive.daemon.web import bounded_websocket, connections
+from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
+from optodrive.daemon.web.request_head import rank_head
 from optodrive.daemon.web.server_state import ARRIVED_S, TRUSTED
+from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_server import Server
+from optodrive.device.config import DaemonSection
 
 GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
-STOP = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n"
+SECRET = "a-valid-secret-of-a-viewer"
+BEARER = f"Authorization: Bearer {SECRET}\r\n".encode()
+STOP = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n" + BEARER + b"Content-Length: 0\r\n\r\n"
 
 
 class Application:
@@ -110,7 +116,8 @@ def application():
 @pytest.fixture
 def port(application):
     listener = open_tcp_listener("127.0.0.1", 0)
-    server = Server(application)
+    policy = AccessPolicy(Tokens([Token("viewer", "viewer", SECRET)]), DaemonSection())
+    server = Server(application, lambda head: rank_head(head, policy))
     ready = threading.Event()
     server.on_ready = ready.set
     thread = threading.Thread(target=server.run, args=([listener],))

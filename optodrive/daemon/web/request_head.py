@@ -1,0 +1,56 @@
+"""The head of a connection's first request, read without taking it from the socket, and the rank that it gives."""
+
+import socket
+from enum import IntEnum
+from urllib.parse import unquote
+
+from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
+from optodrive.daemon.web.stop_priority import STOP_PATH
+
+HEAD_MAX_BYTES = 4096
+"""A longer head counts as complete: what precedes its end decides."""
+
+
+class Rank(IntEnum):
+    """The order in which connections are opened: STOP with a valid token, other callers with one, everybody else."""
+
+    STOP = 0
+    TOKEN = 1
+    OTHER = 2
+
+
+def peek_head(sock: socket.socket) -> bytes | None:
+    """Return the bytes that wait in a socket, as far as a head may be long; b'' at its end, None if there are none."""
+    try:
+        return sock.recv(HEAD_MAX_BYTES, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return None
+    except OSError:
+        return b""
+
+
+def is_complete(head: bytes) -> bool:
+    """Return whether a request can be served: its head has ended, is too long, or is none."""
+    return b"\r\n\r\n" in head or b"\n\n" in head or len(head) >= HEAD_MAX_BYTES or not head[:1].isalpha()
+
+
+def parse_head(head: bytes, address: str = "") -> RequestContext | None:
+    """Return the request that a head states; None if it is none."""
+    first, *lines = head.partition(b"\r\n\r\n")[0].decode("latin-1").split("\r\n")
+    words = first.split(" ")
+    if len(words) != 3:
+        return None
+    headers = {}
+    for line in lines:
+        name, colon, value = line.partition(":")
+        if colon:
+            headers[name.lower()] = value.strip(" \t")
+    return RequestContext(words[0], unquote(words[1].partition("?")[0]), headers, address)
+
+
+def rank_head(head: bytes, policy: AccessPolicy) -> Rank:
+    """Return the rank that a head gives its connection."""
+    request = parse_head(head)
+    if request is None or policy.find_token(request) is None:
+        return Rank.OTHER
+    return Rank.STOP if request.method == "POST" and request.path == STOP_PATH else Rank.TOKEN

@@ -1,0 +1,161 @@
+"""Connections that have been accepted but not opened: each waits for the head of its first request, then by its rank.
+
+A connection costs a few system calls here, and a protocol with its buffers only once somebody asks something on it. So
+connections without a request, and those that are closed at once, delay nobody.
+"""
+
+import select
+import socket
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from typing import NamedTuple
+
+from optodrive.daemon.web.connections import PHASE_MAX_S
+from optodrive.daemon.web.request_head import Rank, is_complete, peek_head
+
+ACCEPTS_MAX, EVENTS_MAX = 64, 64
+"""Connections that are accepted, and sockets that are looked at, before others get a turn."""
+WAITING_MAX = 512
+"""Connections that wait. Beyond that, the oldest of the most numerous kind gives way, one with a valid token last."""
+WAIT_MAX_S = {Rank.STOP: 5.0, Rank.TOKEN: 5.0, Rank.OTHER: 1.0}
+"""The longest time that a request waits to be served. Its head must have arrived within the time of that phase."""
+INPUT = select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET
+END = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
+
+
+class Waiting(NamedTuple):
+    """A connection. since_s: monotonic time since which it waits for its head, or has had one."""
+
+    sock: socket.socket
+    since_s: float
+    rank: Rank | None = None
+
+
+class WaitingRoom:
+    """The accepted connections of listening sockets.
+
+    rank_head: ranks the head of a request; now_s: monotonic clock; on_failure: called when the process has no
+    descriptor left, to free one
+    """
+
+    def __init__(
+        self, listeners: Sequence[socket.socket], rank_head: Callable[[bytes], Rank], now_s: Callable[[], float]
+    ) -> None:
+        self.on_failure: Callable[[], object] = lambda: None
+        self._rank_head = rank_head
+        self._now_s = now_s
+        self._epoll = select.epoll()
+        self._listeners = {listener.fileno(): listener for listener in listeners}
+        self._silent: OrderedDict[int, Waiting] = OrderedDict()
+        self._ranked: dict[Rank, OrderedDict[int, Waiting]] = {rank: OrderedDict() for rank in Rank}
+        for fileno, listener in self._listeners.items():
+            listener.setblocking(False)
+            self._epoll.register(fileno, select.EPOLLIN)
+
+    def __len__(self) -> int:
+        return len(self._silent) + sum(map(len, self._ranked.values()))
+
+    def fileno(self) -> int:
+        """Return the descriptor that is readable when `receive` has something to do."""
+        return self._epoll.fileno()
+
+    def close(self) -> None:
+        """Accept no more, and close what waits."""
+        self._epoll.close()
+        for waiting in (self._silent, *self._ranked.values()):
+            for entry in waiting.values():
+                entry.sock.close()
+            waiting.clear()
+
+    # --- in ---------------------------------------------------------------------------------------------------------
+
+    def receive(self) -> None:
+        """Accept connections and look at those whose head arrives, a bounded number of both."""
+        for fileno, events in self._epoll.poll(0, EVENTS_MAX):
+            if fileno in self._listeners:
+                self._accept(self._listeners[fileno])
+            else:
+                self._look_again(fileno, bool(events & END))
+
+    def _accept(self, listener: socket.socket) -> None:
+        for _ in range(ACCEPTS_MAX):
+            try:
+                sock, _ = listener.accept()
+            except (BlockingIOError, ConnectionAbortedError):
+                return
+            except OSError:  # no descriptor is left
+                if not self._make_room():
+                    self.on_failure()
+                return
+            sock.setblocking(False)
+            self._add(sock)
+            while len(self) > WAITING_MAX:
+                self._make_room()
+
+    def _add(self, sock: socket.socket) -> None:
+        now_s = self._now_s()
+        head = peek_head(sock)
+        if head == b"":
+            sock.close()
+        elif head is not None and is_complete(head):
+            self._rank(Waiting(sock, now_s), head)
+        else:
+            self._silent[sock.fileno()] = Waiting(sock, now_s)
+            self._epoll.register(
+                sock.fileno(), INPUT
+            )  # edge-triggered: one event per arrival, and one for what is there
+
+    def _look_again(self, fileno: int, has_ended: bool) -> None:
+        waiting = self._silent.get(fileno)
+        if waiting is None:  # closed since
+            return
+        head = peek_head(waiting.sock)
+        if head and is_complete(head):
+            self._forget_silent(fileno)
+            self._rank(waiting._replace(since_s=self._now_s()), head)
+        elif head == b"" or has_ended:
+            self._forget_silent(fileno).sock.close()
+
+    def _rank(self, waiting: Waiting, head: bytes) -> None:
+        rank = self._rank_head(head)
+        self._ranked[rank][waiting.sock.fileno()] = waiting._replace(rank=rank)
+
+    def _forget_silent(self, fileno: int) -> Waiting:
+        with suppress(OSError):
+            self._epoll.unregister(fileno)
+        return self._silent.pop(fileno)
+
+    # --- out --------------------------------------------------------------------------------------------------------
+
+    def find_next(self) -> Rank | None:
+        """Return the highest rank that waits with a request, None if there is none."""
+        return next((rank for rank, waiting in self._ranked.items() if waiting), None)
+
+    def take(self) -> Waiting:
+        """Return the connection that is opened next, which the caller owns from now on. KeyError if there is none."""
+        for waiting in self._ranked.values():
+            if waiting:
+                return waiting.popitem(last=False)[1]
+        raise KeyError("nobody waits")
+
+    def close_expired(self) -> None:
+        """Close the connections that have waited too long."""
+        now_s = self._now_s()
+        while self._silent and now_s - next(iter(self._silent.values())).since_s > PHASE_MAX_S["headers"]:
+            self._forget_silent(next(iter(self._silent))).sock.close()
+        for rank, waiting in self._ranked.items():
+            while waiting and now_s - next(iter(waiting.values())).since_s > WAIT_MAX_S[rank]:
+                waiting.popitem(last=False)[1].sock.close()
+
+    def _make_room(self) -> bool:
+        """Close one connection; return whether there was one."""
+        others = self._ranked[Rank.OTHER]
+        if self._silent and len(self._silent) >= len(others):
+            self._forget_silent(next(iter(self._silent))).sock.close()
+            return True
+        for waiting in (others, self._ranked[Rank.TOKEN], self._ranked[Rank.STOP]):
+            if waiting:
+                waiting.popitem(last=False)[1].sock.close()
+                return True
+        return False

@@ -1,0 +1,72 @@
+"""Ranks of requests by their heads, as they wait in a socket."""
+
+import socket
+
+import pytest
+
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_head
+from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.device.config import DaemonSection
+
+SECRET = "a-valid-secret-of-a-viewer"
+
+
+@pytest.fixture
+def policy():
+    return AccessPolicy(Tokens([Token("viewer", "viewer", SECRET)]), DaemonSection())
+
+
+@pytest.mark.parametrize(
+    ("line", "headers", "rank"),
+    [
+        ("POST /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST /v1/stop?now HTTP/1.1", f"authorization:bearer   {SECRET} ", Rank.STOP),
+        ("POST /v1/%73top HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
+        ("POST /v1/stop HTTP/1.1", "Authorization: Bearer guessed-by-nobody", Rank.OTHER),
+        ("POST /v1/stop HTTP/1.1", "Host: localhost", Rank.OTHER),
+        ("GET /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
+        ("POST /v1/arm HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
+        ("GET / HTTP/1.1", f"Host: localhost:80\r\nCookie: optodrive-80={SECRET}", Rank.TOKEN),
+        ("POST /v1/arm HTTP/1.1", f"Host: localhost:80\r\nCookie: optodrive-80={SECRET}", Rank.OTHER),
+        ("GET /v1/health HTTP/1.1", "Host: localhost", Rank.OTHER),
+        ("no request", f"Authorization: Bearer {SECRET}", Rank.OTHER),
+    ],
+)
+def test_a_valid_token_precedes_and_stop_with_one_comes_first(policy, line, headers, rank):
+    assert rank_head(f"{line}\r\n{headers}\r\n\r\n".encode(), policy) is rank
+
+
+def test_a_token_in_the_body_gives_no_rank(policy):
+    head = f"POST /v1/stop HTTP/1.1\r\nHost: a\r\n\r\nAuthorization: Bearer {SECRET}\r\n\r\n"
+    assert rank_head(head.encode(), policy) is Rank.OTHER
+
+
+def test_a_head_is_parsed_as_the_server_does():
+    request = parse_head(b"GET /v1/plans/p%31?x=1 HTTP/1.1\r\nHost:  a:1 \r\nX-Y: b: c\r\nbroken\r\n\r\nbody: 1")
+    assert (request.method, request.path) == ("GET", "/v1/plans/p1")
+    assert request.headers == {"host": "a:1", "x-y": "b: c"}
+
+
+@pytest.mark.parametrize(
+    ("head", "expected"),
+    [
+        (b"GET / HTTP/1.1\r\nHost: a\r\n", False),
+        (b"GET / HTTP/1.1\r\nHost: a\r\n\r\n", True),
+        (b"G" * HEAD_MAX_BYTES, True),
+        (b"\x16\x03\x01", True),
+    ],
+)
+def test_a_head_is_complete_at_its_end_or_when_it_can_have_none(head, expected):
+    assert is_complete(head) is expected
+
+
+def test_peeking_takes_nothing_and_tells_silence_from_the_end():
+    own, peer = socket.socketpair()
+    with own, peer:
+        own.setblocking(False)
+        assert peek_head(own) is None
+        peer.sendall(b"GET")
+        assert peek_head(own) == peek_head(own) == own.recv(10) == b"GET"
+        peer.close()
+        assert peek_head(own) == b""
