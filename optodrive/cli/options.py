@@ -40,6 +40,10 @@ PolicyOption = Annotated[
     Literal["trim", "delay", "refuse"],
     typer.Option("--policy", help="Treatment of a frame that exceeds a cap."),
 ]
+PatternPolicyOption = Annotated[
+    Literal["trim", "delay", "refuse"] | None,
+    typer.Option("--policy", help="Treatment of a frame that exceeds a cap; by default that of the pattern."),
+]
 FitOption = Annotated[
     Literal["as_is", "even", "priority"],
     typer.Option(

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, FitOption, JsonOption, PolicyOption, StrictOption, UrlOption
+from optodrive.cli.options import (
+    DEFAULT_URL,
+    FitOption,
+    JsonOption,
+    PatternPolicyOption,
+    PolicyOption,
+    StrictOption,
+    UrlOption,
+)
 from optodrive.cli.output import print_json, show_progress
 from optodrive.cli.plan_text import format_plan_summary
 from optodrive.core.errors import InputError
@@ -57,7 +65,7 @@ def play(
     url: UrlOption = DEFAULT_URL,
     dry_run: DryRunOption = False,
     strict: StrictOption = False,
-    policy: PolicyOption = "trim",
+    policy: PatternPolicyOption = None,
     fit: FitOption = "as_is",
     wait: WaitOption = True,
     json: JsonOption = False,

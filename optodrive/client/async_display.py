@@ -99,7 +99,7 @@ class AsyncDisplay:
         self,
         name: str,
         *,
-        policy: Policy = "trim",
+        policy: Policy | None = None,
         fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,

@@ -123,13 +123,13 @@ class Display:
         self,
         name: str,
         *,
-        policy: Policy = "trim",
+        policy: Policy | None = None,
         fit: FitMode = "as_is",
         dry_run: bool = False,
         wait: bool = True,
         **parameters: Any,
     ) -> Plan:
-        """Play a named pattern with its parameters by name; `dry_run` plans only."""
+        """Play a named pattern with its parameters by name; `dry_run` plans only; policy None: that of the pattern."""
         return self._client.run(self._operations.play(name, parameters, policy, fit, dry_run, wait))
 
     def preview(

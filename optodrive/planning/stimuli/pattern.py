@@ -7,6 +7,7 @@ from math import isfinite
 from typing import Literal
 
 from optodrive.core.errors import InputError, suggest_nearest
+from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.device.config import Config, build_pixel_layout
 
@@ -38,23 +39,28 @@ class PatternParameter:
 
 @dataclass(frozen=True)
 class PatternDescription:
-    """A pattern without its builder, as GET /v1/patterns lists it."""
+    """A pattern without its builder, as GET /v1/patterns lists it; policy: how it is treated above a cap by default."""
 
     name: str
     summary: str
     notes: str
     parameters: tuple[PatternParameter, ...]
+    policy: Policy
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A named stimulus: build(config, where, **parameters in SI) builds it, notes state its particulars."""
+    """A named stimulus: build(config, where, **parameters in SI) builds it, notes state its particulars.
+
+    policy: treatment above a cap unless the caller states another
+    """
 
     name: str
     summary: str
     parameters: tuple[PatternParameter, ...]
     build: Callable[..., FrameSequence]
     notes: str = ""
+    policy: Policy = "trim"
 
     def resolve_arguments(self, given: object, config: Config) -> dict[str, ParameterValue]:
         """Return the builder's arguments from the given parameters and the defaults.

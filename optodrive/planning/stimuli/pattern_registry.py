@@ -50,6 +50,7 @@ _PATTERN_LIST = (
         (_DIRECTION_PARAMETER, _CENTRE_PARAMETER),
         experiments.build_linear_motion,
         "300 ms per pixel at 20 ms on, 60 ms off; 500 ms between the two passes.",
+        policy="refuse",
     ),
     Pattern(
         "experiment-2",
@@ -64,6 +65,7 @@ _PATTERN_LIST = (
         experiments.build_rotation,
         "25 ms on, 71 ms off, whole pulses only: two per pixel at 16 mm/s, one at 32 and 64. "
         "The paper does not state the number of turns; one is shown.",
+        policy="refuse",
     ),
     Pattern(
         "experiment-3",
@@ -74,6 +76,7 @@ _PATTERN_LIST = (
         ),
         experiments.build_localisation,
         "500 ms each at 25 ms on, 25 ms off; 750 ms between. The paper does not state the numbering.",
+        policy="refuse",
     ),
     Pattern(
         "experiment-4",
@@ -81,6 +84,7 @@ _PATTERN_LIST = (
         (_integer_parameter("level", 5, "power, 0.5 W to 2.5 W in steps of 0.25 W", 1, 9), _CENTRE_PARAMETER),
         experiments.build_intensity,
         "25 ms on, 25 ms off. A level above the laser's maximum power plays at the maximum: level 9, 2.5 W, at 2.45 W.",
+        policy="refuse",
     ),
     Pattern(
         "experiment-5",
@@ -94,6 +98,7 @@ _PATTERN_LIST = (
             _CENTRE_PARAMETER,
         ),
         experiments.build_temporal_pattern,
+        policy="refuse",
     ),
     Pattern(
         "experiment-6",
@@ -102,6 +107,7 @@ _PATTERN_LIST = (
         experiments.build_two_fingers,
         "40 pulses of 15 ms, the two fingers alternating; 600 ms and the settling times. "
         "The paper does not state the positions of the fingers or the order within a square.",
+        policy="refuse",
     ),
     Pattern("showcase", "a moving dot, a ring, braille, two pairs of fingers", (), build_showcase),
     Pattern(
@@ -236,6 +242,6 @@ def build_pattern(name: str, given: object, config: Config) -> FrameSequence:
 def describe_patterns() -> list[PatternDescription]:
     """Describe every pattern and its parameters."""
     return [
-        PatternDescription(pattern.name, pattern.summary, pattern.notes, pattern.parameters)
+        PatternDescription(pattern.name, pattern.summary, pattern.notes, pattern.parameters, pattern.policy)
         for pattern in _PATTERN_LIST
     ]
