@@ -1,18 +1,33 @@
 """Exclusive access to the configured board and its spot sensor, for `home` and `calibrate board`."""
 
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
+import typer
+
 from optodrive.cli.output import announce_compilation
-from optodrive.core.errors import LinkError
+from optodrive.core.errors import InputError, LinkError
 
 if TYPE_CHECKING:
     from optodrive.lab.commissioning.exclusive_board import ExclusiveBoard
     from optodrive.lab.commissioning.spot_reader import SpotReader
 
 SENSOR_BAUD = 115_200
+
+
+def confirm_emission(confirmed: bool, action: str) -> None:
+    """Ask on the terminal whether the laser may emit; do nothing if that is confirmed already.
+
+    action: what the command is about to do. Raises InputError without a terminal to ask on, typer.Abort for a no.
+    """
+    if confirmed:
+        return
+    if not sys.stdin.isatty():
+        raise InputError("--yes", None, f"--yes, because without a terminal nobody can confirm: {action}")
+    typer.confirm(f"optodrive: {action}. Continue?", abort=True, err=True)
 
 
 class BoardAccess(NamedTuple):

@@ -50,7 +50,7 @@ def session_spots(out):
 )
 def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, more):
     board, out = make_board(sensor=("--geometry", str(geometry), *more)), tmp_path / "field.toml"
-    status, output, errors = start(board, "calibrate", "board", "--out", out, "--json").ended()
+    status, output, errors = start(board, "calibrate", "board", "--yes", "--out", out, "--json").ended()
     assert status == 0, errors
     answer = json.loads(output)
     assert answer["target_reached"] is True
@@ -73,7 +73,7 @@ def test_ten_micrometres_with_25_spots(make_board, start, tmp_path, geometry, mo
 @pytest.mark.slow
 def test_ctrl_c_and_resume(make_board, start, tmp_path):
     board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "board", "--out", out)
+    command = start(board, "calibrate", "board", "--yes", "--out", out)
     wait_for(lambda: len(session_spots(out)) >= 6, "six spots", 90.0)
     command.process.send_signal(signal.SIGINT)
     status, _, errors = command.ended()
@@ -83,7 +83,7 @@ def test_ctrl_c_and_resume(make_board, start, tmp_path):
     kept = session_spots(out)
     pulses_before = len(assert_dark(board).of("pulse"))
 
-    status, output, errors = start(board, "calibrate", "board", "--out", out, "--json").ended()
+    status, output, errors = start(board, "calibrate", "board", "--yes", "--out", out, "--json").ended()
     assert status == 0, errors
     assert f"resuming with {len(kept)} spots" in errors
     answer = json.loads(output)
@@ -95,7 +95,7 @@ def test_ctrl_c_and_resume(make_board, start, tmp_path):
 @pytest.mark.slow
 def test_a_moved_display_is_detected(make_board, start, tmp_path):
     board, out = make_board(sensor=("--geometry", "3")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "board", "--out", out, *ENDLESS)
+    command = start(board, "calibrate", "board", "--yes", "--out", out, *ENDLESS)
     wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
     command.process.send_signal(signal.SIGINT)
     assert command.ended()[0] == 130
@@ -105,7 +105,7 @@ def test_a_moved_display_is_detected(make_board, start, tmp_path):
     path.write_text(json.dumps(kept))
     pulses_before = len(assert_dark(board).of("pulse"))
 
-    status, _, errors = start(board, "calibrate", "board", "--out", out).ended()
+    status, _, errors = start(board, "calibrate", "board", "--yes", "--out", out).ended()
     assert status == 1
     found = re.search(r"moved since: .* (\d+) µm off and (\d+) µm off, expected at most (\d+) µm; delete", errors)
     assert found, errors
@@ -116,7 +116,7 @@ def test_a_moved_display_is_detected(make_board, start, tmp_path):
 
 def test_kill_9(make_board, start, tmp_path):
     board, out = make_board(sensor=()), tmp_path / "field.toml"
-    command = start(board, "calibrate", "board", "--out", out, *ENDLESS)
+    command = start(board, "calibrate", "board", "--yes", "--out", out, *ENDLESS)
     wait_for(lambda: len(session_spots(out)) >= 3, "three spots", 90.0)
     command.process.kill()
     killed_us = board.events()[-1]["t_us"]
@@ -148,7 +148,7 @@ def test_kill_9(make_board, start, tmp_path):
 )
 def test_the_cause_of_an_end_is_named(make_board, start, tmp_path, script, says):
     board, out = make_board(sensor=(), script=script), tmp_path / "field.toml"
-    status, output, errors = start(board, "calibrate", "board", "--out", out, "--json", *ENDLESS).ended()
+    status, output, errors = start(board, "calibrate", "board", "--yes", "--out", out, "--json", *ENDLESS).ended()
     assert status == 1
     last = errors.splitlines()[-1]
     assert re.match(f"optodrive: {says}", last), errors
@@ -161,7 +161,7 @@ def test_the_cause_of_an_end_is_named(make_board, start, tmp_path, script, says)
 def test_spots_located_by_a_person(make_board, start, tmp_path):
     """The person locates the spot to 20 µm and enters its distance from the mark."""
     board, out = make_board(sensor=("--geometry", "4")), tmp_path / "field.toml"
-    command = start(board, "calibrate", "board", "--manual", "--spots-max", "9", "--out", out, "--json")
+    command = start(board, "calibrate", "board", "--yes", "--manual", "--spots-max", "9", "--out", out, "--json")
     truth, random = GroundTruthGeometry.sample(4, CONFIG), np.random.default_rng(0)
     for line in command.process.stderr:
         mark = re.match(r"pixel \d+, (\S+) (\S+) mm", line)
@@ -180,7 +180,7 @@ def test_spots_located_by_a_person(make_board, start, tmp_path):
 
 
 def test_without_an_answer_it_ends(board, start, tmp_path):
-    command = start(board, "calibrate", "board", "--manual", "--out", tmp_path / "field.toml")
+    command = start(board, "calibrate", "board", "--yes", "--manual", "--out", tmp_path / "field.toml")
     command.process.stdin.close()
     command.process.stdin = None
     status, _, errors = command.ended()
@@ -190,7 +190,7 @@ def test_without_an_answer_it_ends(board, start, tmp_path):
 
 
 def test_without_a_sensor_it_requests_one(board, start, tmp_path):
-    status, _, errors = start(board, "calibrate", "board", "--out", tmp_path / "field.toml").ended()
+    status, _, errors = start(board, "calibrate", "board", "--yes", "--out", tmp_path / "field.toml").ended()
     assert status == 2
     assert "sensor.port: got None" in errors
     assert errors.count("\n") == 1

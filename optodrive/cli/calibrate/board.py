@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from optodrive.cli.board_access import confirm_emission
 from optodrive.cli.calibrate.board_progress import print_status, show_measurement_progress
 from optodrive.cli.calibrate.field_report import (
     FieldCalibration,
@@ -63,12 +64,15 @@ def board(
     spot_power_mw: Annotated[
         float, typer.Option("--spot-power-mw", metavar="POWER_MW", help="Power of the spot.")
     ] = 5.0,
+    yes: Annotated[bool, typer.Option("--yes", help="Arm and emit without asking.")] = False,
     config: ConfigOption = None,
     json: JsonOption = False,
 ) -> None:
     """Measure spots on the board with a sensor or by eye, and fit the field to them."""
     check_calibration_outputs(out, report)
     request = BoardCalibrationRequest(manual, target_rms_um, spots_max, readings, spot_power_mw)
+    places = f"up to {spots_max} places with a spot of {spot_power_mw:g} mW"
+    confirm_emission(yes, f"this arms the board, lights {places}, and writes {out}")
     write_calibration(calibrate_on_board(config, out, request), out, report, json)
     delete_session(out)
 
