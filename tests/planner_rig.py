@@ -11,7 +11,7 @@ from optodrive.core.ipc import MessageDecoder, encode_message
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_record import PlanStore
+from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.link.service import remote_session
 from optodrive.link.service.remote_session import RemoteSession

@@ -235,9 +235,11 @@ def _build_report(
     true_display: "ThermalState",
 ) -> dict[str, Any]:
     from optodrive.core.units import m_to_um
-    from optodrive.planning.plan_summary import list_pulse_columns, summarize_plan
+    from optodrive.planning.listed_pulses import ListedPulses
+    from optodrive.planning.plan_summary import summarize_plan
 
     columns = (executed.pixel, executed.start_s, executed.width_s, executed.power_w)
+    pulses = ListedPulses.from_planned(planned_sequence)
     simulated_m = true_display.copy().apply_pulses(*columns).displacement_m
     return {
         "summary": summarize_plan(planned_sequence, feasibility),
@@ -255,7 +257,7 @@ def _build_report(
             for item in traces
             for column, pixel in enumerate(item.pixel.tolist())
         ],
-        "pulses": list_pulse_columns(planned_sequence),
+        "pulses": None if pulses is None else pulses.to_columns(),
     }
 
 

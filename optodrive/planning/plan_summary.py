@@ -1,4 +1,4 @@
-"""The summary of a planned sequence, its pulses by column, and plan.csv."""
+"""The summary of a planned sequence, and plan.csv."""
 
 import csv
 from pathlib import Path
@@ -16,7 +16,6 @@ from optodrive.planning.summary_schema import (
     DelaySummary,
     FrameSummary,
     PlanSummary,
-    PulseColumns,
     ShortfallSummary,
     SimultaneitySummary,
     SkippedTarget,
@@ -26,8 +25,6 @@ from optodrive.planning.summary_schema import (
 
 DEAD_LISTED_MAX = 20
 TRIMMED_LISTED_MAX = 20
-PULSES_LISTED_MAX = 20_000
-"""The largest number of pulses that a response lists one by one."""
 SKIP_REASON = "the residual heat of the pixel reaches the target without a pulse"
 
 
@@ -162,24 +159,6 @@ def _summarize_trimming(planned: PlannedSequence) -> TrimmingSummary:
 
 def _finite_or_none(value: float) -> float | None:
     return value if np.isfinite(value) else None
-
-
-def list_pulse_columns(planned: PlannedSequence) -> PulseColumns | None:
-    """List the plan's pulses by column; None if there are more than PULSES_LISTED_MAX."""
-    plan = planned.plan
-    if len(plan) > PULSES_LISTED_MAX:
-        return None
-    return PulseColumns(
-        start_s=plan.start_s.tolist(),
-        width_s=plan.width_s.tolist(),
-        power_w=plan.power_w.tolist(),
-        pixel=plan.pixel.tolist(),
-        energy_j=plan.energy_j.tolist(),
-        trimmed_j=plan.trimmed_j.tolist(),
-        reason=[str(reason) for reason in plan.reason],
-        target_um=[_finite_or_none(value) for value in m_to_um(plan.target_m).tolist()],
-        predicted_um=m_to_um(planned.predicted_m).tolist(),
-    )
 
 
 PLAN_COLUMNS = (

@@ -66,7 +66,7 @@ def test_queued_plans_can_be_cancelled_and_the_others_run(armed):
 
 def test_the_queue_is_bounded_and_ended_plans_are_dropped(armed, monkeypatch):
     monkeypatch.setattr("optodrive.daemon.engine.engine.QUEUE_MAX", 2)
-    monkeypatch.setattr("optodrive.daemon.engine.plan_record.RECORDS_MAX", 3)
+    monkeypatch.setattr("optodrive.daemon.engine.plan_store.RECORDS_MAX", 3)
     first = armed.submit(lambda: train(1.0), "first").result(10)
     wait_for(lambda: armed.get_plan(first.plan).status == "running", "the first to run")
     waiting = [armed.submit(lambda: train(0.02), "waiting").result(10) for _ in range(2)]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.progress import PlanProgress
 from optodrive.link.protocol.quantisation import DUTY_MAX, WireScale
 from optodrive.physics.nominal_display import DisplayState
@@ -24,7 +24,7 @@ class ExecutedBatch(NamedTuple):
     start_s: board time
     """
 
-    record: PlanRecord
+    plan: ActivePlan
     row: IntArray
     pixel: IntArray
     start_s: FloatArray
@@ -36,11 +36,11 @@ class ExecutedBatch(NamedTuple):
     @classmethod
     def from_progress(cls, progress: PlanProgress, scale: WireScale) -> "ExecutedBatch":
         """Build the batch from the board's reports."""
-        record, job = progress.run
-        plan, reported = record.planned.plan, job.read_reported(progress.begin, progress.end)
+        active, job = progress.run
+        plan, reported = active.planned.plan, job.read_reported(progress.begin, progress.end)
         row = reported.row
         return cls(
-            record=record,
+            plan=active,
             row=row,
             pixel=plan.pixel[row],
             start_s=np.asarray(reported.on_tick * scale.tick_s, dtype=np.float64),

@@ -17,11 +17,12 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
+from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress
 from optodrive.daemon.engine.session_connection import SessionConnection
@@ -240,7 +241,7 @@ class Engine:
 
         return self.commands.submit(end)
 
-    def add_plan_end_callback(self, callback: Callable[[PlanRecord], None]) -> None:
+    def add_plan_end_callback(self, callback: Callable[[ActivePlan], None]) -> None:
         """Register a callback for every plan that ends. Any thread may call it; it must not block."""
         self._plan_store.end_callbacks.append(callback)
 
@@ -272,11 +273,11 @@ class Engine:
             drained.append(events.popleft())
         return drained
 
-    def list_upcoming(self) -> list[PlanRecord]:
+    def list_upcoming(self) -> list[ActivePlan]:
         """Return the running plans and the first waiting one."""
         plan_queue = self._plan_queue
         waiting = plan_queue.waiting.copy()
-        return [run.record for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
+        return [run.plan for run in plan_queue.running.copy()] + ([waiting[0]] if waiting else [])
 
     @property
     def board_state(self) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from optodrive import __version__
 from optodrive.core.histogram import Histogram
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.responses.state import StateReport
 from optodrive.link.protocol.states import BoardState
 from optodrive.link.service.remote_session import RemoteSession
@@ -25,10 +25,11 @@ class PlanCounters:
         self.first_light = Histogram(LATENCY_BUCKETS_S)
         self.min_headroom_k: float | None = None
 
-    def record_end(self, record: PlanRecord) -> None:
+    def record_end(self, plan: ActivePlan) -> None:
         """Count an ended plan. The loop's thread and the simulation thread call it, for different plans."""
+        record = plan.record
         self.ended[record.status] += 1
-        self.min_headroom_k = float(record.planned.plan.headroom_k.min())
+        self.min_headroom_k = float(plan.planned.plan.headroom_k.min())
         if record.first_light_after_s is not None:
             self.first_light.add(record.first_light_after_s)
 

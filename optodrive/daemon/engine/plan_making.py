@@ -7,14 +7,17 @@ from typing import NamedTuple
 
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_record import LargestTarget, PlanRecord
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.link.protocol.quantisation import WireScale, decode, quantise
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.check import check_feasibility
 from optodrive.planning.feasibility.report import FeasibilityReport, FitMode
 from optodrive.planning.limiter.limiter import verify
+from optodrive.planning.listed_pulses import ListedPulses
 from optodrive.planning.pipeline import plan_sequence
+from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.planned_sequence import PlannedSequence
 from optodrive.planning.stimuli.streamed_frame import can_split, stale_pixels_first
 
@@ -42,7 +45,7 @@ class PlanningRequest(NamedTuple):
     caller_left: threading.Event = NEVER
 
 
-def make_record(
+def make_plan(
     display: DisplayModel,
     scale: WireScale,
     request: PlanningRequest,
@@ -50,7 +53,7 @@ def make_record(
     snapshot: PlanningSnapshot,
     plan_id: str,
     on_progress: Callable[[float], None],
-) -> PlanRecord:
+) -> ActivePlan:
     """Plan a sequence, quantise the plan, and verify the decoded bytes against the budget.
 
     Raises InputError and RefusedError as `plan_sequence` and `check_feasibility` do, and what on_progress raises.
@@ -63,20 +66,27 @@ def make_record(
     decoded = decode(payload, scale)
     verify(planned.plan, points.row[decoded.index], decoded, snapshot.budget, display.budget, lambda: on_progress(1.0))
     on_progress(1.0)
-    return PlanRecord(
+    record = PlanRecord(
         plan_id=plan_id,
         name=request.name,
+        pulse_count=len(planned.plan),
+        duration_s=planned.duration_s,
+        summary_json=summarize_plan(planned, feasibility).model_dump_json().encode(),
+        pulses=ListedPulses.from_planned(planned),
+        largest_target=LargestTarget.from_planned(planned),
+        start_s=snapshot.start_s,
+        arrived_s=request.arrived_s,
+        caller=request.caller,
+        streamed=request.streamed,
+    )
+    return ActivePlan(
+        record=record,
         planned=planned,
-        feasibility=feasibility,
         points=points,
         heat_before=snapshot.heat,
         budget_before=snapshot.budget,
-        start_s=snapshot.start_s,
-        arrived_s=request.arrived_s,
         epoch=request.epoch,
         crc=zlib.crc32(payload),
-        caller=request.caller,
-        streamed=request.streamed,
         refreshed=snapshot.refreshed,
     )
 

@@ -10,8 +10,10 @@ from concurrent.futures import Executor
 from math import inf
 
 from optodrive.core.errors import StoppedError
-from optodrive.daemon.engine.plan_record import PlanRecord, PlanStore
-from optodrive.daemon.engine.plan_simulation import simulate_record
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.plan_simulation import simulate_plan
+from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planning_snapshot import (
     PlanningSnapshot,
     RefreshCycle,
@@ -25,7 +27,6 @@ from optodrive.daemon.responses.plan import PlanStatus
 from optodrive.link.protocol.states import UNARMED_STATES
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.link.session.fault_hints import get_fault_hint
-from optodrive.link.session.plan_job import PlanJob
 from optodrive.link.session.timing_error import TimingTotals, compute_timing_error
 from optodrive.planning.display_model import DisplayModel
 
@@ -37,8 +38,8 @@ STREAM_SEND_AHEAD_S = 0.04
 MIN_DELAY_S = 1e-5
 HOLD_MAX_S = 1.0
 """Longest time for which the board waits for points before it ends a plan."""
-EVENTS_MAX = 20_000
-"""Maximum number of events without a reader, several minutes. Events are references and cost little."""
+EVENTS_MAX = 4000
+"""Maximum number of events without a reader, 20 s at least. An event keeps its plan in memory."""
 
 
 class PlanQueue:
@@ -56,7 +57,7 @@ class PlanQueue:
         self.lock = threading.RLock()
         self.on_progress: Callable[[], None] = lambda: None
         self.running: deque[PlanRun] = deque()
-        self.waiting: deque[PlanRecord] = deque()
+        self.waiting: deque[ActivePlan] = deque()
         self.totals = {"planned": 0, "sent": 0, "executed": 0}
         self.timing = TimingTotals()
         self.events: deque[PlanProgress | ClockShift] = deque(maxlen=EVENTS_MAX)
@@ -75,8 +76,8 @@ class PlanQueue:
 
     def count_pulses(self) -> int:
         """Count the pulses of all running and waiting plans."""
-        running = [run.record for run in self.running.copy()]
-        return sum(len(record.planned.plan) for record in (*running, *self.waiting.copy()))
+        running = [run.plan for run in self.running.copy()]
+        return sum(plan.record.pulse_count for plan in (*running, *self.waiting.copy()))
 
     # --- planning snapshots -------------------------------------------------------------------------------------
 
@@ -97,47 +98,48 @@ class PlanQueue:
         refreshed = cycle.refreshed if streamed and cycle is not None and cycle.thermal is thermal else None
         return PlanningSnapshot(thermal, start_s, *thermal.shift_to_plan(start_s), refreshed=refreshed)
 
-    def _find_running_stream(self) -> PlanRecord | None:
+    def _find_running_stream(self) -> ActivePlan | None:
         """Return the running streamed plan that a newer one may truncate, None without one."""
         if self.waiting or not self.running:
             return None
-        record = self.running[-1].record
-        return record if record.streamed and not record.dropped else None
+        plan = self.running[-1].plan
+        return plan if plan.record.streamed and not plan.record.dropped else None
 
     def _earliest_start_s(self, streamed: bool, planning_time_s: float = 0.0) -> float:
         lead_s = STREAM_LEAD_S if streamed else START_LEAD_S
         return max(self._queue_end_s, self._session.board_s() + planning_time_s) + lead_s
 
     def _build_cut_snapshot(
-        self, record: PlanRecord, thermal: ThermalEstimate, planning_time_s: float
+        self, running: ActivePlan, thermal: ThermalEstimate, planning_time_s: float
     ) -> PlanningSnapshot | None:
         min_start_s = self._session.board_s() + STREAM_SEND_AHEAD_S + planning_time_s
-        return build_cut_snapshot(record, thermal, min_start_s, self._display.budget)
+        return build_cut_snapshot(running, thermal, min_start_s, self._display.budget)
 
     # --- accepting plans ----------------------------------------------------------------------------------------
 
-    def commit(self, record: PlanRecord, snapshot: PlanningSnapshot) -> bool:
+    def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot) -> bool:
         """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late.
 
         Raise StoppedError if the epoch of its request has passed.
         """
         self._session.receive()  # a STOP that has been answered is known from here on
+        record = plan.record
         with self.lock:
-            self.require_epoch(record.epoch)
+            self.require_epoch(plan.epoch)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self._thermal is not snapshot.thermal:
                 return False
             if snapshot.predecessor is None:
                 record.start_s = max(record.start_s, self._earliest_start_s(record.streamed))
-                self.waiting.append(record)
-            elif not self._splice(record, snapshot.predecessor, snapshot.cut_row):
+                self.waiting.append(plan)
+            elif not self._splice(plan, snapshot.predecessor, snapshot.cut_row):
                 return False
-            self._thermal = ThermalEstimate.from_plan(record.planned.heat, record.planned.budget, record.start_s)
-            self._queue_end_s = record.start_s + record.planned.duration_s
-            self.totals["planned"] += len(record.planned.plan)
+            self._thermal = ThermalEstimate.from_plan(plan.planned.heat, plan.planned.budget, record.start_s)
+            self._queue_end_s = record.start_s + record.duration_s
+            self.totals["planned"] += record.pulse_count
             record.status = "queued" if snapshot.predecessor is None else "running"
             record.planned_after_s = self._session.board_s() - record.arrived_s
-            self._plan_store.add(record)
+            self._plan_store.add(plan)
             return True
 
     def require_epoch(self, epoch: int) -> None:
@@ -145,35 +147,35 @@ class PlanQueue:
         if epoch != self._session.epoch:
             raise StoppedError(f"the request was stopped before it was carried out ({self._session.epoch_reason})")
 
-    def _splice(self, record: PlanRecord, predecessor: PlanRecord, cut_row: int) -> bool:
-        if not self.running or self.running[-1].record is not predecessor:
+    def _splice(self, plan: ActivePlan, predecessor: ActivePlan, cut_row: int) -> bool:
+        if not self.running or self.running[-1].plan is not predecessor:
             return False
         kept_points = predecessor.points.count_before(cut_row)
-        job = self._session.splice(record.points, kept_points, record.epoch, STREAM_SEND_AHEAD_S, record.crc)
+        job = self._session.splice(plan.points, kept_points, plan.epoch, STREAM_SEND_AHEAD_S, plan.crc)
         if job is None:
             return False
-        predecessor.dropped = len(predecessor.planned.plan) - cut_row
-        self.running.append(PlanRun(record, job))
+        predecessor.record.dropped = predecessor.record.pulse_count - cut_row
+        self.running.append(PlanRun(plan, job))
         return True
 
     @property
     def must_preempt(self) -> bool:
         """Whether a newer streamed plan must preempt others first."""
         with self.lock:
-            return bool(self.waiting) or any(not run.record.streamed for run in self.running)
+            return bool(self.waiting) or any(not run.plan.record.streamed for run in self.running)
 
     def preempt(self) -> None:
         """Supersede the waiting plans, and end a running plan that is not streamed, for a newer plan."""
         with self.lock:
             if self.waiting:
                 first = self.waiting[0]
-                self._thermal = ThermalEstimate.from_plan(first.heat_before, first.budget_before, first.start_s)
+                self._thermal = ThermalEstimate.from_plan(first.heat_before, first.budget_before, first.record.start_s)
                 self._queue_end_s = self._thermal.budget.at_s
             while self.waiting:
                 self._supersede(self.waiting.popleft())
-            if self.running and not self.running[-1].record.streamed:
-                record, job = self.running[0]
-                record.dropped = len(record.planned.plan) - job.sent_count
+            if self.running and not self.running[-1].plan.record.streamed:
+                plan, job = self.running[0]
+                plan.record.dropped = plan.record.pulse_count - job.sent_count
                 self._session.flush()
                 self.end_running("superseded", "replaced by a newer plan")
 
@@ -189,22 +191,23 @@ class PlanQueue:
             snapshot = self._build_cut_snapshot(last, self._thermal, planning_time_s=0.0)
             if snapshot is None or not self._session.truncate(last.points.count_before(snapshot.cut_row)):
                 return
-            last.dropped = len(last.planned.plan) - snapshot.cut_row
+            last.record.dropped = last.record.pulse_count - snapshot.cut_row
             self._thermal = ThermalEstimate.from_plan(snapshot.heat, snapshot.budget, snapshot.start_s)
             self._queue_end_s = snapshot.start_s
             self._refresh_cycle = RefreshCycle(self._thermal, mark_refreshed(last, snapshot.cut_row))
 
-    def _supersede(self, record: PlanRecord) -> None:
-        record.dropped = len(record.planned.plan)
-        record.end("superseded", "replaced by a newer plan")
+    def _supersede(self, plan: ActivePlan) -> None:
+        plan.record.dropped = plan.record.pulse_count
+        plan.end("superseded", "replaced by a newer plan")
 
     def cancel(self, record: PlanRecord) -> None:
         """Remove a waiting plan, or turn the gate off and end a running plan with its splices."""
-        if record in self.waiting:
+        plan = next((plan for plan in self.waiting if plan.record is record), None)
+        if plan is not None:
             with self.lock:
-                self.waiting.remove(record)
-            record.end("cancelled", "removed from the queue")
-        elif any(run.record is record for run in self.running):
+                self.waiting.remove(plan)
+            plan.end("cancelled", "removed from the queue")
+        elif any(run.plan.record is record for run in self.running):
             self._session.flush()
             self.end_running("cancelled", "cancelled while running")
 
@@ -215,32 +218,37 @@ class PlanQueue:
         if self.running or not self.waiting or not self._session.is_ready:
             return
         with self.lock:
-            record = self.waiting.popleft()
-            if not len(record.planned.plan):
-                record.end("done", None)
+            plan = self.waiting.popleft()
+            record = plan.record
+            if not record.pulse_count:
+                plan.end("done", None)
                 return
             record.status = "running"
             ahead_s = STREAM_SEND_AHEAD_S if record.streamed else inf
-            job = self._session.begin(record.points, record.start_s, record.epoch, ahead_s, record.crc)
-            self.running.append(PlanRun(record, job))
+            job = self._session.begin(plan.points, record.start_s, plan.epoch, ahead_s, plan.crc)
+            self.running.append(PlanRun(plan, job))
 
     def update_jobs(self, refusal: str | None) -> None:
         """Update the plans from the board's reports. refusal: reason of a refusal since the last update."""
         if self._session.board.state in UNARMED_STATES and self.is_busy:
             self.fail_all(self._describe_unarmed())
         for run in self.running:
-            record, job = run
-            executed = job.executed_count
-            if executed > record.executed_count:
-                self.events.append(PlanProgress(run, record.executed_count, executed))
-            self.totals["sent"] += job.sent_count - record.sent
-            self.totals["executed"] += executed - record.executed_count
-            record.sent, record.executed_count = job.sent_count, executed
+            self._count_progress(run)
         while self.running and self.running[0].job.is_finished:
             self._finish_first()
         if self.running and refusal is not None:
             self._session.flush()
             self.end_running("failed", f"the board refused a part of the plan ({refusal})")
+
+    def _count_progress(self, run: PlanRun) -> None:
+        """Count the pulses of a running plan that were sent and executed since the last call."""
+        record, job = run.plan.record, run.job
+        sent, executed = job.sent_count, job.executed_count
+        if executed > record.executed_count:
+            self.events.append(PlanProgress(run, record.executed_count, executed))
+        self.totals["sent"] += sent - record.sent
+        self.totals["executed"] += executed - record.executed_count
+        record.sent, record.executed_count = sent, executed
 
     def _describe_unarmed(self) -> str:
         """Return why the board no longer executes plans, in one sentence."""
@@ -253,39 +261,40 @@ class PlanQueue:
     def _finish_first(self) -> None:
         """End the first running plan. A delay of it shifts everything after it."""
         with self.lock:
-            record, job = self.running.popleft()
-            self._conclude(record, job, "superseded" if record.dropped else "done", None)
+            run = self.running.popleft()
+            record = run.plan.record
+            self._conclude(run, "superseded" if record.dropped else "done", None)
             if record.delay_s > MIN_DELAY_S:
                 self._delay_all(record.delay_s)
 
-    def _conclude(self, record: PlanRecord, job: PlanJob, status: PlanStatus, error: str | None) -> None:
-        scale = self._session.scale
-        executed = job.build_executed(record.planned.plan, scale.full_power_w, scale.tick_s)
-        record.executed = executed
+    def _conclude(self, run: PlanRun, status: PlanStatus, error: str | None) -> None:
+        self._count_progress(run)  # reports may have arrived with what ends the plan
+        plan, job = run
+        record, start_s, scale = plan.record, plan.planned.plan.start_s, self._session.scale
+        executed = job.build_executed(plan.planned.plan, scale.full_power_w, scale.tick_s)
+        rows = job.list_executed_rows()
+        plan.executed, plan.executed_rows = executed, rows
+        plan.update_execution()
         if record.executed_count < job.pulse_count:
-            self.events.append(PlanProgress(PlanRun(record, job), record.executed_count, job.pulse_count))
+            self.events.append(PlanProgress(run, record.executed_count, job.pulse_count))
         if job.first_sent_tick is not None:
             record.first_byte_after_s = job.first_sent_tick * scale.tick_s - record.arrived_s
         if len(executed):
             record.first_light_after_s = record.start_s + float(executed.start_s[0]) - record.arrived_s
-            record.executed_rows = job.list_executed_rows()
-            last = int(record.executed_rows[-1])
-            record.delay_s = float(executed.start_s[-1] - record.planned.plan.start_s[last])
-            record.timing_error = compute_timing_error(
-                record.planned.plan.start_s[record.executed_rows], executed.start_s
-            )
+            record.delay_s = float(executed.start_s[-1] - start_s[rows[-1]])
+            record.timing_error = compute_timing_error(start_s[rows], executed.start_s)
             if record.timing_error is not None:
                 self.timing.add(record.timing_error)
         if status in ("failed", "cancelled"):
-            record.end(status, error)
-        self._executor.submit(simulate_record, record, status, error)
+            plan.end(status, error)
+        self._executor.submit(simulate_plan, plan, status, error)
 
     def _delay_all(self, delay_s: float) -> None:
         with self.lock:
             self._thermal = self._thermal.with_delay(delay_s)
             self._queue_end_s += delay_s
-            for record in (*(run.record for run in self.running), *self.waiting):
-                record.start_s += delay_s
+            for plan in (*(run.plan for run in self.running), *self.waiting):
+                plan.record.start_s += delay_s
             for run in self.running:
                 run.job.delay(round(delay_s / self._session.scale.tick_s))
 
@@ -294,17 +303,17 @@ class PlanQueue:
         with self.lock:
             ended = list(self.running)
             self.running.clear()
-            for record, job in ended:
-                self._conclude(record, job, status, error)
-            delay_s = max((record.delay_s for record, _ in ended), default=0.0)
+            for run in ended:
+                self._conclude(run, status, error)
+            delay_s = max((run.plan.record.delay_s for run in ended), default=0.0)
             if delay_s > MIN_DELAY_S:
                 self._delay_all(delay_s)
             if ended and not self.waiting:
-                self._rewind_thermal_state([record for record, _ in ended], clock_shift_s)
+                self._rewind_thermal_state([run.plan for run in ended], clock_shift_s)
 
-    def _rewind_thermal_state(self, ended: list[PlanRecord], clock_shift_s: float) -> None:
+    def _rewind_thermal_state(self, ended: list[ActivePlan], clock_shift_s: float) -> None:
         gate_off_s = self._session.board_s() - clock_shift_s + self._display.config.board.lease_s
-        plans = [EndedPlan.from_record(record) for record in ended]
+        plans = [EndedPlan.from_plan(plan) for plan in ended]
         self._thermal = rewind_estimate(plans, gate_off_s, self._display.budget, self.on_progress)
         self._queue_end_s = max(gate_off_s, self._thermal.budget.at_s)
 
@@ -320,8 +329,8 @@ class PlanQueue:
                 self.end_running("failed", reason, clock_shift_s)
             elif waiting:
                 self._rewind_thermal_state(waiting[:1], clock_shift_s)
-        for record in waiting:
-            record.end("failed", reason)
+        for plan in waiting:
+            plan.end("failed", reason)
 
     def on_board_restarted(self, delay_s: float) -> None:
         """Shift heat and budget to the restarted clock of the board."""
@@ -335,14 +344,15 @@ class PlanQueue:
     def build_saved_state(self, host_s: float) -> SavedThermalState:
         """Return the state from which a successor of this process continues. host_s: present host time."""
         with self.lock:
-            records = [run.record for run in self.running] or list(self.waiting)[:1]
-            plans = tuple(EndedPlan.from_record(record) for record in records)
+            active = [run.plan for run in self.running] or list(self.waiting)[:1]
+            plans = tuple(EndedPlan.from_plan(plan) for plan in active)
             return SavedThermalState(host_s, self._session.board_s(), self._thermal, plans)
 
     @property
     def saved_key(self) -> object:
         """A value that changes whenever build_saved_state() would return another state."""
-        records = [run.record for run in self.running] or list(self.waiting)[:1]
+        active = [run.plan for run in self.running] or list(self.waiting)[:1]
+        records = [plan.record for plan in active]
         return id(self._thermal), tuple((record.plan_id, record.dropped, record.start_s) for record in records)
 
     def restore(self, saved: SavedThermalState, host_s: float) -> None:

@@ -1,67 +1,133 @@
 """Records of submitted plans, from queued to done, superseded, failed or cancelled."""
 
-import threading
-from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import NamedTuple, Self
 
 import numpy as np
 
-from optodrive.core.errors import InputError
-from optodrive.core.types.arrays import BoolArray, FloatArray, IntArray
-from optodrive.core.types.plans import BudgetState, ExecutedPulses
+from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.core.types.plans import ExecutedPulses
 from optodrive.core.units import m_to_um
-from optodrive.daemon.engine.loop_commands import uncancellable_future
 from optodrive.daemon.responses.plan import ExecutedColumns, MaxTarget, PlanLatency, PlanReport, PlanStatus
-from optodrive.link.protocol.quantisation import WirePoints
 from optodrive.link.session.timing_error import TimingError
-from optodrive.physics.thermal_state import ThermalState
-from optodrive.planning.feasibility.report import FeasibilityReport
-from optodrive.planning.plan_summary import PULSES_LISTED_MAX, list_pulse_columns, summarize_plan
+from optodrive.planning.listed_pulses import PULSES_LISTED_MAX, Int32Array, ListedPulses
 from optodrive.planning.planned_sequence import PlannedSequence
+from optodrive.planning.summary_schema import PlanSummary
 
-RECORDS_MAX = 200
-PULSES_MAX = 1_000_000
-"""Beyond these numbers of plans or pulses the oldest ended plans are dropped."""
-RECENT_PLANS = 20
+
+class LargestTarget(NamedTuple):
+    """The pulse of a plan with the largest target."""
+
+    row: int
+    pixel: int
+    target_m: float
+    predicted_m: float
+
+    @classmethod
+    def from_planned(cls, planned: PlannedSequence) -> Self | None:
+        """Find the pulse; None if no pulse has a target."""
+        plan = planned.plan
+        target_m = np.nan_to_num(plan.target_m)
+        if not len(plan) or not target_m.any():
+            return None
+        row = int(target_m.argmax())
+        return cls(row, int(plan.pixel[row]), float(target_m[row]), float(planned.predicted_m[row]))
+
+
+@dataclass(frozen=True, eq=False)
+class Execution:
+    """What the board executed of a plan.
+
+    start_s, width_s, power_w, pixel, simulated_m: [n] columns as in `ExecutedPulses`, and displacements computed from
+    them; all empty if n exceeds PULSES_LISTED_MAX; simulated_m is None until the simulation is done
+    complete: whether no report is missing; is_listed: whether the columns are complete
+    simulated_max_m, simulated_target_m: largest displacement, and that of the plan's largest target
+    """
+
+    start_s: FloatArray
+    width_s: FloatArray
+    power_w: FloatArray
+    pixel: Int32Array
+    complete: bool
+    is_listed: bool
+    simulated_m: FloatArray | None = None
+    simulated_max_m: float | None = None
+    simulated_target_m: float | None = None
+
+    @classmethod
+    def from_pulses(
+        cls,
+        executed: ExecutedPulses,
+        rows: IntArray,
+        simulated_m: FloatArray | None = None,
+        largest: LargestTarget | None = None,
+    ) -> Self:
+        """Build it from executed pulses [n], their rows in the plan [n], and their displacements [n]."""
+        is_listed = len(executed) <= PULSES_LISTED_MAX
+        kept = slice(None) if is_listed else slice(0)
+        max_m = target_m = None
+        if simulated_m is not None and len(simulated_m):
+            max_m = float(simulated_m.max())
+            of_target = [] if largest is None else simulated_m[rows == largest.row]
+            target_m = float(of_target[0]) if len(of_target) else None
+        return cls(
+            start_s=executed.start_s[kept].copy(),
+            width_s=executed.width_s[kept].copy(),
+            power_w=executed.power_w[kept].copy(),
+            pixel=executed.pixel[kept].astype(np.int32),
+            complete=executed.complete,
+            is_listed=is_listed,
+            simulated_m=None if simulated_m is None else simulated_m[kept].copy(),
+            simulated_max_m=max_m,
+            simulated_target_m=target_m,
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all columns, bytes."""
+        return sum(value.nbytes for value in vars(self).values() if isinstance(value, np.ndarray))
+
+    def to_columns(self) -> ExecutedColumns | None:
+        """Convert the columns to the units of a response; None if they are too long."""
+        if not self.is_listed:
+            return None
+        return ExecutedColumns(
+            start_s=self.start_s.tolist(),
+            width_s=self.width_s.tolist(),
+            power_w=self.power_w.tolist(),
+            pixel=self.pixel.tolist(),
+            simulated_um=[] if self.simulated_m is None else m_to_um(self.simulated_m).tolist(),
+        )
 
 
 @dataclass
 class PlanRecord:
-    """One plan with its progress.
+    """One plan with its progress. It stays after the plan's end, so it holds only what its report states.
 
-    heat_before, budget_before: initial state of the plan, on its own time line
+    pulse_count, duration_s: of the whole plan; summary_json: encoded `PlanSummary`, which is larger in memory
+    pulses: None if there are too many to list
     start_s: board time of the plan's zero
     arrived_s: board time of the request; *_after_s: time from the request to an event
-    epoch: in which the request arrived; the board executes nothing of an older one
-    crc: CRC-32 of the verified bytes of the points
     caller: name of the token that submitted it
     streamed: whether a newer plan may replace its unsent pulses, which then count as dropped
-    executed_rows, simulated_m: [n executed] plan rows, and displacements computed from the board's report
-    refreshed: [p] pixels that the stream's refresh cycle had drawn before this plan
-    end_future: done when the plan has ended
-    on_end: called with the record at its end; must neither block nor raise
+    execution: None until execution has ended
     """
 
     plan_id: str
     name: str
-    planned: PlannedSequence
-    feasibility: FeasibilityReport | None
-    points: WirePoints
-    heat_before: ThermalState
-    budget_before: BudgetState
+    pulse_count: int
+    duration_s: float
+    summary_json: bytes
+    pulses: ListedPulses | None
+    largest_target: LargestTarget | None
     start_s: float
     arrived_s: float
-    epoch: int
-    crc: int
     caller: str = ""
     streamed: bool = False
     status: PlanStatus = "planned"
     error: str | None = None
     sent: int = 0
-    executed: ExecutedPulses | None = None
-    executed_rows: IntArray | None = None
-    simulated_m: FloatArray | None = None
+    execution: Execution | None = None
     executed_count: int = 0
     delay_s: float = 0.0
     timing_error: TimingError | None = None
@@ -69,24 +135,21 @@ class PlanRecord:
     planned_after_s: float | None = None
     first_byte_after_s: float | None = None
     first_light_after_s: float | None = None
-    refreshed: BoolArray | None = None
-    end_future: "Future[None]" = field(default_factory=uncancellable_future)
-    on_end: "Callable[[PlanRecord], None]" = field(default=lambda record: None)
 
     @property
     def has_ended(self) -> bool:
         """Whether the plan has ended."""
         return self.status in ("done", "superseded", "failed", "cancelled")
 
-    def end(self, status: PlanStatus, error: str | None) -> None:
-        """End the plan with a final status."""
-        self.status, self.error = status, error
-        self.end_future.set_result(None)
-        self.on_end(self)
+    @property
+    def nbytes(self) -> int:
+        """Size of everything that grows with the plan, bytes."""
+        columns = (self.pulses, self.execution)
+        return len(self.summary_json) + sum(item.nbytes for item in columns if item is not None)
 
     def build_report(self, board_now_s: float, pulses: bool = True) -> PlanReport:
         """Report the plan; `pulses` lists them one by one."""
-        executed, simulated_m = self.executed, self.simulated_m
+        execution = self.execution
         return PlanReport(
             plan=self.plan_id,
             name=self.name,
@@ -94,7 +157,7 @@ class PlanRecord:
             status=self.status,
             error=self.error,
             starts_in_s=self.start_s + self.delay_s - board_now_s,
-            planned=len(self.planned.plan),
+            planned=self.pulse_count,
             sent=self.sent,
             executed=self.executed_count,
             dropped=self.dropped,
@@ -104,85 +167,26 @@ class PlanRecord:
                 first_light_s=self.first_light_after_s,
             ),
             timing_error=self.timing_error,
-            summary=summarize_plan(self.planned, self.feasibility),
-            pulses=list_pulse_columns(self.planned) if pulses else None,
-            simulated_max_um=_max_um(simulated_m) if executed is not None else None,
-            max_target=self._report_max_target(),
-            executed_pulses=_list_executed(executed, simulated_m) if pulses and executed is not None else None,
-            executed_complete=None if executed is None else executed.complete,
-            delay_s=None if executed is None else self.delay_s,
+            summary=PlanSummary.model_validate_json(self.summary_json),
+            pulses=self.pulses.to_columns() if pulses and self.pulses is not None else None,
+            simulated_max_um=None if execution is None else _to_um(execution.simulated_max_m),
+            max_target=self._report_max_target(execution),
+            executed_pulses=execution.to_columns() if pulses and execution is not None else None,
+            executed_complete=None if execution is None else execution.complete,
+            delay_s=None if execution is None else self.delay_s,
         )
 
-    def _report_max_target(self) -> MaxTarget | None:
-        """Report the pulse with the largest target; None if no pulse has a target."""
-        plan = self.planned.plan
-        target_m = np.nan_to_num(plan.target_m)
-        if not len(plan) or not target_m.any():
+    def _report_max_target(self, execution: Execution | None) -> MaxTarget | None:
+        largest = self.largest_target
+        if largest is None:
             return None
-        row = int(target_m.argmax())
-        simulated_um = None
-        if self.simulated_m is not None and self.executed_rows is not None and row in self.executed_rows:
-            simulated_um = m_to_um(float(self.simulated_m[self.executed_rows == row][0]))
         return MaxTarget(
-            pixel=int(plan.pixel[row]),
-            target_um=m_to_um(float(target_m[row])),
-            predicted_um=m_to_um(float(self.planned.predicted_m[row])),
-            simulated_um=simulated_um,
+            pixel=largest.pixel,
+            target_um=m_to_um(largest.target_m),
+            predicted_um=m_to_um(largest.predicted_m),
+            simulated_um=None if execution is None else _to_um(execution.simulated_target_m),
         )
 
 
-def _max_um(displacement_m: FloatArray | None) -> float | None:
-    return None if displacement_m is None or not len(displacement_m) else m_to_um(float(displacement_m.max()))
-
-
-def _list_executed(executed: ExecutedPulses, simulated_m: FloatArray | None) -> ExecutedColumns | None:
-    if len(executed) > PULSES_LISTED_MAX:
-        return None
-    return ExecutedColumns(
-        start_s=executed.start_s.tolist(),
-        width_s=executed.width_s.tolist(),
-        power_w=executed.power_w.tolist(),
-        pixel=executed.pixel.tolist(),
-        simulated_um=[] if simulated_m is None else m_to_um(simulated_m).tolist(),
-    )
-
-
-class PlanStore:
-    """Records of plans by id, thread-safe. Beyond RECORDS_MAX or PULSES_MAX the oldest ended plans are dropped.
-
-    end_callbacks: called with every plan that ends, by any thread; must not block
-    """
-
-    def __init__(self) -> None:
-        self.end_callbacks: list[Callable[[PlanRecord], None]] = []
-        self._lock = threading.Lock()
-        self._records: dict[str, PlanRecord] = {}
-
-    def add(self, record: PlanRecord) -> None:
-        """Add a plan."""
-        record.on_end = self._run_end_callbacks
-        with self._lock:
-            self._records[record.plan_id] = record
-            pulses = sum(len(kept.planned.plan) for kept in self._records.values())
-            for plan_id, oldest in list(self._records.items()):
-                if not oldest.has_ended or (len(self._records) <= RECORDS_MAX and pulses <= PULSES_MAX):
-                    break
-                del self._records[plan_id]
-                pulses -= len(oldest.planned.plan)
-
-    def _run_end_callbacks(self, record: PlanRecord) -> None:
-        for callback in self.end_callbacks:
-            callback(record)
-
-    def find(self, plan_id: str) -> PlanRecord:
-        """Return a plan by its id. Raise InputError (plan_not_found) for an unknown plan."""
-        with self._lock:
-            record = self._records.get(plan_id)
-        if record is None:
-            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "plan_not_found")
-        return record
-
-    def list_recent(self) -> list[PlanRecord]:
-        """Return the latest plans, oldest first."""
-        with self._lock:
-            return list(self._records.values())[-RECENT_PLANS:]
+def _to_um(value_m: float | None) -> float | None:
+    return None if value_m is None else m_to_um(value_m)

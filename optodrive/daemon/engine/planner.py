@@ -10,9 +10,9 @@ from typing import Protocol, TypeVar
 from optodrive.core.clock import Clock
 from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_record
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
-from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
@@ -114,23 +114,23 @@ class Planner:
 
         try:
             check(0.0)
-            record = self._plan_until_committed(request.build(), request, check)
-            return record.build_report(self._session.board_s())
+            plan = self._plan_until_committed(request.build(), request, check)
+            return plan.record.build_report(self._session.board_s())
         finally:
             self._progress_at_s = self._clock.now_s()
 
     def _plan_until_committed(
         self, sequence: FrameSequence, request: PlanningRequest, check: Callable[[float], None]
-    ) -> PlanRecord:
+    ) -> ActivePlan:
         planning_time_s, late_count = PLANNING_TIME_FACTOR * self._last_planning_s, 0
         while True:
             check(0.0)
             self._require_armed()
             if request.streamed and self._plan_queue.must_preempt:
                 self._run_in_loop(lambda: self._preempt(request))
-            record = self._plan_once(sequence, request, planning_time_s, check)
-            if record is not None:
-                return record
+            plan = self._plan_once(sequence, request, planning_time_s, check)
+            if plan is not None:
+                return plan
             # The snapshot is stale: a predecessor was late, or has sent points beyond the splice.
             late_count += 1
             planning_time_s = PLANNING_TIME_FACTOR * (1 + late_count) * self._last_planning_s
@@ -148,11 +148,11 @@ class Planner:
         request: PlanningRequest,
         planning_time_s: float,
         check: Callable[[float], None],
-    ) -> PlanRecord | None:
+    ) -> ActivePlan | None:
         """Plan once. Return None if the snapshot became stale meanwhile."""
         began_s = self._clock.now_s()
         snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
         plan_id = f"p{next(self._ids)}"
-        record = make_record(self._display, self._session.scale, request, sequence, snapshot, plan_id, check)
+        plan = make_plan(self._display, self._session.scale, request, sequence, snapshot, plan_id, check)
         self._last_planning_s = self._clock.now_s() - began_s
-        return record if self._run_in_loop(lambda: self._plan_queue.commit(record, snapshot)) else None
+        return plan if self._run_in_loop(lambda: self._plan_queue.commit(plan, snapshot)) else None

@@ -49,7 +49,7 @@ class PlannerServer:
             engine, clock, lambda message: engine.commands.post(partial(self._send_telemetry, message))
         )
         self._telemetry.start()
-        engine.add_plan_end_callback(lambda record: engine.commands.post(partial(self._report_end, record)))
+        engine.add_plan_end_callback(lambda plan: engine.commands.post(partial(self._report_end, plan.record)))
 
     def close(self) -> None:
         """End the connections and the threads."""

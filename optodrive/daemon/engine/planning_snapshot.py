@@ -7,7 +7,7 @@ import numpy as np
 
 from optodrive.core.types.arrays import BoolArray
 from optodrive.core.types.plans import BudgetState
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.limiter.budget import Budget
@@ -30,7 +30,7 @@ class PlanningSnapshot:
     start_s: float
     heat: ThermalState
     budget: BudgetState
-    predecessor: PlanRecord | None = None
+    predecessor: ActivePlan | None = None
     cut_row: int = 0
     initial_pixel: int | None = None
     refreshed: BoolArray | None = None
@@ -47,44 +47,44 @@ class RefreshCycle(NamedTuple):
 
 
 def build_cut_snapshot(
-    record: PlanRecord, thermal: ThermalEstimate, min_start_s: float, budget: Budget
+    running: ActivePlan, thermal: ThermalEstimate, min_start_s: float, budget: Budget
 ) -> PlanningSnapshot | None:
     """Build the snapshot for truncating a running plan before its first pulse after board time min_start_s.
 
     Return None if no pulse would be left, or none would be dropped.
     """
-    plan = record.planned.plan
-    cut_row = int(np.searchsorted(plan.start_s, min_start_s - record.start_s))
+    plan, zero_s = running.planned.plan, running.record.start_s
+    cut_row = int(np.searchsorted(plan.start_s, min_start_s - zero_s))
     # The mirrors point at the last pulse's pixel only if that pulse emits.
     while 0 < cut_row < len(plan) and plan.power_w[cut_row - 1] == 0.0:
         cut_row += 1
     if not 0 < cut_row < len(plan):
         return None
     end_s = float(plan.start_s[cut_row - 1] + plan.width_s[cut_row - 1])
-    heat = record.heat_before.copy()
+    heat = running.heat_before.copy()
     heat.apply_pulses(plan.pixel[:cut_row], plan.start_s[:cut_row], plan.width_s[:cut_row], plan.power_w[:cut_row])
-    state = commit_until(plan, float(plan.start_s[cut_row]), record.budget_before, budget)
+    state = commit_until(plan, float(plan.start_s[cut_row]), running.budget_before, budget)
     return PlanningSnapshot(
         thermal=thermal,
-        start_s=record.start_s + end_s,
+        start_s=zero_s + end_s,
         heat=heat.copy_shifted(-end_s),
         budget=shift_state(state, -end_s),
-        predecessor=record,
+        predecessor=running,
         cut_row=cut_row,
         initial_pixel=int(plan.pixel[cut_row - 1]),
-        refreshed=mark_refreshed(record, cut_row),
+        refreshed=mark_refreshed(running, cut_row),
     )
 
 
-def mark_refreshed(record: PlanRecord, cut_row: int) -> BoolArray:
+def mark_refreshed(truncated: ActivePlan, cut_row: int) -> BoolArray:
     """Return the pixels that a refresh cycle has drawn when its plan is truncated, [p].
 
     All pixels are unmarked if the dropped pulses contain no pixel that is still to be drawn: a new cycle starts.
     """
-    pixel = record.planned.plan.pixel
-    if record.refreshed is None:
-        refreshed = np.zeros(len(record.heat_before.pixels), dtype=np.bool_)
+    pixel = truncated.planned.plan.pixel
+    if truncated.refreshed is None:
+        refreshed = np.zeros(len(truncated.heat_before.pixels), dtype=np.bool_)
     else:
-        refreshed = record.refreshed.copy()
+        refreshed = truncated.refreshed.copy()
     refreshed[pixel[:cut_row]] = True
     return refreshed if not refreshed[pixel[cut_row:]].all() else np.zeros_like(refreshed)

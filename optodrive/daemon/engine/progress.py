@@ -3,14 +3,14 @@
 from collections.abc import Iterable
 from typing import NamedTuple
 
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.link.session.plan_job import PlanJob
 
 
 class PlanRun(NamedTuple):
     """Running plan with its job."""
 
-    record: PlanRecord
+    plan: ActivePlan
     job: PlanJob
 
 

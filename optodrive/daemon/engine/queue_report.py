@@ -7,8 +7,8 @@ from optodrive.daemon.responses.state import QueuedPlan, QueueReport, RecentPlan
 
 def build_queue_report(plan_queue: PlanQueue, recent: list[PlanRecord], board_now_s: float) -> QueueReport:
     """Report the running and waiting plans with their progress at a board time, s, and the recent ones."""
-    running = [run.record for run in plan_queue.running.copy()]
-    waiting = plan_queue.waiting.copy()
+    running = [run.plan.record for run in plan_queue.running.copy()]
+    waiting = [plan.record for plan in plan_queue.waiting.copy()]
     return QueueReport(
         waiting=len(waiting),
         running=running[0].plan_id if running else None,
@@ -23,18 +23,17 @@ def _build_recent(record: PlanRecord) -> RecentPlan:
         name=record.name,
         caller=record.caller,
         status=record.status,
-        planned=len(record.planned.plan),
+        planned=record.pulse_count,
         executed=record.executed_count,
         error=record.error,
     )
 
 
 def _build_queued(record: PlanRecord, board_now_s: float) -> QueuedPlan:
-    duration_s = record.planned.duration_s
     starts_in_s = record.start_s + record.delay_s - board_now_s
     return QueuedPlan(
         **dict(_build_recent(record)),
-        duration_s=duration_s,
+        duration_s=record.duration_s,
         starts_in_s=starts_in_s,
-        ends_in_s=max(0.0, starts_in_s + duration_s),
+        ends_in_s=max(0.0, starts_in_s + record.duration_s),
     )

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from optodrive import __version__
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.plan_simulation import compute_simulated_m
 from optodrive.daemon.log import DaemonLog
 from optodrive.lab.recording.session_recorder import SessionRecorder
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.effective_config import build_effective_config
-from optodrive.planning.plan_summary import summarize_plan
 from optodrive.planning.stimuli.train_json import train_to_json
 
 PlanEntry = tuple[dict[str, Any], dict[str, np.ndarray[Any, Any]]]
@@ -38,9 +37,9 @@ def describe_display(display: DisplayModel) -> dict[str, Any]:
     }
 
 
-def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> PlanEntry:
+def build_plan_entry(active: ActivePlan, tick_s: float, board_now_s: float) -> PlanEntry:
     """Return the entry of an ended plan: request, plan, execution on the board's clock, and simulated heights."""
-    planned, plan = record.planned, record.planned.plan
+    record, planned, plan = active.record, active.planned, active.planned.plan
     frames = planned.sequence.frames
     trains = [train_to_json(train) for train in planned.sequence.trains]
     attributes: dict[str, Any] = {
@@ -49,7 +48,7 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
         "status": record.status,
         "error": record.error,
         "start_s": record.start_s,
-        "summary": summarize_plan(planned, record.feasibility).model_dump_json(),
+        "summary": record.summary_json.decode(),
         "trains": json.dumps(trains),
     }
     arrays = {
@@ -60,13 +59,13 @@ def build_plan_entry(record: PlanRecord, tick_s: float, board_now_s: float) -> P
         "planned": np.column_stack([plan.start_s, plan.width_s, plan.power_w, plan.pixel, plan.trimmed_j]),
         "predicted_m": planned.predicted_m,
     }
-    executed = record.executed
+    executed = active.executed
     if executed is not None and len(executed):
         on_s = executed.on_tick * tick_s
         unix_s = time.time() - (board_now_s - float(on_s[0]))
         attributes |= {"first_pulse_unix_s": unix_s, "first_pulse_at": datetime.fromtimestamp(unix_s, UTC).isoformat()}
         arrays["executed"] = np.column_stack([on_s, executed.width_s, executed.power_w, executed.pixel])
-        heights_m = record.simulated_m if record.simulated_m is not None else compute_simulated_m(record)
+        heights_m = active.simulated_m if active.simulated_m is not None else compute_simulated_m(active)
         if heights_m is not None:
             arrays["simulated_m"] = heights_m
     return attributes, arrays
@@ -80,8 +79,8 @@ def start_session_recorder(engine: Engine, path: Path | None, log: DaemonLog) ->
     path = build_session_path(Path(folder)) if path is None else path
     recorder = SessionRecorder(path, describe_display(engine.display), log.warn)
 
-    def record_plan(record: PlanRecord) -> None:
-        recorder.record(lambda: build_plan_entry(record, engine.scale.tick_s, engine.board_s()))
+    def record_plan(plan: ActivePlan) -> None:
+        recorder.record(lambda: build_plan_entry(plan, engine.scale.tick_s, engine.board_s()))
 
     engine.add_plan_end_callback(record_plan)
     return recorder

@@ -7,7 +7,7 @@ from math import isfinite
 import numpy as np
 
 from optodrive.core.types.arrays import FloatArray, IntArray
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.responses.telemetry import CapUsage, DisplayEvent, PulseBatch
 from optodrive.device.config import LimitsSection
 from optodrive.physics.nominal_display import DisplayState
@@ -29,13 +29,13 @@ def build_display_event(board_s: float, warm: bool, state: DisplayState, ambient
 
 
 def build_pulse_batch(
-    record: PlanRecord, row: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
+    active: ActivePlan, row: IntArray, start_s: FloatArray, width_s: FloatArray, power_w: FloatArray
 ) -> PulseBatch:
     """Build a batch from rows [n] of a plan with their times on the board's clock and their powers."""
-    plan = record.planned.plan
+    plan = active.planned.plan
     return PulseBatch(
-        plan=record.plan_id,
-        name=record.name,
+        plan=active.record.plan_id,
+        name=active.record.name,
         row=row.tolist(),
         pixel=plan.pixel[row].tolist(),
         start_s=_round_values(start_s, 6),

@@ -13,9 +13,9 @@ from optodrive.core.clock import Clock
 from optodrive.core.ipc import Message
 from optodrive.core.json_model import JsonModel
 from optodrive.core.types.arrays import FloatArray, IntArray
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.daemon.engine.display_snapshot import ExecutedBatch, LiveThermalState
 from optodrive.daemon.engine.engine import Engine
-from optodrive.daemon.engine.plan_record import PlanRecord
 from optodrive.daemon.engine.progress import ClockShift, merge_events
 from optodrive.daemon.engine.telemetry_events import build_display_event, build_pulse_batch, describe_caps
 from optodrive.daemon.responses.telemetry import BudgetEvent
@@ -28,9 +28,10 @@ WARM_DISPLACEMENT_M, WARM_RISE_K = 5e-8, 0.1
 """A pixel above either threshold is warm."""
 ANNOUNCE_LEAD_S = 1.0
 """Planned pulses are published this long before they start."""
-BATCHES_MAX = 300
-"""Batches of pulses that are kept for later readers."""
+BATCHES_MAX, PULSES_KEPT_MAX = 300, 6000
+"""Batches and pulses that are kept for later readers."""
 PULSES_MAX = 3000
+"""Pulses of one batch; the earlier ones are omitted."""
 
 
 class TelemetryProducer:
@@ -139,26 +140,28 @@ class TelemetryProducer:
             if len(executed.row):
                 self._executed_state.apply(executed)
                 columns = (executed.start_s, executed.width_s, executed.power_w)
-                self._add_batch("executed", executed.record, executed.row, *columns)
+                self._add_batch("executed", executed.plan, executed.row, *columns)
 
     def _announce_planned(self, board_s: float) -> None:
         """Publish the planned pulses that start soon."""
-        records = self._engine.list_upcoming()
-        self._has_upcoming = bool(records)
-        self._announced_rows = {record.plan_id: self._announced_rows.get(record.plan_id, 0) for record in records}
-        for record in records:
-            plan, begin = record.planned.plan, self._announced_rows[record.plan_id]
+        upcoming = self._engine.list_upcoming()
+        self._has_upcoming = bool(upcoming)
+        plan_ids = [active.record.plan_id for active in upcoming]
+        self._announced_rows = {plan_id: self._announced_rows.get(plan_id, 0) for plan_id in plan_ids}
+        for active in upcoming:
+            record, plan = active.record, active.planned.plan
+            begin = self._announced_rows[record.plan_id]
             end = int(np.searchsorted(plan.start_s, board_s + ANNOUNCE_LEAD_S - record.start_s))
             if end > begin:
                 row = np.arange(begin, end)
                 columns = (plan.start_s[begin:end] + record.start_s, plan.width_s[begin:end], plan.power_w[begin:end])
-                self._add_batch("planned", record, row, *columns)
+                self._add_batch("planned", active, row, *columns)
                 self._announced_rows[record.plan_id] = end
 
     def _add_batch(
         self,
         kind: str,
-        record: PlanRecord,
+        plan: ActivePlan,
         row: IntArray,
         start_s: FloatArray,
         width_s: FloatArray,
@@ -166,7 +169,7 @@ class TelemetryProducer:
     ) -> None:
         newest = slice(-PULSES_MAX, None)
         row = row[newest]
-        batch = build_pulse_batch(record, row, start_s[newest], width_s[newest], power_w[newest])
+        batch = build_pulse_batch(plan, row, start_s[newest], width_s[newest], power_w[newest])
         self._batch_number += 1
         fields = {
             "number": self._batch_number,
@@ -176,5 +179,8 @@ class TelemetryProducer:
         }
         message = Message("pulses", fields, batch.model_dump_json().encode())
         self._batches.append(message)
+        kept_pulses = sum(batch.fields["count"] for batch in self._batches)
+        while kept_pulses > PULSES_KEPT_MAX:
+            kept_pulses -= self._batches.popleft().fields["count"]
         if self._readers:
             self._publish_message(message)

@@ -1,14 +1,14 @@
 """Thermal state and budget state on the board's time line, as estimated by the daemon."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import inf
 from typing import NamedTuple, Self
 
 import numpy as np
 
-from optodrive.core.types.plans import BudgetState, ExecutedPulses, LimitedPlan
-from optodrive.daemon.engine.plan_record import PlanRecord
+from optodrive.core.types.plans import BudgetState, ExecutedPulses, PulsePlan
+from optodrive.daemon.engine.active_plan import ActivePlan
 from optodrive.physics.thermal_state import ThermalState
 from optodrive.planning.limiter.budget import Budget
 from optodrive.planning.limiter.limiter import commit_until, shift_state
@@ -52,20 +52,20 @@ class EndedPlan(NamedTuple):
     heat_before: ThermalState
     budget_before: BudgetState
     start_s: float
-    plan: LimitedPlan
+    plan: PulsePlan
     dropped: int
     executed: ExecutedPulses | None
 
     @classmethod
-    def from_record(cls, record: PlanRecord) -> Self:
-        """Build it from a record."""
+    def from_plan(cls, plan: ActivePlan) -> Self:
+        """Build it from a plan that waits, runs or has ended."""
         return cls(
-            record.heat_before,
-            record.budget_before,
-            record.start_s,
-            record.planned.plan,
-            record.dropped,
-            record.executed,
+            plan.heat_before,
+            plan.budget_before,
+            plan.record.start_s,
+            PulsePlan(**{item.name: getattr(plan.planned.plan, item.name) for item in fields(PulsePlan)}),
+            plan.record.dropped,
+            plan.executed,
         )
 
 

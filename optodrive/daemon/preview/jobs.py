@@ -8,7 +8,7 @@ from optodrive.core.ipc import Message
 from optodrive.core.json_model import iterate_json
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.dry_run import DryRunStart
-from optodrive.daemon.engine.plan_making import PlanningRequest, make_record
+from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
 from optodrive.daemon.engine.thermal_estimate import ThermalEstimate
 from optodrive.daemon.responses.error_problem import build_error_problem
@@ -69,5 +69,5 @@ def plan_dry_run(
     request = PlanningRequest(lambda: sequence, fields["name"], fields["policy"], fields["fit"])
     thermal = ThermalEstimate(start.heat, start.budget)
     snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
-    record = make_record(display, scale, request, sequence, snapshot, DRY_RUN_PLAN, lambda fraction: None)
-    return record.build_report(0.0)
+    plan = make_plan(display, scale, request, sequence, snapshot, DRY_RUN_PLAN, lambda fraction: None)
+    return plan.record.build_report(0.0)

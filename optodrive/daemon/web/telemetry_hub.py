@@ -26,7 +26,7 @@ STATE_PERIOD_S, PULSES_PERIOD_S = 0.5, 0.08
 BATCHES_MAX = 300
 """Batches of pulses that are kept for slow readers."""
 PULSES_MAX = 6000
-"""Pulses of one event."""
+"""Pulses of one event, and of all kept batches."""
 
 
 class EventStream(StreamingResponse):
@@ -93,6 +93,9 @@ class TelemetryHub:
             self._board_s = fields["board_s"]
             text = message.payload.decode()
             self._batches.append(_Batch(self._batch_number, fields["count"], str(fields["batch"]), text))
+            kept_pulses = sum(batch.pulse_count for batch in self._batches)
+            while kept_pulses > PULSES_MAX:
+                kept_pulses -= self._batches.popleft().pulse_count
 
     def publish_state(self, state: StateReport) -> None:
         """Make the state event if the state has changed or the event is due, and the fault event if that has changed.

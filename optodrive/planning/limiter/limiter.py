@@ -193,7 +193,7 @@ def concatenate(batches: list[LimitedPlan], state: BudgetState, budget: Budget) 
 
 
 def commit_until(
-    plan: LimitedPlan,
+    plan: PulsePlan,
     until_s: float,
     state: BudgetState,
     budget: Budget,

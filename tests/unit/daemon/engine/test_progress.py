@@ -4,8 +4,8 @@ from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun, 
 
 
 def test_consecutive_events_of_a_run_are_merged_and_nothing_is_lost_or_reordered():
-    first, second = (PlanRun(record, job) for record, job in ((object(), object()), (object(), object())))
-    again = PlanRun(first.record, first.job)  # another tuple for the same run
+    first, second = (PlanRun(plan, job) for plan, job in ((object(), object()), (object(), object())))
+    again = PlanRun(first.plan, first.job)  # another tuple for the same run
     events = [
         PlanProgress(first, 0, 3),
         PlanProgress(again, 3, 9),

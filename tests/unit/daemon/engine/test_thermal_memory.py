@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optodrive.daemon.engine.plan_queue import HOLD_MAX_S, PlanQueue
-from optodrive.daemon.engine.plan_record import PlanStore
+from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.thermal_memory import HEADER, ThermalMemory
 from optodrive.planning.limiter.cap_checks import compute_levels
 from planner_rig import DISPLAY, InlineExecutor, PlannerRig, build_frame, build_train

@@ -199,7 +199,7 @@ def test_a_body_that_is_built_too_slowly_ends_at_its_limit_and_others_are_built_
 
 def test_a_dry_run_that_takes_too_long_ends_at_its_limit(start, monkeypatch):
     monkeypatch.setitem(worker.WALL_S, "dry_run", 0.5)
-    monkeypatch.setattr(jobs, "make_record", build_slowly)
+    monkeypatch.setattr(jobs, "make_plan", build_slowly)
     preview = start()
     preview.dry_run(1, SMALL)
     assert_serves(preview)
@@ -228,7 +228,7 @@ def test_a_worker_that_crashes_costs_only_its_job(start):
 
 
 def test_the_work_of_a_caller_that_left_ends_at_once(start, monkeypatch):
-    monkeypatch.setattr(jobs, "make_record", build_slowly)
+    monkeypatch.setattr(jobs, "make_plan", build_slowly)
     preview = start()
     for job_id in range(3):  # one runs, two wait
         preview.dry_run(job_id, SMALL)

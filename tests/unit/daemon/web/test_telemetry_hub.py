@@ -123,6 +123,7 @@ def test_a_slow_reader_gets_the_newest_pulses(monkeypatch):
         reader = Reader(hub)
         ((_, data),) = await reader.until(1)
         assert [batch.row for batch in PulsesEvent.model_validate_json(data).executed] == [[2], [3], [4]]
+        assert len(hub._batches) == 3  # older ones are never sent, and not kept
         await reader.leave()
 
     run(scenario)

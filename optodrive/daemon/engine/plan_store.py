@@ -1,0 +1,54 @@
+"""Records of the latest plans by id."""
+
+import threading
+from collections.abc import Callable
+
+from optodrive.core.errors import InputError
+from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.plan_record import PlanRecord
+
+RECORDS_MAX = 200
+BYTES_MAX = 30_000_000
+"""Beyond these numbers of plans or bytes the oldest ended plans are dropped."""
+RECENT_PLANS = 20
+
+
+class PlanStore:
+    """Records of plans by id, thread-safe. Beyond RECORDS_MAX or BYTES_MAX the oldest ended plans are dropped.
+
+    end_callbacks: called with every plan that ends, by any thread; must not block
+    """
+
+    def __init__(self) -> None:
+        self.end_callbacks: list[Callable[[ActivePlan], None]] = []
+        self._lock = threading.Lock()
+        self._records: dict[str, PlanRecord] = {}
+
+    def add(self, plan: ActivePlan) -> None:
+        """Keep the record of a plan."""
+        plan.on_end = self._run_end_callbacks
+        with self._lock:
+            self._records[plan.record.plan_id] = plan.record
+            kept_bytes = sum(kept.nbytes for kept in self._records.values())
+            for plan_id, oldest in list(self._records.items()):
+                if not oldest.has_ended or (len(self._records) <= RECORDS_MAX and kept_bytes <= BYTES_MAX):
+                    break
+                del self._records[plan_id]
+                kept_bytes -= oldest.nbytes
+
+    def _run_end_callbacks(self, plan: ActivePlan) -> None:
+        for callback in self.end_callbacks:
+            callback(plan)
+
+    def find(self, plan_id: str) -> PlanRecord:
+        """Return a plan by its id. Raise InputError (plan_not_found) for an unknown plan."""
+        with self._lock:
+            record = self._records.get(plan_id)
+        if record is None:
+            raise InputError("plan", plan_id, f"one of the last {RECORDS_MAX} plans", "plan_not_found")
+        return record
+
+    def list_recent(self) -> list[PlanRecord]:
+        """Return the latest plans, oldest first."""
+        with self._lock:
+            return list(self._records.values())[-RECENT_PLANS:]
