@@ -106,8 +106,8 @@ class ServiceRig:
         self.until(lambda: self.session.connected)
         return self
 
-    def arm(self, client=WEB):
-        result = self.await_result(client, self.request(client, "arm"))
+    def arm(self, client=WEB, **fields):
+        result = self.await_result(client, self.request(client, "arm", **fields))
         assert result["error"] is None, result
         return self
 

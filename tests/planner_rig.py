@@ -112,10 +112,11 @@ class PlannerRig(ServiceRig):
         self.queue.update_jobs(self.remote.pop_refusal())
         self.queue.start_next()
 
-    def submit(self, sequence, epoch, streamed=False):
+    def submit(self, sequence, epoch, streamed=False, caller=""):
         """Plan a sequence; return its future."""
+        arrived_s = self.remote.board_s()
         return self.planner.submit(
-            PlanningRequest(lambda: sequence, "push", streamed=streamed, arrived_s=self.remote.board_s(), epoch=epoch)
+            PlanningRequest(lambda: sequence, "push", "trim", "as_is", streamed, arrived_s, epoch, caller)
         )
 
     def ready(self):

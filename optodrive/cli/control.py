@@ -93,6 +93,8 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
     print(f"display   {state.display}, {state.pixels} pixels")
     print(f"link      {link.port}: {link.state}")
     print(f"board     {board.state}" + (f", fault {board.fault}: {board.hint}" if board.fault else ""))
+    if state.control is not None:
+        print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
     if link.state == "up":

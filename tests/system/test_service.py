@@ -5,7 +5,6 @@ import os
 import re
 import shutil
 import signal
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from optodrive.core.kernels import code_folder
 from optodrive.device.config_file import locate_shipped
 from rig import OPTODRIVE, TOKEN, Daemon, long_train, wait_for
 from sandbox import build_sandboxed, find_obstacle
+from service_manager import Manager, reload
 
 TRANSPORTS = {
     "serial": 'transport = "serial"\nport = "/dev/optodrive-board"\nvendor_id = 0x2e8a\nproduct_id = 0x000a\n',
@@ -67,28 +67,6 @@ def test_an_invalid_unit_is_detected(unit):
 # --- notifications -----------------------------------------------------------------------------------------------
 
 
-class Manager:
-    """Receiver of notifications in place of systemd."""
-
-    def __init__(self, folder, monkeypatch, watchdog_us=200_000):
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._socket.bind(str(folder / "notify"))
-        self._socket.settimeout(0.01)
-        self.heard = []
-        monkeypatch.setenv("NOTIFY_SOCKET", str(folder / "notify"))
-        monkeypatch.setenv("WATCHDOG_USEC", str(watchdog_us))
-
-    def listen(self):
-        while True:
-            try:
-                self.heard += self._socket.recv(4096).decode().split("\n")
-            except TimeoutError:
-                return self.heard
-
-    def close(self):
-        self._socket.close()
-
-
 @pytest.fixture
 def manager(tmp_path, monkeypatch):
     manager = Manager(tmp_path, monkeypatch)
@@ -116,16 +94,6 @@ def test_a_restarted_service_is_not_armed(manager, board, make_daemon):
 
 
 # --- SIGHUP -----------------------------------------------------------------------------------------------------
-
-
-def reload(daemon, manager, edit):
-    """Edit the configuration, request a reload and return the log line."""
-    daemon.config.write_text(edit(daemon.config.read_text()))
-    lines, ready = daemon.errors.read_text(), manager.listen().count("READY=1")
-    daemon.process.send_signal(signal.SIGHUP)
-    wait_for(lambda: manager.listen().count("READY=1") > ready, "the reload's end")
-    assert "RELOADING=1" in manager.heard
-    return daemon.errors.read_text().removeprefix(lines)
 
 
 def test_sighup_applies_reloadable_keys_and_reports_the_others(manager, board, make_daemon):

@@ -241,6 +241,10 @@ class Engine:
 
         return self.commands.submit(end)
 
+    def revoke(self, caller: str) -> None:
+        """End all plans of a caller whose token was revoked. Only the engine's thread may call it."""
+        self._plan_queue.revoke(caller)
+
     def add_plan_end_callback(self, callback: Callable[[ActivePlan], None]) -> None:
         """Register a callback for every plan that ends. Any thread may call it; it must not block."""
         self._plan_store.end_callbacks.append(callback)

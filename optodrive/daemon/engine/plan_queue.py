@@ -21,6 +21,7 @@ from optodrive.daemon.engine.planning_snapshot import (
     mark_refreshed,
 )
 from optodrive.daemon.engine.progress import ClockShift, PlanProgress, PlanRun
+from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from optodrive.daemon.engine.thermal_estimate import EndedPlan, ThermalEstimate, rewind_estimate
 from optodrive.daemon.engine.thermal_memory import SavedThermalState
 from optodrive.daemon.responses.plan import PlanStatus
@@ -68,6 +69,7 @@ class PlanQueue:
         self._thermal = ThermalEstimate(*display.build_cold_state())
         self._queue_end_s = 0.0
         self._refresh_cycle: RefreshCycle | None = None
+        self._revoked_callers = RevokedCallers()
 
     @property
     def is_busy(self) -> bool:
@@ -120,12 +122,13 @@ class PlanQueue:
     def commit(self, plan: ActivePlan, snapshot: PlanningSnapshot) -> bool:
         """Accept a plan into the queue. Return False if its snapshot is stale or its splice too late.
 
-        Raise StoppedError if the epoch of its request has passed.
+        Raise StoppedError if the epoch of its request has passed, or if the token of its caller was revoked.
         """
         self._session.receive()  # a STOP that has been answered is known from here on
         record = plan.record
         with self.lock:
             self.require_epoch(plan.epoch)
+            self._revoked_callers.require_valid(record.caller, record.arrived_s)
             # A snapshot is stale if an earlier plan was late or failed, or the board restarted.
             if self._thermal is not snapshot.thermal:
                 return False
@@ -200,16 +203,23 @@ class PlanQueue:
         plan.record.dropped = plan.record.pulse_count
         plan.end("superseded", "replaced by a newer plan")
 
-    def cancel(self, record: PlanRecord) -> None:
-        """Remove a waiting plan, or turn the gate off and end a running plan with its splices."""
+    def cancel(self, record: PlanRecord, reason: str = "") -> None:
+        """Remove a waiting plan, or turn the gate off and end a running plan with its splices. reason: for people."""
         plan = next((plan for plan in self.waiting if plan.record is record), None)
         if plan is not None:
             with self.lock:
                 self.waiting.remove(plan)
-            plan.end("cancelled", "removed from the queue")
+            plan.end("cancelled", reason or "removed from the queue")
         elif any(run.plan.record is record for run in self.running):
             self._session.flush()
-            self.end_running("cancelled", "cancelled while running")
+            self.end_running("cancelled", reason or "cancelled while running")
+
+    def revoke(self, caller: str) -> None:
+        """End all plans of a caller whose token was revoked, and accept none that was requested before now."""
+        reason = self._revoked_callers.revoke(caller, self._session.board_s())
+        for plan in [*self.waiting, *(run.plan for run in self.running)]:
+            if plan.record.caller == caller:
+                self.cancel(plan.record, reason)
 
     # --- running plans ------------------------------------------------------------------------------------------
 

@@ -68,6 +68,7 @@ class PlannerServer:
             "get_plan": lambda: self._answer(
                 connection, fields["id"], lambda: self._engine.get_plan(fields["plan"], fields["pulses"])
             ),
+            "revoke": lambda: self._engine.revoke(fields["caller"]),
             "cancel": lambda: self._cancel(connection, fields["id"], fields["plan"]),
             "metrics": lambda: self._reply(connection, fields["id"], 200, self._engine.render_metrics().encode()),
             "snapshot": lambda: self._reply(connection, fields["id"], 200, build_dry_run_start(self._engine)),

@@ -6,6 +6,7 @@ from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
+    ControlReport,
     LinkReport,
     PlannerReport,
     PlannerState,
@@ -39,6 +40,7 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
             **session.stats,
         ),
         board=_build_board_report(session),
+        control=None if session.control is None else ControlReport(**session.control),
         queue=planner_state.queue,
         totals=planner_state.totals,
         planner=planner_state.planner,

@@ -50,6 +50,13 @@ class BoardReport(JsonModel):
         return self.state in ARMED_STATES
 
 
+class ControlReport(JsonModel):
+    """Who armed the board: the name of a token, and the time since the request."""
+
+    caller: str
+    armed_for_s: float
+
+
 class RecentPlan(JsonModel):
     """One of the latest plans: its caller (the name of a token), and how many of its planned pulses were executed."""
 
@@ -104,12 +111,13 @@ class PlannerState(JsonModel):
 
 
 class StateReport(JsonModel):
-    """The daemon's state: display, link, board, queue, totals and planner."""
+    """The daemon's state: display, link, board, queue, totals and planner; `control` is null unless armed."""
 
     display: str
     pixels: int
     link: LinkReport
     board: BoardReport
+    control: ControlReport | None
     queue: QueueReport
     totals: PulseTotals
     planner: PlannerReport

@@ -68,6 +68,7 @@ class LinkView:
 
     def stop(self) -> None:
         """Send STOP. It is answered when the board has confirmed it, or at once if there is no board."""
+        self.is_stopped = False
         try:
             if self._connection is not None:
                 self._connection.send(Message("stop", {"id": 1}))

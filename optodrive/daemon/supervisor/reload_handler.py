@@ -27,12 +27,15 @@ class ReloadHandler:
             result = self._reloader.reload(self._supervisor.link_view.board_state)
         except OptodriveError as error:
             self._log.write(f"not reloaded, nothing changed: {error}", "err", EVENT="reload-refused")
-            self._notifier.send("READY=1")
+            self._notifier.send("READY=1", f"STATUS=not reloaded: {error}")
             return
         self._number += 1
         self._applied = result
         if not self._supervisor.send_to_web(result.build_web_message(self._number)):
-            self._finish(result)  # the web process gets it when it starts
+            # The web process gets it when it starts; a caller who has lost the right may have armed the board.
+            if result.revoked:
+                self._supervisor.link_view.stop()
+            self._finish(result)
 
     def on_web_message(self, fields: dict[str, Any]) -> None:
         """End the reload when the web process has applied it."""
@@ -42,4 +45,4 @@ class ReloadHandler:
     def _finish(self, result: ReloadResult) -> None:
         self._applied = None
         self._log.write(result.line, "notice", EVENT="reloaded")
-        self._notifier.send("READY=1")
+        self._notifier.send("READY=1", f"STATUS={result.line}")

@@ -3,31 +3,29 @@
 It runs in front of the application, so that no new route can omit the checks.
 """
 
-import math
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 from starlette.requests import ClientDisconnect
 
-from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
-from optodrive.daemon.web.access_policy import ANONYMOUS, AccessPolicy, RequestContext
+from optodrive.daemon.responses.problem import Problem, build_problem
+from optodrive.daemon.web.access_policy import AccessPolicy, RequestContext
+from optodrive.daemon.web.problem_response import send_login_page, send_problem
 from optodrive.daemon.web.request_limits import (
     App,
     BoundedBody,
-    Message,
     RateLimitedFrames,
     Receive,
     Scope,
     Send,
     receive_empty_body,
 )
+from optodrive.daemon.web.revocation import RequestInProgress, build_revoked_problem
 from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
-from optodrive.daemon.web.server_state import TRUSTED
-from optodrive.daemon.web.static_files import SECURITY_HEADERS, is_page_request, load_login_page
+from optodrive.daemon.web.server_state import CALLER
+from optodrive.daemon.web.static_files import is_page_request
 
-CALLER = "optodrive.caller"
-"""Key in the ASGI scope of the token that the request presented."""
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
 STREAMS = ("GET /v1/telemetry", "WEBSOCKET /v1/stream")
@@ -54,6 +52,8 @@ class AccessMiddleware:
         problem = self._policy.check(request, self._table)
         if problem is None and request.route is not None and request.route.key == ARM:
             problem = await self._record_intent(request)
+            if self._policy.is_revoked(request.token):
+                problem = build_revoked_problem(request.token)
         if problem is None:
             with self._load.count(request) as problem:
                 if problem is None:
@@ -64,25 +64,28 @@ class AccessMiddleware:
         )
         prefix = "websocket.http" if scope["type"] == "websocket" else "http"
         if problem.status == 401 and is_page_request(request.method, request.path):
-            await _send_login_page(send, prefix)
+            await send_login_page(send, prefix)
         else:
-            await _send_problem(send, problem, prefix)
+            await send_problem(send, problem, prefix)
 
     async def _forward(self, request: RequestContext, scope: Scope, receive: Receive, send: Send) -> None:
-        body = self._bound_receive(request, receive)
+        in_progress = RequestInProgress(scope["type"], receive, send)
+        body = self._bound_receive(request, in_progress.receive)
         audit_fields: dict[str, object] = {}
         scope[AUDIT_FIELDS] = audit_fields
         scope[CALLER] = request.token
-        scope[TRUSTED] = request.token is not ANONYMOUS
-        status_recorder = _StatusRecorder(send)
+        is_stop = request.route is not None and request.route.key == STOP
         try:
-            await self._app(scope, body, status_recorder)
+            with nullcontext() if is_stop else self._policy.in_progress.track(in_progress, request.token):
+                await self._app(scope, body, in_progress.send)
         except ClientDisconnect:  # within its body: there is nobody to answer
             audit_fields["hung_up"] = True
         finally:
             if isinstance(body, BoundedBody | RateLimitedFrames):
                 audit_fields |= body.audit_fields
-            self._record(request, {**audit_fields, "event": "answered", "status": status_recorder.status})
+            if in_progress.is_revoked:
+                audit_fields["revoked"] = True
+            self._record(request, {**audit_fields, "event": "answered", "status": in_progress.status})
 
     def _bound_receive(self, request: RequestContext, receive: Receive) -> Receive:
         if request.route is not None and request.route.key == STOP:
@@ -139,55 +142,9 @@ class CallerLoad:
                         del counter[caller]
 
 
-class _StatusRecorder:
-    """Forwards the messages of a response and records its status."""
-
-    def __init__(self, send: Send) -> None:
-        self._send = send
-        self.status: int | None = None
-
-    async def __call__(self, message: Message) -> None:
-        if message["type"] == "http.response.start":
-            self.status = message["status"]
-        elif message["type"] == "websocket.accept":
-            self.status = 101
-        await self._send(message)
-
-
 def _read_request(scope: Scope) -> RequestContext:
     headers = {name.decode("latin-1"): value.decode("latin-1") for name, value in scope["headers"]}
     client = scope.get("client")
     # A caller on the Unix socket has no address.
     address = client[0] if client and client[0] else "unix"
     return RequestContext(scope.get("method", "WEBSOCKET"), scope["path"], headers, address)
-
-
-async def _send_problem(send: Send, problem: Problem, prefix: str) -> None:
-    headers = []
-    if problem.status == 401:
-        headers.append((b"www-authenticate", b"Bearer"))
-    if problem.allow is not None:
-        headers.append((b"allow", problem.allow.encode()))
-    if problem.status == 413:
-        headers.append((b"connection", b"close"))
-    if problem.retry_after_s is not None:
-        headers.append((b"retry-after", str(math.ceil(problem.retry_after_s)).encode()))
-    await _send_response(send, prefix, problem.status, problem.to_json(), MEDIA_TYPE, headers)
-
-
-async def _send_login_page(send: Send, prefix: str) -> None:
-    headers = [(name.lower().encode(), value.encode()) for name, value in SECURITY_HEADERS.items()]
-    headers.append((b"www-authenticate", b"Bearer"))
-    await _send_response(send, prefix, 401, load_login_page(), "text/html", headers)
-
-
-async def _send_response(
-    send: Send, prefix: str, status: int, body: bytes, content_type: str, headers: list[tuple[bytes, bytes]]
-) -> None:
-    headers = [
-        (b"content-type", content_type.encode()),
-        (b"content-length", str(len(body)).encode()),
-        *headers,
-    ]
-    await send({"type": f"{prefix}.response.start", "status": status, "headers": headers})
-    await send({"type": f"{prefix}.response.body", "body": body})

@@ -13,17 +13,17 @@ from optodrive.daemon.responses.problem import Problem, build_problem
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.rate_limit import RateLimiter
 from optodrive.daemon.web.refusal_audit import RefusalAudit
+from optodrive.daemon.web.revocation import RequestsInProgress
 from optodrive.daemon.web.roles import is_role_sufficient
 from optodrive.daemon.web.route_table import STOP, Route, RouteTable
 from optodrive.daemon.web.static_files import is_page_request, read_cookie_token
-from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.device.config import DaemonSection
 
 LOOPBACK_NAMES = ("127.0.0.1", "localhost", "[::1]")
 DEFAULT_PORTS = {"http": "80", "https": "443"}
 AUTHORITY = re.compile(r"(\[[0-9a-f:.]+\]|[^\[\]:/?#@\s]+)(?::([0-9]{0,5}))?")
 TEXT_MAX = 100
-ANONYMOUS = Token("", "viewer", "")
 
 
 @dataclass
@@ -56,7 +56,7 @@ class RequestContext:
 class AccessPolicy:
     """The tokens and limits that requests are checked against, and the audit log.
 
-    Tokens and limits may be replaced at run time. now_s: monotonic clock.
+    Tokens and limits may be replaced at run time. now_s: monotonic clock; in_progress: requests that were accepted.
     """
 
     def __init__(
@@ -68,15 +68,22 @@ class AccessPolicy:
     ) -> None:
         self.audit = audit
         self.refusals = RefusalAudit(audit, now_s)
+        self.in_progress = RequestsInProgress()
+        self.tokens = Tokens(())
         self._now_s = now_s
         self.update(tokens, daemon)
 
-    def update(self, tokens: Tokens, daemon: DaemonSection) -> None:
-        """Replace the tokens and limits; every caller's rate limit starts anew."""
-        self.tokens = tokens
+    def update(self, tokens: Tokens, daemon: DaemonSection) -> tuple[Token, ...]:
+        """Replace the tokens and limits; every caller's rate limit starts anew. Return the tokens that are revoked."""
+        revoked, self.tokens = self.tokens.find_revoked(tokens), tokens
         self.body_max_bytes = daemon.body_max_bytes
         self._hosts = {*LOOPBACK_NAMES, *daemon.hosts}
         self._rate_limiter = RateLimiter(daemon.requests_per_s, daemon.requests_burst)
+        return revoked
+
+    def is_revoked(self, token: Token) -> bool:
+        """Return whether a token that was accepted is no longer valid."""
+        return token is not ANONYMOUS and token not in self.tokens.all
 
     def check(self, request: RequestContext, table: RouteTable) -> Problem | None:
         """Identify token and route of a request; return why it is refused, None if it is accepted."""

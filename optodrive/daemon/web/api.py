@@ -22,7 +22,7 @@ from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE
 from optodrive.daemon.responses.state import StateReport
-from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, CALLER, AccessMiddleware
+from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.daemon_client import NO_EPOCH, DaemonClient, PushFields
 from optodrive.daemon.web.error_handlers import add_error_handlers
@@ -36,7 +36,7 @@ from optodrive.daemon.web.openapi_bodies import (
     build_request_body,
 )
 from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
-from optodrive.daemon.web.server_state import ARRIVED_S
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
 from optodrive.daemon.web.static_files import add_page_routes
 from optodrive.daemon.web.stop_priority import StopPriorityMiddleware
 from optodrive.daemon.web.telemetry_hub import DEFAULT_RATE_HZ, EventStream
@@ -106,9 +106,9 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
         return Response(config_json, media_type="application/json")
 
     @routes.post("/v1/arm", "armer", response_model=StateReport)
-    async def arm() -> Response:
+    async def arm(request: Request) -> Response:
         """Arm the board; its indicator is on for at least two seconds before it emits."""
-        await daemon.link.command("arm")
+        await daemon.link.command("arm", request.scope[CALLER].name)
         return _send_state(daemon)
 
     @routes.post("/v1/disarm", "operator", response_model=StateReport)

@@ -7,7 +7,8 @@ import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ARRIVED_S, TRUSTED, ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, ServerState
+from optodrive.daemon.web.tokens import ANONYMOUS, Token
 
 HEADER_READ_BYTES, BODY_READ_BYTES = 2048, 8192
 """The size of one read: a body of chunks of one byte takes 2 µs per byte to parse, and STOP waits meanwhile."""
@@ -48,10 +49,11 @@ class BoundedHttp(H11Protocol):
         super().on_response_complete()
         self.server_state.clients.update_phase(self.transport)
 
-    def is_trusted(self) -> bool:
-        """Return whether the last request had a valid token."""
+    def get_caller(self) -> Token:
+        """Return the token of the last request, ANONYMOUS without one."""
         scope: Any = self.scope  # None before the first request
-        return scope is not None and bool(scope.get(TRUSTED))
+        caller: Token = ANONYMOUS if scope is None else scope.get(CALLER, ANONYMOUS)
+        return caller
 
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""

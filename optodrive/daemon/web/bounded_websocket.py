@@ -12,7 +12,8 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.frames import Frame
 
 from optodrive.daemon.web.connections import PhaseOfRequest
-from optodrive.daemon.web.server_state import ARRIVED_S, ServerState
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER, ServerState
+from optodrive.daemon.web.tokens import ANONYMOUS, Token
 
 MESSAGE_MAX_BYTES = 262_144
 FRAGMENTS_MAX = 64
@@ -56,9 +57,11 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
                 handle.cancel()
         super().connection_lost(exc)
 
-    def is_trusted(self) -> bool:
-        """Return true: only a request with a valid token opens a WebSocket."""
-        return True
+    def get_caller(self) -> Token:
+        """Return the token that opened the WebSocket, ANONYMOUS before that."""
+        scope: Any = getattr(self, "scope", {})
+        caller: Token = scope.get(CALLER, ANONYMOUS)
+        return caller
 
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""

@@ -1,11 +1,12 @@
 """The open connections of the web server: their number, and how long each may stay in one phase."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
 
 from optodrive.daemon.web.request_head import Rank
+from optodrive.daemon.web.tokens import ANONYMOUS, Token
 
 CONNECTIONS_MAX = 256
 STOP_RESERVE = 64
@@ -32,8 +33,8 @@ class ClientProtocol(Protocol):
     def get_phase(self) -> PhaseOfRequest:
         """Return the present phase."""
 
-    def is_trusted(self) -> bool:
-        """Return whether the last request had a valid token."""
+    def get_caller(self) -> Token:
+        """Return the token of the last request, ANONYMOUS without one."""
 
 
 @dataclass
@@ -85,11 +86,11 @@ class Connections:
         idle = [
             item
             for item in self._entries.items()
-            if _is_replaceable(item[1], now_s) and not (spares_trusted and item[1].client.is_trusted())
+            if _is_replaceable(item[1], now_s) and not (spares_trusted and _is_trusted(item[1]))
         ]
         if not idle:
             return False
-        self._abort(min(idle, key=lambda item: (item[1].client.is_trusted(), item[1].since_s))[0])
+        self._abort(min(idle, key=lambda item: (_is_trusted(item[1]), item[1].since_s))[0])
         return True
 
     def close_expired(self) -> None:
@@ -99,6 +100,18 @@ class Connections:
             limit_s = PHASE_MAX_S.get(entry.phase.phase)
             if limit_s is not None and now_s - entry.since_s > limit_s:
                 self._abort(transport)
+
+    def close_revoked(self, tokens: Iterable[Token], is_final: bool) -> None:
+        """Close the connections of some tokens that are between requests; is_final: those in a stream, too.
+
+        Requests that are being answered end first; they may be STOP.
+        """
+        revoked = set(tokens)
+        for transport, entry in list(self._entries.items()):
+            phase = entry.client.get_phase().phase
+            if entry.client.get_caller() in revoked and phase != "answer" and (is_final or phase in IDLE_PHASES):
+                self.remove(transport)
+                transport.abort() if is_final else transport.close()
 
     def _update_phases(self) -> float:
         now_s = self._now_s()
@@ -111,6 +124,10 @@ class Connections:
     def _abort(self, transport: asyncio.Transport) -> None:
         self.remove(transport)
         transport.abort()
+
+
+def _is_trusted(entry: _Entry) -> bool:
+    return entry.client.get_caller() is not ANONYMOUS
 
 
 def _is_replaceable(entry: _Entry, now_s: float) -> bool:

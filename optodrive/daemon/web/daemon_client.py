@@ -77,9 +77,12 @@ class LinkClient:
         """Prove that the event loop runs."""
         self.peer.send(Message("beat", {"alive": True}))
 
-    async def command(self, kind: str) -> None:
-        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal."""
-        call = asyncio.ensure_future(self.peer.call(Message(kind, {})))
+    async def command(self, kind: str, caller: str = "") -> None:
+        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal.
+
+        caller: name of the token
+        """
+        call = asyncio.ensure_future(self.peer.call(Message(kind, {"caller": caller})))
         call.add_done_callback(lambda done: done.cancelled() or done.exception())  # retrieved if the caller has left
         result = await asyncio.shield(call)
         if result.fields["error"] is not None:
@@ -219,6 +222,11 @@ class DaemonClient:
         if built.fields["status"] != 200:
             return built
         return await self.planner.submit(built.payload, push)
+
+    def revoke(self, caller: str) -> None:
+        """End the plans of a caller whose token is no longer valid, and the arming if it has armed the board."""
+        for peer in (self.link.peer, self.planner.peer):
+            peer.send(Message("revoke", {"caller": caller}))
 
     def _send_readers(self) -> None:
         readers, rate_hz = self.hub.readers

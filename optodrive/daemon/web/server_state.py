@@ -7,8 +7,8 @@ import uvicorn.server
 from optodrive.daemon.web.connections import Connections
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
 
-TRUSTED = "optodrive.trusted"
-"""Key in the ASGI scope of a request with a valid token."""
+CALLER = "optodrive.caller"
+"""Key in the ASGI scope of the token that the request presented, ANONYMOUS without one."""
 ARRIVED_S = "arrived_s"
 """Key in the state of an ASGI scope, and in a WebSocket's message, of the monotonic time at which it arrived."""
 

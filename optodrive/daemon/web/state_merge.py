@@ -5,6 +5,7 @@ from typing import Any
 
 from optodrive.daemon.responses.state import (
     BoardReport,
+    ControlReport,
     LinkReport,
     PlannerReport,
     PlannerState,
@@ -53,12 +54,14 @@ def merge_state(
             **status["stats"],
         )
         board = status["board"] if status["connected"] else {**status["board"], **UNKNOWN_BOARD}
+    control = status["control"] if status is not None and status["connected"] else None
     planner = planner or NO_PLANNER
     return StateReport(
         display=display,
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
+        control=None if control is None else ControlReport(**control),
         queue=planner.queue,
         totals=planner.totals,
         planner=planner.planner,

@@ -34,6 +34,10 @@ class Token:
     secret: str = field(repr=False)
 
 
+ANONYMOUS = Token("", "viewer", "")
+"""In place of a token, of a request that presents none."""
+
+
 class Tokens:
     """The tokens of a daemon."""
 
@@ -49,6 +53,10 @@ class Tokens:
             if secrets.compare_digest(presented_bytes, secret):
                 found = token
         return found
+
+    def find_revoked(self, new: "Tokens") -> tuple[Token, ...]:
+        """Return the tokens that new ones lack: removed, or with another name, role or secret."""
+        return tuple(token for token in self.all if token not in new.all)
 
     @property
     def highest_role(self) -> Token:

@@ -73,6 +73,7 @@ class WebProcess:
         self._policy = policy
         self._beat = beat
         self._daemon = daemon
+        self._revocations: list[asyncio.Task[None]] = []
         app = build_app(client, policy)
         app.router.lifespan_context = self._run_connections
         self.server = Server(app, lambda head: rank_head(head, policy))
@@ -125,11 +126,21 @@ class WebProcess:
             self._daemon = self._daemon.model_copy(
                 update=fields["daemon"] | {"hosts": tuple(fields["daemon"]["hosts"])}
             )
-            self._policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), self._daemon)
+            revoked = self._policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), self._daemon)
+            if revoked and self.server.loop is not None and self.server.loop.is_running():
+                self._revoke(revoked)
             self._record(fields["fields"])
             self._beat.send({"kind": "reloaded", "id": fields["id"]})
         elif fields["kind"] == "end":
             self.end()
+
+    def _revoke(self, tokens: tuple[Token, ...]) -> None:
+        """End what was begun with tokens that are no longer valid: first the light."""
+        for token in tokens:
+            self._client.revoke(token.name)
+        tasks = self._policy.in_progress.revoke(tokens)
+        tasks.append(asyncio.create_task(self.server.close_revoked(tokens)))
+        self._revocations = [task for task in self._revocations if not task.done()] + tasks
 
     def _record(self, fields: dict[str, Any]) -> None:
         if self._policy.audit is not None:

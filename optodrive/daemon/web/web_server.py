@@ -4,7 +4,7 @@ import asyncio
 import resource
 import socket
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 
 import uvicorn
@@ -17,10 +17,12 @@ from optodrive.daemon.web.request_head import Rank
 from optodrive.daemon.web.request_limits import App
 from optodrive.daemon.web.server_state import ServerState
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
+from optodrive.daemon.web.tokens import Token
 from optodrive.daemon.web.waiting_room import WaitingRoom
 
 SHUTDOWN_GRACE_S = 2
 DESCRIPTORS_MIN = 1024
+REVOKED_MAX_S = 1.0
 
 
 class Server(uvicorn.Server):
@@ -74,6 +76,12 @@ class Server(uvicorn.Server):
         self._acceptor = Acceptor(self._room, self._selector, self._connections, self._create_protocol)
         self._acceptor.start()
         self.on_ready()
+
+    async def close_revoked(self, tokens: Collection[Token]) -> None:
+        """Close the kept connections of some tokens, and cut those whose clients do not follow within a second."""
+        self._connections.close_revoked(tokens, is_final=False)
+        await asyncio.sleep(REVOKED_MAX_S)
+        self._connections.close_revoked(tokens, is_final=True)
 
     def _create_protocol(self) -> asyncio.Protocol:
         return BoundedHttp(self.config, self.server_state, self.lifespan.state)

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 from optodrive.core.clock import Clock
 from optodrive.core.errors import InputError, LinkError, NotReadyError, OptodriveError
 from optodrive.core.ipc import IpcError, Message
-from optodrive.link.protocol.states import ARMED_STATES, UNARMED_STATES
+from optodrive.link.protocol.states import ARMED_STATES, LEASED_STATES, UNARMED_STATES
 from optodrive.link.service.clients import Clients
+from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.service.point_handover import PointHandover
 from optodrive.link.service.results import build_result
@@ -69,6 +70,7 @@ class LinkService:
         self._connecting_wait_s = 0.0
         self._retry_at_s = -inf
         self._arm_requested = self._was_armed = False
+        self._control: Control | None = None
         self._attended_s = 0.0
         self._seen_fault = ""
         self._outgoing: list[Outgoing] = []
@@ -88,7 +90,9 @@ class LinkService:
             if message.kind == "beat":
                 self._clients.record_beat(client, bool(message.fields["alive"]))
             elif message.kind in ("stop", "arm", "disarm"):
-                self._command(client, message.kind, int(message.fields["id"]))
+                self._command(client, message.kind, int(message.fields["id"]), str(message.fields.get("caller", "")))
+            elif message.kind == "revoke":
+                self._revoke(str(message.fields["caller"]))
             else:
                 self._handover.carry_out(message)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
@@ -130,7 +134,7 @@ class LinkService:
 
     # --- commands -----------------------------------------------------------------------------------------------
 
-    def _command(self, client: int, command: str, request_id: int) -> None:
+    def _command(self, client: int, command: str, request_id: int, caller: str) -> None:
         try:
             if command == "stop":
                 self.go_dark("ended by stop")
@@ -143,10 +147,16 @@ class LinkService:
                 self._clients.require_lease()
                 self._session.arm()
                 self._arm_requested = True
+                self._control = Control(caller, self._clock.now_s())
         except OptodriveError as error:
             self._reply(client, request_id, error)
             return
         self._waiters.add(client, request_id, command, self._clock.now_s())
+
+    def _revoke(self, caller: str) -> None:
+        """Go dark if a caller has armed the board, or is arming it, whose token is no longer valid."""
+        if self._control is not None and self._control.caller == caller:
+            self.go_dark(f"the token {caller!r}, which armed the board, was revoked")
 
     def _require_link(self) -> None:
         if not self._session.connected:
@@ -168,6 +178,7 @@ class LinkService:
     def _end_epoch(self, reason: str) -> None:
         self.epoch.end(reason)
         self._arm_requested = self._was_armed = False
+        self._control = None
         self._session.hold_points()
         self._handover.clear()
         for waiter in self._waiters.pop_arming():
@@ -191,7 +202,8 @@ class LinkService:
         now_s = self._clock.now_s()
         for waiter, error in self._waiters.pop_results(self._session, refusal, self._describe_link_error(), now_s):
             self._reply(waiter.client, waiter.request_id, error)
-        status = self._status.build_if_due(self.epoch, self.link_error, self._handover.commands)
+        control = self._control if self._session.board.state in LEASED_STATES else None
+        status = self._status.build_if_due(self.epoch, self.link_error, control, self._handover.commands)
         if status is not None:
             self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         if refusal is not None:

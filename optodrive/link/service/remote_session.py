@@ -61,6 +61,7 @@ class RemoteSession:
     epoch: latest epoch, NO_EPOCH without a link process; epoch_reason: what raised it, as an end of a sentence
     connected: whether the link process is reached and its link to the board is up
     port: name of the board's port; board: latest reported state of the board; stats: link statistics
+    control: who armed the board, None while it is not armed
     """
 
     def __init__(self, scale: WireScale, clock: Clock) -> None:
@@ -76,6 +77,7 @@ class RemoteSession:
         self.faults: Counter[str] = Counter()
         self.lease = LeaseStats()
         self.is_acknowledged = False
+        self.control: dict[str, Any] | None = None
         self.last_event_reason = ""
         self.likely_cause: LinkCause | None = None
         self._clock = clock
@@ -219,7 +221,7 @@ class RemoteSession:
         self.lease.ages.load(fields["lease"]["counts"], fields["lease"]["sum_s"])
         self.lease.slack_s = fields["lease"]["slack_s"]
         self.is_acknowledged, self._reported_ready = fields["is_acknowledged"], fields["is_ready"]
-        self._commands_seen = fields["commands"]
+        self.control, self._commands_seen = fields["control"], fields["commands"]
         self.last_event_reason = fields["last_event_reason"]
         self.likely_cause = None if fields["cause"] is None else LinkCause(*fields["cause"])
 

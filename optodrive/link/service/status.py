@@ -5,6 +5,7 @@ from math import inf
 from optodrive.core.clock import Clock
 from optodrive.core.errors import OptodriveError
 from optodrive.core.ipc import Message
+from optodrive.link.service.control import Control
 from optodrive.link.service.epoch import Epoch
 from optodrive.link.session.session import BoardSession
 
@@ -24,14 +25,16 @@ class StatusPublisher:
         """Publish at the next opportunity, for a new client."""
         self._due_s = -inf
 
-    def build_if_due(self, epoch: Epoch, link_error: OptodriveError | None, commands: int) -> Message | None:
+    def build_if_due(
+        self, epoch: Epoch, link_error: OptodriveError | None, control: Control | None, commands: int
+    ) -> Message | None:
         """Return the status if something relevant has changed or the interval has passed, else None.
 
-        commands: number of the planner's commands carried out since it connected
+        control: who armed the board; commands: number of the planner's commands carried out since it connected
         """
         session, board = self._session, self._session.board
         outcome = session.is_ready, session.last_event_reason, session.likely_cause
-        key = (epoch.number, session.connected, link_error, board.state, board.fault, commands, *outcome)
+        key = (epoch.number, session.connected, link_error, board.state, board.fault, control, commands, *outcome)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None
@@ -57,6 +60,7 @@ class StatusPublisher:
             "is_acknowledged": session.is_acknowledged,
             "last_event_reason": session.last_event_reason,
             "cause": None if cause is None else list(cause),
+            "control": None if control is None else control.to_dict(now_s),
             "commands": commands,
         }
         return Message("status", fields)

@@ -5,7 +5,6 @@ from optodrive.daemon.reload import (
     ConfigReloader,
     describe_reload,
     merge_reloadable,
-    require_disarmed,
     split_changed_keys,
 )
 from optodrive.daemon.web.tokens import Token, Tokens
@@ -43,17 +42,51 @@ def test_hosts_and_limits_apply_at_once_and_the_rest_needs_a_restart(config):
 
 
 @pytest.mark.parametrize("state", LEASED_STATES)
-def test_an_armed_board_prevents_a_reload(state):
+def test_an_armed_board_prevents_a_reload(config, state):
+    reloader = ConfigReloader(config, TOKENS, lambda: with_(config, "daemon", hosts=("lab",)))
     with pytest.raises(NotReadyError, match="disarm it first"):
-        require_disarmed(state)
+        reloader.reload(state)
+    assert reloader.config == config
 
 
 @pytest.mark.parametrize("state", ["DISARMED", "FAULT", "BOOT", "no link"])
-def test_an_unarmed_board_permits_a_reload(state):
-    require_disarmed(state)
+def test_an_unarmed_board_permits_a_reload(config, state):
+    assert ConfigReloader(config, TOKENS, lambda: config).reload(state).tokens is TOKENS
 
 
-TOKENS = Tokens([Token("ann", "armer", "a-secret-of-ann")])
+ANN, BEN, CARA = (
+    Token(name, role, f"the-secret-of-{name}")
+    for name, role in (("ann", "armer"), ("ben", "operator"), ("cara", "viewer"))
+)
+TOKENS = Tokens([ANN])
+
+
+def write_tokens(path, *tokens):
+    entries = (f'[[token]]\nname = "{t.name}"\nrole = "{t.role}"\nsecret = "{t.secret}"\n' for t in tokens)
+    path.write_text('format = "optodrive-tokens"\nversion = 1\n' + "".join(entries))
+    path.chmod(0o600)
+
+
+def test_an_armed_board_permits_only_to_revoke_tokens(config, tmp_path):
+    """A new token, a new secret and a new key wait until the board is disarmed; what they replace ends at once."""
+    path = tmp_path / "tokens.toml"
+    running = with_(config, "daemon", tokens=str(path))
+    reloader = ConfigReloader(running, Tokens([ANN, BEN]), lambda: with_(running, "daemon", hosts=("lab",)))
+    changed = Token("ben", "operator", "the-new-secret-of-ben")
+    write_tokens(path, ANN, changed, CARA)
+    result = reloader.reload("RUNNING")
+    assert (result.tokens.all, result.revoked) == ((ANN,), (BEN,))
+    assert result.build_web_message(1)["fields"]["revoked"] == ["ben"]
+    assert "tokens revoked: ben; the rest waits" in result.line
+    assert (reloader.config, reloader.tokens.all) == (running, (ANN,))
+    with pytest.raises(NotReadyError, match="disarm it first"):
+        reloader.reload("RUNNING")
+    result = reloader.reload("DISARMED")
+    assert (result.tokens.all, result.revoked, result.reloaded) == ((ANN, changed, CARA), (), ["daemon.hosts"])
+    path.chmod(0o644)
+    with pytest.raises(InputError, match="chmod 600"):
+        reloader.reload("ARMED")
+    assert reloader.tokens.all == (ANN, changed, CARA)
 
 
 def test_a_reload_is_kept_for_a_web_process_that_starts_later(config):
@@ -61,8 +94,13 @@ def test_a_reload_is_kept_for_a_web_process_that_starts_later(config):
     reloader = ConfigReloader(config, TOKENS, lambda: new)
     message = reloader.reload("DISARMED").build_web_message(7)
     assert (message["kind"], message["id"], message["daemon"]["hosts"]) == ("reload", 7, ("lab",))
-    assert message["tokens"] == [["ann", "armer", "a-secret-of-ann"]]
-    assert message["fields"] == {"event": "reloaded", "applied": ["daemon.hosts"], "waiting": ["daemon.port"]}
+    assert message["tokens"] == [["ann", "armer", "the-secret-of-ann"]]
+    assert message["fields"] == {
+        "event": "reloaded",
+        "applied": ["daemon.hosts"],
+        "waiting": ["daemon.port"],
+        "revoked": [],
+    }
     assert reloader.config.daemon.hosts == ("lab",)
     assert reloader.config.daemon.port == config.daemon.port
 

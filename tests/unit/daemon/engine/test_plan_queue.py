@@ -10,6 +10,7 @@ from optodrive.daemon.engine import planner
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.planner import PLANNING_MAX_S, REQUESTS_MAX
+from optodrive.daemon.engine.revoked_callers import RevokedCallers
 from planner_rig import PlannerRig, build_frame, build_train
 
 
@@ -21,8 +22,8 @@ def rig(monkeypatch):
     return rig
 
 
-def submit(rig, sequence, streamed=False):
-    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed).result().plan)
+def submit(rig, sequence, streamed=False, caller=""):
+    return rig.store.find(rig.submit(sequence, rig.remote.epoch, streamed, caller).result().plan)
 
 
 def finish(rig, record):
@@ -168,6 +169,48 @@ def test_a_cancelled_plan_ends_and_the_next_one_runs(rig):
     assert (running.status, running.error) == ("cancelled", "cancelled while running")
     assert finish(rig, waiting).status == "done"
     assert rig.session.board.state == "ARMED"
+
+
+@pytest.mark.parametrize("caller", ["ann", "ben"])
+def test_the_plans_of_a_revoked_caller_end_and_the_others_run(rig, caller):
+    plans = [submit(rig, build_train(1.0), caller="ann"), submit(rig, build_frame(), caller="ben")]
+    plans.append(submit(rig, build_frame(), caller="ann"))
+    rig.until(lambda: plans[0].executed_count > 5)
+    rig.queue.revoke(caller)
+    emitted = len(rig.list_emitted())
+    finish(rig, plans[1 if caller == "ann" else 2])
+    of_caller = [plan for plan in plans if plan.caller == caller]
+    assert {(plan.status, plan.error) for plan in of_caller} == {("cancelled", f"the token '{caller}' was revoked")}
+    assert {plan.status for plan in plans if plan.caller != caller} == {"done"}
+    if caller == "ann":
+        assert len(rig.list_emitted()) <= emitted + 2 + plans[1].executed_count
+    assert rig.session.board.state == "ARMED"
+
+
+def revoke_before_commit(rig):
+    """Submit a plan of ann, and revoke her token between its planning and its commit."""
+
+    def revoke():
+        rig.before_loop_action = lambda: None
+        rig.queue.revoke("ann")
+
+    rig.before_loop_action = revoke
+    return rig.submit(build_frame(), rig.remote.epoch, caller="ann")
+
+
+def test_a_request_from_before_the_revocation_of_its_token_is_refused(rig):
+    with pytest.raises(StoppedError, match="the token 'ann' was revoked"):
+        revoke_before_commit(rig).result()
+    assert not rig.queue.is_busy
+    rig.run(0.01)
+    assert finish(rig, submit(rig, build_frame(), caller="ann")).status == "done"  # of a new token with her name
+
+
+def test_without_the_time_of_the_revocation_such_a_request_is_lit(rig, monkeypatch):
+    """Mutant: forgets who was revoked."""
+    monkeypatch.setattr(RevokedCallers, "require_valid", lambda self, caller, arrived_s: None)
+    record = rig.store.find(revoke_before_commit(rig).result().plan)
+    assert finish(rig, record).executed_count
 
 
 @pytest.mark.parametrize("client", [WEB, PLANNER])

@@ -26,6 +26,7 @@ def build_status(epoch, state="ARMED"):
             "link_error": None,
             "stats": dict(NO_STATS),
             "board": BoardView(state=state).to_dict(),
+            "control": None,
         },
     )
 

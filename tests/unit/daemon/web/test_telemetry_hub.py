@@ -25,6 +25,7 @@ def build_state(board="DISARMED", fault=None, error=None):
             "pixels": 16,
             "link": LINK | {"port": "p", "state": "down" if error else "up", "error": error},
             "board": BOARD | {"state": board, "fault": fault, "hint": ""},
+            "control": None,
             "queue": {"waiting": 0, "running": None, "active": [], "plans": []},
             "totals": {"planned": 0, "sent": 0, "executed": 0, "timing_error": None},
             "planner": {"busy": False, "alive": True},

@@ -14,8 +14,8 @@ from optodrive.daemon.web import bounded_websocket, connections
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
 from optodrive.daemon.web.request_head import rank_head
-from optodrive.daemon.web.server_state import ARRIVED_S, TRUSTED
-from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
+from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import DaemonSection
 
@@ -23,6 +23,7 @@ GET = b"GET /v1/state HTTP/1.1\r\nHost: localhost\r\n\r\n"
 SECRET = "a-valid-secret-of-a-viewer"
 BEARER = f"Authorization: Bearer {SECRET}\r\n".encode()
 STOP = b"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n" + BEARER + b"Content-Length: 0\r\n\r\n"
+ANN = Token("ann", "armer", "a-secret-of-ann")
 
 
 class Application:
@@ -43,7 +44,7 @@ class Application:
             await self.echo(receive, send)
         else:
             self.ages_s.append(time.monotonic() - scope["state"][ARRIVED_S])
-            scope[TRUSTED] = scope["path"] == "/trusted"
+            scope[CALLER] = ANN if scope["path"] == "/trusted" else ANONYMOUS
             await self.answer(scope["path"], receive, send)
 
     async def echo(self, receive, send):

@@ -315,3 +315,53 @@ def test_a_malformed_message_ends_only_its_client(rig, message):
     with pytest.raises(IpcError):
         rig.service.on_message(PLANNER, message)
     rig.run(0.1)
+
+
+def find_control(rig):
+    return rig.of_kind(WEB, "status")[-1].fields["control"]
+
+
+def test_the_status_states_who_armed_the_board_and_when(rig):
+    rig.run(0.2)
+    assert find_control(rig) is None
+    rig.arm(caller="ann")
+    rig.run(1.0)
+    control = find_control(rig)
+    assert control["caller"] == "ann"
+    assert control["armed_for_s"] == pytest.approx(3.0, abs=0.5)
+    rig.await_result(WEB, rig.request(WEB, "disarm"))
+    rig.run(0.2)
+    assert find_control(rig) is None
+
+
+def test_revoking_the_token_that_armed_the_board_ends_dark(rig):
+    rig.arm(caller="ann")
+    rig.begin(build_points(500, DUTY))
+    rig.run(0.3)
+    before = rig.epoch
+    rig.send(WEB, "revoke", caller="ben")
+    rig.run(0.1)
+    assert (rig.epoch, rig.session.board.state) == (before, BoardState.RUNNING)
+    rig.send(WEB, "revoke", caller="ann")
+    emitted = len(rig.list_emitted())
+    assert emitted
+    rig.until(lambda: rig.session.board.state == BoardState.DISARMED)
+    assert len(rig.list_emitted()) <= emitted + 2
+    rig.run(0.2)
+    status = rig.of_kind(PLANNER, "status")[-1].fields
+    assert status["epoch_reason"] == "the token 'ann', which armed the board, was revoked"
+
+
+def test_revoking_the_token_that_is_arming_the_board_ends_the_arming(rig):
+    request_id = rig.request(WEB, "arm", caller="ann")
+    rig.run(0.5)
+    rig.send(WEB, "revoke", caller="ann")
+    assert "was revoked" in rig.await_result(WEB, request_id)["error"]["message"]
+    rig.run(3.0)
+    assert rig.session.board.state == BoardState.DISARMED
+
+
+@pytest.mark.parametrize("client", [PLANNER, OPERATOR, SUPERVISOR])
+def test_only_the_web_process_may_revoke(rig, client):
+    with pytest.raises(IpcError, match="not permitted"):
+        rig.send(client, "revoke", caller="ann")

@@ -1,0 +1,106 @@
+"""Tokens that are removed while they are in use: what was begun with them ends at once, and the others stay."""
+
+import threading
+import time
+
+import httpx
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+
+from rig import TOKEN, long_train, wait_for
+from service_manager import Manager, reload
+
+SECRETS = {"rig": TOKEN, "ben": "another-token-for-ben", "cara": "another-token-for-cara"}
+ROLES = {"rig": "armer", "ben": "operator", "cara": "armer"}
+ENDED_MAX_S = 0.5
+
+
+def write_tokens(path, *names):
+    entries = (f'[[token]]\nname = "{name}"\nrole = "{ROLES[name]}"\nsecret = "{SECRETS[name]}"\n' for name in names)
+    path.write_text('format = "optodrive-tokens"\nversion = 1\n' + "".join(entries))
+    path.chmod(0o600)
+
+
+def present(name):
+    return {"Authorization": f"Bearer {SECRETS[name]}"}
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch):
+    manager = Manager(tmp_path, monkeypatch)
+    yield manager
+    manager.close()
+
+
+class Reader(threading.Thread):
+    """Reads telemetry until it ends. text: everything that came; ended_s: when it ended."""
+
+    def __init__(self, daemon, name):
+        super().__init__()
+        self.text, self.ended_s = "", None
+        self._request = daemon.url + "/v1/telemetry", present(name)
+        self.start()
+        wait_for(lambda: "event: state" in self.text, "telemetry")
+
+    def run(self):
+        url, headers = self._request
+        with httpx.stream("GET", url, headers=headers, timeout=20) as response:
+            for piece in response.iter_text():
+                self.text += piece
+        self.ended_s = time.monotonic()
+
+
+def open_stream(daemon, name):
+    return connect(f"ws{daemon.url.removeprefix('http')}/v1/stream", additional_headers=present(name), compression=None)
+
+
+def test_a_reload_while_armed_ends_what_a_removed_token_has_begun(manager, board, make_daemon, tmp_path):
+    path = tmp_path / "tokens.toml"
+    write_tokens(path, "rig", "ben", "cara")
+    daemon = make_daemon(board, replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\ntokens = "{path}"\n#')])
+    daemon.arm()
+    assert daemon.state()["control"]["caller"] == "rig"
+
+    # An operator's plan, streams and kept connection end; the board stays armed, and the others stay connected.
+    kept = httpx.Client(base_url=daemon.url, headers=present("ben"))
+    plan = kept.post("/v1/plans", json=long_train()).json()["plan"]
+    of_ben, of_cara = Reader(daemon, "ben"), Reader(daemon, "cara")
+    wait_for(lambda: daemon.state()["totals"]["executed"], "light")
+    write_tokens(path, "rig", "cara")
+    with open_stream(daemon, "ben") as stream, open_stream(daemon, "cara") as other_stream:
+        removed_s = time.monotonic()
+        said = reload(daemon, manager, lambda text: text + "\n# changed\n")
+        with pytest.raises(ConnectionClosed) as closed:
+            stream.recv(timeout=5)
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "the token 'ben' was revoked")
+        other_stream.send("no frame")
+        assert "refused" in other_stream.recv(timeout=5)
+    of_ben.join(5)
+    assert of_ben.text.endswith(": the token 'ben' was revoked\n\n")
+    assert of_ben.ended_s - removed_s < ENDED_MAX_S
+    assert "tokens revoked: ben; the rest waits" in said
+    assert any(line.startswith("STATUS=tokens revoked: ben") for line in manager.heard)
+    ended = daemon.finished(plan)
+    assert (ended["status"], ended["error"]) == ("cancelled", "the token 'ben' was revoked")
+    assert kept.get("/v1/state").status_code == 401
+    kept.close()
+    assert daemon.board_state() == "ARMED"
+    assert of_cara.is_alive()
+
+    # The token that has armed the board takes the light with it, also of the plans of others.
+    daemon.call("POST", "/v1/disarm")
+    daemon.call("POST", "/v1/arm", headers=present("cara"))
+    assert daemon.state()["control"]["caller"] == "cara"
+    plan = daemon.call("POST", "/v1/plans", json=long_train())["plan"]
+    wait_for(lambda: board.of("state")[-1]["state"] == "RUNNING", "the plan to run")
+    write_tokens(path, "rig")
+    removed_s = time.monotonic()
+    reload(daemon, manager, lambda text: text)
+    wait_for(lambda: board.of("state")[-1]["state"] == "DISARMED", "DISARMED")
+    assert time.monotonic() - removed_s < ENDED_MAX_S
+    ended = daemon.finished(plan)
+    assert (ended["status"], ended["error"]) == ("failed", "the token 'cara', which armed the board, was revoked")
+    of_cara.join(5)
+    assert not of_cara.is_alive()
+    assert daemon.state()["control"] is None
