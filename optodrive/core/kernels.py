@@ -3,6 +3,9 @@
 The cache key of a kernel is its bytecode together with everything that the bytecode refers to: called kernels, global
 constants and the fields of the named tuples in its signature. A comment, a docstring or an edit elsewhere in the file
 therefore does not invalidate machine code, and a changed callee or constant in another file does.
+
+A kernel counts no references to its arguments unless it creates arrays: numba would count each array at each call of a
+small kernel, atomically, which takes longer than what the kernel computes.
 """
 
 import os
@@ -36,8 +39,11 @@ def _is_writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
-CACHE_VERSION = "2"
-"""Changes with what cached machine code refers to; 1 named generated modules by their content."""
+CACHE_VERSION = "3"
+"""Changes with what cached machine code refers to and with the compiler's options.
+
+1 named generated modules by their content; 2 counted references in every kernel.
+"""
 _FOLDER = _cache_dir()
 CACHED = _is_writable(_FOLDER)
 """False where the cache folder is not writable: every process then compiles its kernels anew."""
@@ -174,8 +180,24 @@ def is_cold() -> bool:
 
 
 def kernel(function: Callable[P, T]) -> Callable[P, T]:
-    """Compile a function on its first use and cache the machine code on disk."""
-    compiled: Any = numba.njit(nogil=True, error_model="numpy")(function)
+    """Compile a function that creates no array on its first use and cache the machine code on disk.
+
+    Views of its arguments are no new arrays. Without reference counts, small kernels are several times as fast, and the
+    compiler refuses to create or return an array.
+    """
+    return _compile(function, counts_references=False)
+
+
+def array_kernel(function: Callable[P, T]) -> Callable[P, T]:
+    """Compile a function that creates arrays on its first use and cache the machine code on disk."""
+    return _compile(function, counts_references=True)
+
+
+_njit: Any = numba.njit  # numba's types lack _nrt
+
+
+def _compile(function: Callable[P, T], counts_references: bool) -> Callable[P, T]:
+    compiled = _njit(nogil=True, error_model="numpy", _nrt=counts_references)(function)
     if CACHED:
         compiled._cache = _new_cache(function)
         _caches.append(compiled._cache)

@@ -5,7 +5,7 @@ Kernels over `pixel_ode.step`; `ExtendedThermalState` is their interface.
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.physics.nominal_display import TIME_ROUNDING_S, pixel_at
 from optodrive.physics.pixel import Pixel
@@ -41,7 +41,7 @@ def advance_states(
     peak_k = work[0, ABSORBER]
     done_s, after_edge = 0.0, True
     while done_s < duration_s:
-        if c[POWER_W] == 0.0 and np.abs(work[0]).max() < COLD_K:
+        if c[POWER_W] == 0.0 and _is_cold(work[0]):
             work[0] = 0.0
             break
         h_s = next_step_s(pixel, active, since_edge_s + done_s)
@@ -55,11 +55,27 @@ def advance_states(
         middle_m = output_signal(pixel, active, work[7], c, DISPLACEMENT_SIGNAL)
         peak_m = max(peak_m, end_m, _vertex_m(begin_m, middle_m, end_m))
         peak_k = max(peak_k, work[2, ABSORBER])
-        work[0] = work[2]
-        work[1] = work[3]
+        copy_states(work[2], work[0])
+        copy_states(work[3], work[1])
         after_edge = False
         done_s = duration_s if last else done_s + h_s
     return peak_m, peak_k
+
+
+@kernel
+def copy_states(source: FloatArray, target: FloatArray) -> None:
+    """Copy the states [STATE_COUNT] of a pixel; an assignment of arrays would create one."""
+    for row in range(len(source)):
+        target[row] = source[row]
+
+
+@kernel
+def _is_cold(state: FloatArray) -> bool:
+    """Return whether no rise of a pixel's state [STATE_COUNT] is as large as COLD_K."""
+    for rise_k in state:  # noqa: SIM110 — compiled as it is, without a generator
+        if not abs(rise_k) < COLD_K:
+            return False
+    return True
 
 
 @kernel
@@ -93,7 +109,7 @@ def _peak_after_off_m(
     return peak_m
 
 
-@kernel
+@array_kernel
 def apply_pulses(
     columns: FloatArray,
     at_s: FloatArray,
@@ -130,7 +146,7 @@ def apply_pulses(
             if i < 0:
                 continue
             one, wait_s = pixel_at(columns, i), max(0.0, start_s[row] - at_s[i])
-            work[0] = states[i]
+            copy_states(states[i], work[0])
             c[POWER_W], c[ILLUMINATED_PIXEL], c[IS_TARGET] = 0.0, pixel[row], 1.0 if is_target else 0.0
             off_peak_m, _ = advance_states(one, active, c, is_target, work, 0.0, off_s[i], wait_s)
             if last_pulse[i] >= 0:
@@ -143,12 +159,12 @@ def apply_pulses(
                 peak_k[row] = max(before_k, on_peak_k)
             if last_pulse[i] >= 0:
                 peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], on_peak_m)
-            states[i] = work[0]
+            copy_states(work[0], states[i])
             at_s[i], off_s[i] = start_s[row] + width_s[row], 0.0
     return end
 
 
-@kernel
+@array_kernel
 def add_peaks_after_off(
     columns: FloatArray,
     states: FloatArray,
@@ -163,13 +179,13 @@ def add_peaks_after_off(
     work, c = np.zeros((8, states.shape[1])), context.copy()
     for i in range(begin, end):
         if last_pulse[i] >= 0:
-            work[0] = states[i]
+            copy_states(states[i], work[0])
             c[ILLUMINATED_PIXEL], c[IS_TARGET] = i, 1.0
             off_peak_m = _peak_after_off_m(pixel_at(columns, i), active, c, work, 0.0, 0.0)
             peak_m[last_pulse[i]] = max(peak_m[last_pulse[i]], off_peak_m)
 
 
-@kernel
+@array_kernel
 def simulate_displacement(
     pixel: Pixel,
     active: ActiveTerms,
@@ -187,7 +203,7 @@ def simulate_displacement(
     at_s, off_s, state: time of the last event, time since gate off at that event, and the states then
     """
     work = np.zeros((8, len(state)))
-    work[0] = state
+    copy_states(state, work[0])
     now_s, since_edge_s, row = at_s, off_s, 0
     for edge in range(2 * len(pulses) + 1):
         pulse, gate_on, is_target = edge // 2, edge % 2 == 1, True
@@ -221,7 +237,7 @@ def _peak_after_state_m(
     peak_after_s: float,
 ) -> float:
     """Return `_peak_after_off_m` from `state`, which stays as it is."""
-    work[0] = state
+    copy_states(state, work[0])
     return _peak_after_off_m(pixel, active, c, work, since_edge_s, peak_after_s)
 
 
@@ -244,15 +260,15 @@ def find_shortest_pulse(
 
     on_states: [max_periods + 1, STATE_COUNT], work space for the states after each period at full power
     """
-    on_states[0] = work[0]
+    copy_states(work[0], on_states[0])
     if _peak_after_state_m(pixel, active, c, work, on_states[0], off_s, peak_after_s) >= target_m:
         return 0, 0.0
     high, highest_m = max_periods, 0.0
-    work[0] = on_states[0]
+    copy_states(on_states[0], work[0])
     for period in range(max_periods):
         c[POWER_W] = max_power_w
         highest_m = advance_states(pixel, active, c, True, work, 0.0, period * period_s, period_s)[0]
-        on_states[period + 1] = work[0]
+        copy_states(work[0], on_states[period + 1])
         if highest_m >= target_m and peak_after_s <= 0.0:
             high = max(period + 1, min_periods)
             break
@@ -314,7 +330,7 @@ def _pulse_peak_m(
     peak_after_s: float,
 ) -> float:
     """Return the peak displacement, m, of a pulse from `state`, counted from peak_after_s after its start."""
-    work[0] = state
+    copy_states(state, work[0])
     c[POWER_W] = power_w
     on_peak_m = advance_states(pixel, active, c, True, work, 0.0, 0.0, width_s)[0]
     off_peak_m = _peak_after_off_m(pixel, active, c, work, 0.0, max(0.0, peak_after_s - width_s))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.core.types.measurements import PixelTrace
 from optodrive.physics.parameters import PixelArray
@@ -201,7 +201,7 @@ class NominalThermalState:
         )
 
 
-@kernel
+@array_kernel
 def _apply_pulses(
     columns: FloatArray,
     at_s: FloatArray,

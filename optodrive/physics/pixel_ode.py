@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.physics.pixel import Pixel
 from optodrive.physics.term import (
@@ -282,7 +282,7 @@ def _fill_samples(
     return index
 
 
-@kernel
+@array_kernel
 def _simulate(
     pulses: FloatArray,
     index: int,

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray
-from optodrive.physics.extended_pulses import DISPLACEMENT_SIGNAL, advance_states
+from optodrive.physics.extended_pulses import DISPLACEMENT_SIGNAL, advance_states, copy_states
 from optodrive.physics.nominal_display import pixel_at
 from optodrive.physics.pixel_ode import ActiveTerms, output_signal
 from optodrive.physics.term import ABSORBER, ILLUMINATED_PIXEL, IS_TARGET, POWER_W
@@ -25,7 +25,7 @@ class SnapshotCache(NamedTuple):
         return cls(np.full(len(states), np.nan), np.full(len(states), np.nan), np.zeros_like(states))
 
 
-@kernel
+@array_kernel
 def compute_snapshot(
     columns: FloatArray,
     at_s: FloatArray,
@@ -48,12 +48,12 @@ def compute_snapshot(
         # After a new event, or for an earlier time, the cached states are no start: begin at the event.
         if cache.event_s[i] != at_s[i] or now_s < cache.at_s[i]:
             cache.event_s[i] = cache.at_s[i] = at_s[i]
-            cache.states[i] = states[i]
+            copy_states(states[i], cache.states[i])
         one, wait_s = pixel_at(columns, i), max(0.0, now_s - cache.at_s[i])
         c[ILLUMINATED_PIXEL] = i
-        work[0] = cache.states[i]
+        copy_states(cache.states[i], work[0])
         advance_states(one, active, c, True, work, 0.0, off_s[i] + cache.at_s[i] - at_s[i], wait_s)
-        cache.states[i] = work[0]
+        copy_states(work[0], cache.states[i])
         cache.at_s[i] += wait_s
         displacement_m[i] = output_signal(one, active, work[0], c, DISPLACEMENT_SIGNAL)
         absorber_k[i] = work[0, ABSORBER]

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 from optodrive.device.neighbours import Neighbours
 from optodrive.physics.nominal_display import TIME_ROUNDING_S, build_kernel_columns
@@ -197,7 +197,7 @@ def _zero_amplitudes(modes: int) -> ModalAmplitudes:
     return ModalAmplitudes(np.zeros(modes), np.zeros(modes), np.zeros(modes))
 
 
-@kernel
+@array_kernel
 def _apply_pulses(
     modes: Modes,
     now: ModalAmplitudes,
@@ -245,7 +245,7 @@ def _apply_pulses(
     return len(pixel)
 
 
-@kernel
+@array_kernel
 def _next_on_pixel(pixels: int, pixel: IntArray, start_s: FloatArray) -> FloatArray:
     """Return the start of the next pulse on the pixel of each pulse, [n]; infinite for its last one."""
     coming_s = np.full(pixels, np.inf)
@@ -288,7 +288,7 @@ def _advance_motion(
         after_k[k] = before_k[k] * left[k] + light_j * share[k] * k_per_j[k] * mean[k]
 
 
-@kernel
+@array_kernel
 def _decay(rate_per_s: FloatArray, max_per_s: float, time_s: float) -> tuple[FloatArray, FloatArray]:
     """Return the mean of e^(−rate t) over the time and its value at the end, each [p].
 

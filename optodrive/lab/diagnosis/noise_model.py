@@ -12,7 +12,7 @@ from math import cos, exp, log, pi, sin, sqrt
 import numpy as np
 from scipy.optimize import minimize
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel
 from optodrive.core.types.arrays import FloatArray
 from optodrive.lab.diagnosis.dataset import PIXEL_KINDS, Dataset
 from optodrive.lab.diagnosis.replicate_contrasts import Contrast, build_residual_contrasts, compute_contrasts
@@ -62,7 +62,7 @@ class NoiseModel:
     has_noise: bool = True
 
 
-@kernel
+@array_kernel
 def _whiten(
     t_s: FloatArray,
     columns: FloatArray,

@@ -7,7 +7,7 @@ Or-opt, Or 1976).
 
 import numpy as np
 
-from optodrive.core.kernels import kernel
+from optodrive.core.kernels import array_kernel, kernel
 from optodrive.core.types.arrays import FloatArray, IntArray
 
 NEIGHBOUR_COUNT = 10
@@ -73,7 +73,7 @@ def path_rad(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) 
     return total
 
 
-@kernel
+@array_kernel
 def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count: int) -> IntArray:
     """Return the nearest pixels of each pixel of a tour, nearest first, [p, count]; −1 for pixels outside the tour."""
     neighbours = np.full((len(x_rad), count), -1)
@@ -94,7 +94,7 @@ def _find_neighbours(tour: IntArray, x_rad: FloatArray, y_rad: FloatArray, count
     return neighbours
 
 
-@kernel
+@array_kernel
 def _improve(tour: IntArray, neighbours: IntArray, x_rad: FloatArray, y_rad: FloatArray, origin: int) -> None:
     """Shorten a path in place until no reversal or move of a segment between near pixels shortens it."""
     place = np.full(len(x_rad), -1)
@@ -221,7 +221,7 @@ def _try_shift(
     return False
 
 
-@kernel
+@array_kernel
 def _move_segment(tour: IntArray, place: IntArray, first: int, last: int, after: int, is_reversed: bool) -> None:
     """Move the segment from `first` to `last` behind the position `after`, which is outside it."""
     segment = tour[first : last + 1].copy()

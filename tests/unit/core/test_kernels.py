@@ -5,9 +5,11 @@ import subprocess
 import sys
 from types import ModuleType
 
+import numpy as np
 import pytest
+from numba.core.errors import TypingError
 
-from optodrive.core.kernels import code_stamp
+from optodrive.core.kernels import array_kernel, code_stamp, kernel
 
 IS_COLD = (
     "import optodrive.planning.limiter.pulse_application, optodrive.core.kernels as c;"
@@ -93,6 +95,29 @@ def test_a_constant_read_through_a_module_of_the_package_changes_the_stamp(monke
     before = stamp(kernel=kernel)
     monkeypatch.setattr("optodrive.core.units.FACTOR", 2.0, raising=False)
     assert stamp(kernel=kernel) != before
+
+
+def create(x):
+    return np.zeros(len(x)) + x
+
+
+def view(x):
+    return x[1:]
+
+
+def sum_of_view(x):
+    return x[1:].sum()
+
+
+@pytest.mark.parametrize("function", [create, view])
+def test_a_kernel_that_creates_or_returns_an_array_is_not_compiled_without_reference_counts(function):
+    with pytest.raises(TypingError, match="Only accept returning of array passed into the function as argument"):
+        kernel(function)(np.ones(3))
+    assert array_kernel(function)(np.ones(3)).tolist() == function(np.ones(3)).tolist()
+
+
+def test_a_kernel_may_look_at_a_part_of_its_arguments():
+    assert kernel(sum_of_view)(np.ones(3)) == 2.0
 
 
 RUN = """
