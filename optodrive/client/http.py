@@ -2,6 +2,11 @@
 
 import asyncio
 import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from functools import partial
+from threading import Thread
 from typing import Any
 
 import httpx
@@ -11,8 +16,14 @@ from optodrive.client.exchange import Exchange, ExchangePolicy, Pause, Step, T
 from optodrive.client.requests import ApiRequest, Response
 from optodrive.daemon.responses.state import StateReport
 
+READ_TIMEOUT_S = 3.0
+"""Longest wait for what the daemon only reads."""
 TIMEOUT_S = 60.0
-STOP_TIMEOUT_S = 3.0
+"""Longest wait for an action, while the daemon shows that it is alive."""
+PROBE_PERIOD_S = 1.0
+PROBE_TIMEOUT_S = 2.5
+STOP_TIMEOUT_S = 1.5
+PROBE: dict[str, Any] = {"method": "GET", "url": "/v1/health", "timeout": PROBE_TIMEOUT_S}
 
 
 class DaemonClient:
@@ -22,6 +33,7 @@ class DaemonClient:
         self, url: str, token: str | None = None, reconnect_timeout_s: float = 0.0, timeout_s: float = TIMEOUT_S
     ) -> None:
         self.policy = ExchangePolicy(Endpoint(url, token), reconnect_timeout_s)
+        self._timeout_s = timeout_s
         self._client = self.policy.endpoint.open_client(timeout_s)
 
     def close(self) -> None:
@@ -58,7 +70,26 @@ class DaemonClient:
         if step.on_new_connection:
             with self.policy.endpoint.open_client(STOP_TIMEOUT_S) as client:
                 return client.request(**_build_arguments(step.request, self.policy.endpoint))
-        return self._client.request(**_build_arguments(step.request, self.policy.endpoint))
+        arguments = _build_arguments(step.request, self.policy.endpoint)
+        if step.request.method == "GET":
+            return self._client.request(**arguments, timeout=min(READ_TIMEOUT_S, self._timeout_s))
+        return self._request_watched(arguments)
+
+    def _request_watched(self, arguments: dict[str, Any]) -> httpx.Response:
+        """Send a request that may take long; raise TransportError as soon as the daemon no longer answers others."""
+        future: Future[httpx.Response] = Future()
+        Thread(target=_complete, args=(future, partial(self._client.request, **arguments)), daemon=True).start()
+        while True:
+            with suppress(TimeoutError):
+                return future.result(PROBE_PERIOD_S)
+            self._client.request(**PROBE)
+
+
+def _complete(future: "Future[httpx.Response]", send: Callable[[], httpx.Response]) -> None:
+    try:
+        future.set_result(send())
+    except BaseException as error:  # of the caller's thread
+        future.set_exception(error)
 
 
 class AsyncDaemonClient:
@@ -94,7 +125,16 @@ class AsyncDaemonClient:
         if step.on_new_connection:
             async with self.policy.endpoint.open_async_client(STOP_TIMEOUT_S) as client:
                 return await client.request(**_build_arguments(step.request, self.policy.endpoint))
-        return await self._client.request(**_build_arguments(step.request, self.policy.endpoint))
+        arguments = _build_arguments(step.request, self.policy.endpoint)
+        if step.request.method == "GET":
+            return await self._client.request(**arguments, timeout=READ_TIMEOUT_S)
+        task = asyncio.ensure_future(self._client.request(**arguments))
+        try:
+            while not (await asyncio.wait({task}, timeout=PROBE_PERIOD_S))[0]:
+                await self._client.request(**PROBE)
+            return task.result()
+        finally:
+            task.cancel()
 
 
 def _build_arguments(request: ApiRequest[Any], endpoint: Endpoint) -> dict[str, Any]:

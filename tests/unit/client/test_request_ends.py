@@ -1,0 +1,90 @@
+"""Every request to a daemon ends: one that no longer answers is noticed, one that only takes long is not."""
+
+import asyncio
+import socket
+import threading
+import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from optodrive.client import http
+from optodrive.client.http import AsyncDaemonClient, DaemonClient
+from optodrive.client.requests import ApiRequest
+from optodrive.core.errors import LinkError
+from optodrive.daemon.responses.health import HealthReport
+
+READ = ApiRequest("GET", "/v1/read", HealthReport, idempotent=True)
+ACT = ApiRequest("POST", "/v1/act", HealthReport)
+ACTION_S = 0.6
+"""Time of an action of the server, several probes."""
+
+
+class Server(BaseHTTPRequestHandler):
+    def do_GET(self):
+        self.reply()
+
+    def do_POST(self):
+        time.sleep(ACTION_S)
+        self.reply()
+
+    def reply(self):
+        body = b'{"status": "ok", "version": "1"}'
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *values):
+        pass
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch):
+    monkeypatch.setattr(http, "READ_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(http, "PROBE_PERIOD_S", 0.1)
+    monkeypatch.setitem(http.PROBE, "timeout", 0.2)
+
+
+@pytest.fixture(params=["blocking", "asynchronous"])
+def call(request):
+    """Return a function that sends a request to a URL with one of the clients."""
+
+    def blocking(url, sent):
+        client = DaemonClient(url, "token")
+        try:
+            return client.call(sent)
+        finally:
+            client.close()
+
+    def asynchronous(url, sent):
+        async def run():
+            client = AsyncDaemonClient(url, "token")
+            try:
+                return await client.run(client.policy.call(sent))
+            finally:
+                await client.close()
+
+        return asyncio.run(run())
+
+    return {"blocking": blocking, "asynchronous": asynchronous}[request.param]
+
+
+@pytest.mark.parametrize("sent", [READ, ACT], ids=["read", "act"])
+def test_a_daemon_that_is_suspended_is_noticed(call, sent):
+    with socket.create_server(("127.0.0.1", 0), backlog=8) as listener:  # the kernel accepts, nobody answers
+        begin_s = time.monotonic()
+        with pytest.raises(LinkError, match="no daemon answers"):
+            call(f"http://127.0.0.1:{listener.getsockname()[1]}", sent)
+    assert time.monotonic() - begin_s < 10.0  # of the 60 s of an action
+
+
+def test_an_action_may_take_as_long_as_the_daemon_answers_others(call):
+    with ThreadingHTTPServer(("127.0.0.1", 0), Server) as server:
+        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
+        thread.start()
+        try:
+            assert call(f"http://127.0.0.1:{server.server_port}", ACT) == HealthReport(version="1")
+        finally:
+            server.shutdown()
+            thread.join()
