@@ -2,9 +2,11 @@
 
 from collections import Counter
 
-from bench import BOARD_KINDS
-from scenario import GUARDS, SCENARIOS
+from all_scenarios import SCENARIOS
+from process_board import PROCESS_KINDS
+from scenario import GUARDS
 from test_conform_mutants import MUTANTS
+from test_conformance_pty import IN_EVERY_RUN
 
 ENFORCED = {
     "B1": "gate off unless running",
@@ -26,16 +28,19 @@ ENFORCED = {
 
 
 def scenarios_of(guard):
-    """Return the names of a guard's scenarios, with the number of cases."""
+    """Return the names of a guard's scenarios with the number of cases; †: some of them in every run on a pty."""
     counts = Counter(case.name.partition("-")[0] for case in SCENARIOS if case.subject == guard)
-    return ", ".join(f"`{name}`" + (f" ×{count}" if count > 1 else "") for name, count in counts.items())
+    played = {name.partition("-")[0] for name in IN_EVERY_RUN}
+    return ", ".join(
+        f"`{name}`" + (f" ×{count}" if count > 1 else "") + "†" * (name in played) for name, count in counts.items()
+    )
 
 
 def row(guard):
     """Return a row of the table."""
-    boards = [kind.name for kind in BOARD_KINDS if not kind.spares(guard)]
+    boards = [kind.name for kind in PROCESS_KINDS if not kind.spares(guard)]
     broken = Counter(mutant.board for mutant in MUTANTS if mutant.guard == guard)
-    killed = ", ".join(f"{board} {count}" for board, count in broken.items())
+    killed = ", ".join(f"{board.replace('c', 'C')} {count}" for board, count in broken.items())
     return f"| {guard} | {ENFORCED[guard]} | {scenarios_of(guard)} | {', '.join(boards)} | {killed} |"
 
 

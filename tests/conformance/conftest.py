@@ -1,13 +1,30 @@
-"""Fixtures of board kinds; the scenarios of a module run concurrently."""
+"""Fixtures of the kinds of boards: cores in this process in virtual time, and processes in real time."""
 
-from functools import cache
+from functools import cache, partial
 
 import pytest
 
 pytest.register_assert_rewrite(*(f"{name}_scenarios" for name in ("guard", "job", "link", "order", "self", "trust")))
 
-from bench import BOARD_KINDS  # noqa: E402
-from scenario import run_all  # noqa: E402
+from process_board import ABOUT_ITSELF, PROCESS_KINDS  # noqa: E402
+from virtual_board import VirtualKind  # noqa: E402
+
+from c_core import SeededCBoard, build_library  # noqa: E402
+from optodrive.link.simulator.board_core import BoardCore  # noqa: E402
+
+
+@pytest.fixture(scope="session")
+def virtual(tmp_path_factory):
+    """Return a function for a virtual kind by name, or a mutant of the C core; each is built once."""
+    folder = tmp_path_factory.mktemp("core")
+
+    @cache
+    def build(name, mutant=0):
+        if name == "python":
+            return VirtualKind(name, BoardCore, dict.fromkeys(("B14", "B15"), ABOUT_ITSELF))
+        return VirtualKind(name, partial(SeededCBoard, build_library(folder, mutant)))
+
+    return build
 
 
 @pytest.fixture(scope="session")
@@ -17,35 +34,7 @@ def ready(tmp_path_factory):
 
     @cache
     def build(name, mutant):
-        (kind,) = [kind for kind in BOARD_KINDS if kind.name == name]
+        (kind,) = [kind for kind in PROCESS_KINDS if kind.name == name]
         return kind.ready(boards / f"{name}-{mutant}", mutant)
 
     return build
-
-
-@pytest.fixture(scope="module", params=[kind.name for kind in BOARD_KINDS])
-def board_kind(request, ready):
-    return ready(request.param, 0)
-
-
-@pytest.fixture(scope="module")
-def outcomes(board_kind, request):
-    """Return the futures of this module's selected scenarios, by name."""
-    here = [item for item in request.session.items if item.module is request.module and hasattr(item, "callspec")]
-    requested = {item.callspec.params["case"].name: item.callspec.params["case"] for item in here}
-    futures = run_all(board_kind, [case for case in requested.values() if not board_kind.spares(case.subject)])
-    yield futures
-    for future in futures.values():
-        future.cancel()
-
-
-@pytest.fixture
-def conforms(board_kind, outcomes):
-    """Return a function that raises a scenario's error, or skips it for an exempted kind of board."""
-
-    def look(case):
-        if why := board_kind.spares(case.subject):
-            pytest.skip(f"{board_kind.name}: {why}")
-        outcomes[case.name].result()
-
-    return look

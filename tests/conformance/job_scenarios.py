@@ -6,12 +6,6 @@ from scenario import scenario
 DIM = dict(duty=999)
 
 
-def until(host, state, reason):
-    """Wait for a change of state; return its log entry."""
-    host.wait(lambda: host.board.states()[-1] == (state, reason), f"{state} {reason}")
-    return host.board.of("state")[-1]
-
-
 def start(host, first=0, watermark=1, job=1, start_tick=0):
     """Send START; return the reasons of its NAKs."""
     return host.send_checked("START", job=job, first_index=first, start_tick=start_tick, watermark=watermark)
@@ -35,7 +29,7 @@ def job_begins_at_its_watermark(bench):
     assert host.board.of("gate") == []
     host.order(host.data(here(100, **DIM)))
     host.wait(lambda: host.board.pulse_numbers() == [0, 1, 2], "the points")
-    until(host, "HOLD", "queue empty")
+    host.wait_for_change("queue empty")
 
 
 @scenario("jobs")
@@ -48,7 +42,7 @@ def job_begins_when_all_its_points_are_queued(bench):
     assert host.send_checked("END", job=1, end_index=2) == ["INDEX"]
     assert host.send_checked("END", job=2, end_index=1) == ["STATE"]
     assert host.send_checked("END", job=1, end_index=1) == []
-    until(host, "ARMED", "job done")
+    host.wait_for_change("job done")
     assert host.board.pulse_numbers() == [0]
 
 
@@ -59,7 +53,7 @@ def points_after_end_belong_to_the_next_job(bench):
     assert start(host) == []
     assert host.send_checked("END", job=1, end_index=1) == []
     assert host.order(host.data(here(200, **DIM), here(300, **DIM))) == []
-    until(host, "ARMED", "job done")
+    host.wait_for_change("job done")
     host.pause(0.05)
     assert host.board.pulse_numbers() == [0]
     assert host.status().queued == 2
@@ -67,7 +61,7 @@ def points_after_end_belong_to_the_next_job(bench):
     assert start(host, first=1) == []
     assert start(host, first=1) == ["STATE"]
     assert host.send_checked("END", job=1, end_index=3) == []
-    until(host, "ARMED", "job done")
+    host.wait_for_change("job done", count=2)
     assert host.board.pulse_numbers() == [0, 1, 2]
 
 
@@ -75,8 +69,8 @@ def points_after_end_belong_to_the_next_job(bench):
 def missing_points_disarm_a_second_after_the_start(bench):
     host = bench.ready(**BRIGHT)
     assert start(host) == []
-    began = host.board.of("state")[-1]
-    over = until(host, "DISARMED", "hold too long")
+    (began,) = host.board.changes("start")
+    over = host.wait_for_change("hold too long")
     assert 0 <= over["t_us"] - began["t_us"] - 1_000_000 <= host.board.late_us
 
 
@@ -88,15 +82,15 @@ def hold_ends_at_the_watermark_and_dark_us_counts_from_then(bench):
     host = bench.ready(**BRIGHT)
     host.order(host.data(here(100, **DIM), here(100, **DIM)))
     assert start(host, watermark=2) == []
-    until(host, "HOLD", "queue empty")
+    host.wait_for_change("queue empty")
     host.order(host.data(here(100, dark_us=7000, **DIM)))
     host.pause(0.05)
     assert host.status().state == "HOLD"
     host.order(host.data(here(100, dark_us=7000, **DIM)))
     host.wait(lambda: len(host.board.pulse_numbers()) == 4, "the points")
-    (refilled,) = [entry for entry in host.board.of("state") if entry["reason"] == "refilled"]
+    (refilled,) = host.board.changes("refilled")
     assert 0 <= host.board.of("pulse")[2]["on_us"] - refilled["t_us"] - 7000 <= host.board.late_us
-    assert host.board.states()[-1] == ("HOLD", "queue empty")
+    host.wait_for_change("queue empty", count=2)
     assert host.send_checked("END", job=1, end_index=4) == []
     assert host.board.states()[-1] == ("ARMED", "job done")
 
@@ -105,8 +99,8 @@ def hold_ends_at_the_watermark_and_dark_us_counts_from_then(bench):
 def hold_of_a_second_disarms(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(100, **DIM), end=False)
-    hold = until(host, "HOLD", "queue empty")
-    over = until(host, "DISARMED", "hold too long")
+    hold = host.wait_for_change("queue empty")
+    over = host.wait_for_change("hold too long")
     assert 0 <= over["t_us"] - hold["t_us"] - 1_000_000 <= host.board.late_us
 
 
@@ -114,17 +108,17 @@ def hold_of_a_second_disarms(bench):
 def third_underrun_is_a_fault_and_clearing_resets_the_count(bench):
     host = bench.ready(**BRIGHT)
     host.play(here(100, **DIM), end=False)
-    until(host, "HOLD", "queue empty")
+    host.wait_for_change("queue empty")
     host.order(host.data(here(100, **DIM)))
-    host.wait(lambda: len(host.board.pulse_numbers()) == 2 and host.board.states()[-1][0] == "HOLD", "another")
+    host.wait_for_change("queue empty", count=2)
     host.order(host.data(here(100, **DIM)))
-    until(host, "FAULT", "fault")
-    assert [entry["fault"] for entry in host.board.of("fault")] == ["UNDERRUN"]
+    host.wait_for_change("fault")
+    assert host.board.faults() == ["UNDERRUN"]
     assert host.status().underruns == 3
     assert host.send_checked("CLEAR_FAULT") == []
     host.arm()
     host.play(here(100, **DIM), end=False)
-    until(host, "HOLD", "queue empty")
+    host.wait_for_change("queue empty", count=3)
     assert host.status().underruns == 4
 
 
@@ -134,30 +128,28 @@ def third_underrun_is_a_fault_and_clearing_resets_the_count(bench):
 @scenario("FLUSH")
 def flush_drops_the_queue_and_stays_armed(bench):
     host = bench.ready(**BRIGHT)
-    host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.is_gate_on, "light")
+    count = host.shine(**DIM)
     assert host.send_checked("FLUSH") == []
     status = host.status()
-    assert (status.state, status.queued, status.done_index) == ("ARMED", 0, 24)
+    assert (status.state, status.queued, status.done_index) == ("ARMED", 0, count)
     cut = host.board.of("pulse")[-1]
     flushed = host.board.of("state")[-1]
     assert (flushed["state"], flushed["reason"]) == ("ARMED", "flush")
     assert cut["off_us"] == flushed["t_us"]
     assert cut["off_us"] - cut["on_us"] <= 60_000
     # A host that dropped points continues its own count, never a smaller one.
-    assert host.send_checked("DATA", first_index=23, points=[here(100)]) == ["INDEX"]
-    host.index = 30
+    assert host.send_checked("DATA", first_index=count - 1, points=[here(100)]) == ["INDEX"]
+    host.index = count + 6
     assert host.play(here(100, **DIM)) == []
-    until(host, "ARMED", "job done")
-    assert host.board.pulse_numbers()[-1] == 30
-    assert host.status().done_index == 31
+    host.wait_for_change("job done")
+    assert host.board.pulse_numbers()[-1] == count + 6
+    assert host.status().done_index == count + 7
 
 
 @scenario("ABORT")
 def abort_drops_everything_and_disarms(bench):
     host = bench.ready(**BRIGHT)
-    host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.is_gate_on, "light")
+    host.shine(**DIM)
     _, status = host.request(host.frame("ABORT"))
     assert (status.state, status.queued) == ("DISARMED", 0)
     assert host.board.states()[-1] == ("DISARMED", "abort")
@@ -211,25 +203,22 @@ def each_point_is_reported_and_can_be_requested_again(bench):
 
 @scenario("reports")
 def interrupted_pulse_is_reported_with_its_actual_width(bench):
-    host = bench.ready(settle_ns_per_code=30_000, **BRIGHT)
-    host.play(*[here(60_000, **DIM)] * 24, end=False)
-    host.wait(host.board.is_gate_on, "light")
+    host = bench.ready(settle_ns_per_code=65_000, **BRIGHT)
+    count = host.shine(**DIM)
     assert host.send_checked("FLUSH") == []
     cut = host.board.of("pulse")[-1]
     host.wait(lambda: cut["index"] in reported(host), "its report")
     assert reported(host)[cut["index"]][1:] == (cut["off_us"] - cut["on_us"], 999)
     assert cut["index"] + 1 not in reported(host)
-    host.index = 24
-    host.play(here(100, x=CENTRE + 20_000, **DIM), here(100, **DIM), end=False)
+    host.play(here(100, x=CENTRE + 32_000, **DIM), here(100, **DIM), end=False)  # moves for two seconds
     assert host.send_checked("FLUSH") == []
-    host.index = 40
-    host.play(*[here(100, x=CENTRE + 20_000, **DIM)] * 2)
-    until(host, "ARMED", "job done")
-    host.wait(lambda: 41 in reported(host), "the reports")
-    assert 24 not in reported(host)
+    host.index = later = count + 16
+    host.play(*[here(100, x=CENTRE + 32_000, **DIM)] * 2)
+    host.wait(lambda: later + 1 in reported(host), "the reports")
+    assert count not in reported(host)
     (report,) = host.request(host.frame("GET_EXECUTED", first_index=cut["index"]))[0]
     assert (report.first_index, len(report.records)) == (cut["index"], 1), "a gap in the numbers ends a report"
     (report,) = host.request(host.frame("GET_EXECUTED", first_index=cut["index"] + 1))[0]
-    assert (report.first_index, len(report.records)) == (40, 2)
+    assert (report.first_index, len(report.records)) == (later, 2)
     host.hello()
     assert host.request(host.frame("GET_EXECUTED", first_index=0))[0] == [], "records are the session's"

@@ -6,6 +6,7 @@ import threading
 import time
 import tty
 from contextlib import suppress
+from dataclasses import replace
 
 import serial
 from bench import Bench
@@ -99,18 +100,21 @@ class WitnessedPort(SerialPort):
 
 
 class PtyRig(SessionRig):
-    """A board of a kind behind a proxy, with leases of one second."""
+    """A board of a kind behind a proxy. lease_s: by default more than this process is ever suspended."""
 
-    def __init__(self, kind, folder, seed, loss=0.0, extra=0.0, pauses=0.0):
+    def __init__(self, kind, folder, seed, loss=0.0, extra=0.0, pauses=0.0, lease_s=20.0):
         up, down = (LinkFaults(2 * seed + way, loss, extra, pauses) for way in (0, 1))
         self._bench = Bench(kind, folder)
-        self.board = self._bench.board(lease_ms=1000)
+        self.board = self._bench.board(lease_ms=round(1000 * lease_s))
         self.witness = Witness()
         link = folder / "host"
         self.proxy = Proxy(self.board.port, link, up, down)
         clock = MonotonicClock()
         port = WitnessedPort(str(link), self.witness)
-        super().__init__(BoardSession(port, clock, build_board_requirements(configured(lease_s=1.0))), clock, up, down)
+        required = build_board_requirements(configured())
+        limits = replace(required.limits, lease_ms=round(1000 * lease_s))
+        session = BoardSession(port, clock, replace(required, lease_s=lease_s, limits=limits))
+        super().__init__(session, clock, up, down)
 
     def finish(self):
         """Stop host, proxy and board; check the log and return the number of pulses."""

@@ -1,4 +1,4 @@
-"""Registry and concurrent execution of scenarios, which mostly wait for the two seconds of arming."""
+"""Registry of scenarios, their execution, and the audit of a board's log."""
 
 import tempfile
 import tomllib
@@ -7,12 +7,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from bench import Bench, BoardKind, TooLateError
+from bench import Bench
 
 TABLE = tomllib.loads((Path(__file__).parents[2] / "firmware_protocol" / "messages.toml").read_text())
 TRANSITIONS = {(state, entry["event"], entry["to"]) for entry in TABLE["transition"] for state in entry["from"]}
-AT_ONCE = 12
-ATTEMPTS = 3
+AT_ONCE = 4
+"""Scenarios in real time, which mostly wait for the two seconds of arming."""
 GUARDS = [f"B{k}" for k in range(1, 16)]
 
 
@@ -43,27 +43,16 @@ def scenario(subject, cases=None):
     return register
 
 
-def judge(kind: BoardKind, case: Scenario, excused=Bench.kept):
-    """Run a scenario against a board of a kind; raise AssertionError if the board does not conform.
-
-    It is repeated if the machine was overloaded; a fault of the board fails every time.
-    """
-    for attempt in range(ATTEMPTS):
-        with tempfile.TemporaryDirectory(prefix="conform-") as folder:
-            bench = Bench(kind, folder)
-            try:
-                case.play(bench)
-            except (TooLateError, AssertionError) as error:
-                again = isinstance(error, TooLateError) or excused(bench)
-                bench.finish(audit if again else unseen)
-                if not again or attempt == ATTEMPTS - 1:
-                    raise
-            except BaseException:
-                bench.finish(unseen)
-                raise
-            else:
-                bench.finish(audit)
-                return
+def judge(kind, case: Scenario):
+    """Run a scenario once against a board of a kind; raise AssertionError if the board does not conform."""
+    with tempfile.TemporaryDirectory(prefix="conform-") as folder:
+        bench = Bench(kind, folder)
+        try:
+            case.play(bench)
+        except BaseException:
+            bench.finish(unseen)
+            raise
+        bench.finish(audit)
 
 
 def unseen(board):
@@ -99,9 +88,9 @@ def audit_log(events, state="BOOT"):
     assert [edge for edge in pulsed if edge in shown] == pulses, "pulses that the gate does not show"
 
 
-def run_all(kind: BoardKind, cases: list[Scenario]):
+def run_all(kind, cases: list[Scenario]):
     """Start all scenarios with limited concurrency; return their futures by name."""
-    pool = ThreadPoolExecutor(kind.at_once)
+    pool = ThreadPoolExecutor(AT_ONCE)
     futures = {case.name: pool.submit(judge, kind, case) for case in cases}
     pool.shutdown(wait=False)
     return futures

@@ -5,20 +5,15 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import NamedTuple
 
-import guard_scenarios
 import mutants
-import order_scenarios
 import pytest
-import self_scenarios
-import trust_scenarios
-from bench import BoardKind
-from scenario import AT_ONCE, GUARDS, SCENARIOS, judge
-
-MODULES = [module.__name__ for module in (guard_scenarios, trust_scenarios, order_scenarios, self_scenarios)]
+from all_scenarios import GUARD_MODULES, SCENARIOS
+from process_board import ProcessKind
+from scenario import AT_ONCE, GUARDS, judge
 
 
 class Mutant(NamedTuple):
-    """A board of a kind that violates a guard; name: of the Python mutant, or the C core's MUTANT."""
+    """A board that violates a guard; name: of the simulated board's mutant, or the C core's MUTANT."""
 
     board: str
     guard: str
@@ -26,48 +21,57 @@ class Mutant(NamedTuple):
 
 
 MUTANTS = [Mutant("python", name.partition("_")[0].upper(), name) for name in mutants.MUTANTS]
-MUTANTS += [Mutant("host", guard, guard.removeprefix("B")) for guard in GUARDS]
+MUTANTS += [Mutant("c", guard, guard.removeprefix("B")) for guard in GUARDS]
 
 
-def caught_by(mutant, ready):
-    """Return the first scenario of its guard that a mutant fails, '' if it passes all."""
-    kind = BoardKind(mutant.name, (sys.executable, str(Path(mutants.__file__)), mutant.name))
-    if mutant.board != "python":
-        kind = ready(mutant.board, int(mutant.name))
+def caught_by(kind, guard):
+    """Return the first scenario of a guard that a board fails, '' if it passes all."""
     for case in SCENARIOS:
-        if case.subject == mutant.guard:
+        if case.subject == guard:
             try:
-                judge(kind, case, excused=lambda _: False)
+                judge(kind, case)
             except AssertionError:
                 return case.name
     return ""
 
 
-@pytest.fixture(scope="module")
-def verdicts(request, ready):
-    """Return the futures of `caught_by` for the selected mutants."""
-    requested = [
-        item.callspec.params["mutant"]
-        for item in request.session.items
-        if item.module is request.module and hasattr(item, "callspec")
-    ]
-    with ThreadPoolExecutor(AT_ONCE) as pool:
-        yield {mutant: pool.submit(caught_by, mutant, ready) for mutant in requested}
-
-
-FIRST = {mutant.guard: mutant for mutant in reversed(MUTANTS) if mutant.board == "host"}
-"""The C core's mutant of each guard; scripts/test --slow runs the others."""
-CASES = [mutant if mutant in FIRST.values() else pytest.param(mutant, marks=pytest.mark.slow) for mutant in MUTANTS]
-
-
-@pytest.mark.parametrize("mutant", CASES, ids=lambda mutant: f"{mutant.board}-{mutant.guard}-{mutant.name}")
-def test_caught(mutant, verdicts):
-    scenario = verdicts[mutant].result()
+def assert_caught(mutant, scenario):
     print(f"{mutant.guard}: {mutant.board}'s {mutant.name} is caught by {scenario}")
     assert scenario, "passes every scenario of its guard"
 
 
+@pytest.mark.parametrize("mutant", MUTANTS, ids="-".join)
+def test_caught(mutant, virtual, monkeypatch):
+    if mutant.board == "python":
+        monkeypatch.setattr(*mutants.MUTANTS[mutant.name]())
+        kind = virtual("python")
+    else:
+        kind = virtual("c", int(mutant.name))
+    assert_caught(mutant, caught_by(kind, mutant.guard))
+
+
+@pytest.fixture(scope="module")
+def verdicts(request, ready):
+    """Return the futures of `caught_by` for the selected mutants as processes."""
+
+    def find(mutant):
+        kind = ProcessKind(mutant.name, (sys.executable, str(Path(mutants.__file__)), mutant.name))
+        return caught_by(kind if mutant.board == "python" else ready("host", int(mutant.name)), mutant.guard)
+
+    requested = [
+        item.callspec.params["mutant"] for item in request.session.items if item.function is test_caught_as_a_process
+    ]
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        yield {mutant: pool.submit(find, mutant) for mutant in requested}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mutant", MUTANTS, ids="-".join)
+def test_caught_as_a_process(mutant, verdicts):
+    assert_caught(mutant, verdicts[mutant].result())
+
+
 def test_every_guard_has_scenarios_and_mutants():
-    assert {mutant.guard for mutant in MUTANTS if mutant.board == "host"} == set(GUARDS)
+    assert {mutant.guard for mutant in MUTANTS if mutant.board == "c"} == set(GUARDS)
     assert {mutant.guard for mutant in MUTANTS if mutant.board == "python"} == set(GUARDS[:13])
-    assert {case.subject for case in SCENARIOS if case.module in MODULES} == set(GUARDS)
+    assert {case.subject for case in SCENARIOS if case.module in GUARD_MODULES} == set(GUARDS)

@@ -7,7 +7,9 @@ import pytest
 for folder in ("simulator", "protocol"):  # bench, checks and vectors of the Python tests
     sys.path.append(str(Path(__file__).parents[1] / "unit" / "link" / folder))
 
-from c_board import CBench, build_library  # noqa: E402 - it stands on the bench
+from c_board import CBench  # noqa: E402 - it stands on the bench
+
+from c_core import build_library  # noqa: E402
 
 
 @pytest.fixture(scope="session")

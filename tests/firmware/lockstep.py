@@ -2,8 +2,7 @@
 
 import random
 
-from c_board import CBoard
-
+from c_core import CBoard
 from optodrive.link.protocol import messages as m
 from optodrive.link.protocol.framing import Frame, FrameDecoder, encode_frame
 from optodrive.link.simulator.board_core import BoardCore

@@ -6,8 +6,9 @@ from itertools import pairwise
 import pytest
 import test_board_guards as python_board
 from board_bench import CENTRE, here, naks
-from c_board import CBench, CBoard
+from c_board import CBench
 
+from c_core import CBoard
 from optodrive.link.protocol import messages as m
 
 CHECKS = {n: getattr(python_board, f"check_b{n}") for n in range(1, 14)}

@@ -5,7 +5,6 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from c_board import CBoard
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "conformance"))  # before a folder with its own bench module
 
@@ -13,19 +12,13 @@ import test_link_faults_virtual as python_board
 from test_link_faults_virtual import *  # noqa: F403
 from virtual_rig import VirtualRig
 
+from c_core import SeededCBoard
+
 # Tests of the fault injection or of the host alone, and mutants of the simulated board, replaced below.
 del test_a_board_that_violates_a_guard_is_detected  # noqa: F821
 del test_equal_seeds_give_equal_faults  # noqa: F821
 del test_goodput_of_a_full_line_at_one_percent_loss  # noqa: F821
 del test_goodput_of_a_job_at_one_percent_loss  # noqa: F821
-
-
-class SeededCBoard(CBoard):
-    """A C core with the constructor of the simulated board."""
-
-    def __init__(self, library, settings, sink, seed):
-        entropy = python_board.random.Random(seed)
-        super().__init__(library, settings, sink, [entropy.getrandbits(32) for _ in range(4096)])
 
 
 SEEDS = range(5, 13)

@@ -4,9 +4,10 @@ import ctypes
 
 import pytest
 import test_messages as wire
-from c_board import CBench, CBoard
+from c_board import CBench
 from lockstep import Lockstep
 
+from c_core import CBoard
 from optodrive.link.protocol import messages as m
 
 SESSION = 0xBEEF

@@ -50,6 +50,8 @@ def make_firmware_board(make_board, program):
         ("--script", '[[step]]\nat_s = 1\nset = "door"', "interlock, key, estop"),
         ("--script", '[[step]]\ndo = "reset"', "at_s"),
         ("--script", '[[step]]\nat_s = 1\ndo = "reset"\nhow = 1', "got how"),
+        ("--script", '[[step]]\nat_s = 1\ndo = "reset"\nfrom = "light"', "start or signal"),
+        ("--script", '[[step]]\nat_s = 1\ndo = "reset"\nfrom = "signal"', "got at_s"),
         ("--script", "at_s = 1", "nothing but [[step]]"),
         ("--script", None, "a readable file"),
         ("--log", None, "--log"),

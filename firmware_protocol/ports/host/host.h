@@ -55,12 +55,16 @@ struct step {
     enum step_kind kind;
     uint8_t input; /* INPUT_ bit */
     bool value;
+    bool waits; /* for a signal, not for at_us */
     double rate;
 };
 
 struct script {
     struct step steps[STEPS_MAX];
     size_t count, next;
+    struct step signalled[STEPS_MAX]; /* in the order of the file; each SIGUSR1 carries out the next one */
+    size_t signalled_count, signalled_next;
+    int signals_seen;
 };
 
 void script_read(struct script *script, const char *path);

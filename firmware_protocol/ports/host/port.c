@@ -21,11 +21,16 @@
 #define LATE_TICK_US 1000u
 #define TIMER_SLACK_NS 1000ul
 
-static volatile sig_atomic_t stopped;
+static volatile sig_atomic_t stopped, signals;
 
 static void on_signal(int number) {
     (void)number;
     stopped = 1;
+}
+
+static void on_step_signal(int number) {
+    (void)number;
+    signals++;
 }
 
 static uint64_t clock_ns(void) {
@@ -166,6 +171,12 @@ static void run_due_steps(struct port *port) {
         run_ticks_until(port, step->at_us);
         run_step(port, step);
     }
+    for (; script->signals_seen != (int)signals; script->signals_seen++) {
+        if (script->signalled_next < script->signalled_count) {
+            run_ticks_until(port, now_us(port));
+            run_step(port, &script->signalled[script->signalled_next++]);
+        }
+    }
 }
 
 /* --- one iteration --- */
@@ -259,6 +270,7 @@ void port_run(struct port *port) {
     };
     signal(SIGTERM, on_signal);
     signal(SIGINT, on_signal);
+    signal(SIGUSR1, on_step_signal);
     prctl(PR_SET_TIMERSLACK, TIMER_SLACK_NS);
     port->inputs = INPUT_INTERLOCK | INPUT_KEY;
     port->started_ns = clock_ns();

@@ -1,4 +1,4 @@
-/* Scripts: timed steps of inputs and faults. */
+/* Scripts: steps of inputs and faults, at a time or at a signal. */
 
 #include <string.h>
 
@@ -48,22 +48,35 @@ static void read_action(struct step *step, const struct toml *toml, unsigned tab
     }
 }
 
+static bool read_origin(const struct toml *toml, unsigned table, const char *where) {
+    const struct toml_entry *from = toml_find(toml, table, "from");
+    bool waits = from && from->kind == TOML_STRING && strcmp(from->text, "signal") == 0;
+    if (from && !waits && !(from->kind == TOML_STRING && strcmp(from->text, "start") == 0)) {
+        bad_input(where, from->raw, "from to be start or signal");
+    }
+    return waits;
+}
+
 static struct step read_step(const struct toml *toml, unsigned table, const char *path) {
     struct step step = {.rate = 0.01};
     char where[300];
     snprintf(where, sizeof where, "%s: step %u", path, table - 1);
     read_action(&step, toml, table, where);
+    step.waits = read_origin(toml, table, where);
     const struct toml_entry *value = toml_find(toml, table, "value"), *rate = toml_find(toml, table, "rate");
     for (size_t k = 0; k < toml->count; k++) {
         const struct toml_entry *entry = &toml->entries[k];
-        bool known = strcmp(entry->key, "at_s") == 0 || strcmp(entry->key, step.kind == STEP_SET ? "set" : "do") == 0 ||
+        bool known = strcmp(entry->key, "from") == 0 || (!step.waits && strcmp(entry->key, "at_s") == 0) ||
+                     strcmp(entry->key, step.kind == STEP_SET ? "set" : "do") == 0 ||
                      strcmp(entry->key, step.kind == STEP_SET ? "value" : "rate") == 0;
         if (entry->table == table && !known) {
-            bad_input(where, entry->key, step.kind == STEP_SET ? "at_s, set, value" : "at_s, do, rate");
+            bad_input(where, entry->key, step.kind == STEP_SET ? "at_s, from, set, value" : "at_s, from, do, rate");
         }
     }
-    double at_s = read_number(toml_find(toml, table, "at_s"), where, "at_s, a time from 0 in s", 1e9);
-    step.at_us = (uint64_t)(at_s * 1e6 + 0.5);
+    if (!step.waits) {
+        double at_s = read_number(toml_find(toml, table, "at_s"), where, "at_s, a time from 0 in s", 1e9);
+        step.at_us = (uint64_t)(at_s * 1e6 + 0.5);
+    }
     if (rate) {
         step.rate = read_number(rate, where, "a rate per byte, 0 to 1", 1.0);
     }
@@ -85,6 +98,10 @@ void script_read(struct script *script, const char *path) {
     }
     for (unsigned table = 1; table <= toml->tables; table++) {
         struct step step = read_step(toml, table, path);
+        if (step.waits) {
+            script->signalled[script->signalled_count++] = step;
+            continue;
+        }
         size_t at = script->count++;
         for (; at > 0 && script->steps[at - 1].at_us > step.at_us; at--) {
             script->steps[at] = script->steps[at - 1];

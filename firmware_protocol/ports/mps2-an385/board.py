@@ -20,6 +20,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,7 @@ POLL_US = 1_000
 TIMEOUT_S = 5.0
 START_TIMEOUT_S = 40.0
 """Time limit for the emulator to open its sockets, if several start from disk at once."""
+READ_MAX = 65_536
 FAULT_COMMANDS = {"stop_loop": b"H", "late_tick": b"T", "stick_gate": b"S"}
 KINDS = ("gate", "state", "fault", "pulse", "rx_error")
 
@@ -137,8 +139,10 @@ class QemuCore:
             data = data[self._host_socket.send(data) :]
 
     def bytes_to_send(self) -> bytes:
-        """Return the bytes for the host."""
-        return self._read(self._host_socket)
+        """Return the bytes for the host, after all that the chip logged before them."""
+        data = self._read(self._host_socket)
+        self._poll()
+        return data
 
     def on_link_lost(self, now_us: int) -> None:
         """Report the lost link and wait until the board is disarmed."""
@@ -180,10 +184,11 @@ class QemuCore:
     # --- log ----------------------------------------------------------------------------------------------------
 
     def _read(self, link: socket.socket) -> bytes:
-        try:
-            return link.recv(65_536)
-        except BlockingIOError:
-            return b""
+        data = b""
+        with suppress(BlockingIOError):
+            while piece := link.recv(READ_MAX):
+                data += piece
+        return data
 
     def _poll(self) -> None:
         *whole, self._log_buffer = (self._log_buffer + self._read(self._log_socket)).split(b"\n")

@@ -71,6 +71,7 @@ def main(
         request_realtime_scheduling()  # not for an emulator, which this process would starve
     signal.signal(signal.SIGTERM, board.stop)
     signal.signal(signal.SIGINT, board.stop)
+    signal.signal(signal.SIGUSR1, board.on_signal)
     board.run()
     if board.failure:
         print(f"optodrive.link.simulator.board_process: {board.failure}", file=sys.stderr)

@@ -76,8 +76,10 @@ class PtyBoard:
         self._optics = optics
         self._link_path = link
         self._log_file = log
-        self._script = [step for step in script if not step.from_first_pulse]
-        self._steps_from_first_pulse = [step for step in script if step.from_first_pulse]
+        self._script = [step for step in script if step.origin == "start"]
+        self._steps_from_first_pulse = [step for step in script if step.origin == "light"]
+        self._steps_on_signal = [step for step in script if step.origin == "signal"]
+        self._signal_count = 0
         self._exit_when_closed_s = exit_when_closed_s
         self._started_s = time.monotonic()
         self._running = True
@@ -115,6 +117,10 @@ class PtyBoard:
     def stop(self, *_: object) -> None:
         """Stop after this iteration."""
         self._running = False
+
+    def on_signal(self, *_: object) -> None:
+        """Carry out the next step that waits for a signal in the next iteration."""
+        self._signal_count += 1
 
     def run(self) -> None:
         """Run until stopped; then disarm and remove the link."""
@@ -233,10 +239,14 @@ class PtyBoard:
 
     def _run_due_steps(self) -> None:
         while self._script and self._script[0].at_s <= self._now_s():
-            self._run_step(self._script.pop(0))
+            step = self._script.pop(0)
+            self._run_step(step, int(step.at_s * 1e6))  # the scripted time, not the time of this poll
+        while self._signal_count:
+            self._signal_count -= 1
+            if self._steps_on_signal:
+                self._run_step(self._steps_on_signal.pop(0), self._now_us())
 
-    def _run_step(self, step: ScriptStep) -> None:
-        now_us = min(self._now_us(), int(step.at_s * 1e6))  # the scripted time, not the time of this poll
+    def _run_step(self, step: ScriptStep, now_us: int) -> None:
         if step.kind == "set":
             self._core.set_input(step.name, step.value, now_us)
         elif step.name == "reset":

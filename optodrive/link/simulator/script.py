@@ -10,7 +10,8 @@ at_s = 2.0
 do = "flip_bits"       # or "drop_bytes" (both with rate), "hang", "repair", "reset", "close"
 rate = 0.01
 
-With from = "light", at_s counts from the first pulse. With --sensor also: "stick_x", "stick_y", "invert_readback",
+With from = "light", at_s counts from the first pulse; with from = "signal", a step has no at_s, and each SIGUSR1 to the
+process carries out the next one. With --sensor also: "stick_x", "stick_y", "invert_readback",
 "blind_sensor", "unplug_sensor".
 """
 
@@ -18,7 +19,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 from optodrive.core.errors import InputError, suggest_nearest
 from optodrive.core.files import read_toml
@@ -26,6 +27,7 @@ from optodrive.link.protocol.messages import INPUTS
 
 SENSOR_ACTIONS = ("stick_x", "stick_y", "invert_readback", "blind_sensor", "unplug_sensor")
 """Faults of mirrors and spot sensor."""
+Origin = Literal["start", "light", "signal"]
 ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSOR_ACTIONS)
 
 
@@ -33,7 +35,7 @@ ACTIONS = ("flip_bits", "drop_bytes", "hang", "repair", "reset", "close", *SENSO
 class ScriptStep:
     """One step. kind: "set" or "do"; name: the input or the action.
 
-    from_first_pulse: at_s counts from the first pulse, else from the start
+    origin: what at_s counts from, the start or the first pulse; "signal": the step waits for a signal instead
     """
 
     at_s: float
@@ -41,7 +43,7 @@ class ScriptStep:
     name: str
     value: bool = False
     rate: float = 0.0
-    from_first_pulse: bool = False
+    origin: Origin = "start"
 
 
 def load_script(path: Path, extra_actions: Collection[str] = ()) -> list[ScriptStep]:
@@ -65,19 +67,20 @@ def _parse_step(where: str, entry: dict[str, Any], actions: tuple[str, ...]) -> 
     name = entry.get(kind)
     if not isinstance(name, str) or name not in known:
         raise InputError(f"{where}: {kind}", name, f"a known one, {suggest_nearest(str(name), list(known))}")
-    at_s = _parse_number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
+    origin = entry.get("from", "start")
+    if origin not in get_args(Origin):
+        raise InputError(f"{where}: from", origin, "start, light or signal")
+    waits = origin == "signal"
+    at_s = 0.0 if waits else _parse_number(f"{where}: at_s", entry.get("at_s"), "a time ≥ 0 in s", inf)
     rate = _parse_number(f"{where}: rate", entry.get("rate", 0.01), "a rate per byte, 0 to 1", 1.0)
     value = entry.get("value", False)
     if not isinstance(value, bool):
         raise InputError(f"{where}: value", value, "true or false")
-    origin = entry.get("from", "start")
-    if origin not in ("start", "light"):
-        raise InputError(f"{where}: from", origin, "start or light")
-    allowed = ["at_s", "from", *(("set", "value") if kind == "set" else ("do", "rate"))]
+    allowed = [*(() if waits else ("at_s",)), "from", *(("set", "value") if kind == "set" else ("do", "rate"))]
     for key in entry:
         if key not in allowed:
             raise InputError(where, key, f"a known key, {suggest_nearest(key, allowed)}")
-    return ScriptStep(at_s, kind, name, value, rate, origin == "light")
+    return ScriptStep(at_s, kind, name, value, rate, origin)
 
 
 def _parse_number(where: str, value: object, expected: str, max_value: float) -> float:

@@ -76,13 +76,15 @@ def test_script_is_sorted_and_has_defaults(file):
     steps = load_script(
         file(
             '[[step]]\nat_s = 2\ndo = "flip_bits"\nrate = 0.5\n'
-            '[[step]]\nat_s = 1.5\nset = "key"\n[[step]]\nat_s = 3\ndo = "hang"\nfrom = "light"'
+            '[[step]]\nat_s = 1.5\nset = "key"\n[[step]]\nat_s = 3\ndo = "hang"\nfrom = "light"\n'
+            '[[step]]\nfrom = "signal"\ndo = "reset"'
         )
     )
     assert steps == [
+        ScriptStep(0.0, "do", "reset", rate=0.01, origin="signal"),
         ScriptStep(1.5, "set", "key", value=False, rate=0.01),
         ScriptStep(2.0, "do", "flip_bits", rate=0.5),
-        ScriptStep(3.0, "do", "hang", rate=0.01, from_first_pulse=True),
+        ScriptStep(3.0, "do", "hang", rate=0.01, origin="light"),
     ]
     assert load_script(file("")) == []
 
@@ -103,6 +105,7 @@ def test_script_is_sorted_and_has_defaults(file):
         ('[[step]]\nat_s = 1\nset = "key"\ndo = "reset"', "got 'do'"),
         ('[[step]]\nat_s = 1\ndo = "flip_bits"\nrate = 2', "rate: got 2"),
         ('[[step]]\nat_s = 1\ndo = "hang"\nfrom = "dawn"', "from: got 'dawn'"),
+        ('[[step]]\nat_s = 1\ndo = "hang"\nfrom = "signal"', "step 0: got 'at_s'"),
         ('[step]\nat_s = 1\ndo = "reset"', "two brackets"),
         ("steps = 1", "nothing but"),
     ],

@@ -1,0 +1,188 @@
+"""Boards in virtual time: a board core in this process, the port of a host, and a clock that waits for nobody."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+from board_log import BoardLog
+
+from c_core import SeededCBoard
+from optodrive.core.clock import ManualClock
+from optodrive.link.simulator.board_limits import DEFAULT_LIMITS, BoardSettings
+
+READ_WAIT_S = 0.005
+ADVANCE_US = 5000
+"""Longest step of a board; its events have their exact times."""
+WATCHDOG_US = 50_000
+WATCHDOG_CAUSE = 3
+LATE_TICK_US = 1000
+BYTE_S = 10 / 1_000_000
+"""Time of a byte on the line."""
+
+
+class VirtualKind(NamedTuple):
+    """A board core. make_core: (settings, sink, seed) → core; spared: as of a process."""
+
+    name: str
+    make_core: Callable[..., Any]
+    spared: dict[str, str] = {}  # noqa: RUF012 - nobody writes to it
+
+    def spares(self, subject):
+        """Return the reason for exempting it from a subject, '' if it is tested."""
+        return self.spared.get(subject, "")
+
+    def make_clock(self):
+        """Return the clock of a bench."""
+        return VirtualClock()
+
+    def start(self, folder, clock, number, steps, limits):
+        """Return a new board; number: its seed."""
+        guarded = {name: value for name, value in limits.items() if hasattr(DEFAULT_LIMITS, name)}
+        others = {name: value for name, value in limits.items() if name not in guarded}
+        settings = BoardSettings(replace(DEFAULT_LIMITS, **guarded), **others)
+        return VirtualBoard(self.make_core, settings, clock, number, steps)
+
+
+class VirtualClock(ManualClock):
+    """A clock that advances boards while its owner sleeps."""
+
+    def __init__(self):
+        super().__init__()
+        self.boards = []
+
+    def now_us(self):
+        """Return the time in µs."""
+        return round(self.now_s() * 1e6)
+
+    def sleep(self, duration_s):
+        """Advance the boards and the time."""
+        before_us = self.now_us()
+        super().sleep(duration_s)
+        for board in self.boards:
+            for at_us in range(before_us + ADVANCE_US, self.now_us(), ADVANCE_US):
+                board.advance(at_us)
+            board.advance(self.now_us())
+
+
+class VirtualBoard(BoardLog):
+    """A board core with its port. steps: of its script, carried out by `next_step`.
+
+    The C core's main loop can stop (the watchdog then resets it), its tick be late and its gate stick, as in the ports.
+    """
+
+    patience_s = 15.0
+
+    def __init__(self, make_core, settings, clock, seed, steps):
+        self.clock = clock
+        self._log = []
+        self._core = make_core(settings, self._log.append, seed=seed)
+        self._has_loop = isinstance(self._core, SeededCBoard)
+        self._steps = list(steps)
+        self._is_open = self._loop_stopped = False
+        self._resumes_us = 0
+        self._input = self._output = b""
+        clock.boards.append(self)
+
+    def events(self):
+        """Return all log entries so far."""
+        return list(self._log)
+
+    # --- time ---
+
+    @property
+    def _is_serving(self):
+        return not self._loop_stopped and self.clock.now_us() >= self._resumes_us
+
+    def advance(self, now_us):
+        """Advance to a time."""
+        if now_us < self._resumes_us:
+            return
+        if self._resumes_us:
+            self._core.tick(self._resumes_us)
+            self._resumes_us = 0
+        if not self._loop_stopped:
+            self._core.advance(now_us)
+            self._receive(now_us)
+            return
+        self._core.advance(now_us, loop=False)
+        if now_us - self._core.fed_us > WATCHDOG_US:
+            self._core.reset(now_us, WATCHDOG_CAUSE)
+            self._loop_stopped = False
+
+    def _receive(self, now_us):
+        data, self._input = self._input, b""
+        if data:
+            self._core.receive(data, now_us)
+        self._output += self._core.bytes_to_send() if self._is_open else b""
+
+    def next_step(self):
+        """Carry out the next step of the script."""
+        step, now_us = self._steps.pop(0), self.clock.now_us()
+        if "set" in step:
+            self._core.set_input(step["set"], step["value"], now_us)
+        elif step["do"] == "reset":
+            self._core.reset(now_us)
+            self._output = b""
+        elif step["do"] == "stop_loop":
+            self._loop_stopped = True
+        elif step["do"] == "late_tick":
+            self._resumes_us = now_us + LATE_TICK_US
+        else:
+            assert step["do"] == "stick_gate"
+            self._core.stick(stuck=True, on=self._core.gate_output)
+
+    # --- port ---
+
+    def open(self):
+        """Return the host's end of the port."""
+        assert not self._is_open, "one host at a time"
+        self._is_open = True
+        self._log.append({"t_us": self.clock.now_us(), "event": "port", "open": True})
+        self._core.bytes_to_send()
+        return VirtualLine(self)
+
+    def close(self):
+        """Close the port."""
+        if self._is_open:
+            self._log.append({"t_us": self.clock.now_us(), "event": "port", "open": False})
+            self._core.on_link_lost(self.clock.now_us())
+            self._is_open, self._output = False, b""
+
+    def receive(self, data):
+        """Receive bytes from the host."""
+        self._input += data
+        if self._is_serving:
+            self._receive(self.clock.now_us())
+
+    def take_output(self):
+        """Return the bytes for the host."""
+        data, self._output = self._output, b""
+        return data
+
+    def end(self):
+        """Close the port."""
+        self.close()
+
+
+class VirtualLine:
+    """The host's end of a board's port."""
+
+    def __init__(self, board):
+        self._board = board
+
+    def write(self, data):
+        """Send bytes; they take their time on the line."""
+        self._board.clock.sleep(len(data) * BYTE_S)
+        self._board.receive(data)
+
+    def read(self):
+        """Return the bytes that have arrived; wait for READ_WAIT_S if there are none."""
+        data = self._board.take_output()
+        if not data:
+            self._board.clock.sleep(READ_WAIT_S)
+            data = self._board.take_output()
+        return data
+
+    def close(self):
+        """Close the port."""
+        self._board.close()
