@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from board_fixtures import board_disarmed, daemon_disarmed, disarmed, kept, make_board, make_daemon  # noqa: F401 - fixtures
+from page_bench import Bench
 from window import TIMEOUT_MS, PageVisit, launch_chromium
 
 
@@ -15,12 +15,51 @@ def browser():
         yield browser
 
 
+@pytest.fixture(scope="module")
+def kept_bench(tmp_path_factory):
+    bench = Bench(tmp_path_factory.mktemp("bench"))
+    yield bench
+    bench.stop()
+
+
 @pytest.fixture
-def visit(browser):
+def bench(kept_bench):
+    """One board and one daemon for all tests of a module, disarmed and without a fault before each test."""
+    kept_bench.reset()
+    return kept_bench
+
+
+@pytest.fixture
+def daemon(bench):
+    return bench.daemon
+
+
+@pytest.fixture(scope="module")
+def kept_window(browser, kept_bench):
+    window = PageVisit(browser, kept_bench.daemon.url, has_touch=True, reduced_motion="reduce")
+    yield window
+    window.context.close()
+
+
+@pytest.fixture
+def window(kept_window, bench):
+    """One window for all tests of a module: a page that was just loaded, in a browser that remembers nothing."""
+    kept_window.reset()
+    return kept_window
+
+
+@pytest.fixture
+def page(window):
+    return window.page
+
+
+@pytest.fixture
+def visit(browser, bench):
+    """Return a function that opens a window of its own, for tests of a browser that was not here before."""
     visits = []
 
-    def open_visit(host, **options):
-        visits.append(PageVisit(browser, host.url, **options))
+    def open_visit(**options):
+        visits.append(PageVisit(browser, bench.daemon.url, **{"reduced_motion": "reduce"} | options))
         return visits[-1]
 
     yield open_visit

@@ -18,20 +18,6 @@ FLAGS = (
 )
 TIMEOUT_MS = 30_000
 WIDE, PHONE = {"width": 1280, "height": 800}, {"width": 390, "height": 844}
-INTERLOCK = """
-[[step]]
-from = "light"
-at_s = 1.0
-set = "interlock"
-value = false
-
-[[step]]
-from = "light"
-at_s = 4.0
-set = "interlock"
-value = true
-"""
-"""Script of a board whose interlock opens during light, and closes three seconds later."""
 
 
 @contextmanager
@@ -73,6 +59,24 @@ class PageVisit:
             ) from error
         return self.page
 
+    def reset(self, token=TOKEN):
+        """Load the page anew with a token, as if this browser had never been here; its motion is reduced."""
+        self.page.unroute_all()
+        self.page.set_viewport_size(WIDE)
+        self.page.emulate_media(color_scheme="light", reduced_motion="reduce")
+        if self.page.url.startswith(self.url):
+            self.page.evaluate("Storage.prototype.setItem = () => {}; sessionStorage.clear(); localStorage.clear()")
+        self.sign_in(token)
+        self.console_errors.clear()
+
+    def sign_in(self, token):
+        """Load the page with the cookie that a login leaves."""
+        name = f"optodrive-{self.url.rpartition(':')[2]}"
+        self.context.clear_cookies()
+        self.context.add_cookies([{"name": name, "value": token, "url": self.url, "sameSite": "Strict"}])
+        self.page.goto(self.url)
+        self.page.get_by_text("live", exact=True).wait_for()
+
     def unexpected_errors(self, *expected):
         """Return the console errors except the expected ones; the 401 of the login is always expected."""
         expected = ("401", *expected)
@@ -91,6 +95,19 @@ def press_escape(page):
     with page.expect_response("**/v1/stop", timeout=5_000):
         page.keyboard.press("Escape")
     page.locator("#stopping").wait_for(state="hidden")
+
+
+def list_violations(page, axe, within="html"):
+    """Return what axe-core finds in a part of the page."""
+    if not page.evaluate("'axe' in window"):
+        page.evaluate(axe)
+    return page.evaluate(
+        """async (within) => {
+            const { violations } = await axe.run(within, { resultTypes: ["violations"] });
+            return violations.map(({ id, nodes }) => `${id}: ${nodes.map((node) => node.html.slice(0, 120))}`);
+        }""",
+        within,
+    )
 
 
 def play_for(daemon, seconds):

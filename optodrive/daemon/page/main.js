@@ -304,7 +304,8 @@ telemetry.addEventListener("display", ({ detail }) => {
 });
 telemetry.run();
 
-// Texts and charts are updated a few times per second.
+// Charts are updated a few times per second, texts once.
+const updateMs = reducedMotion ? 500 : 100;
 let lastCount = { frames: 0, at: performance.now() };
 let updates = 0;
 setInterval(() => {
@@ -314,11 +315,11 @@ setInterval(() => {
     describeSelected();
     trace.paint();
   }
-  if (updates % 10 === 0) {
+  if (updates % (1000 / updateMs) === 0) {
     const now = performance.now();
     view.rate = Math.round(((view.frames - lastCount.frames) * 1000) / (now - lastCount.at));
     lastCount = { frames: view.frames, at: now };
     describeDisplay();
     timeline.describe();
   }
-}, reducedMotion ? 500 : 100);
+}, updateMs);
