@@ -25,8 +25,8 @@ PROBLEMS_HEAD = """Every route may send these statuses with a [Problem](#problem
 |---|---|"""
 MODELS_HEAD = """## Models
 
-The JSON bodies. A type in parentheses may be null. Members of `Problem` and `FrameResult` that do not apply are absent;
-all other models always have all members.
+The JSON bodies. A type in parentheses may be null. Members of `Problem`, `FrameResult` and `HoldReport` that do not
+apply are absent; all other models always have all members.
 """
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from optodrive.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from optodrive.cli.options import DEFAULT_URL, HoldOption, JsonOption, UrlOption
 from optodrive.cli.output import print_json
 from optodrive.core.errors import OptodriveError
 
@@ -35,12 +35,21 @@ def status(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
         print(f"limits    {_format_limits(client.call(READ_CONFIG).limits)}")
 
 
-def arm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
-    """Arm the board; its indicator is on for two seconds first."""
+def arm(url: UrlOption = DEFAULT_URL, hold: HoldOption = False, json: JsonOption = False) -> None:
+    """Arm the board; its indicator is on for two seconds first. With --hold, until this command ends (Ctrl-C)."""
     from optodrive.client.http import DaemonClient
-    from optodrive.client.requests import ARM
+    from optodrive.client.requests import ARM, READ_STATE
 
-    _print_state(DaemonClient(url).call(ARM), json)
+    client = DaemonClient(url)
+    if not hold:
+        _print_state(client.call(ARM), json)
+        return
+    from optodrive.client.hold import Hold
+
+    with Hold(client.policy.endpoint) as held:
+        _print_state(client.call(READ_STATE), json)
+        sys.stdout.flush()
+        print(f"optodrive: the board was disarmed: {held.wait()}", file=sys.stderr)
 
 
 def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -94,7 +103,8 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
     print(f"link      {link.port}: {link.state}")
     print(f"board     {board.state}" + (f", fault {board.fault}: {board.hint}" if board.fault else ""))
     if state.control is not None:
-        print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago")
+        held = ", held by its connection" if state.control.hold else ""
+        print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago{held}")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
     if link.state == "up":

@@ -35,6 +35,10 @@ PixelMapOption = Annotated[
 UrlOption = Annotated[
     str, typer.Option("--url", envvar="OPTODRIVE_URL", help="URL of the daemon, or unix:PATH for its socket.")
 ]
+HoldOption = Annotated[
+    bool,
+    typer.Option("--hold", help="Arm the board for the time of this command: it disarms with the end of its process."),
+]
 StrictOption = Annotated[bool, typer.Option("--strict", help="Same as --policy refuse.")]
 PolicyOption = Annotated[
     Literal["trim", "delay", "refuse"],

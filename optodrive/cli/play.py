@@ -2,6 +2,7 @@
 
 import base64
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +11,7 @@ import typer
 from optodrive.cli.options import (
     DEFAULT_URL,
     FitOption,
+    HoldOption,
     JsonOption,
     PatternPolicyOption,
     PolicyOption,
@@ -45,6 +47,7 @@ def push(
     policy: PolicyOption = "trim",
     fit: FitOption = "as_is",
     wait: WaitOption = True,
+    hold: HoldOption = False,
     json: JsonOption = False,
 ) -> None:
     """Plan frames and trains, show them, and report what was executed."""
@@ -56,7 +59,8 @@ def push(
     except OSError as error:
         raise InputError(str(frames), error.strerror, "a readable file") from None
     client = DaemonClient(url)
-    _follow_plan(client, client.call(build_push_request(body, policy, fit, dry_run, strict)), wait, json)
+    with _hold_if(hold, client, dry_run, wait):
+        _follow_plan(client, client.call(build_push_request(body, policy, fit, dry_run, strict)), wait, json)
 
 
 def play(
@@ -68,6 +72,7 @@ def play(
     policy: PatternPolicyOption = None,
     fit: FitOption = "as_is",
     wait: WaitOption = True,
+    hold: HoldOption = False,
     json: JsonOption = False,
 ) -> None:
     """Play a named pattern, for example: play text "hello" height_um=150."""
@@ -77,7 +82,20 @@ def play(
     parameters = _parse_parameters(pattern, values or [])
     client = DaemonClient(url)
     request = build_play_request(pattern, parameters, policy, fit, dry_run, strict)
-    _follow_plan(client, client.call(request), wait, json)
+    with _hold_if(hold, client, dry_run, wait):
+        _follow_plan(client, client.call(request), wait, json)
+
+
+def _hold_if(hold: bool, client: "DaemonClient", dry_run: bool, wait: bool) -> AbstractContextManager[object]:
+    """Arm the board until the command ends, if `hold`."""
+    if not hold:
+        return nullcontext()
+    if dry_run or not wait:
+        other = "--dry-run" if dry_run else "--no-wait"
+        raise InputError("--hold", other, "a command that shows a plan and waits for its end")
+    from optodrive.client.hold import Hold
+
+    return Hold(client.policy.endpoint)
 
 
 def patterns(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:

@@ -9,6 +9,7 @@ from optodrive.client.async_stream import AsyncStream
 from optodrive.client.display import RECONNECT_TIMEOUT_S
 from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
+from optodrive.client.hold import AsyncHold
 from optodrive.client.http import AsyncDaemonClient
 from optodrive.client.operations import DisplayOperations
 from optodrive.client.plan import Plan
@@ -30,6 +31,7 @@ class AsyncDisplay:
         self._client = AsyncDaemonClient(url or read_default_url(), token, reconnect_timeout_s)
         self._operations = DisplayOperations(self._client.policy)
         self._reconnect_timeout_s = reconnect_timeout_s
+        self._hold: AsyncHold | None = None
 
     async def __aenter__(self) -> Self:
         return self
@@ -48,12 +50,19 @@ class AsyncDisplay:
             await self.close()
 
     async def close(self) -> None:
-        """Close the connections without stopping anything."""
+        """See `Display.close`."""
+        if self._hold is not None:
+            await self._hold.close()
         await self._client.close()
 
-    async def arm(self) -> StateReport:
-        """See `Display.arm`."""
-        return await self._client.run(self._operations.arm())
+    async def arm(self, *, hold: bool = False) -> StateReport:
+        """See `Display.arm`; a loop that is blocked for a second disarms, too."""
+        if not hold:
+            return await self._client.run(self._operations.arm())
+        self._record_emission()
+        self._hold = AsyncHold(self._client.policy.endpoint)
+        await self._hold.open()
+        return await self.state()
 
     async def disarm(self) -> StateReport:
         """See `Display.disarm`."""

@@ -7,22 +7,20 @@ from contextlib import AsyncExitStack
 from types import TracebackType
 from typing import Self
 
-from websockets.asyncio.client import ClientConnection, connect
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.asyncio.client import ClientConnection
+from websockets.exceptions import ConnectionClosed
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import RETRY_S
 from optodrive.client.frame_results import (
-    CONNECTION_ERRORS,
-    OPEN_TIMEOUT_S,
     RESULT_TIMEOUT_S,
     ResultBuffer,
-    build_stream_url,
+    build_stream_path,
     build_timeout_error,
-    parse_refusal,
     raise_if_failed,
 )
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
+from optodrive.client.socket_connection import open_async_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.stream import FrameResult
@@ -42,7 +40,7 @@ class AsyncStream:
     ) -> None:
         self._endpoint = endpoint
         self._read_layout = read_layout
-        self._url = build_stream_url(endpoint, policy)
+        self._path = build_stream_path(policy)
         self._reconnect_timeout_s = reconnect_timeout_s
         self._on_send = on_send
         self._next_frame = 0
@@ -104,27 +102,9 @@ class AsyncStream:
         return raise_if_failed(result)
 
     async def _connect(self) -> None:
-        try:
-            self._connection = await self._open_connection()
-        except InvalidStatus as error:
-            if error.response.status_code != 401 or not self._endpoint.renew_token():
-                raise parse_refusal(error) from None
-            self._connection = await self._open_connection()
-        except CONNECTION_ERRORS as error:
-            raise self._endpoint.build_unreachable_error(error) from None
-        self._reader_task = asyncio.create_task(self._read(self._connection))
-
-    async def _open_connection(self) -> ClientConnection:
         await self._exit_stack.aclose()
-        connection = connect(
-            self._url,
-            additional_headers=self._endpoint.headers,
-            sock=self._endpoint.open_unix_socket(),
-            proxy=None,
-            open_timeout=OPEN_TIMEOUT_S,
-            compression=None,
-        )
-        return await self._exit_stack.enter_async_context(connection)
+        self._connection = await open_async_connection(self._endpoint, self._path, self._exit_stack)
+        self._reader_task = asyncio.create_task(self._read(self._connection))
 
     async def _read(self, connection: ClientConnection) -> None:
         try:

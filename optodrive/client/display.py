@@ -10,6 +10,7 @@ import numpy as np
 
 from optodrive.client.endpoint import read_default_url
 from optodrive.client.heights import HeightsLike
+from optodrive.client.hold import Hold
 from optodrive.client.http import DaemonClient
 from optodrive.client.operations import DisplayOperations
 from optodrive.client.plan import Plan
@@ -42,6 +43,7 @@ class Display:
         self._client = DaemonClient(url or read_default_url(), token, reconnect_timeout_s)
         self._operations = DisplayOperations(self._client.policy)
         self._reconnect_timeout_s = reconnect_timeout_s
+        self._hold: Hold | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -60,17 +62,24 @@ class Display:
             self.close()
 
     def close(self) -> None:
-        """Close the connections without stopping anything."""
+        """Close the connections without stopping anything, but for an arming that they hold."""
+        if self._hold is not None:
+            self._hold.close()
         self._client.close()
 
     # --- the board ----------------------------------------------------------------------------------------------
 
-    def arm(self) -> StateReport:
+    def arm(self, *, hold: bool = False) -> StateReport:
         """Arm the board unless it is armed; its indicator is on for two seconds first.
 
-        Raises NotReadyError or BoardFaultError.
+        hold: the board disarms, dark, when this display is closed, or when its process ends or stops for a second; a
+        board that is armed already is refused. Raises NotReadyError or BoardFaultError.
         """
-        return self._client.run(self._operations.arm())
+        if not hold:
+            return self._client.run(self._operations.arm())
+        self._record_emission()
+        self._hold = Hold(self._client.policy.endpoint)
+        return self.state()
 
     def disarm(self) -> StateReport:
         """Disarm the board; this also acknowledges a fault whose cause is gone."""

@@ -2,19 +2,14 @@
 
 from collections import deque
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
-
-from optodrive.client.endpoint import Endpoint
-from optodrive.client.problems import build_error, parse_problem
-from optodrive.core.errors import LinkError, OptodriveError, RefusedError
+from optodrive.client.problems import build_error
+from optodrive.core.errors import LinkError, RefusedError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.stream import FrameResult
 
 RESULTS_MAX = 1000
 """Results that are kept for a caller who does not read them; the oldest are dropped first."""
-OPEN_TIMEOUT_S = 10.0
 RESULT_TIMEOUT_S = 30.0
-CONNECTION_ERRORS = (OSError, InvalidHandshake, ConnectionClosed, TimeoutError)
 
 
 class ResultBuffer:
@@ -56,14 +51,9 @@ class ResultBuffer:
         return result
 
 
-def build_stream_url(endpoint: Endpoint, policy: Policy) -> str:
-    """Build the WebSocket address of the stream."""
-    return f"ws{endpoint.url.removeprefix('http')}/v1/stream?policy={policy}"
-
-
-def parse_refusal(error: InvalidStatus) -> OptodriveError:
-    """Build the error for a refused WebSocket handshake."""
-    return parse_problem(error.response.status_code, bytes(error.response.body or b""))
+def build_stream_path(policy: Policy) -> str:
+    """Build the path of the stream's WebSocket."""
+    return f"/v1/stream?policy={policy}"
 
 
 def build_timeout_error(frame: int, timeout_s: float) -> LinkError:

@@ -7,22 +7,20 @@ from contextlib import ExitStack
 from types import TracebackType
 from typing import Self
 
-from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection
 
 from optodrive.client.endpoint import Endpoint
 from optodrive.client.exchange import RETRY_S
 from optodrive.client.frame_results import (
-    CONNECTION_ERRORS,
-    OPEN_TIMEOUT_S,
     RESULT_TIMEOUT_S,
     ResultBuffer,
-    build_stream_url,
+    build_stream_path,
     build_timeout_error,
-    parse_refusal,
     raise_if_failed,
 )
 from optodrive.client.heights import HeightsLike, convert_to_pixels, encode_frame
+from optodrive.client.socket_connection import open_connection
 from optodrive.core.errors import LinkError
 from optodrive.core.types.policy import Policy
 from optodrive.daemon.responses.stream import FrameResult
@@ -45,7 +43,7 @@ class Stream:
     ) -> None:
         self._endpoint = endpoint
         self._layout = layout
-        self._url = build_stream_url(endpoint, policy)
+        self._path = build_stream_path(policy)
         self._reconnect_timeout_s = reconnect_timeout_s
         self._on_send = on_send
         self._next_frame = 0
@@ -99,28 +97,10 @@ class Stream:
         return raise_if_failed(result)
 
     def _connect(self) -> ClientConnection:
-        try:
-            connection = self._open_connection()
-        except InvalidStatus as error:
-            if error.response.status_code != 401 or not self._endpoint.renew_token():
-                raise parse_refusal(error) from None
-            connection = self._open_connection()
-        except CONNECTION_ERRORS as error:
-            raise self._endpoint.build_unreachable_error(error) from None
+        self._exit_stack.close()
+        connection = open_connection(self._endpoint, self._path, self._exit_stack)
         threading.Thread(target=self._read, args=(connection,), name="stream", daemon=True).start()
         return connection
-
-    def _open_connection(self) -> ClientConnection:
-        self._exit_stack.close()
-        connection = connect(
-            self._url,
-            additional_headers=self._endpoint.headers,
-            sock=self._endpoint.open_unix_socket(),
-            proxy=None,
-            open_timeout=OPEN_TIMEOUT_S,
-            compression=None,
-        )
-        return self._exit_stack.enter_context(connection)
 
     def _reconnect(self, deadline_s: float) -> None:
         while True:

@@ -24,7 +24,7 @@ from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.roles import ROLES
-from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
+from optodrive.daemon.web.route_table import ARMING, STOP, RouteTable
 from optodrive.daemon.web.static_files import LOGIN_PATHS, is_page_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config_file import load_config
@@ -154,7 +154,7 @@ def test_every_route_refuses_an_insufficient_role(running, key):
         )
 
 
-@pytest.mark.parametrize("key", sorted(ROUTES.keys() - {ARM}))  # armed below
+@pytest.mark.parametrize("key", sorted(ROUTES.keys() - {*ARMING}))  # armed below
 def test_every_route_accepts_its_role(running, key):
     min_role = ROUTES[key] or ROLES[0]
     assert request_route(running, key, build_bearer_header(read_role_tokens(running)[min_role]))[0] not in (

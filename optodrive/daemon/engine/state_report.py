@@ -6,12 +6,12 @@ from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
-    ControlReport,
     LinkReport,
     PlannerReport,
     PlannerState,
     PulseTotals,
     StateReport,
+    build_control_report,
 )
 from optodrive.link.service.remote_session import RemoteSession
 from optodrive.planning.display_model import DisplayModel
@@ -40,7 +40,7 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
             **session.stats,
         ),
         board=_build_board_report(session),
-        control=None if session.control is None else ControlReport(**session.control),
+        control=build_control_report(session.control),
         queue=planner_state.queue,
         totals=planner_state.totals,
         planner=planner_state.planner,

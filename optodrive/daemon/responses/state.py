@@ -1,6 +1,7 @@
 """The response of GET /v1/state, and of arm, disarm and stop."""
 
-from typing import Literal
+from collections.abc import Mapping
+from typing import Any, Literal
 
 from optodrive.core.json_model import JsonModel
 from optodrive.daemon.responses.plan import PlanStatus
@@ -51,10 +52,11 @@ class BoardReport(JsonModel):
 
 
 class ControlReport(JsonModel):
-    """Who armed the board: the name of a token, and the time since the request."""
+    """Who armed the board: the name of a token, the time since the request, and whether a connection holds it armed."""
 
     caller: str
     armed_for_s: float
+    hold: bool
 
 
 class RecentPlan(JsonModel):
@@ -121,3 +123,10 @@ class StateReport(JsonModel):
     queue: QueueReport
     totals: PulseTotals
     planner: PlannerReport
+
+
+def build_control_report(control: Mapping[str, Any] | None) -> ControlReport | None:
+    """Build the report from the status of the link process, which has further fields; None while it is not armed."""
+    if control is None:
+        return None
+    return ControlReport(caller=control["caller"], armed_for_s=control["armed_for_s"], hold=control["hold"])

@@ -22,13 +22,13 @@ from optodrive.daemon.web.request_limits import (
     receive_empty_body,
 )
 from optodrive.daemon.web.revocation import RequestInProgress, build_revoked_problem
-from optodrive.daemon.web.route_table import ARM, STOP, RouteTable
+from optodrive.daemon.web.route_table import ARMING, STOP, RouteTable
 from optodrive.daemon.web.server_state import CALLER
 from optodrive.daemon.web.static_files import is_page_request
 
 AUDIT_FIELDS = "optodrive.audit_fields"
 """Key in the ASGI scope of the dict to which a route adds fields for the audit log."""
-STREAMS = ("GET /v1/telemetry", "WEBSOCKET /v1/stream")
+STREAMS = ("GET /v1/telemetry", "WEBSOCKET /v1/stream", "WEBSOCKET /v1/hold")
 STREAMS_PER_CALLER_MAX, REQUESTS_PER_CALLER_MAX = 16, 64
 """Streams, and requests in progress, of the same token and address: a part of the server's connections."""
 Caller = tuple[str, str]
@@ -50,7 +50,7 @@ class AccessMiddleware:
             return
         request = _read_request(scope)
         problem = self._policy.check(request, self._table)
-        if problem is None and request.route is not None and request.route.key == ARM:
+        if problem is None and request.route is not None and request.route.key in ARMING:
             problem = await self._record_intent(request)
             if self._policy.is_revoked(request.token):
                 problem = build_revoked_problem(request.token)

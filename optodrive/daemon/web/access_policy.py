@@ -16,6 +16,7 @@ from optodrive.daemon.web.refusal_audit import RefusalAudit
 from optodrive.daemon.web.revocation import RequestsInProgress
 from optodrive.daemon.web.roles import is_role_sufficient
 from optodrive.daemon.web.route_table import STOP, Route, RouteTable
+from optodrive.daemon.web.socket_token import is_websocket_request, read_subprotocol_token
 from optodrive.daemon.web.static_files import is_page_request, read_cookie_token
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.device.config import DaemonSection
@@ -162,6 +163,8 @@ def _read_presented_token(request: RequestContext) -> str:
     scheme, _, credentials = request.headers.get("authorization", "").partition(" ")
     if not scheme and is_page_request(request.method, request.path):
         return read_cookie_token(request.headers)
+    if not scheme and is_websocket_request(request.headers):
+        return read_subprotocol_token(request.headers)
     return credentials.strip() if scheme.lower() == "bearer" else ""
 
 

@@ -26,6 +26,7 @@ from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddlewar
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.daemon_client import NO_EPOCH, DaemonClient, PushFields
 from optodrive.daemon.web.error_handlers import add_error_handlers
+from optodrive.daemon.web.hold_socket import HoldSocket
 from optodrive.daemon.web.live_stream import LiveStream
 from optodrive.daemon.web.openapi import ERROR_RESPONSES, EVENT_RESPONSES, extend_openapi
 from optodrive.daemon.web.openapi_bodies import (
@@ -108,8 +109,13 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     @routes.post("/v1/arm", "armer", response_model=StateReport)
     async def arm(request: Request) -> Response:
         """Arm the board; its indicator is on for at least two seconds before it emits."""
-        await daemon.link.command("arm", request.scope[CALLER].name)
+        await daemon.link.arm(request.scope[CALLER].name)
         return _send_state(daemon)
+
+    @routes.websocket("/v1/hold", "armer")
+    async def hold(socket: WebSocket) -> None:
+        """Arm the board for as long as the connection lasts and its client sends a message every second."""
+        await HoldSocket(daemon.link, socket, socket.scope[CALLER].name).run()
 
     @routes.post("/v1/disarm", "operator", response_model=StateReport)
     async def disarm() -> Response:

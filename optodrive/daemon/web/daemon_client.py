@@ -7,6 +7,7 @@ import asyncio
 import time
 from bisect import bisect_right
 from collections import OrderedDict, deque
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from optodrive.core.ipc import Message
@@ -46,12 +47,14 @@ class LinkClient:
         self.status: dict[str, Any] | None = None
         self.peer = peer
         self._epochs: deque[tuple[float, int]] = deque([(0.0, NO_EPOCH)], EPOCHS_MAX)
+        self._held: dict[int, asyncio.Future[str]] = {}
         peer.on_connected = lambda: peer.send(Message("hello", {"role": "web"}))
 
     def on_message(self, message: Message) -> None:
         """Take a status or a result."""
         if message.kind == "status":
             self.status = message.fields
+            self._end_armings(message.fields["control"], message.fields["epoch_reason"])
         elif message.kind == "result" and self.status is not None and "board" in message.fields:
             self.status = {**self.status, "board": message.fields["board"]}
         if "epoch" in message.fields:
@@ -61,6 +64,7 @@ class LinkClient:
         """Take the end of the process."""
         self.status = None
         self._record_epoch(NO_EPOCH)
+        self._end_armings(None, "the link process has ended")
 
     def _record_epoch(self, epoch: int) -> None:
         if epoch != self._epochs[-1][1]:
@@ -77,12 +81,31 @@ class LinkClient:
         """Prove that the event loop runs."""
         self.peer.send(Message("beat", {"alive": True}))
 
-    async def command(self, kind: str, caller: str = "") -> None:
-        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal.
+    async def arm(self, caller: str, arming: int | None = None) -> None:
+        """Arm as `command` does. caller: name of the token; arming: new number of an arming that needs beats."""
+        await self.command("arm", caller=caller, arming=arming or 0, hold=arming is not None)
 
-        caller: name of the token
-        """
-        call = asyncio.ensure_future(self.peer.call(Message(kind, {"caller": caller})))
+    def hold(self, arming: int, age_s: float) -> None:
+        """Prove that the client that holds an arming is there. age_s: time since it did."""
+        self.peer.send(Message("hold", {"arming": arming, "age_s": age_s}))
+
+    def release(self, arming: int, reason: str) -> None:
+        """End an arming, if it still lasts. reason: for people, as the end of a sentence."""
+        self._held.pop(arming, None)
+        self.peer.send(Message("release", {"arming": arming, "reason": reason}))
+
+    def watch_arming(self, arming: int) -> "asyncio.Future[str]":
+        """Return the future of the reason for which an arming ends. `release` forgets it."""
+        return self._held.setdefault(arming, asyncio.get_running_loop().create_future())
+
+    def _end_armings(self, control: Mapping[str, Any] | None, reason: str) -> None:
+        for arming, future in self._held.items():
+            if (control is None or control["arming"] != arming) and not future.done():
+                future.set_result(reason)
+
+    async def command(self, kind: str, **fields: object) -> None:
+        """Carry out `stop`, `arm` or `disarm`; return when the board has done it. Raise the error of a refusal."""
+        call = asyncio.ensure_future(self.peer.call(Message(kind, fields)))
         call.add_done_callback(lambda done: done.cancelled() or done.exception())  # retrieved if the caller has left
         result = await asyncio.shield(call)
         if result.fields["error"] is not None:

@@ -15,6 +15,7 @@ from optodrive.daemon.responses.problem import Problem
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.web.daemon_client import DaemonClient, PushFields
 from optodrive.daemon.web.server_state import ARRIVED_S
+from optodrive.daemon.web.socket_token import select_subprotocol
 from optodrive.planning.stimuli.sequence_codec import encode_sequence
 from optodrive.planning.stimuli.streamed_frame import parse_live_frame
 
@@ -52,7 +53,7 @@ class LiveStream:
 
     async def run(self) -> None:
         """Serve until the client disconnects. Then drop the unsent pulses of the last frame."""
-        await self._socket.accept()
+        await self._socket.accept(select_subprotocol(self._socket.scope))
         tasks = [asyncio.create_task(work()) for work in (self._read, self._plan, self._write)]
         try:
             await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -6,6 +6,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from optodrive.core.json_model import JsonModel
+from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem
 from optodrive.daemon.responses.stream import FrameResult
 from optodrive.daemon.responses.telemetry import EVENTS
@@ -88,7 +89,7 @@ def extend_openapi(app: FastAPI, table: RouteTable) -> None:
 
 
 def _list_extra_schemas() -> dict[str, Any]:
-    models: list[type[JsonModel]] = [Problem, FrameResult, *EVENTS.values()]
+    models: list[type[JsonModel]] = [Problem, FrameResult, HoldReport, *EVENTS.values()]
     _, document = models_json_schema([(model, "serialization") for model in models], ref_template=REF_TEMPLATE)
     schemas: dict[str, Any] = document["$defs"]
     return schemas

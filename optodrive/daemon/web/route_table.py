@@ -15,7 +15,8 @@ from starlette.routing import Route as HttpRoute
 from optodrive.daemon.web.roles import Role, is_role_sufficient
 
 STOP = "POST /v1/stop"
-ARM = "POST /v1/arm"
+ARMING = ("POST /v1/arm", "WEBSOCKET /v1/hold")
+"""The routes that arm the board."""
 ROLE_ATTRIBUTE = "_min_role"
 Endpoint = TypeVar("Endpoint", bound=Callable[..., Any])
 

@@ -5,13 +5,13 @@ from typing import Any
 
 from optodrive.daemon.responses.state import (
     BoardReport,
-    ControlReport,
     LinkReport,
     PlannerReport,
     PlannerState,
     PulseTotals,
     QueueReport,
     StateReport,
+    build_control_report,
 )
 from optodrive.link.session.board_view import BoardView
 
@@ -61,7 +61,7 @@ def merge_state(
         pixels=pixels,
         link=link,
         board=BoardReport(**board),
-        control=None if control is None else ControlReport(**control),
+        control=build_control_report(control),
         queue=planner.queue,
         totals=planner.totals,
         planner=planner.planner,

@@ -11,7 +11,7 @@ BEAT_AGE_MAX_S = 1.0
 """Age of a beat beyond which its sender counts as stalled."""
 PERMISSIONS = {
     "planner": {"stop", "beat", "begin", "splice", "truncate", "flush", "delay"},
-    "web": {"stop", "beat", "arm", "disarm", "revoke"},
+    "web": {"stop", "beat", "arm", "disarm", "revoke", "hold", "release"},
     "supervisor": {"stop", "disarm"},
     "operator": {"stop"},
 }

@@ -90,9 +90,13 @@ class LinkService:
             if message.kind == "beat":
                 self._clients.record_beat(client, bool(message.fields["alive"]))
             elif message.kind in ("stop", "arm", "disarm"):
-                self._command(client, message.kind, int(message.fields["id"]), str(message.fields.get("caller", "")))
+                self._command(client, message)
             elif message.kind == "revoke":
                 self._revoke(str(message.fields["caller"]))
+            elif message.kind == "hold":
+                self._hold(int(message.fields["arming"]), float(message.fields["age_s"]))
+            elif message.kind == "release":
+                self._release(int(message.fields["arming"]), str(message.fields["reason"]))
             else:
                 self._handover.carry_out(message)
         except (LookupError, TypeError, ValueError, OverflowError) as error:
@@ -134,7 +138,8 @@ class LinkService:
 
     # --- commands -----------------------------------------------------------------------------------------------
 
-    def _command(self, client: int, command: str, request_id: int, caller: str) -> None:
+    def _command(self, client: int, message: Message) -> None:
+        command, request_id = message.kind, int(message.fields["id"])
         try:
             if command == "stop":
                 self.go_dark("ended by stop")
@@ -147,11 +152,27 @@ class LinkService:
                 self._clients.require_lease()
                 self._session.arm()
                 self._arm_requested = True
-                self._control = Control(caller, self._clock.now_s())
+                self._control = self._build_control(message.fields)
         except OptodriveError as error:
             self._reply(client, request_id, error)
             return
         self._waiters.add(client, request_id, command, self._clock.now_s())
+
+    def _build_control(self, fields: dict[str, Any]) -> Control:
+        """Build the control of an arming that is requested now; `hold`: whether it needs beats from now on."""
+        now_s = self._clock.now_s()
+        held_s = now_s if fields.get("hold") else None
+        return Control(str(fields.get("caller", "")), now_s, int(fields.get("arming", 0)), held_s)
+
+    def _hold(self, arming: int, age_s: float) -> None:
+        """Record a beat of the client that holds an arming; age_s: time since it arrived."""
+        if self._control is not None and self._control.arming == arming:
+            self._control = self._control.record_beat(self._clock.now_s() - max(0.0, age_s))
+
+    def _release(self, arming: int, reason: str) -> None:
+        """Go dark if the client that held this arming has left."""
+        if self._control is not None and self._control.arming == arming:
+            self.go_dark(reason)
 
     def _revoke(self, caller: str) -> None:
         """Go dark if a caller has armed the board, or is arming it, whose token is no longer valid."""
@@ -216,6 +237,7 @@ class LinkService:
             self._session.step(wait_s, renew_lease=not stalled, stalled=stalled)
             self._watch_board()
             self._end_unattended()
+            self._end_abandoned()
         except (LinkError, InputError) as error:
             message = self._session.on_lost(error)
             self.link_error = LinkError(message) if isinstance(error, LinkError) else error
@@ -242,6 +264,11 @@ class LinkService:
             self._attended_s = now_s
         elif now_s - self._attended_s > UNATTENDED_MAX_S:
             self.go_dark("nobody could disarm: the web process has ended")
+
+    def _end_abandoned(self) -> None:
+        """Go dark when the client that holds the arming has stopped to beat."""
+        if self._control is not None and self._control.is_abandoned(self._clock.now_s()):
+            self.go_dark(f"the client of {self._control.caller!r} that held the board armed does not beat")
 
     def _step_connecting(self, wait_s: float) -> None:
         if self._connecting is None:

@@ -34,7 +34,8 @@ class StatusPublisher:
         """
         session, board = self._session, self._session.board
         outcome = session.is_ready, session.last_event_reason, session.likely_cause
-        key = (epoch.number, session.connected, link_error, board.state, board.fault, control, commands, *outcome)
+        arming = None if control is None else control.arming
+        key = (epoch.number, session.connected, link_error, board.state, board.fault, arming, commands, *outcome)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None

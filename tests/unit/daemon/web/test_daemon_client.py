@@ -21,6 +21,7 @@ def build_status(epoch, state="ARMED"):
         "status",
         {
             "epoch": epoch,
+            "epoch_reason": "",
             "connected": True,
             "port": "tty",
             "link_error": None,

@@ -10,7 +10,7 @@ STATUS = {
     "link_error": None,
     "stats": {**NO_STATS, "naks": 3},
     "board": BoardView(state="RUNNING", uid="b1").to_dict(),
-    "control": {"caller": "ann", "armed_for_s": 3.0},
+    "control": {"caller": "ann", "armed_for_s": 3.0, "hold": True, "arming": 7},
 }
 
 
@@ -25,7 +25,7 @@ def test_the_parts_of_both_processes_are_reported():
     state = merge(planner=planner)
     assert (state.board.state, state.board.uid, state.link.naks, state.link.state) == ("RUNNING", "b1", 3, "up")
     assert state.planner.busy
-    assert (state.control.caller, state.control.armed_for_s) == ("ann", 3.0)
+    assert (state.control.caller, state.control.armed_for_s, state.control.hold) == ("ann", 3.0, True)
 
 
 def test_a_board_without_a_link_has_no_known_state():

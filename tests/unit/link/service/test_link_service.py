@@ -6,6 +6,8 @@ import pytest
 from link_service_rig import OPERATOR, PLANNER, SUPERVISOR, WEB, ServiceRig
 from optodrive.core.ipc import IpcError, Message
 from optodrive.link.protocol.states import BoardState
+from optodrive.link.service import control
+from optodrive.link.service.control import HOLD_MAX_S
 from optodrive.link.service.point_handover import EXECUTED
 from optodrive.link.service.remote_session import EXECUTED_RECORD
 from optodrive.link.service.results import build_error
@@ -365,3 +367,89 @@ def test_revoking_the_token_that_is_arming_the_board_ends_the_arming(rig):
 def test_only_the_web_process_may_revoke(rig, client):
     with pytest.raises(IpcError, match="not permitted"):
         rig.send(client, "revoke", caller="ann")
+
+
+ARMING = 77
+
+
+def hold(rig, duration_s, beat_s=0.25, age_s=0.0):
+    """Run while a client holds the arming with beats that arrive age_s late."""
+    until_s = rig.clock.now_s() + duration_s
+    while rig.clock.now_s() < until_s:
+        rig.send(WEB, "hold", arming=ARMING, age_s=age_s)
+        rig.run(beat_s)
+
+
+def arm_and_hold(rig):
+    """Arm the board with beats, and begin a plan."""
+    request_id = rig.request(WEB, "arm", caller="ann", arming=ARMING, hold=True)
+    hold(rig, 3.0)
+    assert rig.find_result(WEB, request_id)["error"] is None
+    rig.begin(build_points(3000, DUTY))
+    hold(rig, 2.0)
+    assert rig.session.board.state == BoardState.RUNNING
+    assert find_control(rig)["hold"]
+    return rig.clock.now_s()
+
+
+def find_dark_s(rig, began_s, patience_s=3.0):
+    """Return the time until the board was disarmed, None if it still emits."""
+    while rig.clock.now_s() < began_s + patience_s:
+        rig.run(0.01)
+        if rig.session.board.state == BoardState.DISARMED:
+            emitted = len(rig.list_emitted())
+            dark_s = rig.clock.now_s() - began_s
+            rig.run(0.5)
+            assert len(rig.list_emitted()) == emitted
+            return dark_s
+    return None
+
+
+@pytest.mark.parametrize("on_web_loss", ["dark", "finish"])
+def test_a_held_arming_ends_without_beats(on_web_loss):
+    rig = ServiceRig(on_web_loss).hello_all().connect()
+    dark_s = find_dark_s(rig, arm_and_hold(rig))
+    assert HOLD_MAX_S - 0.3 < dark_s < HOLD_MAX_S + 0.1
+    assert rig.service.epoch.reason == "the client of 'ann' that held the board armed does not beat"
+
+
+def test_without_the_limit_it_would_not(rig, monkeypatch):
+    """Mutant."""
+    monkeypatch.setattr(control, "HOLD_MAX_S", float("inf"))
+    assert find_dark_s(rig, arm_and_hold(rig)) is None
+
+
+def test_a_held_arming_ends_with_its_client_at_once(rig):
+    began_s = arm_and_hold(rig)
+    rig.send(WEB, "release", arming=ARMING + 1, reason="another client has left")
+    hold(rig, 0.5)
+    assert rig.session.board.state == BoardState.RUNNING
+    began_s = rig.clock.now_s()
+    rig.send(WEB, "release", arming=ARMING, reason="the client has left")
+    assert find_dark_s(rig, began_s) < 0.05
+    assert rig.service.epoch.reason == "the client has left"
+
+
+def test_beats_that_waited_or_that_belong_to_another_arming_hold_nothing(rig):
+    began_s = arm_and_hold(rig)
+    while rig.session.board.state == BoardState.RUNNING and rig.clock.now_s() < began_s + 3.0:
+        rig.send(WEB, "hold", arming=ARMING + 1, age_s=0.0)
+        rig.send(WEB, "hold", arming=ARMING, age_s=rig.clock.now_s() - began_s + 0.25)
+        rig.run(0.05)
+    assert rig.clock.now_s() - began_s < HOLD_MAX_S + 0.1
+
+
+def test_a_held_arming_ends_with_the_web_process_even_if_others_may_finish():
+    rig = ServiceRig("finish").hello_all().connect()
+    began_s = arm_and_hold(rig)
+    rig.leave(WEB)
+    assert find_dark_s(rig, began_s) < HOLD_MAX_S + 0.1
+
+
+def test_a_client_that_leaves_while_the_board_arms_ends_the_arming(rig):
+    request_id = rig.request(WEB, "arm", caller="ann", arming=ARMING, hold=True)
+    hold(rig, 0.5)
+    rig.send(WEB, "release", arming=ARMING, reason="the client has left")
+    assert "the client has left" in rig.await_result(WEB, request_id)["error"]["message"]
+    rig.run(3.0)
+    assert rig.session.board.state == BoardState.DISARMED
