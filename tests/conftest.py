@@ -3,6 +3,7 @@
 import pytest
 from hypothesis import HealthCheck, settings
 
+import forked_process
 from displays import DISPLAYS
 
 settings.register_profile(
@@ -13,6 +14,14 @@ settings.register_profile("every run", settings.get_profile("thorough"), max_exa
 
 def pytest_configure(config):
     settings.load_profile("every run" if config.getoption("markexpr") == "not slow" else "thorough")
+
+
+def pytest_sessionstart():
+    forked_process.enable()
+
+
+def pytest_sessionfinish():
+    forked_process.disable()
 
 
 def pytest_addoption(parser):

@@ -9,6 +9,7 @@ small kernel, atomically, which takes longer than what the kernel computes.
 """
 
 import os
+import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from hashlib import sha256
@@ -111,6 +112,27 @@ def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[
         parts.append(getattr(value, "__qualname__", None) or repr(value))
 
 
+def _import_array_functions() -> None:
+    """Import numba's array functions without SciPy, of which they use linear algebra that no kernel calls.
+
+    SciPy is optional here, and its import takes longer than that of all kernels.
+    """
+    if "numba.np.arraymath" in sys.modules:
+        return
+    import numba.np.linalg as linear_algebra
+
+    original = linear_algebra.ensure_blas
+    linear_algebra.ensure_blas = _refuse_blas
+    try:
+        import numba.np.arraymath
+    finally:
+        linear_algebra.ensure_blas = original
+
+
+def _refuse_blas() -> None:
+    raise ImportError("no kernel calls linear algebra")
+
+
 class _KernelLocator:
     """Places the machine code of every kernel in one folder; the stamp in `_KernelCache` tells its versions apart."""
 
@@ -157,6 +179,11 @@ class _KernelCache(FunctionCache):
     def is_empty(self) -> bool:
         """Return whether no machine code of the kernel is cached."""
         return not Path(self.cache_path, f"{self.file_base}.nbi").exists()
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Return the cached machine code for a signature, None if there is none."""
+        _import_array_functions()
+        return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         self._open()

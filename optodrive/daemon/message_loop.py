@@ -46,8 +46,9 @@ class MessageLoop:
         self._selector.unregister(descriptor)
 
     def poll(self, timeout_s: float) -> None:
-        """Wait for at most timeout_s and process what has arrived."""
-        for key, events in self._selector.select(max(0.0, timeout_s)):
+        """Wait for at most timeout_s and process what has arrived, on connections after what is watched."""
+        ready = self._selector.select(max(0.0, timeout_s))
+        for key, events in sorted(ready, key=lambda item: isinstance(item[0].data, _Connection)):
             if not isinstance(key.data, _Connection):
                 key.data()
             elif isinstance(key.fileobj, MessageSocket) and not key.fileobj.is_closed:

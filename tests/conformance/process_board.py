@@ -9,8 +9,8 @@ import serial
 from board_log import BoardLog
 
 from firmware_ports import build_board
+from forked_process import SIMULATED
 from optodrive.core.clock import MonotonicClock
-from rig import SIMULATED
 
 READ_WAIT_S = 0.005
 ABOUT_ITSELF = "the simulated board does B1 to B13: it has no tick, readback or watchdog of its own"

@@ -6,7 +6,6 @@ import re
 import resource
 import signal
 import subprocess
-import sys
 import time
 import tomllib
 from contextlib import contextmanager
@@ -15,9 +14,9 @@ from pathlib import Path
 
 import httpx
 
+from forked_process import OPTODRIVE, SHORT_INDICATOR, start_process
 from optodrive.device.config_file import locate_shipped
 
-OPTODRIVE = Path(sys.executable).with_name("optodrive")
 TOKEN = "a-token-for-tests"
 PATIENCE_S = 20.0
 START_S = 60.0
@@ -48,13 +47,10 @@ def ended(engine, plan):
     return wait_for(look, "the plan's end")
 
 
-SIMULATED = (sys.executable, "-m", "optodrive.link.simulator.board_process")
-
-
 class Board:
-    """Board process with its log. program: command line, the simulated board by default."""
+    """Board process with its log. program: command line, by default the simulated board with a short indicator."""
 
-    def __init__(self, folder, script="", limits="", disk_bytes=None, program=SIMULATED, seed=None, sensor=None):
+    def __init__(self, folder, script="", limits="", disk_bytes=None, program=SHORT_INDICATOR, seed=None, sensor=None):
         self.port = folder / "tty"
         self.log = folder / "board.jsonl"
         arguments = ["--pty", self.port, "--log", self.log]
@@ -69,20 +65,29 @@ class Board:
                 path = folder / f"board{option}.toml"
                 path.write_text(text)
                 arguments += [option, path]
-        self.process = subprocess.Popen(
-            [*program, *arguments],
-            stderr=subprocess.PIPE if disk_bytes else None,
-            text=True,
-            preexec_fn=disk_bytes and partial(resource.setrlimit, resource.RLIMIT_FSIZE, (disk_bytes, disk_bytes)),
-        )
-        self._forgotten = 0
+        options = {}
+        if disk_bytes:
+            limit = partial(resource.setrlimit, resource.RLIMIT_FSIZE, (disk_bytes, disk_bytes))
+            options = {"stderr": subprocess.PIPE, "preexec_fn": limit}
+        self.process = start_process([*program, *arguments], text=True, **options)
+        self._events, self._read_bytes, self._forgotten = [], 0, 0
         wait_for(self.port.exists, "the board's port", START_S)
 
     def events(self):
-        if not self.log.exists():
-            return []
-        lines = self.log.read_text().splitlines(keepends=True)
-        return [json.loads(line) for line in lines if line.endswith("\n")][self._forgotten :]
+        if self.log.exists():  # only what is new is read: tests poll
+            with self.log.open("rb") as file:
+                file.seek(self._read_bytes)
+                text = file.read()
+            text = text[: text.rfind(b"\n") + 1]
+            self._read_bytes += len(text)
+            self._events += [json.loads(line) for line in text.splitlines()]
+        return self._events[self._forgotten :]
+
+    def now_us(self):
+        """Return the present time on the clock of the log, which the log itself reaches only with its next event."""
+        path = Path(f"{self.port}.clock")
+        text = wait_for(lambda: path.exists() and path.read_text().strip(), "the board's clock")
+        return (time.monotonic() - float(text)) * 1e6
 
     def forget(self):
         """Ignore the events logged so far."""
@@ -113,7 +118,7 @@ class Command:
     def __init__(self, folder, board, *arguments, lease_s=PATIENT_LEASE_S):
         config = folder / "bench.toml"
         config.write_text(config_text(board.port, sensor=board.sensor, lease_s=lease_s))
-        self.process = subprocess.Popen(
+        self.process = start_process(
             [OPTODRIVE, *map(str, arguments), "--config", config],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -134,9 +139,19 @@ class Command:
 
 
 class Daemon:
-    """Process of `optodrive serve` on a board's port."""
+    """Process of `optodrive serve` on a board's port. is_fresh: in an interpreter of its own, as a user starts it."""
 
-    def __init__(self, folder, port, name="display-437", replace=(), options=(), lease_s=PATIENT_LEASE_S, runtime=None):
+    def __init__(
+        self,
+        folder,
+        port,
+        name="display-437",
+        replace=(),
+        options=(),
+        lease_s=PATIENT_LEASE_S,
+        runtime=None,
+        is_fresh=False,
+    ):
         text = config_text(port, name, lease_s=lease_s)
         for old, new in replace:
             assert old in text
@@ -146,7 +161,7 @@ class Daemon:
         self.errors = folder / "daemon.err"
         environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN, "XDG_RUNTIME_DIR": str(runtime or folder)}
         with self.errors.open("a") as errors:
-            self.process = subprocess.Popen(
+            self.process = (subprocess.Popen if is_fresh else start_process)(
                 [OPTODRIVE, "serve", "--config", self.config, "--port", "0", *options],
                 stdout=subprocess.PIPE,
                 stderr=errors,

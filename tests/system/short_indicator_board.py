@@ -1,6 +1,7 @@
-"""Simulated board whose indicator lasts 0.1 s before it emits, for tests that arm it a hundred times.
+"""Simulated board whose indicator lasts 0.1 s before it emits, for tests of anything but the indicator.
 
-It writes the host's monotonic time at the zero of its log's clock, s, next to the link to its port.
+With `--full-indicator` as its first argument, the indicator lasts as long as it must. The board writes the host's
+monotonic time at the zero of its log's clock, s, next to the link to its port.
 """
 
 import sys
@@ -10,6 +11,7 @@ from optodrive.link.simulator import board_machine, board_process
 from optodrive.link.simulator.pty_board import PtyBoard
 
 INDICATOR_US = 100_000
+FULL_INDICATOR = "--full-indicator"
 
 
 class ClockedBoard(PtyBoard):
@@ -20,7 +22,14 @@ class ClockedBoard(PtyBoard):
         Path(f"{link}.clock").write_text(f"{self._started_s!r}\n")
 
 
-if __name__ == "__main__":
-    board_machine.INDICATOR_US = INDICATOR_US
+def main():
+    if sys.argv[1:2] == [FULL_INDICATOR]:
+        del sys.argv[1]
+    else:
+        board_machine.INDICATOR_US = INDICATOR_US
     board_process.PtyBoard = ClockedBoard
-    sys.exit(board_process.main())
+    return board_process.main()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

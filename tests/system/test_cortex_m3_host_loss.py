@@ -42,20 +42,7 @@ class TooLateError(Exception):
 
 
 class FollowedBoard(Board):
-    """Board whose log is read incrementally."""
-
-    def __init__(self, folder, program):
-        super().__init__(folder, program=program)
-        self._read, self._entries = 0, []
-
-    def events(self):
-        with self.log.open("rb") as file:
-            file.seek(self._read)
-            text = file.read()
-        text = text[: text.rfind(b"\n") + 1]
-        self._read += len(text)
-        self._entries += [json.loads(line) for line in text.splitlines()]
-        return self._entries
+    """Board with a look at the end of its log."""
 
     def last(self, kind, **fields):
         matches = (e for e in reversed(self.events()) if e["event"] == kind and fields.items() <= e.items())
@@ -148,7 +135,7 @@ def measure_all(folder, program, count, boards):
     def one_board(number):
         home = folder / str(number)
         home.mkdir()
-        board, source = FollowedBoard(home, program), random.Random(number)
+        board, source = FollowedBoard(home, program=program), random.Random(number)
         try:
             ways, done = [WAYS[k % len(WAYS)] for k in range(number, count, boards)], []
             for _ in range(TRIES * len(ways)):

@@ -2,12 +2,12 @@
 
 import os
 import signal
-import subprocess
 import time
 from pathlib import Path
 
 import pytest
 
+from forked_process import run_process
 from optodrive.daemon.runtime_folder import find_link_socket
 from optodrive.link.service.operator_client import stop_board
 from rig import OPTODRIVE, long_train, running, wait_for
@@ -49,7 +49,7 @@ def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
     suspended(others)
     environment = {name: value for name, value in os.environ.items() if name != "OPTODRIVE_TOKEN"}  # none is needed
     begin_s = time.monotonic()
-    ended = subprocess.run(
+    ended = run_process(
         [OPTODRIVE, "stop", "--url", daemon.url],
         env=environment | {"XDG_RUNTIME_DIR": str(tmp_path), "OPTODRIVE_TOKENS": str(tmp_path / "none")},
         capture_output=True,
@@ -69,7 +69,7 @@ def test_a_second_daemon_on_the_same_socket_leaves_the_direct_stop_of_the_first(
     options = f'lease_s = 1.0\n[daemon]\nsocket = "{unix}"\n#'
     with running(tmp_path, replace=[("lease_s = 1.0", options)]) as (board, daemon):
         daemon.arm()
-        second = subprocess.run(
+        second = run_process(
             [OPTODRIVE, "serve", "--config", daemon.config, "--port", "0"],
             env=os.environ | {"XDG_RUNTIME_DIR": str(tmp_path)},
             capture_output=True,

@@ -2,10 +2,10 @@
 
 import json
 import os
-import subprocess
 
 import pytest
 
+from forked_process import run_process
 from rig import OPTODRIVE, TOKEN, running
 
 PIXELS = [str(pixel) for pixel in range(40)]
@@ -22,7 +22,7 @@ def armed(tmp_path_factory):
 
 def run(*arguments):
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
-    return subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=60, env=environment)
+    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=60, env=environment)
 
 
 def test_a_feasible_sequence_is_reported(armed):

@@ -2,15 +2,23 @@
 
 import json
 import signal
+from functools import partial
 
 import pytest
 
+from forked_process import FULL_INDICATOR
 from optodrive.lab.commissioning.exclusive_board import SPOT_POWER_MAX_W
 from optodrive.link.simulator.board_limits import DEFAULT_LIMITS
 from rig import PATIENT_LEASE_S, wait_for
 
 STEPS = ["link", "status", "inputs", "indicator", "zero", "travel x", "travel y", "readback", "zero again"]
 LEASE_US, LATENESS_US = round(PATIENT_LEASE_S * 1e6), 30_000
+
+
+@pytest.fixture(name="make_board")
+def make_board_with_full_indicator(make_board):
+    """`home` measures the indicator."""
+    return partial(make_board, program=FULL_INDICATOR)
 
 
 def assert_dark(board, states=("DISARMED",)):
@@ -111,7 +119,7 @@ def test_a_signal_ends_it(make_board, start, number):
     command = start(board, "home", "--spot-power-mw", "5")
     armed(board)
     command.process.send_signal(number)
-    ended_us = board.events()[-1]["t_us"]
+    ended_us = board.now_us()
     status, _, errors = command.ended()
     assert_dark(board, ("DISARMED", "FAULT"))
     if number == signal.SIGKILL:

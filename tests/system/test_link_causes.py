@@ -3,10 +3,10 @@
 import json
 import os
 import signal
-import subprocess
 
 import pytest
 
+from forked_process import run_process
 from optodrive.link.transport.link_capture import LinkCapture
 from rig import OPTODRIVE, Board, long_train, wait_for
 
@@ -92,7 +92,7 @@ def test_a_stalled_host_is_named_and_its_session_captured(board, make_daemon, tm
     assert "FAULT (LINK: this computer" in failed["error"]
     daemon.stop()
     assert LinkCapture(capture).ignored_bytes == 0
-    run = subprocess.run([OPTODRIVE, "wire", "dump", capture, "--json"], capture_output=True, text=True, check=True)
+    run = run_process([OPTODRIVE, "wire", "dump", capture, "--json"], capture_output=True, text=True, check=True)
     *lines, last = map(json.loads, run.stdout.splitlines())
     names = [line["message"] for line in lines if "message" in line]
     assert {"HELLO", "HELLO_REPLY", "ARM_CONFIRM", "DATA", "START", "EXECUTED", "LEASE"} <= set(names)
@@ -123,7 +123,7 @@ def seeded(tmp_path):
 
 def replay(*arguments):
     command = [OPTODRIVE, "wire", "replay", *arguments, "--json"]
-    run = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    run = run_process(command, capture_output=True, text=True, timeout=60)
     assert run.returncode in (0, 1), run.stderr
     verdict = json.loads(run.stdout)
     assert run.returncode == (not verdict["identical"])
@@ -153,7 +153,7 @@ def test_a_captured_session_is_replayed_to_a_simulated_board_and_does_not_arm_on
 
 
 def doctor(config):
-    run = subprocess.run([OPTODRIVE, "doctor", "--config", config, "--json"], capture_output=True, text=True)
+    run = run_process([OPTODRIVE, "doctor", "--config", config, "--json"], capture_output=True, text=True)
     document = json.loads(run.stdout)
     assert run.returncode == (document["problems"] > 0)
     return {finding["check"]: finding for finding in document["findings"]}
@@ -180,7 +180,7 @@ def test_the_doctor_does_not_disturb_a_daemon_and_checks_a_free_board(board, dae
 def test_a_capture_is_never_overwritten(board, tmp_path):
     capture = tmp_path / "capture"
     capture.write_text("precious")
-    run = subprocess.run([OPTODRIVE, "serve", "--port", "0", "--capture", capture], capture_output=True, text=True)
+    run = run_process([OPTODRIVE, "serve", "--port", "0", "--capture", capture], capture_output=True, text=True)
     assert run.returncode == 2
     assert run.stderr.splitlines()[-1].startswith("optodrive: --capture")
     assert capture.read_text() == "precious"

@@ -108,7 +108,7 @@ def test_splice_and_truncation_through_the_planners_view(link, board):
     arm(link)
     first = begin(link, build_points(400, DUTY), send_ahead_s=0.05)
     link.run(0.2)
-    second = link.planner.splice(build_points(300, 2 * DUTY), 250, link.planner.epoch, 0.05)
+    second = link.planner.splice(build_points(300, 2 * DUTY, dark_us=8000), 250, link.planner.epoch, 0.05)
     assert second.start_tick == first.end_tick_after(250)
     link.until(lambda: first.is_finished)
     assert link.planner.truncate(200)

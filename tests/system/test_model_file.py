@@ -1,10 +1,10 @@
 """`--model`: plan, simulate and serve with a parameter set in the format of `diagnose`."""
 
 import json
-import subprocess
 
 import pytest
 
+from forked_process import run_process
 from optodrive.cli import main
 from rig import OPTODRIVE, Board, Daemon
 
@@ -24,7 +24,7 @@ FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 1.0, "target_um": {"5": 60
 
 
 def run(*arguments):
-    return subprocess.run([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=120)
+    return run_process([OPTODRIVE, *arguments], capture_output=True, text=True, timeout=120)
 
 
 @pytest.fixture

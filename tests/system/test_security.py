@@ -6,7 +6,6 @@ import json
 import os
 import resource
 import socket
-import subprocess
 import time
 from contextlib import ExitStack
 from functools import partial
@@ -17,6 +16,7 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
+from forked_process import run_process
 from optodrive.client import AsyncDisplay, Display
 from optodrive.core.errors import NotReadyError
 from optodrive.daemon.runtime_folder import RuntimeFolder
@@ -189,7 +189,7 @@ def test_command_line_and_client_use_the_unix_socket(running, folder):
     place = f"unix:{folder / 's'}"
     environment = {**os.environ, "OPTODRIVE_TOKEN": TOKEN}
     command = [OPTODRIVE, "status", "--url", place, "--json"]
-    output = subprocess.run(command, capture_output=True, text=True, env=environment, check=True).stdout
+    output = run_process(command, capture_output=True, text=True, env=environment, check=True).stdout
     assert json.loads(output)["display"] == running.state()["display"]
     with Display(place, TOKEN) as display:
         assert display.preview({5: 60.0}).planned == 1
@@ -202,7 +202,7 @@ def test_command_line_and_client_use_the_unix_socket(running, folder):
                 await stream.wait(await stream.send({5: 60.0}))
 
     asyncio.run(asynchronously())
-    gone = subprocess.run([*command[:3], place + "x"], capture_output=True, text=True, env=environment)
+    gone = run_process([*command[:3], place + "x"], capture_output=True, text=True, env=environment)
     assert gone.returncode == 1
     assert gone.stderr.count("\n") == 1
     assert place + "x" in gone.stderr

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 
+from forked_process import run_process
 from optodrive.core.types.measurements import Measurement, Run, Signal
 from optodrive.lab.recording import read_recording, write_recording
 from rig import long_train, wait_for
@@ -60,7 +61,7 @@ def test_request_plan_execution_and_simulation_are_recorded_and_merged(board, ma
     signal = Signal(17, t_s, 1e-6 * t_s, 1e-7)
     write_recording(lab, Measurement((Run(run, 293.0, np.zeros((0, 4)), {"displacement_m": signal}, {}),)))
     merge = [OPTODRIVE, "recording", "merge", path, lab, "--out", tmp_path / "both.h5"]
-    subprocess.run(merge, check=True, timeout=60)
+    run_process(merge, check=True, timeout=60)
     np.testing.assert_array_equal(read_recording(tmp_path / "both.h5").runs[0].pulses, pulses)
 
 

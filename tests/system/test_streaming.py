@@ -8,6 +8,7 @@ import pytest
 
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
 from optodrive.daemon.engine import plan_making
+from optodrive.daemon.engine.planner import PLANNING_TIME_FACTOR, SPLICE_TRIES
 from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
@@ -23,10 +24,10 @@ def stream(armed, sequence):
 
 
 def test_the_newest_frame_wins_without_a_pause(armed, board):
-    """A frame of 85 pixels takes 0.6 s. A new one follows when a part of the previous one was executed."""
+    """A frame of 85 pixels takes seconds. A new one follows when a part of the previous one was executed."""
     answers = []
     for k in range(5):
-        answers.append(stream(armed, frame(range(85 * k, 85 * k + 85))))
+        answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 300.0 if k < 4 else 60.0)))
         wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
     records = [ended(armed, answer) for answer in answers]
     assert [record.status for record in records] == ["superseded"] * 4 + ["done"]
@@ -47,13 +48,14 @@ def test_the_newest_frame_wins_without_a_pause(armed, board):
 def test_a_slow_planner_plans_a_frame_three_or_four_times(armed, monkeypatch):
     """After two late splices the running stream is truncated, so the third plan has no deadline."""
     stream(armed, frame(range(30)))
-    first = stream(armed, frame(range(437), 200.0))  # long beside the naps
+    first = stream(armed, frame(range(437), 200.0))  # seconds, long beside the naps
     wait_for(lambda: armed.get_plan(first.plan).executed >= 4, "a part of the frame")
-    naps_s = iter([0.15, 0.6, 1.5, 1.5])  # longer than the time reserved from the plan before
     tries = []
 
     def slowly(*arguments, **more):
-        tries.append(time.sleep(next(naps_s)))
+        """Take longer than the time reserved from the plan before."""
+        tries.append(0.05 + PLANNING_TIME_FACTOR * (1 + len(tries)) * armed._planner._last_planning_s)
+        time.sleep(tries[-1] if len(tries) <= SPLICE_TRIES else 0.0)
         return plan_sequence(*arguments, **more)
 
     monkeypatch.setattr(plan_making, "plan_sequence", slowly)
@@ -80,7 +82,7 @@ def test_frames_reach_their_targets_in_sequence(armed):
 
 
 def test_an_empty_frame_ends_the_previous_one(armed, board):
-    first = stream(armed, frame(range(100)))
+    first = stream(armed, frame(range(100), 300.0))  # long beside the time until the next has been planned
     wait_for(lambda: armed.get_plan(first.plan).executed >= 5, "a part of the frame")
     nothing = stream(armed, frame(()))
     assert ended(armed, first).status == "superseded"

@@ -14,6 +14,7 @@ from unittest.mock import patch
 import httpx
 import pytest
 
+from forked_process import run_process
 from optodrive.cli.main import run
 from optodrive.device.config_file import locate_shipped
 from rig import TOKEN, running
@@ -94,7 +95,7 @@ def assert_one_line(arguments, naming, environment=None):
     """Run a command in this process, to save its start. The daemon and its clients run in their own processes."""
     if arguments[0] == "serve" or "--url" in arguments:
         command = [OPTODRIVE, *arguments]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment})
+        done = run_process(command, capture_output=True, text=True, timeout=60, env={**os.environ, **environment})
         status, output, errors = done.returncode, done.stdout, done.stderr
     else:
         out, err = io.StringIO(), io.StringIO()

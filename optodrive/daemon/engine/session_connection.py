@@ -33,6 +33,7 @@ class SessionConnection:
             self._retry_at_s = now_s + RECONNECT_INTERVAL_S
             with suppress(LinkError):
                 self._session.connect(self._link_socket)
+                self._beaten_s = -float("inf")  # the board cannot be armed before the first beat
             self._follow_descriptor()
         self._loop.poll(min(wait_s, UNSENT_WAIT_S) if self._session.wants_write else wait_s)
         self._session.receive()
@@ -44,8 +45,12 @@ class SessionConnection:
             if self._watched is not None:
                 self._loop.unwatch(self._watched)
             if descriptor is not None:
-                self._loop.watch(descriptor, lambda: None)
+                self._loop.watch(descriptor, self._receive)
             self._watched = descriptor
+
+    def _receive(self) -> None:
+        self._session.receive()
+        self._follow_descriptor()
 
     def beat(self, alive: bool) -> None:
         """Prove that the loop runs. alive: whether the planner is idle or makes progress."""

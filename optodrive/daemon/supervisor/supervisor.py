@@ -93,7 +93,7 @@ class Supervisor:
         self._link.start()
 
     def start_others(self, others: list[Child], web: Child) -> bool:
-        """Start the other children; return whether all serve and the link has an answer about the board.
+        """Start the other children; return whether all serve each other and the link has an answer about the board.
 
         Return False if a signal ended the start. Raise StartError if a child cannot serve.
         """
@@ -113,8 +113,10 @@ class Supervisor:
         return True
 
     def _has_started(self) -> bool:
-        is_answered = bool(self.link_view.status.get("connected") or self.link_view.link_error)
-        return is_answered and all(child.is_ready for child in self._children)
+        status = self.link_view.status
+        is_answered = bool(status.get("connected") or self.link_view.link_error)
+        can_arm = not status.get("stalled")  # planner and web have reached the link process
+        return is_answered and can_arm and all(child.is_ready for child in self._children)
 
     def serve(self) -> None:
         """Watch the children until a signal ends the daemon."""

@@ -197,9 +197,14 @@ class DaemonClient:
             peer.close()
 
     @property
-    def is_complete(self) -> bool:
-        """Whether both processes have reported their state."""
+    def knows_state(self) -> bool:
+        """Whether link and planner have reported their state."""
         return self.link.status is not None and self.planner.state is not None
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether the state is known and previews can be requested."""
+        return self.knows_state and self.preview.is_connected
 
     def build_state(self) -> StateReport:
         """Report the state as last known; it is built once per change."""

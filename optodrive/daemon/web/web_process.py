@@ -30,7 +30,8 @@ BEAT_INTERVAL_S = 0.05
 NICE = -10
 """Priority, so that STOP is read in time beside other work on the computer; less than real time, which the link has."""
 READY_TIMEOUT_S = 1.0
-"""Time after which the server counts as ready, even if link or planner have not reported their state."""
+"""Time after which the server accepts callers and counts as ready, even if another process does not run."""
+STATE_POLL_S = 0.005
 
 
 def run_web(
@@ -91,11 +92,18 @@ class WebProcess:
         loop.add_reader(self._beat.fileno(), self.receive_control)
         beats = loop.create_task(self._send_beats())
         try:
+            await self._wait_for_state()
             yield
         finally:
             beats.cancel()
             loop.remove_reader(self._beat.fileno())
             self._client.close()
+
+    async def _wait_for_state(self) -> None:
+        """Let callers wait until the first answer is true; without link and planner the board is dark."""
+        deadline_s = time.monotonic() + READY_TIMEOUT_S
+        while not (self._client.knows_state or self.server.should_exit or time.monotonic() > deadline_s):
+            await asyncio.sleep(STATE_POLL_S)
 
     async def _send_beats(self) -> None:
         deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False

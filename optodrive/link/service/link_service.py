@@ -219,14 +219,16 @@ class LinkService:
             self._step_session(wait_s)
         else:
             self._step_connecting(wait_s)
+        stalled = self._clients.find_stalled()
+        control = self._control if self._session.board.state in LEASED_STATES else None
+        commands = self._handover.commands
+        status = self._status.build_if_due(self.epoch, self.link_error, control, commands, stalled)
+        if status is not None:  # before the results: who knows of ARMED from one may push to the planner at once
+            self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         refusal = self._session.pop_refusal()
         now_s = self._clock.now_s()
         for waiter, error in self._waiters.pop_results(self._session, refusal, self._describe_link_error(), now_s):
             self._reply(waiter.client, waiter.request_id, error)
-        control = self._control if self._session.board.state in LEASED_STATES else None
-        status = self._status.build_if_due(self.epoch, self.link_error, control, self._handover.commands)
-        if status is not None:
-            self._outgoing.append(Outgoing(self._clients.list_observers(), status))
         if refusal is not None:
             self._send_to_planner(Message("refusal", {"reason": refusal}))
         self._handover.report_progress()

@@ -26,16 +26,22 @@ class StatusPublisher:
         self._due_s = -inf
 
     def build_if_due(
-        self, epoch: Epoch, link_error: OptodriveError | None, control: Control | None, commands: int
+        self,
+        epoch: Epoch,
+        link_error: OptodriveError | None,
+        control: Control | None,
+        commands: int,
+        stalled: str,
     ) -> Message | None:
         """Return the status if something relevant has changed or the interval has passed, else None.
 
         control: who armed the board; commands: number of the planner's commands carried out since it connected
+        stalled: role of the process that withholds the lease, so that the board cannot be armed; '' if none does
         """
         session, board = self._session, self._session.board
         outcome = session.is_ready, session.last_event_reason, session.likely_cause
-        arming = None if control is None else control.arming
-        key = (epoch.number, session.connected, link_error, board.state, board.fault, arming, commands, *outcome)
+        causes = None if control is None else control.arming, commands, stalled, *outcome
+        key = (epoch.number, session.connected, link_error, board.state, board.fault, *causes)
         now_s = self._clock.now_s()
         if key == self._published and now_s < self._due_s:
             return None
@@ -63,5 +69,6 @@ class StatusPublisher:
             "cause": None if cause is None else list(cause),
             "control": None if control is None else control.to_dict(now_s),
             "commands": commands,
+            "stalled": stalled,
         }
         return Message("status", fields)

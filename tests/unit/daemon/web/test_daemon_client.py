@@ -68,7 +68,7 @@ def test_the_state_is_merged_anew_for_every_report(client):
     assert (client.build_state().link.state, client.is_complete) == ("down", False)
     client._on_link_message(build_status(1, "RUNNING"))
     client._on_planner_message(Message("state", NO_PLANNER.model_dump(mode="json")))
-    assert (client.build_state().board.state, client.is_complete) == ("RUNNING", True)
+    assert (client.build_state().board.state, client.is_complete) == ("RUNNING", False)  # there are no previews yet
     client._on_link_message(Message("result", {"id": 1, "error": None, "epoch": 2, "board": BoardView().to_dict()}))
     assert client.build_state().board.state == "UNKNOWN"
     client._on_link_lost()

@@ -218,6 +218,35 @@ def test_arming_needs_planner_and_web(rig):
     rig.arm()
 
 
+def test_the_status_names_who_withholds_the_lease(rig):
+    rig.run(0.02)
+    assert rig.of_kind(SUPERVISOR, "status")[-1].fields["stalled"] == ""
+    rig.leave(WEB)
+    rig.run(0.01)
+    assert rig.of_kind(SUPERVISOR, "status")[-1].fields["stalled"] == "web"
+
+
+@pytest.mark.parametrize("kind", ["arm", "stop"])
+def test_all_know_the_new_state_before_a_caller_has_the_answer(rig, kind):
+    """A caller who knows of ARMED may push at once, and the planner must not refuse it."""
+    if kind == "stop":
+        rig.arm()
+    request, seen = rig.request(WEB, kind), []
+    collect = rig.service.pop_outgoing
+
+    def keep():
+        seen.extend(collected := collect())
+        return collected
+
+    rig.service.pop_outgoing = keep
+    rig.await_result(WEB, request)
+    (answered,) = (k for k, (_, message) in enumerate(seen) if message.kind == "result")
+    state = seen[answered].message.fields["board"]["state"]
+    known = [message.fields for clients, message in seen[:answered] if PLANNER in clients and message.kind == "status"]
+    assert state == (BoardState.ARMED if kind == "arm" else BoardState.DISARMED)
+    assert (known[-1]["board"]["state"], known[-1]["epoch"]) == (state, rig.epoch)
+
+
 def test_a_fault_and_its_acknowledgement_end_epochs(rig):
     rig.arm()
     before = rig.epoch
