@@ -13,6 +13,7 @@ import sys
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from hashlib import sha256
+from importlib import import_module
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, ParamSpec, TypeVar
@@ -112,19 +113,21 @@ def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[
         parts.append(getattr(value, "__qualname__", None) or repr(value))
 
 
+ARRAY_FUNCTIONS = "numba.np.arraymath"
+
+
 def _import_array_functions() -> None:
     """Import numba's array functions without SciPy, of which they use linear algebra that no kernel calls.
 
     SciPy is optional here, and its import takes longer than that of all kernels.
     """
-    if "numba.np.arraymath" in sys.modules:
+    if ARRAY_FUNCTIONS in sys.modules:
         return
-    import numba.np.linalg as linear_algebra
-
+    linear_algebra: Any = import_module("numba.np.linalg")
     original = linear_algebra.ensure_blas
     linear_algebra.ensure_blas = _refuse_blas
     try:
-        import numba.np.arraymath
+        import_module(ARRAY_FUNCTIONS)
     finally:
         linear_algebra.ensure_blas = original
 

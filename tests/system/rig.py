@@ -25,14 +25,14 @@ PATIENT_LEASE_S = 1.0
 ENDED = ("done", "superseded", "failed", "cancelled")
 
 
-def wait_for(condition, what, patience_s=PATIENCE_S):
+def wait_for(condition, what, patience_s=PATIENCE_S, nap_s=0.005):
     """Poll until condition() is truthy and return its value."""
     until = time.monotonic() + patience_s
     while time.monotonic() < until:
         value = condition()
         if value:
             return value
-        time.sleep(0.005)
+        time.sleep(nap_s)
     raise AssertionError(f"timed out after {patience_s} s waiting for {what}")
 
 
@@ -207,7 +207,7 @@ class Daemon:
             answer = self.call("GET", f"/v1/plans/{plan}")
             return answer if answer["status"] in ENDED else None
 
-        return wait_for(ended, f"plan {plan} to end")
+        return wait_for(ended, f"plan {plan} to end", nap_s=0.02)
 
     def stop(self):
         if self.process.poll() is None:

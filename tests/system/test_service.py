@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from forked_process import run_process
 from optodrive.core.kernels import code_folder
 from optodrive.device.config_file import locate_shipped
 from rig import OPTODRIVE, TOKEN, Daemon, long_train, wait_for
@@ -33,8 +34,8 @@ def unit(request, tmp_path):
     config = tmp_path / "mine.toml"
     text = locate_shipped("display-437.toml").read_text()
     config.write_text(text.replace('transport = "simulated"', TRANSPORTS[request.param]))
-    command = [sys.executable, "-m", "optodrive.cli.main", "service", "install", "--program", "/usr/bin/true"]
-    subprocess.run([*command, "--root", tmp_path / "root", "--config", config], check=True, capture_output=True)
+    command = [OPTODRIVE, "service", "install", "--program", "/usr/bin/true"]
+    run_process([*command, "--root", tmp_path / "root", "--config", config], check=True, capture_output=True)
     return tmp_path / "root/etc/systemd/system/optodrive.service"
 
 
@@ -123,7 +124,7 @@ def run_unit_reload(daemon):
     names = {"@PROGRAM@": OPTODRIVE, "/etc/optodrive/config.toml": daemon.config, "$MAINPID": daemon.process.pid}
     for command in re.findall(r"^ExecReload=(.+)$", unit, re.MULTILINE):
         words = [str(names.get(word, word)) for word in command.split()]
-        done = subprocess.run(words, capture_output=True, text=True, timeout=60)
+        done = run_process(words, capture_output=True, text=True, timeout=60)
         if done.returncode != 0:
             break
     return done

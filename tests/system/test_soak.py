@@ -11,7 +11,7 @@ sys.path.append(str(SCRIPTS))
 
 import bench_soak  # noqa: E402 - a script
 
-PULSES = 3000
+PULSES = 1000
 
 
 def test_few_pulses_all_arrive():
