@@ -145,7 +145,8 @@ def test_the_client_reconnects_to_a_restarted_daemon_that_is_not_armed(make_boar
             with monkeypatch.context() as other:
                 other.setattr("rig.TOKEN", "another-token-for-tests")
                 restarted.start()
-                assert display.state().board.state == "DISARMED"
+                state = wait_for(lambda: (s := display.state().board.state) != "UNKNOWN" and s, "the board's state")
+                assert state == "DISARMED"
                 restarted.join()
             with pytest.raises(NotReadyError, match="arm it first"):
                 stream.wait(stream.send({6: 60.0}))

@@ -18,6 +18,7 @@ from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.peer import Peer
 from optodrive.daemon.web.state_merge import merge_state
 from optodrive.daemon.web.telemetry_hub import TelemetryHub
+from optodrive.link.service.link_service import CONNECTING
 from optodrive.link.service.results import build_error
 from optodrive.planning.display_model import DisplayModel
 from optodrive.planning.feasibility.report import FitMode
@@ -198,8 +199,9 @@ class DaemonClient:
 
     @property
     def knows_state(self) -> bool:
-        """Whether link and planner have reported their state."""
-        return self.link.status is not None and self.planner.state is not None
+        """Whether the planner has reported its state, and the link process that the board is there or absent."""
+        link = self.link.status
+        return link is not None and link.get("link_error_code") != CONNECTING and self.planner.state is not None
 
     @property
     def is_complete(self) -> bool:
