@@ -131,7 +131,7 @@ class ForkedProcess(subprocess.Popen):
         self._close_pipe_fds(*handles)
 
     def _receive(self, lines, timeout_s):
-        """Receive until so many lines have arrived or the time is over."""
+        """Receive until this number of lines has arrived or the time is over."""
         until_s = None if timeout_s is None else time.monotonic() + timeout_s
         while self._received.count(b"\n") < lines:
             wait_s = None if until_s is None else max(0.0, until_s - time.monotonic())
