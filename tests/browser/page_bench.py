@@ -25,7 +25,7 @@ class Bench:
 
     def __init__(self, folder, display="display-437"):
         self.folder = folder
-        self.is_plain = True
+        self.is_plain = self.is_plain_daemon = True
         self.board = Board(folder, program=SHORT_INDICATOR_BOARD)
         try:
             self.daemon = Daemon(folder, self.board.port, name=display)
@@ -38,6 +38,8 @@ class Bench:
         if not self.is_plain or self.board.process.poll() is not None:
             self.replace_board(program=SHORT_INDICATOR_BOARD)
             self.is_plain = True
+        if not self.is_plain_daemon:
+            self.restart_daemon()
         self.daemon.call("POST", "/v1/disarm")
         wait_for(lambda: self.daemon.board_state() == "DISARMED", "the board to be disarmed")
         self.board.forget()
@@ -51,11 +53,12 @@ class Bench:
         self.board.forget()
         wait_for(lambda: self.daemon.state()["link"]["state"] == "up", "the link")
 
-    def restart_daemon(self):
-        """Start a daemon on the address of the one that was stopped."""
+    def restart_daemon(self, replace=()):
+        """Start a daemon on the address of the one that was stopped. replace: changes of its configuration."""
         port = self.daemon.client.base_url.port
         self.daemon.stop()
-        self.daemon = Daemon(self.folder, self.board.port, options=("--port", str(port)))
+        self.daemon = Daemon(self.folder, self.board.port, replace=replace, options=("--port", str(port)))
+        self.is_plain_daemon = not replace
 
     def stop(self):
         self.daemon.stop()

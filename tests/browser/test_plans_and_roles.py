@@ -1,4 +1,4 @@
-"""Whose plans play and wait, and what the role may use."""
+"""Whose plans play and wait, who armed the board, and what the role may use."""
 
 import json
 import re
@@ -9,7 +9,8 @@ from playwright.sync_api import expect
 from websockets.sync.client import connect
 
 from rig import TOKEN, read_role_tokens, wait_for
-from window import list_violations, play_for, press_escape
+from service_manager import Manager, reload
+from window import arm, list_violations, play_for, press_escape
 
 
 def test_what_plays_and_waits_is_named_and_can_be_cancelled(page, daemon):
@@ -126,3 +127,49 @@ def test_confirm_follows_arm_within_five_seconds_and_the_focus_is_kept(page, dae
     expect(page.locator("#confirm-arm")).to_be_hidden()
     page.keyboard.press("Tab")
     assert read_focus(page) == "disarm"
+
+
+ANNA = "a-token-for-anna"
+
+
+def write_tokens(path, **secrets):
+    entries = (f'[[token]]\nname = "{name}"\nrole = "armer"\nsecret = "{secrets[name]}"\n' for name in secrets)
+    path.write_text('format = "optodrive-tokens"\nversion = 1\n' + "".join(entries))
+    path.chmod(0o600)
+
+
+@pytest.fixture
+def manager(tmp_path, monkeypatch):
+    manager = Manager(tmp_path, monkeypatch)
+    yield manager
+    manager.close()
+
+
+def test_a_page_whose_token_is_revoked_says_so(kept_window, bench, axe, tmp_path, manager):
+    path = tmp_path / "tokens.toml"
+    write_tokens(path, rig=TOKEN, anna=ANNA)
+    bench.restart_daemon(replace=[("lease_s = 1.0", f'lease_s = 1.0\n[daemon]\ntokens = "{path}"\n#')])
+    kept_window.reset(ANNA)
+    page, daemon = kept_window.page, bench.daemon
+    control = page.locator("#control")
+    daemon.arm()
+    expect(control).to_have_text(re.compile(r"^Armed by rig \d s ago\.$"))
+    daemon.call("POST", "/v1/disarm")
+    expect(control).to_be_hidden()
+    arm(page)
+    expect(control).to_have_text(re.compile(r"^Armed by anna \(this page’s token\) \d s ago\.$"))
+    write_tokens(path, rig=TOKEN)
+    reload(daemon, manager, str)
+    trouble = page.get_by_role("alert").filter(has_text="The token 'anna' was revoked.")
+    expect(trouble).to_be_visible()
+    expect(page.locator("#board-state")).to_have_text("UNKNOWN")
+    expect(page.locator("#caller")).to_have_text("token not valid")
+    for name in ("Arm …", "Disarm", "Preview"):
+        expect(page.get_by_role("button", name=name)).to_be_disabled()
+    expect(page.locator("#fault-history")).to_have_text("None.")
+    assert list_violations(page, axe) == []
+    wait_for(lambda: daemon.board_state() == "DISARMED", "the arming of anna to end")
+    trouble.get_by_role("link", name="Enter another one").click()
+    page.get_by_label("Token of this daemon").fill(TOKEN)
+    page.keyboard.press("Enter")
+    expect(page.locator("#caller")).to_have_text("rig, armer")

@@ -155,12 +155,16 @@ def test_hidden_windows_leave_their_connection_to_others(page):
     expect(page.locator("#link")).to_have_text("live")
 
 
-def test_a_daemon_with_another_token_is_told_from_one_that_is_gone(page):
+def test_a_token_that_the_daemon_does_not_know_is_told_from_a_daemon_that_is_gone(page):
     page.route("**/v1/telemetry*", lambda route: route.fulfill(status=401))
+    page.route(STOP, lambda route: route.fulfill(status=401))
     set_hidden(page, True)
     set_hidden(page, False)
-    expect(page.locator("#trouble")).to_contain_text("another token")
-    expect(page.get_by_role("link", name="Enter the new one")).to_be_visible()
+    expect(page.locator("#trouble")).to_contain_text("does not know this page’s token")
+    expect(page.get_by_role("link", name="Enter another one")).to_be_visible()
+    expect(page.get_by_role("button", name="Arm …")).to_be_disabled()
+    page.keyboard.press("Escape")
+    expect(page.locator("#stopping")).to_contain_text("STOP was refused")
 
 
 def read_look(page):

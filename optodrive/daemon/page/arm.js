@@ -18,6 +18,7 @@ export class ArmControl {
     this.confirmButton = find("confirm-arm");
     this.countdown = find("confirm-left");
     this.status = find("arming");
+    this.holder = find("control");
     this.idleText = this.status.textContent;
     this.announce = announce;
     this.onError = onError;
@@ -36,6 +37,15 @@ export class ArmControl {
       if (state !== BoardState.DISARMED) {
         this.#closeConfirmation();
       }
+    }
+  }
+
+  // Show who armed the board; ownName: the name of this page's token.
+  showControl(control, ownName) {
+    this.holder.hidden = control === null;
+    if (control) {
+      const { caller, armed_for_s } = control;
+      this.holder.textContent = `Armed by ${caller}${caller === ownName ? " (this page’s token)" : ""} ${describeAge(armed_for_s)}.`;
     }
   }
 
@@ -87,4 +97,9 @@ export class ArmControl {
     await call("POST", "/v1/arm").catch(this.onError);
     this.#setEnabled(this.state === BoardState.DISARMED);
   }
+}
+
+function describeAge(seconds) {
+  const [amount, unit] = seconds < 120 ? [seconds, "s"] : seconds < 7200 ? [seconds / 60, "min"] : [seconds / 3600, "h"];
+  return `${Math.floor(amount)} ${unit} ago`;
 }

@@ -236,7 +236,15 @@ function showNothingKnown(reason) {
   header.showUnknown(reason);
   queue.clear(`Unknown: ${reason}.`);
   arm.show("");
+  arm.showControl(null);
   showTitle();
+}
+
+function showInvalidToken() {
+  header.showConnection("no access", "bad");
+  showNothingKnown("no access to the daemon");
+  status.showInvalidToken(telemetry.revocation);
+  permissions.refuse();
 }
 
 telemetry.addEventListener("up", () => {
@@ -245,7 +253,9 @@ telemetry.addEventListener("up", () => {
 });
 telemetry.addEventListener("down", () => {
   freshness.lose();
-  if (telemetry.paused) {
+  if (telemetry.revocation) {
+    showInvalidToken();
+  } else if (telemetry.paused) {
     header.showConnection("paused", "bad");
     showNothingKnown("telemetry is paused");
   } else {
@@ -256,10 +266,7 @@ telemetry.addEventListener("down", () => {
   }
   find("stale").hidden = false;
 });
-telemetry.addEventListener("unauthorized", () => {
-  header.showConnection("another token", "bad");
-  status.showTokenChange();
-});
+telemetry.addEventListener("unauthorized", showInvalidToken);
 telemetry.addEventListener("state", ({ detail }) => {
   const isLinked = detail.link.state === "up";
   isOff = isLinked && !LEASED_STATES.includes(detail.board.state);
@@ -276,6 +283,7 @@ telemetry.addEventListener("state", ({ detail }) => {
   queue.show(detail.queue);
   pastEvents.showPlans(detail);
   arm.show(isLinked ? detail.board.state : "");
+  arm.showControl(isLinked ? detail.control : null, permissions.caller?.name);
   hasLink = isLinked;
   freshness.see("state");
   if (isLinked) {

@@ -24,6 +24,17 @@ export class Permissions {
     this.apply();
   }
 
+  // Disable everything: the daemon does not know the token.
+  refuse() {
+    this.caller = null;
+    this.label.textContent = "token not valid";
+    this.label.title = "";
+    this.apply();
+    for (const controls of document.querySelectorAll("[data-route]")) {
+      controls.disabled = true;
+    }
+  }
+
   // Disable what the role may not use; again after a control has been added.
   apply() {
     const { caller } = this;

@@ -55,7 +55,7 @@ export class StopControl {
         return true;
       }
       if (response.status === 401) {
-        this.#show("STOP was refused: the daemon was restarted and has another token. A restarted daemon is never armed.");
+        this.#show("STOP was refused: this page’s token was revoked, or the daemon was restarted and is not armed. In doubt use the emergency stop or the key.");
         return true;
       }
       if (response.status === 503) {

@@ -3,6 +3,7 @@
 import { request } from "./api.js";
 
 const RETRY_MS = 500;
+const REFUSED_RETRY_MS = 5000; // the daemon notes every request with an invalid token
 const SILENCE_MS = 3000;
 
 export class Telemetry extends EventTarget {
@@ -13,6 +14,8 @@ export class Telemetry extends EventTarget {
     super();
     this.rateHz = rateHz;
     this.live = false;
+    this.isRefused = false; // whether the daemon does not know the token
+    this.revocation = ""; // why the token is revoked, as the daemon says it
     // Browsers allow six connections per daemon for all windows: a hidden window must not hold one that STOP needs.
     document.addEventListener("visibilitychange", () => this.pause(document.hidden));
   }
@@ -27,7 +30,7 @@ export class Telemetry extends EventTarget {
         await this.#readEvents().catch(() => {});
         this.#setDown();
       }
-      await new Promise((resolve) => setTimeout(resolve, RETRY_MS));
+      await new Promise((resolve) => setTimeout(resolve, this.isRefused ? REFUSED_RETRY_MS : RETRY_MS));
     }
   }
 
@@ -43,7 +46,8 @@ export class Telemetry extends EventTarget {
     let timer = setTimeout(() => this.#abort.abort(), SILENCE_MS);
     try {
       const response = await request("GET", `/v1/telemetry?rate_hz=${this.rateHz}`, { signal: this.#abort.signal });
-      if (response.status === 401) {
+      this.isRefused = response.status === 401;
+      if (this.isRefused) {
         this.dispatchEvent(new Event("unauthorized"));
       }
       if (!response.ok) {
@@ -71,9 +75,14 @@ export class Telemetry extends EventTarget {
   #dispatch(texts) {
     if (!this.live) {
       this.live = true;
+      this.revocation = "";
       this.dispatchEvent(new Event("up"));
     }
     for (const text of texts) {
+      if (text.startsWith(": ")) {
+        this.revocation = text.slice(2); // the only line of its kind, and the last one
+        continue;
+      }
       const [event, data] = text.split("\n");
       this.dispatchEvent(new CustomEvent(event.slice("event: ".length), { detail: JSON.parse(data.slice("data: ".length)) }));
     }

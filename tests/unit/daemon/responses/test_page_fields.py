@@ -15,7 +15,14 @@ from optodrive.daemon.responses.caller import CallerReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
-from optodrive.daemon.responses.state import PulseTotals, QueuedPlan, QueueReport, RecentPlan, StateReport
+from optodrive.daemon.responses.state import (
+    ControlReport,
+    PulseTotals,
+    QueuedPlan,
+    QueueReport,
+    RecentPlan,
+    StateReport,
+)
 from optodrive.daemon.responses.telemetry import (
     BudgetEvent,
     CapUsage,
@@ -47,6 +54,7 @@ VARIABLES = {
 EVENT_DETAILS = {"state": StateReport, "fault": FaultEvent, "budget": BudgetEvent, "display": DisplayEvent}
 DESTRUCTURED = {
     ("main.js", r"const \[config, \{([^}]*)\}\]"): PatternList,
+    ("arm.js", r"const \{([^}]*)\} = control;"): ControlReport,
     ("header.js", r"showState\(\{([^}]*)\}\)"): StateReport,
     ("permissions.js", r"const \{([^}]*)\} = this.caller;"): CallerReport,
     ("plans.js", r"const \{([^}]*)\} = plan;"): PlanReport,
