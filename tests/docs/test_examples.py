@@ -1,0 +1,134 @@
+"""Every example of README and docs: commands exist with their options, and run as written."""
+
+import re
+import shlex
+
+import pytest
+import typer
+from pages import ROOT, list_examples, list_pages
+from worlds import (
+    find_obstacle,
+    run_script,
+    write_calibration,
+    write_checkout,
+    write_film,
+    write_measured,
+    write_recordings,
+    write_script,
+)
+
+from optodrive.cli.main import UsageError, app
+
+ELSEWHERE = {
+    "scripts/": "scripts of the checkout, which are run as they are",
+    "make ": "tests/firmware builds the ports",
+    "python3 -m venv": "tests/system/test_wheel.py checks the wheel",
+    "/opt/optodrive/": "tests/system/test_service.py runs the commands of the service",
+    "optodrive helios": "tests/helios plays on a DAC's USB protocol; no device is here",
+    "optodrive home": "a synopsis; tests/system/test_home.py",
+    "optodrive calibrate board": "a synopsis; tests/system/test_calibrate_loop.py",
+    "optodrive calibrate camera": "tests/accuracy/test_calibrate_camera.py renders its pictures",
+    "optodrive calibrate pixels": "tests/accuracy/test_calibrate_pixels.py records its sweep, which takes minutes",
+    "optodrive plan frames.json --pixel-map": "tests/accuracy/test_calibrate_pixels.py",
+    "optodrive simulate sweep/": "tests/accuracy/test_calibrate_pixels.py",
+    "optodrive diagnose film.h5 --out answer/ --dask": "tests/accuracy/test_display_diagnosis.py starts a cluster",
+}
+"""Beginnings of examples that are not run here, and where they are."""
+
+SCENARIOS = {
+    "readme": (write_checkout, ["README.md:Shell", "README.md:Python"]),
+    "readme-rest": (write_checkout, ["README.md:REST"]),
+    "quickstart": (write_checkout, ["docs/tutorials/quickstart.md:Quickstart"]),
+    "client": (write_checkout, ["docs/how-to/use-the-python-client.md:Python client"]),
+    "diagnosis": (
+        write_recordings,
+        ["docs/explanation/diagnosis.md:Diagnosis", "docs/explanation/diagnosis.md:Planning with a diagnosed model"],
+    ),
+    "film": (write_film, ["docs/explanation/diagnosis.md:Whole displays"]),
+    "recordings": (write_recordings, ["docs/reference/recordings.md:Recordings"]),
+    "recordings-python": (write_film, ["docs/reference/recordings.md:From Python"]),
+    "sessions": (write_measured, ["docs/reference/recordings.md:Sessions of the driver"]),
+    "field": (
+        write_calibration,
+        [f"docs/how-to/calibrate-the-field.md:{name}" for name in ("Commands", "Positions to codes", "Mirror servos")],
+    ),
+}
+EVERY_TIME = ("readme", "readme-rest")
+INLINE = re.compile(r"`(optodrive [^`]+)`")
+
+
+def is_elsewhere(example):
+    return not example.is_python and example.text.startswith(tuple(ELSEWHERE))
+
+
+def select(place):
+    """Return the examples below a heading that are run here."""
+    page, _, heading = place.partition(":")
+    found = [
+        item for item in list_examples() if (item.page, item.heading) == (page, heading) and not is_elsewhere(item)
+    ]
+    assert found, place
+    return found
+
+
+def test_every_example_is_run_here_or_elsewhere():
+    places = {place for _, listed in SCENARIOS.values() for place in listed}
+    missing = [e for e in list_examples() if f"{e.page}:{e.heading}" not in places and not is_elsewhere(e)]
+    assert missing == []
+    for beginning in ELSEWHERE:
+        assert any(not item.is_python and item.text.startswith(beginning) for item in list_examples()), beginning
+
+
+def parse(words):
+    """Parse the arguments of a command without running it."""
+    command, name = typer.main.get_command(app), "optodrive"
+    parent = None
+    while True:
+        context = command.make_context(name, list(words), parent=parent, resilient_parsing=False)
+        if not hasattr(command, "resolve_command"):
+            return
+        rest = [*context._protected_args, *context.args]
+        name, command, words = command.resolve_command(context, rest)
+        parent = context
+
+
+def find_refusal(words):
+    """Return why the arguments of a command are refused, '' if they are not."""
+    try:
+        parse(words)
+    except typer.Exit:  # of --help and --version
+        return ""
+    except UsageError as error:
+        return error.format_message()
+    return ""
+
+
+def read_words(text):
+    """Return the arguments of a command; of a synopsis, with all that is optional, and numbers for the values."""
+    bare = re.sub(r"\b(POWER_MW|N)\b", "5", text.replace("[--", "--").replace("]", ""))
+    return shlex.split(bare)[1:]
+
+
+@pytest.mark.parametrize("example", [e for e in list_examples() if e.is_optodrive], ids=lambda e: f"{e.page}:{e.line}")
+def test_the_command_and_its_options_exist(example):
+    parse(read_words(example.text))
+
+
+@pytest.mark.parametrize("path", list_pages(), ids=lambda path: str(path.relative_to(ROOT)))
+def test_commands_within_a_sentence_exist(path):
+    for text in INLINE.findall(path.read_text()):
+        if not re.search(r"[|…[]", text):
+            refusal = find_refusal(read_words(text))
+            assert "No such" not in refusal, (text, refusal)  # it may be named without its arguments
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in EVERY_TIME else [pytest.mark.slow]) for name in SCENARIOS]
+)
+def test_the_examples_run_as_written(tmp_path, name):
+    obstacle = find_obstacle()
+    if obstacle:
+        pytest.skip(obstacle)
+    prepare, places = SCENARIOS[name]
+    prepare(tmp_path)
+    run_script(write_script([item for place in places for item in select(place)]), tmp_path)

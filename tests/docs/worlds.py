@@ -1,0 +1,147 @@
+"""Folders with the files that the examples of a page need, and scripts that run the examples in them."""
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from display_lab import display_lab
+from hidden_field import CONFIG, grid_codes, measure_spots
+from hidden_servo import HiddenServo
+from hidden_servo import recording as record_servos
+from labs import lab
+from optodrive.device.config_file import locate_shipped
+from optodrive.lab.calibration.spots import write_spots
+from optodrive.lab.recording.writer import write_recording
+from optodrive.link.simulator.true_geometry import GroundTruthGeometry
+
+PROGRAMS = Path(sys.executable).parent
+FRAMES = {"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": {"17": 50, "18": 120.5}}]}
+WAIT = "for _ in $(seq 300); do curl -fs http://127.0.0.1:8450/v1/health > /dev/null && break; sleep 0.1; done"
+HEAD = """set -euo pipefail
+daemon=
+end() {
+  [ -z "$daemon" ] || { kill "$daemon"; wait "$daemon"; }
+  daemon=
+}"""
+SANDBOX = ("--dev-bind", "/", "/", "--unshare-net", "--unshare-pid", "--proc", "/proc", "--die-with-parent")
+TIMEOUT_S = 300.0
+
+
+def find_obstacle():
+    """Return why examples cannot be run with a network of their own, None if they can."""
+    for program in ("bwrap", "curl", "openssl"):
+        if shutil.which(program) is None:
+            return f"{program} is missing"
+    tried = subprocess.run(["bwrap", *SANDBOX, "true"], capture_output=True, text=True)
+    return f"bubblewrap cannot create a network: {tried.stderr.strip()}" if tried.returncode else None
+
+
+def write_script(examples):
+    """Return the shell script of examples: a daemon runs in the background until the next one, or the end.
+
+    An example that talks to a daemon gets one, with an armed board, if no example has started one.
+    """
+    lines, is_served = [HEAD], False
+    for number, example in enumerate(examples):
+        lines.append(f"echo {example.page}:{example.line} >&2")
+        talks = example.text.startswith("curl") or "Display(" in example.text
+        if talks and not is_served:
+            lines += [*serve("optodrive serve"), "optodrive arm"]
+        is_served = is_served or talks
+        if example.is_python:
+            lines += [f"python - <<'END_OF_EXAMPLE_{number}'", example.text, f"END_OF_EXAMPLE_{number}"]
+        elif "optodrive serve" in example.text:
+            lines += serve(example.text)
+            is_served = True
+            if "--record-session" in example.text:  # an empty session cannot be merged
+                lines += ["optodrive arm", "optodrive play pixel pixel=200 seconds=0.1", "end"]
+        else:
+            lines.append(example.text)
+    return "\n".join([*lines, "end", ""])
+
+
+def serve(command):
+    """Return the lines that start a daemon in the background and wait until it answers."""
+    return ["end", f"{command} > serve.log 2>&1 &", "daemon=$!", WAIT]
+
+
+def run_script(script, folder):
+    """Run a script in a folder with a network, a home and a runtime folder of its own; return what it printed."""
+    (folder / "script.sh").write_text(script)
+    (folder / "runtime").mkdir(mode=0o700)
+    cache = Path.home() / ".cache"
+    ended = subprocess.run(
+        ["bwrap", *SANDBOX, "--chdir", str(folder), "bash", "script.sh"],
+        env={
+            "PATH": f"{PROGRAMS}:/usr/bin:/bin",
+            "HOME": str(folder),
+            "XDG_CACHE_HOME": str(cache),
+            "XDG_RUNTIME_DIR": str(folder / "runtime"),
+            "PYTHONPATH": str(Path(__file__).parents[2]),
+        },
+        capture_output=True,
+        text=True,
+        timeout=TIMEOUT_S,
+    )
+    daemon = folder / "serve.log"
+    shown = ended.stderr + (daemon.read_text() if daemon.exists() else "")
+    assert ended.returncode == 0, shown
+    assert "Traceback" not in shown, shown
+    return ended.stdout
+
+
+def write_frames(folder):
+    """Write frames.json."""
+    (folder / "frames.json").write_text(json.dumps(FRAMES))
+
+
+def write_checkout(folder):
+    """Make the programs of the environment available as those of a checkout, and as those of a new environment."""
+    for name in (".venv", "display"):
+        (folder / name).symlink_to(sys.prefix)
+    write_frames(folder)
+
+
+def write_recordings(folder):
+    """Write recordings of a pixel whose membrane creeps, and a configuration."""
+    write_frames(folder)
+    creep = {"membrane_creep": {"share": 0.12, "time": 0.1, "spread": 0.0}}
+    for seed, name in enumerate(("recording", "monday", "tuesday")):
+        write_recording(folder / f"{name}.h5", lab(seed, creep))
+    shutil.copy(locate_shipped("display-437.toml"), folder / "my-display.toml")
+
+
+def write_film(folder):
+    """Write recordings of several pixels, under the names that the pages use."""
+    film = display_lab({pixel: {} for pixel in range(5)}, groups=("weak", "strong"))
+    for name in ("film", "recording", "display"):
+        write_recording(folder / f"{name}.h5", film)
+
+
+def write_measured(folder):
+    """Write a recording without pulses for the first run of a session."""
+    times_s = np.arange(0.0, 1.0, 1e-3)
+    signal = folder / "measured" / "run1"
+    signal.mkdir(parents=True)
+    (folder / "measured" / "recording.toml").write_text(
+        'format = "optotactile-recording"\nversion = 1\ninstrument_notes = "a vibrometer"\n'
+        "[runs.run1]\nambient_K = 295.0\n[runs.run1.displacement_m]\npixel = 200\nsigma = 2e-7\n"
+    )
+    (signal / "pulses.csv").write_text("start_s,width_s,power_W,pixel\n")
+    rows = "\n".join(f"{time_s:.4f},{1e-7 * np.sin(50 * time_s):.3e}" for time_s in times_s)
+    (signal / "displacement_m.csv").write_text(f"t_s,value\n{rows}\n")
+
+
+def write_calibration(folder):
+    """Write spots of a hidden geometry, points, a recording of hidden mirrors, and frames."""
+    write_frames(folder)
+    random = np.random.default_rng(1)
+    truth = GroundTruthGeometry.sample(1, CONFIG)
+    write_spots(folder / "spots.csv", measure_spots(truth, grid_codes(5), random, outlier_fraction=0.0)[0])
+    (folder / "points.csv").write_text("x_m,y_m\n0.0,0.0\n0.01,-0.02\n")
+    servo = HiddenServo(900.0, 0.7, 30e-6, 60.0)
+    write_recording(folder / "recording.h5", record_servos((servo, servo), random))
