@@ -140,7 +140,7 @@ def _compute_scores(
     values, vectors = np.linalg.eigh(gram)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     draws = root @ generator.standard_normal((len(gram), DRAWS))
-    max_surprisal = np.zeros(DRAWS)
+    max_ratio: dict[int, FloatArray] = {}
     for item, _, indices in column_sets:
         rows = list(indices)
         if independent[rows].min() <= ROUNDING_FRACTION:
@@ -149,7 +149,10 @@ def _compute_scores(
         ratio_drawn = (draws[rows] * solved).sum(axis=0)
         if not item.is_linear:
             ratio_drawn = np.where(solved[0] > 0.0, ratio_drawn, 0.0)
-        max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, len(rows)))
+        max_ratio[len(rows)] = np.maximum(max_ratio.get(len(rows), 0.0), ratio_drawn)
+    max_surprisal = np.zeros(DRAWS)
+    for degrees, ratio_drawn in max_ratio.items():  # once per number of degrees, because it takes long
+        max_surprisal = np.maximum(max_surprisal, -chi_squared.logsf(ratio_drawn, degrees))
     level = float(np.quantile(max_surprisal, 0.99))
     # Beyond the draws, extrapolate as for the maximum of 1 % × e^level independent scores.
     exceedance = float((max_surprisal >= observed).mean())

@@ -45,18 +45,14 @@ def test_the_servo_of_the_shipped_scanners_settles_as_its_class():
 def peak_from_phase(pole, phases):
     """Return the sampled maximum of |Re exp(λ t)| from each phase on, [phases]."""
     t_s = np.linspace(0.0, 3 * np.pi / pole.imag, 3001)
-    return np.abs((np.exp(1j * phases[:, None] + pole * t_s)).real).max(axis=1)
+    return np.abs(np.outer(np.exp(1j * phases), np.exp(pole * t_s)).real).max(axis=1)
 
 
-@pytest.mark.parametrize(
-    "damping", [0.3, *(pytest.param(damping, marks=pytest.mark.slow) for damping in (0.5, 0.7, 0.9))]
-)
+@pytest.mark.parametrize("damping", [0.3, 0.5, 0.7, 0.9])
 def test_what_outlasts_a_tolerance_is_bounded_over_all_phases_and_tightly(damping):
     servo = Servo(1000.0, damping, 0.0, 100.0)
-    pole, phases, max_ratio = pole_per_s(servo), np.linspace(0, np.pi, 721), 0.0
-    now = peak_from_phase(pole, phases)
-    for later_s in np.linspace(0.0, np.pi / pole.imag, 91):
-        later = peak_from_phase(pole, phases + pole.imag * later_s)  # without the decay itself
-        max_ratio = max(max_ratio, (later / now).max())
+    now = peak_from_phase(pole_per_s(servo), np.linspace(0, np.pi, 720, endpoint=False))
+    # From a later phase on, without the decay itself: |Re| has the period π.
+    max_ratio = max((np.roll(now, -shift) / now).max() for shift in range(720))
     assert max_ratio <= envelope_factor(servo) * (1 + 1e-6)
     assert max_ratio >= 0.99 * envelope_factor(servo)
