@@ -27,13 +27,17 @@ CONFIG = DISPLAYS["display-16"].config
 STEP_S = 0.002
 
 
+def drop_nothing(frame):
+    return False
+
+
 class Wire(MemoryLink):
-    """In-memory link that can drop frames."""
+    """In-memory link that can drop frames, after which each exchange takes as long as over a serial port."""
 
     def __init__(self, core, clock):
         super().__init__(core, clock)
         self.cut = False
-        self.drop_frame = lambda frame: False
+        self.drop_frame = drop_nothing
         self.sent = []
         self._up, self._down = FrameDecoder(), FrameDecoder()
 
@@ -44,6 +48,8 @@ class Wire(MemoryLink):
             super().write(b"".join(encode_frame(frame) for frame in frames if not self.drop_frame(frame)))
 
     def read(self, timeout_s):
+        if self.drop_frame is not drop_nothing:
+            self._clock.sleep(STEP_S)
         data = super().read(timeout_s)
         if self.cut:
             return b""
@@ -334,7 +340,7 @@ def test_a_failed_connect_keeps_the_clock(rig, kind):
     with pytest.raises(LinkError):
         rig.connect()
     assert rig.session.board_s() == pytest.approx(rig.core.machine.current_tick * 1e-6, abs=0.01)
-    rig.link.drop_frame = lambda frame: False
+    rig.link.drop_frame = drop_nothing
     before_s = rig.session.board_s()
     rig.connect()
     assert rig.session.board_s() - before_s < CONNECT_TIMEOUT_S
@@ -443,7 +449,7 @@ def test_a_board_that_ended_hold_can_be_armed_again(rig):
     rig.play(plan(500))
     rig.until(lambda: rig.session.board.state == "DISARMED")
     assert rig.session.last_event_reason == "hold too long"
-    rig.link.drop_frame = lambda frame: False
+    rig.link.drop_frame = drop_nothing
     rig.run(0.2)
     rig.arm()
     planned = plan(50)
