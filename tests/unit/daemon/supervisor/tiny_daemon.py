@@ -26,6 +26,8 @@ from optodrive.daemon.supervisor.forking import fork_with_beat
 from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import Supervisor
 
+LIFE_S = 0.1
+"""A child that dies or hangs does so after this time."""
 STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 
 MUTANTS = {
@@ -55,9 +57,10 @@ def behave(behaviour, name, folder, beat):
     started_s = time.monotonic()
     while True:
         is_last = bool(ends)
-        if time.monotonic() - started_s > 0.3 and behaviour == "die":
+        if time.monotonic() - started_s > LIFE_S and behaviour == "die":
             os._exit(3)
-        if time.monotonic() - started_s > 0.3 and behaviour == "hang":
+        if time.monotonic() - started_s > LIFE_S and behaviour == "hang":
+            note(folder, f"{name} hangs")
             time.sleep(60)
         beat.beat()
         for fields in beat.receive():
