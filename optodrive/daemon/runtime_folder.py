@@ -40,6 +40,11 @@ class RuntimeFolder:
         return self.path / "preview.sock"
 
     @property
+    def acceptor_socket(self) -> Path:
+        """Socket of the acceptor process."""
+        return self.path / "acceptor.sock"
+
+    @property
     def link_settings(self) -> Path:
         """File of the link process's settings."""
         return self.path / "link.json"
@@ -70,7 +75,7 @@ def open_runtime_folder(port: int, unix: Path | None) -> RuntimeFolder:
     try:
         known_as.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
         _remove_left_behind(known_as)
-        if len(os.fsencode(known_as / "preview.sock")) <= SOCKET_PATH_MAX_BYTES:
+        if len(os.fsencode(known_as / "acceptor.sock")) <= SOCKET_PATH_MAX_BYTES:
             known_as.mkdir(mode=0o700)
             path = known_as
         else:  # a socket does not fit there

@@ -45,7 +45,7 @@ def test_stop_needs_only_the_link_process(board, daemon, tmp_path, suspended):
     daemon.call("POST", "/v1/plans", json=long_train(seconds=20.0))
     wait_for(lambda: len(board.of("pulse")) > 20, "pulses")
     others = find_others(daemon)
-    assert len(others) == 4
+    assert len(others) == 5
     suspended(others)
     environment = {name: value for name, value in os.environ.items() if name != "OPTODRIVE_TOKEN"}  # none is needed
     begin_s = time.monotonic()

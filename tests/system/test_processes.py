@@ -16,7 +16,7 @@ import pytest
 from optodrive.daemon.supervisor.child import HANG_S
 from rig import PATIENT_LEASE_S, TOKEN, Board, Daemon, long_train, wait_for
 
-PROCESSES = ("link", "planner", "preview", "web", "supervisor")
+PROCESSES = ("link", "planner", "preview", "acceptor", "web", "supervisor")
 SIGNALS = (signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM)
 SITUATIONS = ("idle", "armed", "streaming")
 RESTART_S = 3.0
@@ -34,6 +34,9 @@ DARK_S = {
     ("planner", signal.SIGKILL): AT_ONCE_S,
     ("planner", signal.SIGSTOP): BEAT_TIMEOUT_S + PATIENT_LEASE_S,
     ("planner", signal.SIGTERM): AT_ONCE_S,
+    ("acceptor", signal.SIGKILL): AT_ONCE_S,
+    ("acceptor", signal.SIGSTOP): BEAT_TIMEOUT_S + PATIENT_LEASE_S,
+    ("acceptor", signal.SIGTERM): AT_ONCE_S,
     ("web", signal.SIGKILL): AT_ONCE_S,
     ("web", signal.SIGSTOP): BEAT_TIMEOUT_S + PATIENT_LEASE_S,
     ("web", signal.SIGTERM): AT_ONCE_S,
@@ -225,35 +228,45 @@ def is_alive(pid):
     return read_proc(pid, "stat").rpartition(")")[2].split()[:1] not in ([], ["Z"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
-def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path, number):
+@pytest.mark.parametrize(
+    ("name", "number"),
+    [
+        ("web", signal.SIGKILL),
+        *(
+            pytest.param(name, number, marks=pytest.mark.slow)
+            for name, number in (("web", signal.SIGSTOP), ("acceptor", signal.SIGKILL), ("acceptor", signal.SIGSTOP))
+        ),
+    ],
+)
+def test_a_plan_finishes_without_the_web_process_if_that_is_configured(tmp_path, name, number):
     rig = Rig(tmp_path, 'on_web_loss = "finish"\n')
     try:
         rig.bring_to("armed")
         plan = rig.daemon.call("POST", "/v1/plans", json=long_train(seconds=5.0))
         wait_for(lambda: len(rig.board.of("pulse")) > 20, "pulses")
-        first = rig.find("web")
+        first = rig.find(name)
         os.kill(first, number)
-        wait_for(lambda: rig.find("web") not in (None, first), "another web process")
+        wait_for(lambda: rig.find(name) not in (None, first), f"another {name} process")
         wait_for(lambda: len(rig.board.of("pulse")) == plan["planned"], "the plan's last pulse")
         assert rig.board.of("fault") == []
     finally:
         rig.stop()
 
 
-def test_callers_are_not_refused_while_the_web_process_is_away(shared):
+@pytest.mark.parametrize("name", ["acceptor", "web"])
+def test_callers_are_not_refused_while_the_acceptor_or_the_web_process_is_away(shared, name):
     rig = shared
-    first = rig.find("web")
+    first = rig.find(name)
     os.kill(first, signal.SIGKILL)
     assert ask(rig.daemon)["display"]
-    assert rig.find("web") != first
+    assert rig.find(name) != first
 
 
 def test_the_supervisor_has_one_thread_and_children_hold_only_their_descriptors(shared):
     pid = shared.find("supervisor")
     assert len(list(Path(f"/proc/{pid}/task").iterdir())) == 1
     port = int(shared.daemon.url.rsplit(":")[-1])
-    assert {name for name in PROCESSES if listens(shared.find(name), port)} == {"supervisor", "web"}
+    assert {name for name in PROCESSES if listens(shared.find(name), port)} == {"supervisor", "acceptor"}
 
 
 def listens(pid, port):

@@ -79,6 +79,25 @@ def test_stop_answers_while_the_planner_is_suspended(armed):
         os.kill(planner, signal.SIGCONT)
 
 
+def test_stop_takes_effect_while_the_web_process_is_suspended_and_is_answered_afterwards(armed):
+    board, daemon = armed
+    daemon.call("POST", "/v1/plans", json=long_train())
+    wait_for(lambda: len(board.of("pulse")) > 5, "pulses")
+    web = find_process(daemon, "web")
+    os.kill(web, signal.SIGSTOP)
+    try:
+        with socket.create_connection(("127.0.0.1", daemon.client.base_url.port), timeout=20) as link:
+            request = f"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\nAuthorization: Bearer {TOKEN}\r\n\r\n"
+            link.sendall(request.encode())
+            time.sleep(0.3)  # less than the age of a beat that costs the lease
+            assert board.of("gate")[-1]["on"] is False
+            assert board.of("state")[-1]["state"] == "DISARMED"
+            os.kill(web, signal.SIGCONT)
+            assert receive_answer(link)[0] == 200
+    finally:
+        os.kill(web, signal.SIGCONT)
+
+
 @pytest.mark.parametrize("name", ["planner", "preview"])
 def test_a_push_to_a_process_that_has_died_is_refused_in_one_line_and_the_next_is_served(armed, name):
     _, daemon = armed

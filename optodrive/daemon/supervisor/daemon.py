@@ -124,6 +124,7 @@ def _build_starts(
     from optodrive.daemon.engine.planner_process import run_planner
     from optodrive.daemon.engine.thermal_memory import ThermalMemory
     from optodrive.daemon.preview.process import run_preview
+    from optodrive.daemon.web.acceptor import run_acceptor
     from optodrive.daemon.web.web_process import run_web
 
     memory = ThermalMemory()
@@ -137,15 +138,22 @@ def _build_starts(
     def start_preview(channel: socket.socket, number: int) -> int:
         return fork_with_beat(lambda beat: run_preview(display, folder, beat), "opto-preview", channel.fileno())
 
-    def start_web(channel: socket.socket, number: int) -> int:
+    def start_acceptor(channel: socket.socket, number: int) -> int:
         return fork_with_beat(
-            lambda beat: run_web(display, folder, beat, listeners, reloader.tokens, reloader.config.daemon),
-            "opto-web",
+            lambda beat: run_acceptor(folder, beat, listeners, reloader.tokens, reloader.config.daemon),
+            "opto-acceptor",
             channel.fileno(),
             [listener.fileno() for listener in listeners],
         )
 
-    return {"planner": start_planner, "preview": start_preview, "web": start_web}
+    def start_web(channel: socket.socket, number: int) -> int:
+        return fork_with_beat(
+            lambda beat: run_web(display, folder, beat, reloader.tokens, reloader.config.daemon),
+            "opto-web",
+            channel.fileno(),
+        )
+
+    return {"planner": start_planner, "preview": start_preview, "acceptor": start_acceptor, "web": start_web}
 
 
 def number_path(path: Path, number: int) -> Path:

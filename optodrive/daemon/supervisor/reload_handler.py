@@ -31,7 +31,7 @@ class ReloadHandler:
             return
         self._number += 1
         self._applied = result
-        if not self._supervisor.send_to_web(result.build_web_message(self._number)):
+        if not self._supervisor.send_reload(result.build_web_message(self._number)):
             # The web process gets it when it starts; a caller who has lost the right may have armed the board.
             if result.revoked:
                 self._supervisor.link_view.stop()

@@ -179,6 +179,8 @@ class Supervisor:
             for fields in child.receive():
                 if fields.get("kind") == "warning":
                     self._log.warn(str(fields.get("message")))
+                elif fields.get("kind") == "audit":
+                    self.record_audit(fields["fields"])
                 elif child is self.web:
                     self.on_web_message(fields)
         self.link_view.receive()
@@ -220,6 +222,13 @@ class Supervisor:
             ended = f"{ended}: {child.failure.message}"
         self._log.write(f"the {child.name} process {ended}; it starts again, disarmed", "err", EVENT="restarted")
         self.record_audit({"event": "restarted", "process": child.name, "reason": ended})
+
+    def send_reload(self, fields: dict[str, Any]) -> bool:
+        """Send a reload to the processes that use the tokens; return whether the web process receives it."""
+        for child in self._children:
+            if child.name == "acceptor":
+                child.send(fields)
+        return self.send_to_web(fields)
 
     def send_to_web(self, fields: dict[str, Any]) -> bool:
         """Send a control message to the web process; return whether it serves and receives it."""

@@ -110,6 +110,10 @@ class AccessPolicy:
         """Return the valid token that a request presents, None if there is none."""
         return self.tokens.find(_read_presented_token(request))
 
+    def permits_stop(self, request: RequestContext) -> bool:
+        """Return whether `check` accepts this request if it is for STOP, which needs a token of any role."""
+        return self._check_host_and_origin(request) is None and self.find_token(request) is not None
+
     def acquire_frame(self, request: RequestContext) -> float:
         """Count one streamed frame against the caller's rate; return the time to wait first, s."""
         return self._rate_limiter.acquire((request.token.name, request.address, "frames"), self._now_s())

@@ -25,6 +25,8 @@ from optodrive.planning.feasibility.report import FitMode
 
 EPOCHS_MAX = 1000
 ENDED_MAX = 1000
+NO_REQUEST = 0
+"""Identifier of a request whose result nobody awaits."""
 NO_EPOCH = 0
 """Epoch without a link process."""
 
@@ -78,9 +80,13 @@ class LinkClient:
         position = bisect_right(self._epochs, arrived_s, key=lambda entry: entry[0])
         return self._epochs[max(0, position - 1)][1]
 
-    def beat(self) -> None:
-        """Prove that the event loop runs."""
-        self.peer.send(Message("beat", {"alive": True}))
+    def beat(self, alive: bool) -> None:
+        """Prove that the event loop runs. alive: whether a new caller could stop."""
+        self.peer.send(Message("beat", {"alive": alive}))
+
+    def send_stop(self) -> None:
+        """Send STOP without waiting for its result."""
+        self.peer.send(Message("stop", {"id": NO_REQUEST}))
 
     async def arm(self, caller: str, arming: int | None = None) -> None:
         """Arm as `command` does. caller: name of the token; arming: new number of an arming that needs beats."""

@@ -1,5 +1,6 @@
 """The listening TCP socket of the daemon, and a warning where other computers can reach it."""
 
+import resource
 import socket
 from contextlib import suppress
 from ipaddress import ip_address
@@ -7,6 +8,7 @@ from ipaddress import ip_address
 from optodrive.core.errors import InputError
 
 BACKLOG = 1024
+DESCRIPTORS_MIN = 1024
 
 
 def open_tcp_listener(host: str, port: int) -> socket.socket:
@@ -35,3 +37,11 @@ def describe_exposure(host: str) -> str | None:
         f"listening on {host}: other computers can reach the daemon, and tokens travel unencrypted; "
         "a TLS proxy in front of loopback avoids both"
     )
+
+
+def raise_descriptor_limit() -> None:
+    """Permit a descriptor for every connection that the bounds allow, if the system does."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft < DESCRIPTORS_MIN:
+        with suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (min(DESCRIPTORS_MIN, hard), hard))

@@ -12,7 +12,7 @@ HEAD_MAX_BYTES = 4096
 
 
 class Rank(IntEnum):
-    """The order in which connections are opened: STOP with a valid token, other callers with one, everybody else."""
+    """The order in which connections are served: a permitted STOP, others with a valid token, everybody else."""
 
     STOP = 0
     TOKEN = 1
@@ -48,9 +48,9 @@ def parse_head(head: bytes, address: str = "") -> RequestContext | None:
     return RequestContext(words[0], unquote(words[1].partition("?")[0]), headers, address)
 
 
-def rank_head(head: bytes, policy: AccessPolicy) -> Rank:
-    """Return the rank that a head gives its connection."""
-    request = parse_head(head)
+def rank_request(request: RequestContext | None, policy: AccessPolicy) -> Rank:
+    """Return the rank that a request gives its connection; None: no request."""
     if request is None or policy.find_token(request) is None:
         return Rank.OTHER
-    return Rank.STOP if request.method == "POST" and request.path == STOP_PATH else Rank.TOKEN
+    is_stop = request.method == "POST" and request.path == STOP_PATH and policy.permits_stop(request)
+    return Rank.STOP if is_stop else Rank.TOKEN

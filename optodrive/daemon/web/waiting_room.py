@@ -18,31 +18,31 @@ ACCEPTS_MAX, EVENTS_MAX = 64, 64
 """Connections that are accepted, and sockets that are looked at, before others get a turn."""
 WAITING_MAX = 512
 """Connections that wait. Beyond that, the oldest of the most numerous kind gives way, one with a valid token last."""
-WAIT_MAX_S = {Rank.STOP: 5.0, Rank.TOKEN: 5.0, Rank.OTHER: 1.0}
+WAIT_MAX_S = 5.0
 """The longest time that a request waits to be served. Its head must have arrived within the time of that phase."""
 INPUT = select.EPOLLIN | select.EPOLLRDHUP | select.EPOLLET
 END = select.EPOLLRDHUP | select.EPOLLHUP | select.EPOLLERR
 
 
 class Waiting(NamedTuple):
-    """A connection. since_s: monotonic time since which it waits for its head, or has had one."""
+    """A connection. since_s: monotonic time since which it waits for its head, or has had one; rank: by its head."""
 
     sock: socket.socket
     since_s: float
-    rank: Rank | None = None
+    rank: Rank = Rank.OTHER
 
 
 class WaitingRoom:
     """The accepted connections of listening sockets.
 
-    rank_head: ranks the head of a request; now_s: monotonic clock; on_failure: called when the process has no
-    descriptor left, to free one
+    rank_head: ranks the head of a request; now_s: monotonic clock
+    on_unserved: called before a connection with a request is closed that nobody has taken
     """
 
     def __init__(
         self, listeners: Sequence[socket.socket], rank_head: Callable[[bytes], Rank], now_s: Callable[[], float]
     ) -> None:
-        self.on_failure: Callable[[], object] = lambda: None
+        self.on_unserved: Callable[[Waiting], None] = lambda waiting: None
         self._rank_head = rank_head
         self._now_s = now_s
         self._epoll = select.epoll()
@@ -70,28 +70,31 @@ class WaitingRoom:
 
     # --- in ---------------------------------------------------------------------------------------------------------
 
-    def receive(self) -> None:
-        """Accept connections and look at those whose head arrives, a bounded number of both."""
-        for fileno, events in self._epoll.poll(0, EVENTS_MAX):
+    def receive(self) -> bool:
+        """Accept connections, look at those whose head arrives, and return whether there may be more."""
+        events_of = self._epoll.poll(0, EVENTS_MAX)
+        is_busy = len(events_of) == EVENTS_MAX
+        for fileno, events in events_of:
             if fileno in self._listeners:
-                self._accept(self._listeners[fileno])
+                is_busy |= self._accept(self._listeners[fileno])
             else:
                 self._look_again(fileno, bool(events & END))
+        return is_busy
 
-    def _accept(self, listener: socket.socket) -> None:
+    def _accept(self, listener: socket.socket) -> bool:
         for _ in range(ACCEPTS_MAX):
             try:
                 sock, _ = listener.accept()
             except (BlockingIOError, ConnectionAbortedError):
-                return
+                return False
             except OSError:  # no descriptor is left
-                if not self._make_room():
-                    self.on_failure()
-                return
+                self._make_room()
+                return True
             sock.setblocking(False)
             self._add(sock)
             while len(self) > WAITING_MAX:
                 self._make_room()
+        return True
 
     def _add(self, sock: socket.socket) -> None:
         now_s = self._now_s()
@@ -128,16 +131,18 @@ class WaitingRoom:
 
     # --- out --------------------------------------------------------------------------------------------------------
 
-    def find_next(self) -> Rank | None:
-        """Return the highest rank that waits with a request, None if there is none."""
-        return next((rank for rank, waiting in self._ranked.items() if waiting), None)
+    def count(self, rank: Rank) -> int:
+        """Return the number of connections that wait with a request of a rank."""
+        return len(self._ranked[rank])
 
-    def take(self) -> Waiting:
-        """Return the connection that is opened next, which the caller owns from now on. KeyError if there is none."""
-        for waiting in self._ranked.values():
-            if waiting:
-                return waiting.popitem(last=False)[1]
-        raise KeyError("nobody waits")
+    def take(self, rank: Rank) -> Waiting:
+        """Return the first connection of a rank, which the caller owns from now on. KeyError if there is none."""
+        return self._ranked[rank].popitem(last=False)[1]
+
+    def put_back(self, waiting: Waiting) -> None:
+        """Let a connection that was taken be the first of its rank again."""
+        self._ranked[waiting.rank][waiting.sock.fileno()] = waiting
+        self._ranked[waiting.rank].move_to_end(waiting.sock.fileno(), last=False)
 
     def close_expired(self) -> None:
         """Close the connections that have waited too long."""
@@ -145,17 +150,18 @@ class WaitingRoom:
         while self._silent and now_s - next(iter(self._silent.values())).since_s > PHASE_MAX_S["headers"]:
             self._forget_silent(next(iter(self._silent))).sock.close()
         for rank, waiting in self._ranked.items():
-            while waiting and now_s - next(iter(waiting.values())).since_s > WAIT_MAX_S[rank]:
-                waiting.popitem(last=False)[1].sock.close()
+            while waiting and now_s - next(iter(waiting.values())).since_s > WAIT_MAX_S:
+                self._close_first(rank)
 
-    def _make_room(self) -> bool:
-        """Close one connection; return whether there was one."""
-        others = self._ranked[Rank.OTHER]
-        if self._silent and len(self._silent) >= len(others):
+    def _make_room(self) -> None:
+        if self._silent and len(self._silent) >= self.count(Rank.OTHER):
             self._forget_silent(next(iter(self._silent))).sock.close()
-            return True
-        for waiting in (others, self._ranked[Rank.TOKEN], self._ranked[Rank.STOP]):
-            if waiting:
-                waiting.popitem(last=False)[1].sock.close()
-                return True
-        return False
+            return
+        rank = next((rank for rank in reversed(Rank) if self.count(rank)), None)
+        if rank is not None:
+            self._close_first(rank)
+
+    def _close_first(self, rank: Rank) -> None:
+        waiting = self.take(rank)
+        self.on_unserved(waiting)
+        waiting.sock.close()

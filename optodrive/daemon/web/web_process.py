@@ -3,7 +3,6 @@
 import asyncio
 import os
 import signal
-import socket
 import time
 from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager, suppress
@@ -15,12 +14,13 @@ from fastapi import FastAPI
 from optodrive.core.beat import BeatWriter, SupervisorGoneError
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.api import build_app
 from optodrive.daemon.web.audit import AuditLog
 from optodrive.daemon.web.daemon_client import DaemonClient
 from optodrive.daemon.web.listeners import describe_exposure
-from optodrive.daemon.web.request_head import rank_head
+from optodrive.daemon.web.reload_message import apply_reload
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.daemon.web.web_server import Server
 from optodrive.device.config import DaemonSection
@@ -38,13 +38,12 @@ def run_web(
     display: DisplayModel,
     folder: RuntimeFolder,
     beat: BeatWriter,
-    listeners: list[socket.socket],
     tokens: Tokens,
     daemon: DaemonSection,
 ) -> None:
     """Serve the API until SIGTERM or the end of the supervisor.
 
-    listeners: sockets that listen already; daemon: settings, whose reloaded keys may differ from the display's
+    daemon: settings, whose reloaded keys may differ from the display's
     """
     with suppress(OSError):  # not permitted to every user
         os.setpriority(os.PRIO_PROCESS, 0, NICE)
@@ -60,27 +59,40 @@ def run_web(
             exit_stack.callback(audit.close)
         policy = AccessPolicy(tokens, daemon, audit)
         exit_stack.callback(policy.refusals.flush)
-        process = WebProcess(DaemonClient(display, folder), policy, beat, daemon)
+        acceptor = AcceptorClient(folder.acceptor_socket)
+        process = WebProcess(DaemonClient(display, folder), acceptor, policy, beat, daemon)
         exit_stack.callback(process.receive_control)  # the last entries of the audit log
         signal.signal(signal.SIGTERM, lambda number, frame: process.end())
-        process.server.run(sockets=listeners)
+        process.server.run()
 
 
 class WebProcess:
     """The server with its connections to the other processes and to the supervisor."""
 
-    def __init__(self, client: DaemonClient, policy: AccessPolicy, beat: BeatWriter, daemon: DaemonSection) -> None:
+    def __init__(
+        self,
+        client: DaemonClient,
+        acceptor: AcceptorClient,
+        policy: AccessPolicy,
+        beat: BeatWriter,
+        daemon: DaemonSection,
+    ) -> None:
         self._client = client
+        self._acceptor = acceptor
+        acceptor.on_lost = self._go_dark
         self._policy = policy
         self._beat = beat
         self._daemon = daemon
         self._revocations: list[asyncio.Task[None]] = []
         app = build_app(client, policy)
         app.router.lifespan_context = self._run_connections
-        self.server = Server(app, lambda head: rank_head(head, policy))
+        self.server = Server(app, acceptor)
 
     def end(self) -> None:
-        """End all streams and let the server finish."""
+        """Go dark, end all streams and let the server finish. Also called by a signal handler."""
+        if self.server.loop is not None:
+            with suppress(RuntimeError):  # after the loop's end
+                self.server.loop.call_soon_threadsafe(self._go_dark)
         self._client.hub.close()
         self.server.should_exit = True
 
@@ -108,12 +120,18 @@ class WebProcess:
     async def _send_beats(self) -> None:
         deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False
         while True:
-            self._client.link.beat()
+            self._client.link.beat(alive=self._acceptor.is_alive)
             self._beat.beat()
-            if not is_ready and self.server.started and (self._client.is_complete or time.monotonic() > deadline_s):
+            is_complete = self._client.is_complete and self._acceptor.is_connected
+            if not is_ready and self.server.started and (is_complete or time.monotonic() > deadline_s):
                 is_ready = True
                 self._beat.report_ready()
             await asyncio.sleep(BEAT_INTERVAL_S)
+
+    def _go_dark(self) -> None:
+        """Stop, unless a plan may finish: soon no new caller can."""
+        if self._daemon.on_web_loss == "dark":
+            self._client.link.send_stop()
 
     def receive_control(self) -> None:
         """Carry out the supervisor's messages. End without a supervisor."""
@@ -131,10 +149,7 @@ class WebProcess:
         if fields["kind"] == "audit":
             self._record(fields["fields"])
         elif fields["kind"] == "reload":
-            self._daemon = self._daemon.model_copy(
-                update=fields["daemon"] | {"hosts": tuple(fields["daemon"]["hosts"])}
-            )
-            revoked = self._policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), self._daemon)
+            self._daemon, revoked = apply_reload(self._policy, self._daemon, fields)
             if revoked and self.server.loop is not None and self.server.loop.is_running():
                 self._revoke(revoked)
             self._record(fields["fields"])

@@ -1,40 +1,38 @@
 """The web server: uvicorn with bounded connections, STOP first, and signal handling left to the daemon."""
 
 import asyncio
-import resource
 import socket
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 
 import uvicorn
 
-from optodrive.daemon.web.acceptor import Acceptor
+from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.bounded_http import BoundedHttp
 from optodrive.daemon.web.bounded_websocket import MESSAGE_MAX_BYTES, BoundedWebSocket
+from optodrive.daemon.web.connection_opener import ConnectionOpener
 from optodrive.daemon.web.connections import PHASE_MAX_S, Connections
-from optodrive.daemon.web.request_head import Rank
+from optodrive.daemon.web.listeners import raise_descriptor_limit
 from optodrive.daemon.web.request_limits import App
 from optodrive.daemon.web.server_state import ServerState
 from optodrive.daemon.web.stop_first_selector import StopFirstSelector
 from optodrive.daemon.web.tokens import Token
-from optodrive.daemon.web.waiting_room import WaitingRoom
 
 SHUTDOWN_GRACE_S = 2
-DESCRIPTORS_MIN = 1024
 REVOKED_MAX_S = 1.0
 
 
 class Server(uvicorn.Server):
     """Captures no signals: uvicorn would raise them again and end the process before the board receives ABORT.
 
-    rank_head: ranks the head of a new connection's first request
+    acceptor: hands over the connections
     """
 
     on_ready: Callable[[], None] = staticmethod(lambda: None)
     loop: asyncio.AbstractEventLoop | None = None
 
-    def __init__(self, app: App, rank_head: Callable[[bytes], Rank]) -> None:
+    def __init__(self, app: App, acceptor: AcceptorClient) -> None:
         super().__init__(
             uvicorn.Config(
                 app,
@@ -50,16 +48,15 @@ class Server(uvicorn.Server):
                 ws_per_message_deflate=False,  # a small frame could need any amount of memory
             )
         )
-        self._rank_head = rank_head
+        self._acceptor = acceptor
         self._selector = StopFirstSelector()
         self._connections = Connections(time.monotonic)
         self.server_state: ServerState = ServerState(self._connections, self._selector)
-        self._room: WaitingRoom | None = None
-        self._acceptor: Acceptor | None = None
+        self._opener: ConnectionOpener | None = None
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
-        """Serve on listening sockets until `should_exit`."""
-        _raise_descriptor_limit()
+        """Serve the connections that the acceptor hands over until `should_exit`."""
+        raise_descriptor_limit()
         with asyncio.Runner(loop_factory=lambda: asyncio.SelectorEventLoop(self._selector)) as runner:
             runner.run(self.serve(sockets=sockets))
 
@@ -72,8 +69,7 @@ class Server(uvicorn.Server):
         """Start to accept requests."""
         await super().startup(sockets=[])
         self.loop = asyncio.get_running_loop()
-        self._room = WaitingRoom(sockets or [], self._rank_head, time.monotonic)
-        self._acceptor = Acceptor(self._room, self._selector, self._connections, self._create_protocol)
+        self._opener = ConnectionOpener(self._acceptor, self._selector, self._connections, self._create_protocol)
         self._acceptor.start()
         self.on_ready()
 
@@ -89,20 +85,10 @@ class Server(uvicorn.Server):
     async def on_tick(self, counter: int) -> bool:
         """Close connections that take too long. Return whether the server must end."""
         self._connections.close_expired()
-        if self._room is not None:
-            self._room.close_expired()
         return await super().on_tick(counter)
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
         """End all connections."""
-        if self._acceptor is not None:
-            self._acceptor.close()
+        if self._opener is not None:
+            self._opener.close()
         await super().shutdown(sockets)
-
-
-def _raise_descriptor_limit() -> None:
-    """Permit a descriptor for every connection that the bounds allow, if the system does."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft < DESCRIPTORS_MIN:
-        with suppress(OSError, ValueError):
-            resource.setrlimit(resource.RLIMIT_NOFILE, (min(DESCRIPTORS_MIN, hard), hard))

@@ -12,6 +12,7 @@ BEAT_AGE_MAX_S = 1.0
 PERMISSIONS = {
     "planner": {"stop", "beat", "begin", "splice", "truncate", "flush", "delay"},
     "web": {"stop", "beat", "arm", "disarm", "revoke", "hold", "release"},
+    "acceptor": {"stop"},
     "supervisor": {"stop", "disarm"},
     "operator": {"stop"},
 }

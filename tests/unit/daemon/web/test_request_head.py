@@ -5,7 +5,7 @@ import socket
 import pytest
 
 from optodrive.daemon.web.access_policy import AccessPolicy
-from optodrive.daemon.web.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_head
+from optodrive.daemon.web.request_head import HEAD_MAX_BYTES, Rank, is_complete, parse_head, peek_head, rank_request
 from optodrive.daemon.web.tokens import Token, Tokens
 from optodrive.device.config import DaemonSection
 
@@ -24,22 +24,31 @@ def policy():
         ("POST /v1/stop?now HTTP/1.1", f"authorization:bearer   {SECRET} ", Rank.STOP),
         ("POST /v1/%73top HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.STOP),
         ("POST /v1/stop HTTP/1.1", "Authorization: Bearer guessed-by-nobody", Rank.OTHER),
-        ("POST /v1/stop HTTP/1.1", "Host: localhost", Rank.OTHER),
+        ("POST /v1/stop HTTP/1.1", "Accept: */*", Rank.OTHER),
         ("GET /v1/stop HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
         ("POST /v1/arm HTTP/1.1", f"Authorization: Bearer {SECRET}", Rank.TOKEN),
-        ("GET / HTTP/1.1", f"Host: localhost:80\r\nCookie: optodrive-80={SECRET}", Rank.TOKEN),
-        ("POST /v1/arm HTTP/1.1", f"Host: localhost:80\r\nCookie: optodrive-80={SECRET}", Rank.OTHER),
-        ("GET /v1/health HTTP/1.1", "Host: localhost", Rank.OTHER),
+        ("GET / HTTP/1.1", f"Cookie: optodrive-80={SECRET}", Rank.TOKEN),
+        ("POST /v1/arm HTTP/1.1", f"Cookie: optodrive-80={SECRET}", Rank.OTHER),
+        ("GET /v1/health HTTP/1.1", "Accept: */*", Rank.OTHER),
         ("no request", f"Authorization: Bearer {SECRET}", Rank.OTHER),
     ],
 )
 def test_a_valid_token_precedes_and_stop_with_one_comes_first(policy, line, headers, rank):
-    assert rank_head(f"{line}\r\n{headers}\r\n\r\n".encode(), policy) is rank
+    head = f"{line}\r\nHost: localhost:80\r\n{headers}\r\n\r\n"
+    assert rank_request(parse_head(head.encode()), policy) is rank
+
+
+@pytest.mark.parametrize(
+    "headers", ["", "Host: evil.example\r\n", "Host: localhost\r\nOrigin: https://evil.example\r\n"]
+)
+def test_a_stop_that_the_policy_refuses_has_no_precedence(policy, headers):
+    head = f"POST /v1/stop HTTP/1.1\r\n{headers}Authorization: Bearer {SECRET}\r\n\r\n"
+    assert rank_request(parse_head(head.encode()), policy) is Rank.TOKEN
 
 
 def test_a_token_in_the_body_gives_no_rank(policy):
-    head = f"POST /v1/stop HTTP/1.1\r\nHost: a\r\n\r\nAuthorization: Bearer {SECRET}\r\n\r\n"
-    assert rank_head(head.encode(), policy) is Rank.OTHER
+    head = f"POST /v1/stop HTTP/1.1\r\nHost: localhost\r\n\r\nAuthorization: Bearer {SECRET}\r\n\r\n"
+    assert rank_request(parse_head(head.encode()), policy) is Rank.OTHER
 
 
 def test_a_head_is_parsed_as_the_server_does():

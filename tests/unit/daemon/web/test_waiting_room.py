@@ -57,10 +57,7 @@ def receive_all(room):
 
 
 def take_texts(room, stack):
-    texts = []
-    while room.find_next() is not None:
-        texts.append(stack.enter_context(room.take().sock).recv(100))
-    return texts
+    return [stack.enter_context(room.take(rank).sock).recv(100) for rank in Rank for _ in range(room.count(rank))]
 
 
 def is_closed(link):
@@ -73,26 +70,35 @@ def is_closed(link):
         return True
 
 
-def test_the_highest_rank_leaves_first_then_who_came_first(room, connect, stack):
+def test_of_one_rank_who_came_first_leaves_first(room, connect, stack):
     texts = [rank + number + END for number in (b"1", b"2") for rank in (b"O", b"T", b"S")]
     for head in texts:
         connect(head)
     receive_all(room)
     assert take_texts(room, stack) == sorted(texts, key=lambda head: (RANKS[head[:1]], head))
-    assert room.find_next() is None
     with pytest.raises(KeyError):
-        room.take()
+        room.take(Rank.OTHER)
+
+
+def test_who_is_put_back_is_the_first_again(room, connect):
+    for _ in range(3):
+        connect(b"T" + END)
+    receive_all(room)
+    first = room.take(Rank.TOKEN)
+    room.put_back(first)
+    with room.take(Rank.TOKEN).sock as sock:
+        assert sock is first.sock
+    assert room.count(Rank.TOKEN) == 2
 
 
 def test_a_connection_waits_for_its_whole_head(room, connect, stack, clock):
     link = connect(b"T")
     receive_all(room)
-    assert (len(room), room.find_next()) == (1, None)
+    assert (len(room), room.count(Rank.TOKEN)) == (1, 0)
     clock.now_s += 1.0
     link.sendall(END)
     receive_all(room)
-    assert room.find_next() is Rank.TOKEN
-    waiting = room.take()
+    waiting = room.take(Rank.TOKEN)
     with waiting.sock:
         assert (waiting.since_s, waiting.sock.recv(100)) == (clock.now_s, b"T" + END)
 
@@ -111,13 +117,16 @@ def test_who_waits_too_long_is_closed(room, connect, clock):
     links = {rank: connect(text + END) for text, rank in RANKS.items()}
     silent, partial = connect(), connect(b"T")
     receive_all(room)
-    clock.now_s += WAIT_MAX_S[Rank.OTHER] + 0.1
+    unserved = []
+    room.on_unserved = lambda waiting: unserved.append((waiting.rank, waiting.sock.recv(1, socket.MSG_PEEK)))
+    clock.now_s += min(WAIT_MAX_S, PHASE_MAX_S["headers"]) - 0.1
     room.close_expired()
-    assert [is_closed(link) for link in (links[Rank.OTHER], links[Rank.TOKEN], silent)] == [True, False, False]
-    clock.now_s += PHASE_MAX_S["headers"]
+    assert len(room) == 5
+    clock.now_s += 0.2 + abs(WAIT_MAX_S - PHASE_MAX_S["headers"])
     room.close_expired()
     assert all(is_closed(link) for link in (*links.values(), silent, partial))
     assert len(room) == 0
+    assert unserved == [(rank, text) for text, rank in RANKS.items()]
 
 
 @pytest.mark.parametrize("flood", [b"", b"O" + END])

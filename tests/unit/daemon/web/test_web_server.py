@@ -10,10 +10,12 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
+from optodrive.core.beat import BeatWriter
 from optodrive.daemon.web import bounded_websocket, connections
+from optodrive.daemon.web.acceptor import Acceptor
+from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.listeners import open_tcp_listener
-from optodrive.daemon.web.request_head import rank_head
 from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
 from optodrive.daemon.web.tokens import ANONYMOUS, Token, Tokens
 from optodrive.daemon.web.web_server import Server
@@ -115,16 +117,32 @@ def application():
 
 
 @pytest.fixture
-def port(application):
-    listener = open_tcp_listener("127.0.0.1", 0)
+def acceptor_port(tmp_path):
+    """Keep an acceptor in a thread and return the port that it listens on."""
     policy = AccessPolicy(Tokens([Token("viewer", "viewer", SECRET)]), DaemonSection())
-    server = Server(application, lambda head: rank_head(head, policy))
+    supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    beat = BeatWriter(channel.detach())
+    with supervisor, open_tcp_listener("127.0.0.1", 0) as listener:
+        acceptor = Acceptor([listener], policy, DaemonSection(), tmp_path / "acceptor", tmp_path / "link", beat)
+        thread = threading.Thread(target=acceptor.run)
+        thread.start()
+        yield listener.getsockname()[1]
+        acceptor.end()
+        thread.join(20)
+        acceptor.close()
+        beat.close()
+    assert not thread.is_alive()
+
+
+@pytest.fixture
+def port(application, acceptor_port, tmp_path):
+    server = Server(application, AcceptorClient(tmp_path / "acceptor"))
     ready = threading.Event()
     server.on_ready = ready.set
-    thread = threading.Thread(target=server.run, args=([listener],))
+    thread = threading.Thread(target=server.run)
     thread.start()
     assert ready.wait(20)
-    yield listener.getsockname()[1]
+    yield acceptor_port
     server.loop.call_soon_threadsafe(application.release.set)
     server.should_exit = True
     thread.join(20)

@@ -1,0 +1,105 @@
+"""The web process's connection to the acceptor, from which it gets the connections of its callers."""
+
+import asyncio
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from optodrive.daemon.web.acceptor_protocol import encode_permissions, receive_packet
+from optodrive.daemon.web.request_head import Rank
+from optodrive.daemon.web.waiting_room import Waiting
+
+RETRY_S = 0.05
+BEAT_AGE_MAX_S = 1.0
+"""Age of the acceptor's last beat beyond which it counts as stalled."""
+PACKETS_MAX = 16
+"""Packets taken per turn of the loop."""
+PERMITTED = {Rank.STOP: 16, Rank.TOKEN: 2, Rank.OTHER: 1}
+"""Connections that the acceptor may hand over before the first of them is opened."""
+
+
+class AcceptorClient:
+    """Connection to the acceptor, which connects again after its end. The event loop's thread calls everything.
+
+    on_connection: receives each connection, and owns it; it calls `permit` when the next may come
+    on_lost: called after the end of the acceptor's process
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.on_connection: Callable[[Waiting], None] = lambda waiting: waiting.sock.close()
+        self.on_lost: Callable[[], None] = lambda: None
+        self._path = path
+        self._socket: socket.socket | None = None
+        self._retry: asyncio.TimerHandle | None = None
+        self._beaten_s = -float("inf")
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether the connection is up."""
+        return self._socket is not None
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the acceptor's loop runs, so that a new caller could stop."""
+        return self._socket is not None and time.monotonic() - self._beaten_s <= BEAT_AGE_MAX_S
+
+    def start(self) -> None:
+        """Connect, and keep connecting until `close`."""
+        self._retry = None
+        loop = asyncio.get_running_loop()
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        link.setblocking(False)
+        try:
+            link.connect(str(self._path))
+        except OSError:
+            link.close()
+            self._retry = loop.call_later(RETRY_S, self.start)
+            return
+        self._socket, self._beaten_s = link, time.monotonic()
+        loop.add_reader(link, self._receive, link)
+        for rank, count in PERMITTED.items():
+            for _ in range(count):
+                self.permit(rank)
+
+    def permit(self, rank: Rank) -> None:
+        """Permit one more connection of a rank."""
+        if self._socket is not None:
+            try:
+                self._socket.send(encode_permissions([rank]))
+            except OSError:
+                self._lose()
+
+    def close(self) -> None:
+        """End the connection permanently."""
+        if self._retry is not None:
+            self._retry.cancel()
+        self._forget()
+
+    def _receive(self, link: socket.socket) -> None:
+        for _ in range(PACKETS_MAX):
+            try:
+                packet = receive_packet(link)
+            except BlockingIOError:
+                return
+            except OSError:
+                packet = b""
+            if not packet:
+                self._lose()
+                return
+            self._beaten_s = time.monotonic()
+            if isinstance(packet, Waiting):
+                self.on_connection(packet)
+
+    def _lose(self) -> None:
+        if self._socket is None:
+            return
+        self._forget()
+        self.on_lost()
+        self._retry = asyncio.get_running_loop().call_later(RETRY_S, self.start)
+
+    def _forget(self) -> None:
+        if self._socket is not None:
+            asyncio.get_running_loop().remove_reader(self._socket)
+            self._socket.close()
+            self._socket = None

@@ -1,0 +1,15 @@
+"""The supervisor's message that a reload has changed tokens or settings, as the processes apply it that use them."""
+
+from typing import Any
+
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.device.config import DaemonSection
+
+
+def apply_reload(
+    policy: AccessPolicy, daemon: DaemonSection, fields: dict[str, Any]
+) -> tuple[DaemonSection, tuple[Token, ...]]:
+    """Apply a reload to the policy; return the changed settings and the revoked tokens. fields: of the message."""
+    daemon = daemon.model_copy(update=fields["daemon"] | {"hosts": tuple(fields["daemon"]["hosts"])})
+    return daemon, policy.update(Tokens(Token(*entry) for entry in fields["tokens"]), daemon)
