@@ -16,6 +16,8 @@ from optodrive.core.errors import OptodriveError
 BEAT_INTERVAL_S = 0.1
 PACKET_MAX_BYTES = 256_000
 BEAT, READY, FAILED = "beat", "ready", "failed"
+OUT_OF_MEMORY = "out of memory"
+"""Reported by a process that could not allocate memory, which ends it."""
 
 
 class SupervisorGoneError(OptodriveError):

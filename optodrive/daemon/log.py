@@ -1,23 +1,27 @@
 """Log of the daemon: lines on stderr, or entries with fields if stderr is connected to the journal.
 
-Entries go to the journal's socket as non-blocking datagrams. A pipe to a stalled journal would block its writers, the
-engine's loop among them. What the log writes per minute is bounded, so that no caller can fill a disk with it.
+Entries go to the journal's socket as non-blocking datagrams, and to a pipe or terminal only while it accepts them: a
+reader that has stalled would block the writers, the engine's loop among them. What the log writes per minute is
+bounded, so that no caller can fill a disk with it.
 """
 
 import logging
 import os
+import select
 import socket
 import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TextIO
 
 from optodrive.core.clock import Clock, MonotonicClock
 
 JOURNAL = Path("/run/systemd/journal/socket")
 LINE_MAX = 8000
 BYTES_MAX = 256_000
+WRITE_MAX = 1000
+"""Characters per write, not more than a pipe accepts at once when it accepts any."""
 PERIOD_S = 60.0
 """At most BYTES_MAX bytes of lines are written per period; the number of those omitted follows in one line."""
 LogLevel = Literal["err", "warning", "notice", "info"]
@@ -48,20 +52,22 @@ class DaemonLog:
             if self._bytes > BYTES_MAX:
                 self._suppressed += 1
                 return
-            self._emit(line, level, fields)
+            if not self._emit(line, level, fields):
+                self._suppressed += 1
 
     def _report_suppressed(self) -> None:
-        if self._suppressed:
-            self._emit(f"{self._suppressed} lines suppressed", "warning", {})
-        self._suppressed = 0
+        if self._suppressed and self._emit(f"{self._suppressed} lines suppressed", "warning", {}):
+            self._suppressed = 0
 
-    def _emit(self, line: str, level: LogLevel, fields: dict[str, object]) -> None:
-        with suppress(OSError):  # a failing log must not end the daemon
+    def _emit(self, line: str, level: LogLevel, fields: dict[str, object]) -> bool:
+        """Return whether the line was written. A failing log must not end the daemon."""
+        try:
             if self._journal is None:
-                sys.stderr.write(f"optodrive: {line}\n")
-                sys.stderr.flush()
-            else:
-                self._socket.sendto(format_entry(line, level, fields), self._journal)
+                return _write_to_stderr(f"optodrive: {line}\n")
+            self._socket.sendto(format_entry(line, level, fields), self._journal)
+        except OSError:
+            return False
+        return True
 
     def warn(self, line: str) -> None:
         """Write a line of level warning."""
@@ -78,6 +84,26 @@ class DaemonLog:
         handler = _Handler(self)
         handler.setLevel(logging.WARNING)
         logging.getLogger().addHandler(handler)
+
+
+def _write_to_stderr(text: str) -> bool:
+    """Write a text unless its reader has stalled. Return whether all of it was written."""
+    for begin in range(0, len(text), WRITE_MAX):
+        if not _accepts(sys.stderr):
+            return False
+        sys.stderr.write(text[begin : begin + WRITE_MAX])
+        sys.stderr.flush()
+    return True
+
+
+def _accepts(stream: TextIO) -> bool:
+    """Return whether a write of WRITE_MAX characters would not wait."""
+    poll = select.poll()
+    try:
+        poll.register(stream.fileno(), select.POLLOUT)
+    except (OSError, ValueError):  # without a descriptor, nothing waits
+        return True
+    return bool(poll.poll(0))
 
 
 def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes:

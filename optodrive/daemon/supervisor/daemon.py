@@ -92,8 +92,9 @@ def _build_link_start(
     config: Config, folder: RuntimeFolder, capture_path: Path | None
 ) -> Callable[[socket.socket, int], int]:
     def start(channel: socket.socket, number: int) -> int:
-        settings = build_link_settings(config, folder.link_socket, folder.link_socket_mode, capture_path)
-        folder.link_settings.write_text(settings.to_json(), encoding="utf-8")
+        if number == 1:  # a disk that is full later must not keep the process from starting again
+            settings = build_link_settings(config, folder.link_socket, folder.link_socket_mode, capture_path)
+            folder.link_settings.write_text(settings.to_json(), encoding="utf-8")
         descriptor = str(channel.fileno())
         arguments = ("--settings", str(folder.link_settings), "--supervisor", descriptor)
         return execute_module(LINK_MODULE, arguments, [channel.fileno()])

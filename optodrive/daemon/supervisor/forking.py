@@ -9,7 +9,7 @@ import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.core.errors import OptodriveError
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15
@@ -80,6 +80,9 @@ def fork_with_beat(target: Callable[[BeatWriter], None], name: str, channel: int
         except OptodriveError as error:
             beat.report_failure(str(error), error.exit_status)
             return error.exit_status
+        except MemoryError:
+            beat.report_failure(OUT_OF_MEMORY)
+            return 1
         except Exception as error:
             beat.report_failure(repr(error))
             raise

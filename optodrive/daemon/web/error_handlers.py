@@ -8,7 +8,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
-from optodrive.core.errors import OptodriveError
+from optodrive.core.errors import BusyError, OptodriveError
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.problem import MEDIA_TYPE, Problem, build_problem
 from optodrive.daemon.web.request_limits import BodyTooLargeError
@@ -42,6 +42,10 @@ def add_error_handlers(app: FastAPI) -> None:
         response = _build_response(build_problem(413, "body_too_large", "Body too large", detail))
         response.headers["Connection"] = "close"  # the rest of its body may follow
         return response
+
+    @handles(MemoryError)
+    async def handle_memory_error(request: Request, error: MemoryError) -> Response:
+        return _build_response(build_error_problem(BusyError("not enough memory for this request; try again later")))
 
 
 def _build_response(problem: Problem) -> Response:

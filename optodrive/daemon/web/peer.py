@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import count
 from pathlib import Path
 
@@ -130,8 +131,9 @@ class Peer:
     def _forget(self, connection: MessageSocket) -> None:
         self._socket = None
         loop = asyncio.get_running_loop()
-        loop.remove_reader(self._fileno)
-        loop.remove_writer(self._fileno)
+        for remove in (loop.remove_reader, loop.remove_writer):
+            with suppress(OSError):  # the connection has closed itself while bytes waited to be sent
+                remove(self._fileno)
         connection.close()
         for future in self._results.values():
             if not future.done():

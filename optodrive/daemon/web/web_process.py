@@ -11,7 +11,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.daemon.log import open_daemon_log
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.acceptor_client import AcceptorClient
@@ -101,6 +101,7 @@ class WebProcess:
         """Keep the connections and the beats while the server runs."""
         self._client.start()
         loop = asyncio.get_running_loop()
+        loop.set_exception_handler(self._on_loop_error)
         loop.add_reader(self._beat.fileno(), self.receive_control)
         beats = loop.create_task(self._send_beats())
         try:
@@ -116,6 +117,13 @@ class WebProcess:
         deadline_s = time.monotonic() + READY_TIMEOUT_S
         while not (self._client.knows_state or self.server.should_exit or time.monotonic() > deadline_s):
             await asyncio.sleep(STATE_POLL_S)
+
+    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """End the process if a callback had no memory: it would be called, and fail, again, and STOP would wait."""
+        if isinstance(context.get("exception"), MemoryError):
+            self._beat.report_failure(OUT_OF_MEMORY)
+            os._exit(1)
+        loop.default_exception_handler(context)
 
     async def _send_beats(self) -> None:
         deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False

@@ -15,7 +15,7 @@ import threading
 from contextlib import ExitStack, suppress
 from pathlib import Path
 
-from optodrive.core.beat import BeatWriter, SupervisorGoneError
+from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.core.clock import Clock, MonotonicClock, request_realtime_scheduling
 from optodrive.core.errors import InputError, OptodriveError
 from optodrive.link.service.client_sockets import ClientSockets
@@ -185,6 +185,9 @@ def main(arguments: list[str] | None = None) -> int:
         request_realtime_scheduling()
         try:
             process.run()
+        except MemoryError:
+            supervisor.report_failure(OUT_OF_MEMORY)
+            return 1
         except BaseException as error:
             supervisor.report_failure(f"the link process failed: {error!r}")
             raise

@@ -58,6 +58,22 @@ def test_a_missing_or_stalled_journal_does_not_block(journal, tmp_path):
                 log.warn("x" * 1000)
 
 
+def test_a_pipe_whose_reader_has_stalled_does_not_block(monkeypatch):
+    reader, writer = os.pipe()
+    with open(writer, "w") as pipe, closing(DaemonLog(None, clock := ManualClock())) as log:  # noqa: PTH123 - a descriptor
+        monkeypatch.setattr("sys.stderr", pipe)
+        for _ in range(200):  # twice what the pipe holds
+            log.warn("x" * 1000)
+        kept = os.read(reader, 1 << 20).count(b"\n")
+        assert 30 < kept < 70
+        clock.sleep(PERIOD_S)
+        log.warn("read again")
+        assert os.read(reader, 1 << 20).endswith(
+            f"optodrive: {200 - kept} lines suppressed\noptodrive: read again\n".encode()
+        )
+    os.close(reader)
+
+
 def test_the_journal_is_used_only_if_stderr_is_connected_to_it(monkeypatch, tmp_path):
     monkeypatch.setattr(log_module, "JOURNAL", tmp_path)
     there = os.fstat(2)

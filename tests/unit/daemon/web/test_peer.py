@@ -1,6 +1,7 @@
 """Connections of the web process to the others, over real sockets."""
 
 import asyncio
+import socket
 import threading
 import time
 from contextlib import contextmanager
@@ -107,6 +108,26 @@ def test_the_end_of_the_process_fails_its_requests_and_the_next_process_is_found
             await wait_for(lambda: peer.is_connected)
             assert (await peer.call(Message("echo", {}, b"again"))).payload == b"again"
             assert second.received[0][0] == "hello"
+
+    run(tmp_path / "s", scenario)
+
+
+def test_the_process_after_one_that_died_without_reading_is_found(tmp_path):
+    """Bytes wait in both sockets then, so the connection is reset while its writer is registered."""
+
+    async def scenario(peer):
+        with socket.socket(socket.AF_UNIX) as listener:
+            listener.bind(str(tmp_path / "s"))
+            listener.listen()
+            connection, _ = await asyncio.to_thread(listener.accept)
+            waiting = asyncio.ensure_future(peer.call(Message("wait", {}, bytes(5_000_000))))
+            await asyncio.sleep(0.05)
+            connection.close()
+        with pytest.raises(LinkError, match="does not run"):
+            await waiting
+        with running(tmp_path / "s"):
+            await wait_for(lambda: peer.is_connected)
+            assert (await peer.call(Message("echo", {}, b"again"))).payload == b"again"
 
     run(tmp_path / "s", scenario)
 
