@@ -129,6 +129,63 @@ def test_confirm_follows_arm_within_five_seconds_and_the_focus_is_kept(page, dae
     assert read_focus(page) == "disarm"
 
 
+def look_at_hold(page, daemon):
+    expect(page.locator("#board-state")).to_have_text("RUNNING")
+    expect(page.locator("#control")).to_have_text(
+        re.compile(r"^Armed by armer \(this page’s token\) \d s ago, while held\.$")
+    )
+    assert daemon.state()["control"]["hold"]
+
+
+def test_hold_to_run_plays_what_was_previewed_until_it_is_released(page, daemon, bench, axe):
+    page.locator("#display").focus()
+    page.keyboard.press("Space")
+    page.get_by_label("For, s").fill("20")
+    page.get_by_label("Rate, Hz").fill("10")
+    page.get_by_role("button", name="Preview").click()
+    expect(page.get_by_role("button", name="Play")).to_be_enabled()
+    hold = page.get_by_role("button", name="Hold to run")
+    hold.hover()
+    page.mouse.down()
+    look_at_hold(page, daemon)
+    assert list_violations(page, axe, "#control, #hold, #bar") == []
+    page.mouse.up()
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    assert bench.board.of("gate")[-1]["on"] is False
+    assert daemon.state()["queue"]["active"] == []
+
+    hold.focus()
+    page.keyboard.down("Space")
+    look_at_hold(page, daemon)
+    press_escape(page)  # with the key still down
+    expect(page.locator("#board-state")).to_have_text("DISARMED")
+    expect(page.locator("#hold-ended")).to_have_text("No longer held: ended by stop.")
+    page.keyboard.up("Space")
+
+    daemon.arm()
+    expect(hold).to_be_disabled()
+    hold.dispatch_event("pointerdown", {"button": 0})
+    expect(page.locator("#board-state")).to_have_text("ARMED")
+    assert not daemon.state()["control"]["hold"]
+
+
+@pytest.mark.parametrize("loss", ["hidden", "navigated", "stalled"])
+def test_a_page_that_is_not_there_holds_nothing(page, daemon, loss):
+    page.get_by_role("button", name="Hold to run").focus()
+    page.keyboard.down("Enter")
+    expect(page.locator("#board-state")).to_have_text("ARMED")
+    if loss == "hidden":
+        page.evaluate("Object.defineProperty(document, 'hidden', {configurable: true, value: true})")
+        page.evaluate("document.dispatchEvent(new Event('visibilitychange'))")
+    elif loss == "navigated":
+        page.goto("about:blank")
+    else:
+        page.evaluate("setTimeout(() => { for (const end = Date.now() + 3000; Date.now() < end; ); })")
+    wait_for(lambda: daemon.board_state() == "DISARMED", "the arming to end", patience_s=2.5)
+    assert daemon.state()["control"] is None
+    page.keyboard.up("Enter")
+
+
 ANNA = "a-token-for-anna"
 
 

@@ -44,8 +44,9 @@ export class ArmControl {
   showControl(control, ownName) {
     this.holder.hidden = control === null;
     if (control) {
-      const { caller, armed_for_s } = control;
-      this.holder.textContent = `Armed by ${caller}${caller === ownName ? " (this page’s token)" : ""} ${describeAge(armed_for_s)}.`;
+      const { caller, armed_for_s, hold } = control;
+      const who = `${caller}${caller === ownName ? " (this page’s token)" : ""}`;
+      this.holder.textContent = `Armed by ${who} ${describeAge(armed_for_s)}${hold ? ", while held" : ""}.`;
     }
   }
 

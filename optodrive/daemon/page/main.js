@@ -12,6 +12,7 @@ import { Gauges } from "./gauges.js";
 import { decodeUint16, Grid } from "./grid.js";
 import { Header } from "./header.js";
 import { History } from "./history.js";
+import { HoldControl } from "./hold.js";
 import { PatternLibrary } from "./patterns.js";
 import { Permissions } from "./permissions.js";
 import { buildFrames, PlanControl } from "./plans.js";
@@ -71,6 +72,7 @@ const showError = (error) => {
   announce(error.message);
 };
 const arm = new ArmControl(find, announce, showError);
+const hold = new HoldControl(find, announce, () => plans.playPreviewed());
 const header = new Header(find, announce);
 const permissions = new Permissions(find);
 const status = new Status(find, () => arm.disarm(), () => permissions.apply());
@@ -236,6 +238,7 @@ function showNothingKnown(reason) {
   header.showUnknown(reason);
   queue.clear(`Unknown: ${reason}.`);
   arm.show("");
+  hold.show("");
   arm.showControl(null);
   showTitle();
 }
@@ -283,6 +286,7 @@ telemetry.addEventListener("state", ({ detail }) => {
   queue.show(detail.queue);
   pastEvents.showPlans(detail);
   arm.show(isLinked ? detail.board.state : "");
+  hold.show(isLinked ? detail.board.state : "");
   arm.showControl(isLinked ? detail.control : null, permissions.caller?.name);
   hasLink = isLinked;
   freshness.see("state");

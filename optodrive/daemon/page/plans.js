@@ -96,6 +96,13 @@ export class PlanControl extends EventTarget {
     this.#showLines(...lines);
   }
 
+  // Play what was previewed, if anything was.
+  playPreviewed() {
+    if (!this.playButton.disabled) {
+      this.#play();
+    }
+  }
+
   async #play() {
     const stimulus = this.previewed;
     this.playButton.disabled = true; // a second click would play it twice

@@ -12,6 +12,7 @@ from pydantic import BaseModel
 
 import optodrive.daemon
 from optodrive.daemon.responses.caller import CallerReport
+from optodrive.daemon.responses.hold import HoldReport
 from optodrive.daemon.responses.patterns import PatternList
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.daemon.responses.problem import Problem
@@ -46,6 +47,7 @@ VARIABLES = {
     "permissions.js": {"caller": CallerReport},
     "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
     "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
+    "hold.js": {"report": HoldReport},
     "header.js": {"board": StateReport.model_fields["board"].annotation},
     "status.js": {"fault": FaultEvent, "board": StateReport.model_fields["board"].annotation},
     "timeline.js": {"batch": PulseBatch},
