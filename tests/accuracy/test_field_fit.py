@@ -11,14 +11,20 @@ from optodrive.lab.calibration.next_spot import select_next_spot
 from optodrive.lab.calibration.spots import MeasuredSpots
 from optodrive.link.simulator.true_geometry import GroundTruthGeometry
 
-GEOMETRIES = range(10)
+ALL = range(10)
+SOME = ALL[:4]
+
+
+@pytest.fixture(params=[SOME, pytest.param(ALL, marks=pytest.mark.slow)], ids=["some", "all"])
+def geometries(request):
+    return request.param
 
 
 @cache
-def fit_geometries(side, outlier_fraction=0.02):
+def fit_geometries(geometries, side, outlier_fraction=0.02):
     """Return for each geometry: errors in metres [2, k], the stated sigma there [k], the fit, and the true outliers."""
     out = []
-    for seed in GEOMETRIES:
+    for seed in geometries:
         truth = GroundTruthGeometry.sample(seed, CONFIG)
         spots, is_outlier = measure_spots(
             truth, grid_codes(side), np.random.default_rng([seed, side]), outlier_fraction
@@ -37,39 +43,39 @@ def lengths_m(error_m):
     return np.hypot(*error_m)
 
 
-def test_from_289_spots_5_um_rms_and_25_um_at_most():
-    for miss_m, *_ in fit_geometries(17):
+def test_from_289_spots_5_um_rms_and_25_um_at_most(geometries):
+    for miss_m, *_ in fit_geometries(geometries, 17):
         assert np.sqrt((lengths_m(miss_m) ** 2).mean()) <= 5e-6
         assert lengths_m(miss_m).max() <= 25e-6
 
 
-def test_from_25_spots_10_um_rms():
+def test_from_25_spots_10_um_rms(geometries):
     """Per axis, as noise is given, for each geometry; in length for all of them together."""
-    results = fit_geometries(5)
+    results = fit_geometries(geometries, 5)
     for miss_m, *_ in results:
         assert axis_rms_m(miss_m) <= 10e-6
     assert np.sqrt(np.mean([(lengths_m(miss_m) ** 2).mean() for miss_m, *_ in results])) <= 10e-6
 
 
-def test_from_9_spots_25_um_rms():
-    for miss_m, *_ in fit_geometries(3):
+def test_from_9_spots_25_um_rms(geometries):
+    for miss_m, *_ in fit_geometries(geometries, 3):
         assert np.sqrt((lengths_m(miss_m) ** 2).mean()) <= 25e-6
 
 
-@pytest.mark.parametrize("side", [17, 5, 3])
+@pytest.mark.parametrize("side", [pytest.param(17, marks=pytest.mark.slow), 5, pytest.param(3, marks=pytest.mark.slow)])
 def test_two_stated_sigmas_cover_the_truth_with_nominal_frequency(side):
-    covered = [np.abs(miss_m) <= 2.0 * sigma_m for miss_m, sigma_m, *_ in fit_geometries(side)]
+    covered = [np.abs(miss_m) <= 2.0 * sigma_m for miss_m, sigma_m, *_ in fit_geometries(ALL, side)]
     assert 0.90 <= np.mean(covered) <= 0.98
 
 
-def test_outliers_are_rejected_and_inliers_kept():
+def test_outliers_are_rejected_and_inliers_kept(geometries):
     for share in (0.02, 0.2):
-        for *_, fit, false in fit_geometries(17, share):
+        for *_, fit, false in fit_geometries(geometries, 17, share):
             assert np.array_equal(fit.outlier, false)
 
 
-def test_a_fifth_of_outliers_among_289_spots_does_not_degrade_the_field():
-    for miss_m, *_ in fit_geometries(17, 0.2):
+def test_a_fifth_of_outliers_among_289_spots_does_not_degrade_the_field(geometries):
+    for miss_m, *_ in fit_geometries(geometries, 17, 0.2):
         assert axis_rms_m(miss_m) <= 5e-6
         assert lengths_m(miss_m).max() <= 25e-6
 
@@ -92,7 +98,7 @@ def test_the_noise_is_estimated():
 
 @pytest.mark.slow
 def test_many_random_spots_are_as_good_as_a_grid():
-    for seed in GEOMETRIES:
+    for seed in ALL:
         truth, random = GroundTruthGeometry.sample(seed, CONFIG), np.random.default_rng([seed, 1])
         spots, _ = measure_spots(truth, random_codes(random, 289), random)
         assert axis_rms_m(field_errors_m(truth, fit_field(spots, PRIOR).field)[0]) <= 5e-6

@@ -1,10 +1,13 @@
-"""Effects hidden by the generator are found through the library; the cases change with the printed seed.
+"""Effects hidden by the generator are found through the library.
 
-BLIND_SEED=n replays a failure. Thresholds are such that random failures are rare; `scripts/bench blind` measures rates.
+Every run diagnoses fixed cases, one or two of each block; the slow tests draw cases that change with the printed seed.
+BLIND_SEED=n replays a failure of these. Their thresholds are such that random failures are rare; `scripts/bench blind`
+measures rates.
 """
 
 import os
 import secrets
+from typing import NamedTuple
 
 import pytest
 
@@ -14,9 +17,28 @@ from optodrive.lab.diagnosis.narrative import build_answer
 from optodrive.lab.diagnosis.priors import build_prior
 from optodrive.lab.recording import read_recording
 
-SEED = int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000)
-NULLS, SINGLES, PAIRS, UNKNOWNS = 2, 4, 1, 2
-pytestmark = pytest.mark.timeout(600)  # nine cases are drawn and diagnosed before the first of them
+
+class Draw(NamedTuple):
+    """A seed, the number of cases of each block, and how many answers may be wrong."""
+
+    seed: int
+    counts: dict[str, int]
+    false_alarms_max: int
+    missed_max: int
+    misnamed_max: int
+    unknown_named_max: int
+
+
+FIXED = Draw(2_500_000, {"none": 1, "single": 2, "pair": 1, "unknown": 1}, 0, 0, 0, 0)
+DRAWN = Draw(
+    int(os.environ.get("BLIND_SEED") or secrets.randbelow(1_000_000) + 2_000_000),
+    {"none": 2, "single": 4, "pair": 1, "unknown": 2},
+    1,
+    2,
+    1,
+    1,
+)
+pytestmark = pytest.mark.timeout(600)  # all cases are drawn and diagnosed before the first of them
 
 
 def found(case):
@@ -25,41 +47,46 @@ def found(case):
     return build_answer(diagnose(measurement, 0, prior, epsilon))
 
 
+@pytest.fixture(scope="module", params=[FIXED, pytest.param(DRAWN, marks=pytest.mark.slow)], ids=["fixed", "drawn"])
+def drawn(request):
+    return request.param
+
+
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory):
+def answers(drawn, tmp_path_factory):
     """(case, answer) of every block."""
-    print(f"BLIND_SEED={SEED}")
+    print(f"BLIND_SEED={drawn.seed}")
     results = {}
-    for block, count in (("none", NULLS), ("single", SINGLES), ("pair", PAIRS), ("unknown", UNKNOWNS)):
-        cases = [draw_case(block, SEED + row, tmp_path_factory.mktemp(block)) for row in range(count)]
+    for block, count in drawn.counts.items():
+        cases = [draw_case(block, drawn.seed + row, tmp_path_factory.mktemp(block)) for row in range(count)]
         results[block] = [(case, found(case)) for case in cases]
     return results
 
 
-def what(results):
-    return f"BLIND_SEED={SEED}: " + "; ".join(
+def what(drawn, results):
+    return f"BLIND_SEED={drawn.seed}: " + "; ".join(
         f"{case.causes} → {item['verdict']} {item['causes']}" for case, item in results
     )
 
 
-def test_nothing_hidden_is_mostly_left_alone(answers):
+def test_nothing_hidden_is_mostly_left_alone(drawn, answers):
     alarms = sum(item["verdict"] != "none" for _, item in answers["none"])
-    assert alarms < NULLS, what(answers["none"])
+    assert alarms <= drawn.false_alarms_max, what(drawn, answers["none"])
 
 
-def test_most_single_causes_are_found_and_hardly_one_is_misnamed(answers):
+def test_most_single_causes_are_found_and_hardly_one_is_misnamed(drawn, answers):
     results = [(case, item) for case, item in answers["single"] if "sensor_scale" not in case.causes]
     right = sum(set(case.causes) <= set(item["causes"]) for case, item in results)
     wrong = sum(item["verdict"] == "cause" and set(item["causes"]) != set(case.causes) for case, item in results)
-    assert right >= len(results) - 2, what(results)
-    assert wrong <= 1, what(results)
+    assert right >= len(results) - drawn.missed_max, what(drawn, results)
+    assert wrong <= drawn.misnamed_max, what(drawn, results)
 
 
-def test_what_is_in_no_catalogue_is_not_all_named(answers):
+def test_what_is_in_no_catalogue_is_not_all_named(drawn, answers):
     named = sum(item["verdict"] == "cause" for _, item in answers["unknown"])
-    assert named < UNKNOWNS, what(answers["unknown"])
+    assert named <= drawn.unknown_named_max, what(drawn, answers["unknown"])
 
 
-def test_of_two_causes_no_two_are_false(answers):
+def test_of_two_causes_no_two_are_false(drawn, answers):
     for case, item in answers["pair"]:
-        assert not item["causes"] or set(item["causes"]) & set(case.causes), what(answers["pair"])
+        assert not item["causes"] or set(item["causes"]) & set(case.causes), what(drawn, answers["pair"])
