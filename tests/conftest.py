@@ -1,7 +1,12 @@
 """Shared fixtures and options of pytest, profiles of hypothesis, and the order of the tests."""
 
+import os
+
 import pytest
 from hypothesis import HealthCheck, settings
+
+# Before numpy is imported, also for the workers of xdist: a second thread of BLAS takes the time of the other worker.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import forked_process
 from displays import DISPLAYS
