@@ -9,10 +9,12 @@ from displays import DISPLAYS
 from link_service_rig import PLANNER, ServiceRig
 from optodrive.core.ipc import MessageDecoder, encode_message
 from optodrive.core.types.stimuli import FrameSequence, PulseTrain, TactileFrame
+from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_making import PlanningRequest
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.engine.plan_store import PlanStore
 from optodrive.daemon.engine.planner import Planner
+from optodrive.daemon.engine.thermal_memory import ThermalMemory
 from optodrive.link.service import remote_session
 from optodrive.link.service.remote_session import RemoteSession
 
@@ -87,8 +89,9 @@ class PlannerRig(ServiceRig):
         self.store = PlanStore()
         self.queue = queue_type(DISPLAY, self.remote, self.store, InlineExecutor())
         self.before_loop_action = lambda: None
+        self.dimmer = Dimmer(DISPLAY, ThermalMemory())
         self.planner = Planner(
-            DISPLAY, self.remote, self.queue, self.clock, InlineExecutor(), self._run_in_loop, lambda: None
+            self.dimmer, self.remote, self.queue, self.clock, InlineExecutor(), self._run_in_loop, lambda: None
         )
         self._seen_epoch = None
 

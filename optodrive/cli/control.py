@@ -1,7 +1,7 @@
-"""`optodrive status | arm | disarm | stop`: control a running daemon."""
+"""`optodrive status | arm | disarm | dim | stop`: control a running daemon."""
 
 import sys
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -20,7 +20,7 @@ STATE_TIMEOUT_S = 2.0
 
 def register(app: typer.Typer) -> None:
     """Add the commands."""
-    for command in (status, arm, disarm, stop):
+    for command in (status, arm, disarm, dim, stop):
         app.command()(command)
 
 
@@ -58,6 +58,18 @@ def disarm(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
     from optodrive.client.requests import DISARM
 
     _print_state(DaemonClient(url).call(DISARM), json)
+
+
+def dim(
+    share: Annotated[float, typer.Argument(metavar="SHARE", help="Share of the laser's power, 0 to 1.")],
+    url: UrlOption = DEFAULT_URL,
+    json: JsonOption = False,
+) -> None:
+    """Cap the power of every pulse of the plans from now on; only an armer may raise it again."""
+    from optodrive.client.http import DaemonClient
+    from optodrive.client.requests import build_dim_request
+
+    _print_state(DaemonClient(url).call(build_dim_request(share)), json)
 
 
 def stop(url: UrlOption = DEFAULT_URL, json: JsonOption = False) -> None:
@@ -105,6 +117,8 @@ def _print_state(state: "StateReport", as_json: bool) -> None:
     if state.control is not None:
         held = ", held by its connection" if state.control.hold else ""
         print(f"control   armed by {state.control.caller} {state.control.armed_for_s:.0f} s ago{held}")
+    if state.limits.power_share is not None and state.limits.power_share < 1.0:
+        print(f"dim       pulses have at most {state.limits.power_share:g} of full power")
     print(f"queue     {queue.waiting} waiting, running {queue.running or 'nothing'}")
     print(f"executed  {totals.executed} pulses of {totals.sent} sent")
     if link.state == "up":

@@ -68,6 +68,10 @@ class AsyncDisplay:
         """See `Display.disarm`."""
         return await self._client.run(self._operations.disarm())
 
+    async def dim(self, share: float) -> StateReport:
+        """See `Display.dim`."""
+        return await self._client.run(self._operations.dim(share))
+
     async def stop(self) -> StateReport:
         """See `Display.stop`."""
         return await self._client.run(self._operations.stop())

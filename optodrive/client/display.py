@@ -85,6 +85,13 @@ class Display:
         """Disarm the board; this also acknowledges a fault whose cause is gone."""
         return self._client.run(self._operations.disarm())
 
+    def dim(self, share: float) -> StateReport:
+        """Cap the power of every pulse of the plans from now on, as a share of the laser's, 0 to 1.
+
+        It stays when this client leaves. Only an armer may raise it again; RefusedError for others.
+        """
+        return self._client.run(self._operations.dim(share))
+
     def stop(self) -> StateReport:
         """Switch the gate off, drop all plans, disarm the board; LinkError if no answer confirms it."""
         return self._client.run(self._operations.stop())

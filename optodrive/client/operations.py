@@ -14,6 +14,7 @@ from optodrive.client.requests import (
     READ_STATE,
     ApiRequest,
     build_cancel_request,
+    build_dim_request,
     build_frame_body,
     build_play_request,
     build_push_request,
@@ -57,6 +58,10 @@ class DisplayOperations:
     def disarm(self) -> Exchange[StateReport]:
         """Disarm the board."""
         return (yield from self._policy.call(DISARM))
+
+    def dim(self, share: float) -> Exchange[StateReport]:
+        """Cap the power of plans."""
+        return (yield from self._policy.call(build_dim_request(share)))
 
     def stop(self) -> Exchange[StateReport]:
         """Stop the board."""

@@ -42,6 +42,11 @@ DISARM = ApiRequest("POST", "/v1/disarm", StateReport)
 STOP = ApiRequest("POST", "/v1/stop", StateReport)
 
 
+def build_dim_request(share: float) -> ApiRequest[StateReport]:
+    """Build the request that caps the power of plans at a share of the laser's."""
+    return ApiRequest("PUT", "/v1/dim", StateReport, True, {"json": {"share": share}})
+
+
 def build_frame_body(heights_um: FloatArray, duration_s: float, simultaneous: bool) -> dict[str, Any]:
     """Build the body of one frame that starts at once, in the form of FRAMES.json."""
     frame: dict[str, Any] = {"show_at_s": 0.0, "duration_s": duration_s, "target_um": encode_json(heights_um)}

@@ -150,6 +150,8 @@ class UncertaintySection(Section):
 class LimitsSection(Section):
     """Caps that no sequence of plans exceeds."""
 
+    power_share: Annotated[float, Field(ge=0, le=1)] = 1.0
+    """Largest power of a pulse as a share of the laser's; `optodrive dim` lowers it further while the daemon runs."""
     absorber_max_c: float
     """Highest absorber temperature, °C."""
     wall_max_c: float

@@ -11,16 +11,17 @@ from optodrive.physics.thermal_state import ThermalState
 class DryRunStart(NamedTuple):
     """State of the display at the start of a plan that is submitted now, on the plan's own time line.
 
-    starts_in_s: time from now to that start
+    starts_in_s: time from now to that start; power_share: to which the display is dimmed
     """
 
     heat: ThermalState
     budget: BudgetState
     starts_in_s: float
+    power_share: float = 1.0
 
 
 def build_dry_run_start(engine: Engine) -> bytes:
     """Return the pickled start of a dry run."""
     snapshot = engine.plan_queue.make_snapshot(streamed=False, planning_time_s=0.0)
-    start = DryRunStart(snapshot.heat, snapshot.budget, snapshot.start_s - engine.board_s())
+    start = DryRunStart(snapshot.heat, snapshot.budget, snapshot.start_s - engine.board_s(), engine.dimmer.power_share)
     return pickle.dumps(start, pickle.HIGHEST_PROTOCOL)

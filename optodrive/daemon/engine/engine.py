@@ -18,6 +18,7 @@ from optodrive.core.errors import InputError, LinkError, NotReadyError
 from optodrive.core.types.policy import Policy
 from optodrive.core.types.stimuli import FrameSequence, TactileFrame
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.loop_commands import LoopCommands
 from optodrive.daemon.engine.metrics import PlanCounters, render_metrics
 from optodrive.daemon.engine.plan_making import NEVER, PlanningRequest
@@ -82,8 +83,10 @@ class Engine:
         self._simulation_executor = ThreadPoolExecutor(1, thread_name_prefix="simulation")
         self._planning_executor = ThreadPoolExecutor(1, thread_name_prefix="planner")
         self._plan_queue = PlanQueue(display, session, self._plan_store, self._simulation_executor)
+        self._memory = ThermalMemory() if memory is None else memory
+        self._dimmer = Dimmer(display, self._memory)
         self._planner = Planner(
-            display,
+            self._dimmer,
             session,
             self._plan_queue,
             clock,
@@ -93,7 +96,6 @@ class Engine:
         )
         self._plan_queue.on_progress = self._beat
         self._epoch = session.epoch
-        self._memory = ThermalMemory() if memory is None else memory
         self._restored = False
         self._saved_key: object = None
         self._published_cause: LinkCause | None = None
@@ -256,6 +258,11 @@ class Engine:
         return self._session.board_s()
 
     @property
+    def dimmer(self) -> Dimmer:
+        """Cap on the power of the plans from now on. Only the engine's thread may set it."""
+        return self._dimmer
+
+    @property
     def is_linked(self) -> bool:
         """Whether the link to the board is up and its clock synchronised."""
         return self._session.connected
@@ -291,11 +298,13 @@ class Engine:
     def compute_state_key(self) -> object:
         """Return a value that changes with everything in the planner's state but the totals."""
         plans = tuple((record.plan_id, record.status) for record in self._plan_store.list_recent())
-        return plans, len(self._plan_queue.waiting), self._planner.is_busy, self._planner.is_alive
+        planner = self._planner.is_busy, self._planner.is_alive, self._dimmer.power_share
+        return plans, len(self._plan_queue.waiting), planner
 
     def build_planner_state(self) -> PlannerState:
         """Report queue and planner."""
-        return build_planner_state(self._plan_queue, self._plan_store.list_recent(), self._planner, self.board_s())
+        recent, power_share = self._plan_store.list_recent(), self._dimmer.power_share
+        return build_planner_state(self._plan_queue, recent, self._planner, power_share, self.board_s())
 
     def snapshot(self) -> StateReport:
         """Report everything that GET /v1/state sends."""

@@ -11,11 +11,11 @@ from optodrive.core.clock import Clock
 from optodrive.core.errors import BusyError, InputError, StoppedError
 from optodrive.core.types.stimuli import FrameSequence
 from optodrive.daemon.engine.active_plan import ActivePlan
+from optodrive.daemon.engine.dimmer import Dimmer
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.plan_queue import PlanQueue
 from optodrive.daemon.responses.plan import PlanReport
 from optodrive.link.service.remote_session import RemoteSession
-from optodrive.planning.display_model import DisplayModel
 
 STALL_TIMEOUT_S = 2.0
 """A planner without progress for this time counts as stalled, and the lease is no longer renewed."""
@@ -41,6 +41,7 @@ class LoopRunner(Protocol):
 class Planner:
     """Planner of one sequence at a time.
 
+    dimmer: states the display by which plans are made
     executor: runs one request at a time, in order
     run_in_loop: runs an action in the loop's thread
     require_armed: raises NotReadyError if the board accepts no plans
@@ -48,7 +49,7 @@ class Planner:
 
     def __init__(
         self,
-        display: DisplayModel,
+        dimmer: Dimmer,
         session: RemoteSession,
         plan_queue: PlanQueue,
         clock: Clock,
@@ -56,7 +57,7 @@ class Planner:
         run_in_loop: LoopRunner,
         require_armed: Callable[[], None],
     ) -> None:
-        self._display = display
+        self._dimmer = dimmer
         self._session = session
         self._plan_queue = plan_queue
         self._clock = clock
@@ -149,10 +150,14 @@ class Planner:
         planning_time_s: float,
         check: Callable[[float], None],
     ) -> ActivePlan | None:
-        """Plan once. Return None if the snapshot became stale meanwhile."""
-        began_s = self._clock.now_s()
+        """Plan once. Return None if the snapshot became stale, or the display was dimmed, meanwhile."""
+        began_s, display = self._clock.now_s(), self._dimmer.display
         snapshot = self._plan_queue.make_snapshot(request.streamed, planning_time_s)
         plan_id = f"p{next(self._ids)}"
-        plan = make_plan(self._display, self._session.scale, request, sequence, snapshot, plan_id, check)
+        plan = make_plan(display, self._session.scale, request, sequence, snapshot, plan_id, check)
         self._last_planning_s = self._clock.now_s() - began_s
-        return plan if self._run_in_loop(lambda: self._plan_queue.commit(plan, snapshot)) else None
+
+        def commit() -> bool:
+            return self._dimmer.display is display and self._plan_queue.commit(plan, snapshot)
+
+        return plan if self._run_in_loop(commit) else None

@@ -19,6 +19,7 @@ from optodrive.daemon.engine.telemetry_producer import TelemetryProducer
 from optodrive.daemon.message_loop import MessageServer
 from optodrive.daemon.responses.error_problem import build_error_problem
 from optodrive.daemon.responses.plan import PlanReport
+from optodrive.daemon.responses.problem import build_problem
 from optodrive.planning.stimuli.sequence_codec import decode_sequence
 
 STATE_PERIOD_S = 0.5
@@ -68,6 +69,7 @@ class PlannerServer:
             "get_plan": lambda: self._answer(
                 connection, fields["id"], lambda: self._engine.get_plan(fields["plan"], fields["pulses"])
             ),
+            "dim": lambda: self._dim(connection, fields["id"], fields["share"], fields["may_raise"]),
             "revoke": lambda: self._engine.revoke(fields["caller"]),
             "cancel": lambda: self._cancel(connection, fields["id"], fields["plan"]),
             "metrics": lambda: self._reply(connection, fields["id"], 200, self._engine.render_metrics().encode()),
@@ -135,6 +137,17 @@ class PlannerServer:
         self._engine.cancel(plan).add_done_callback(
             lambda done: self._answer(connection, request_id, done.result)  # the future is done
         )
+
+    def _dim(self, connection: MessageSocket, request_id: int, share: float, may_raise: bool) -> None:
+        """Set the share of the power, unless the caller may only lower it. Raise InputError for a wrong one."""
+        dimmer = self._engine.dimmer
+        if share > dimmer.power_share and not may_raise:
+            detail = f"only a token of role armer may raise the power above {dimmer.power_share:g} of full power"
+            problem = build_problem(403, "insufficient_role", "Forbidden", detail, required_role="armer")
+            self._reply(connection, request_id, problem.status, problem.to_json())
+            return
+        dimmer.set_share(share)
+        self._reply(connection, request_id, 200, b"")
 
     def _refuse(self, connection: MessageSocket, request_id: int | None, error: OptodriveError) -> None:
         if request_id is not None:

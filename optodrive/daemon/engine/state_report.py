@@ -6,6 +6,7 @@ from optodrive.daemon.engine.planner import Planner
 from optodrive.daemon.engine.queue_report import build_queue_report
 from optodrive.daemon.responses.state import (
     BoardReport,
+    LimitsReport,
     LinkReport,
     PlannerReport,
     PlannerState,
@@ -18,13 +19,14 @@ from optodrive.planning.display_model import DisplayModel
 
 
 def build_planner_state(
-    plan_queue: PlanQueue, recent: list[PlanRecord], planner: Planner, board_now_s: float
+    plan_queue: PlanQueue, recent: list[PlanRecord], planner: Planner, power_share: float, board_now_s: float
 ) -> PlannerState:
     """Report the state of queue and planner."""
     return PlannerState(
         queue=build_queue_report(plan_queue, recent, board_now_s),
         totals=PulseTotals(**plan_queue.totals, timing_error=plan_queue.timing.worst),
         planner=PlannerReport(busy=planner.is_busy, alive=planner.is_alive),
+        limits=LimitsReport(power_share=power_share),
     )
 
 
@@ -44,6 +46,7 @@ def build_state_report(display: DisplayModel, session: RemoteSession, planner_st
         queue=planner_state.queue,
         totals=planner_state.totals,
         planner=planner_state.planner,
+        limits=planner_state.limits,
     )
 
 

@@ -12,6 +12,7 @@ SLOT_BYTES = 256 * 2**20
 """Room for one state. Memory that was never written costs nothing."""
 HEADER = struct.Struct("<QQI")
 """Sequence number, length and CRC-32 of a state; sequence number 0: none."""
+SHARE = struct.Struct("<d")
 
 
 class SavedThermalState(NamedTuple):
@@ -33,8 +34,19 @@ class ThermalMemory:
     """
 
     def __init__(self) -> None:
-        self._map = mmap.mmap(-1, 2 * SLOT_BYTES)
+        self._map = mmap.mmap(-1, 2 * SLOT_BYTES + SHARE.size)
         self._sequence = 0
+        self.power_share = 1.0
+
+    @property
+    def power_share(self) -> float:
+        """Largest power of a pulse as a share of the laser's, as it was set last."""
+        share: float = SHARE.unpack_from(self._map, 2 * SLOT_BYTES)[0]
+        return share
+
+    @power_share.setter
+    def power_share(self, share: float) -> None:
+        SHARE.pack_into(self._map, 2 * SLOT_BYTES, share)
 
     def save(self, state: SavedThermalState) -> None:
         """Save a state. Raise ValueError if it exceeds its room."""

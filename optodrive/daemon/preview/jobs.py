@@ -7,6 +7,7 @@ from optodrive.core.errors import InputError, OptodriveError
 from optodrive.core.ipc import Message
 from optodrive.core.json_model import iterate_json
 from optodrive.core.types.stimuli import FrameSequence
+from optodrive.daemon.engine.dimmer import dim_display
 from optodrive.daemon.engine.dry_run import DryRunStart
 from optodrive.daemon.engine.plan_making import PlanningRequest, make_plan
 from optodrive.daemon.engine.planning_snapshot import PlanningSnapshot
@@ -69,5 +70,6 @@ def plan_dry_run(
     request = PlanningRequest(lambda: sequence, fields["name"], fields["policy"], fields["fit"])
     thermal = ThermalEstimate(start.heat, start.budget)
     snapshot = PlanningSnapshot(thermal, start.starts_in_s, start.heat, start.budget)
-    plan = make_plan(display, scale, request, sequence, snapshot, DRY_RUN_PLAN, lambda fraction: None)
+    dimmed = dim_display(display, start.power_share)
+    plan = make_plan(dimmed, scale, request, sequence, snapshot, DRY_RUN_PLAN, lambda fraction: None)
     return plan.record.build_report(0.0)

@@ -104,16 +104,26 @@ class PlannerReport(JsonModel):
     alive: bool
 
 
+class LimitsReport(JsonModel):
+    """Limits that may change while the daemon runs.
+
+    power_share: largest power of a pulse as a share of the laser's, None while the planner process does not run
+    """
+
+    power_share: float | None
+
+
 class PlannerState(JsonModel):
     """The part of the state that the planner process reports."""
 
     queue: QueueReport
     totals: PulseTotals
     planner: PlannerReport
+    limits: LimitsReport
 
 
 class StateReport(JsonModel):
-    """The daemon's state: display, link, board, queue, totals and planner; `control` is null unless armed."""
+    """The daemon's state: display, link, board, queue, totals, planner and limits; `control` is null unless armed."""
 
     display: str
     pixels: int
@@ -123,6 +133,7 @@ class StateReport(JsonModel):
     queue: QueueReport
     totals: PulseTotals
     planner: PlannerReport
+    limits: LimitsReport
 
 
 def build_control_report(control: Mapping[str, Any] | None) -> ControlReport | None:

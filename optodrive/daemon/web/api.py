@@ -25,6 +25,7 @@ from optodrive.daemon.responses.state import StateReport
 from optodrive.daemon.web.access_middleware import AUDIT_FIELDS, AccessMiddleware
 from optodrive.daemon.web.access_policy import AccessPolicy
 from optodrive.daemon.web.daemon_client import NO_EPOCH, DaemonClient, PushFields
+from optodrive.daemon.web.dim_request import DIM_EXAMPLE, DIM_SCHEMA, parse_dim_request
 from optodrive.daemon.web.error_handlers import add_error_handlers
 from optodrive.daemon.web.hold_socket import HoldSocket
 from optodrive.daemon.web.live_stream import LiveStream
@@ -36,6 +37,7 @@ from optodrive.daemon.web.openapi_bodies import (
     SEQUENCE_SCHEMA,
     build_request_body,
 )
+from optodrive.daemon.web.roles import is_role_sufficient
 from optodrive.daemon.web.route_table import RoleRoutes, RouteTable
 from optodrive.daemon.web.server_state import ARRIVED_S, CALLER
 from optodrive.daemon.web.static_files import add_page_routes
@@ -116,6 +118,20 @@ def build_app(daemon: DaemonClient, policy: AccessPolicy) -> FastAPI:
     async def hold(socket: WebSocket) -> None:
         """Arm the board for as long as the connection lasts and its client sends a message every second."""
         await HoldSocket(daemon.link, socket, socket.scope[CALLER].name).run()
+
+    @routes.put(
+        "/v1/dim",
+        "operator",
+        response_model=StateReport,
+        openapi_extra=build_request_body("the share of full power, 0 to 1", DIM_SCHEMA, DIM_EXAMPLE, True),
+    )
+    async def dim(request: Request) -> Response:
+        """Cap the power of every pulse of the plans from now on. Only an armer may raise it again."""
+        share = parse_dim_request(await request.body()).share
+        request.scope[AUDIT_FIELDS]["share"] = share
+        may_raise = is_role_sufficient(request.scope[CALLER].role, "armer")
+        result = await daemon.planner.call("dim", share=share, may_raise=may_raise)
+        return _send_state(daemon) if result.fields["status"] == 200 else _relay(result)
 
     @routes.post("/v1/disarm", "operator", response_model=StateReport)
     async def disarm() -> Response:

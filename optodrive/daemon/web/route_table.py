@@ -35,6 +35,10 @@ class RoleRoutes:
         """Declare a POST route. options: as of `FastAPI.post`."""
         return self._declare(min_role, self._app.post(path, **options))
 
+    def put(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
+        """Declare a PUT route. options: as of `FastAPI.put`."""
+        return self._declare(min_role, self._app.put(path, **options))
+
     def delete(self, path: str, min_role: Role | None, **options: Any) -> Callable[[Endpoint], Endpoint]:
         """Declare a DELETE route. options: as of `FastAPI.delete`."""
         return self._declare(min_role, self._app.delete(path, **options))

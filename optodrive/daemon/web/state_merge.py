@@ -5,6 +5,7 @@ from typing import Any
 
 from optodrive.daemon.responses.state import (
     BoardReport,
+    LimitsReport,
     LinkReport,
     PlannerReport,
     PlannerState,
@@ -31,6 +32,7 @@ NO_PLANNER = PlannerState(
     queue=QueueReport(waiting=0, running=None, active=[], plans=[]),
     totals=PulseTotals(planned=0, sent=0, executed=0, timing_error=None),
     planner=PlannerReport(busy=False, alive=False),
+    limits=LimitsReport(power_share=None),
 )
 UNKNOWN_BOARD: Mapping[str, Any] = {"state": "UNKNOWN", "fault": None, "hint": ""}
 """A board without a link: its last state would be a claim."""
@@ -65,4 +67,5 @@ def merge_state(
         queue=planner.queue,
         totals=planner.totals,
         planner=planner.planner,
+        limits=planner.limits,
     )

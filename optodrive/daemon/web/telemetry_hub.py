@@ -104,7 +104,7 @@ class TelemetryHub:
         """
         board, link, now_s = state.board, state.link, self._clock.now_s()
         plans = tuple((plan.plan, plan.status) for plan in state.queue.plans)
-        key = (board.state, board.fault, board.inputs, link.state, state.planner.busy, plans)
+        key = (board.state, board.fault, board.inputs, link.state, state.planner.busy, plans, state.limits)
         if key != self._state_key or now_s >= self._state_due_s:
             self._state_key, self._state_due_s = key, now_s + STATE_PERIOD_S
             self._publish("state", state)

@@ -28,6 +28,7 @@ PULSE_WIDTH = CAP_NUMBERS["pulse_width"]
 PIXEL_MEAN_POWER = CAP_NUMBERS["pixel_mean_power"]
 DISPLAY_MEAN_POWER = CAP_NUMBERS["display_mean_power"]
 GALVO_ACCELERATION = CAP_NUMBERS["galvo_acceleration"]
+DIM = CAP_NUMBERS["dim"]
 
 
 class PixelStartState(NamedTuple):
@@ -65,6 +66,9 @@ def max_power_w(
         if mean_square > caps.galvo_rad2_per_s4 * (1 + TOLERANCE):
             return 0.0, GALVO_ACCELERATION
     max_w, binding = caps.pulse_energy_j / width_s, PULSE_ENERGY
+    dimmed_w = caps.power_share * budget.heat.power_max_w
+    if caps.power_share < 1.0 and dimmed_w < max_w:
+        max_w, binding = dimmed_w, DIM
     spot_w = (caps.pulse_energy_j - bucket_j) / width_s
     if spot_w < max_w:
         max_w, binding = spot_w, SPOT_ENERGY

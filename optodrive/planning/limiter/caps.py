@@ -135,6 +135,16 @@ CAPS = (
         scale=CapScale.RMS,
         is_per_pixel=False,
     ),
+    Cap(
+        key="dim",
+        label="power, dimmed to",
+        message="dim cap",
+        unit="of full power",
+        setting="power_share",
+        field="power_share",
+        is_gauged=False,
+        is_per_pixel=False,
+    ),
 )
 
 CAPS_BY_KEY: Mapping[str, Cap] = {cap.key: cap for cap in CAPS}
@@ -153,9 +163,11 @@ class CapValues(NamedTuple):
 
     pulse_gap_s: gate-off time after which pulses on a pixel count separately
     pixel_window_s, display_window_s: lengths of the windows over which mean powers are taken
+    power_share: largest power of a pulse as a share of the laser's
     min_power_w: smallest power that the board can emit; weaker pulses count as zero
     """
 
+    power_share: float
     absorber_k: float
     wall_k: float
     touch_k: float

@@ -26,6 +26,7 @@ def build_state(board="DISARMED", fault=None, error=None):
             "link": LINK | {"port": "p", "state": "down" if error else "up", "error": error},
             "board": BOARD | {"state": board, "fault": fault, "hint": ""},
             "control": None,
+            "limits": {"power_share": 1.0},
             "queue": {"waiting": 0, "running": None, "active": [], "plans": []},
             "totals": {"planned": 0, "sent": 0, "executed": 0, "timing_error": None},
             "planner": {"busy": False, "alive": True},

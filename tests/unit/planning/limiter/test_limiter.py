@@ -103,6 +103,7 @@ CASES = {
     ),
     "wall_temperature": (dict(wall_k=3.0), [(1, 0.06 * k, 0.050, 2.45) for k in range(3)]),
     "touch_temperature": (dict(touch_k=2.0), [(1, 0.06 * k, 0.050, 2.45) for k in range(2)]),
+    "dim": (dict(power_share=0.5), [(0, 0.0, 0.020, 1.0), (1, 0.1, 0.020, 2.0)]),
     "galvo_acceleration": (dict(galvo_rad2_per_s4=1e7), [(0, 0.0, 0.001, 1.0), (2, 0.002, 0.001, 1.0)]),
     "pulse_width": ({}, [(0, 0.0, 0.030, 1.0), (0, 0.0302, 0.030, 1.0)]),
 }
@@ -233,6 +234,20 @@ def test_verification_passes_limited_pulses_and_rejects_others():
             build_cold_budget_state(3),
             budget,
         )
+
+
+def test_a_dimmed_budget_passes_no_power_above_its_share():
+    """Also the verification of the bytes refuses it; a share of 1 changes nothing."""
+    plan = run(build_budget(power_share=0.5), (0, 0.0, 0.02, 2.45), (1, 0.06, 0.02, 1.0))
+    assert plan.power_w.tolist() == [1.225, 1.0]
+    bright = run(build_budget(power_share=1.0), (0, 0.0, 0.02, 2.45), (1, 0.06, 0.02, 1.0))
+    assert bright.power_w.tolist() == [2.45, 1.0]
+    cold = build_cold_budget_state(3)
+    verify(bright, np.arange(2), bright, cold, build_budget(power_share=1.0))
+    with pytest.raises(LocalProtocolError, match=r"passes a cap \(dim\)"):
+        verify(bright, np.arange(2), bright, cold, build_budget(power_share=0.5))
+    dark = run(build_budget(power_share=0.0), (0, 0.0, 0.02, 2.45))
+    assert (dark.power_w.tolist(), dark.reason.tolist()) == ([0.0], ["dim"])
 
 
 def test_only_executed_pulses_count():

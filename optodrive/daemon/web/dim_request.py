@@ -1,0 +1,32 @@
+"""The body of PUT /v1/dim."""
+
+from typing import Annotated, Any
+
+from pydantic import Field, ValidationError
+
+from optodrive.core.errors import InputError, Unquoted
+from optodrive.core.json_model import JsonModel
+
+BODY_MAX_BYTES = 1000
+DIM_SCHEMA: dict[str, Any] = {
+    "type": "object",
+    "required": ["share"],
+    "additionalProperties": False,
+    "properties": {"share": {"type": "number", "minimum": 0, "maximum": 1}},
+}
+DIM_EXAMPLE = {"share": 0.4}
+
+
+class DimRequest(JsonModel):
+    """The largest power of a pulse, as a share of the laser's."""
+
+    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+def parse_dim_request(body: bytes) -> DimRequest:
+    """Parse a body. Raise InputError."""
+    try:
+        return DimRequest.model_validate_json(body[: BODY_MAX_BYTES + 1])
+    except ValidationError:
+        text = body[:BODY_MAX_BYTES].decode("utf-8", "replace")
+        raise InputError("body", Unquoted(text or "nothing"), '{"share": a number from 0 to 1}') from None

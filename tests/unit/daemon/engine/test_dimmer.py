@@ -1,0 +1,106 @@
+"""Dimming in virtual time, judged from the power of the pulses in the board's log."""
+
+import pytest
+
+from link_service_rig import REQUIREMENTS
+from optodrive.core.errors import InputError, OverBudgetError
+from optodrive.daemon.engine.dimmer import Dimmer
+from optodrive.daemon.engine.dry_run import DryRunStart
+from optodrive.daemon.engine.plan_making import PlanningRequest
+from optodrive.daemon.engine.thermal_memory import ThermalMemory
+from optodrive.daemon.preview.jobs import plan_dry_run
+from optodrive.planning.pipeline import resolve_policy
+from planner_rig import DISPLAY, PlannerRig, build_frame, build_train
+
+DUTY_MAX = 65535
+
+
+@pytest.fixture
+def rig(monkeypatch):
+    rig = PlannerRig(monkeypatch).ready()
+    rig.arm()
+    rig.run(0.01)
+    return rig
+
+
+def play(rig, sequence):
+    """Play a sequence; return its plan and the largest share of full power that the board has emitted for it."""
+    before = len(rig.list_emitted())
+    plan = rig.submit(sequence, rig.remote.epoch).result()
+    record = rig.store.find(plan.plan)
+    rig.until(lambda: record.has_ended)
+    return plan, max((duty for _, duty in rig.list_emitted()[before:]), default=0) / DUTY_MAX
+
+
+def test_plans_have_at_most_the_share_and_say_why(rig):
+    plan, bright = play(rig, build_frame(90.0))
+    assert plan.summary.trimmed.pulses == 0
+    share = bright / 2
+    rig.dimmer.set_share(share)
+    plan, dimmed = play(rig, build_frame(90.0))
+    assert 0.99 * share < dimmed <= share
+    assert set(plan.pulses.reason) == {"dim"}
+    rig.dimmer.set_share(1.0)
+    assert play(rig, build_frame(90.0))[1] > share
+    rig.dimmer.set_share(0.0)
+    plan, dark = play(rig, build_train(0.1))
+    assert (dark, plan.status) == (0, "queued")
+
+
+def test_a_plan_that_is_being_made_while_the_display_is_dimmed_is_made_again(rig):
+    def dim():
+        rig.before_loop_action = lambda: None
+        rig.dimmer.set_share(0.1)
+
+    rig.before_loop_action = dim
+    plan, dimmed = play(rig, build_frame(90.0))
+    assert 0.0 < dimmed <= 0.1
+    assert set(plan.pulses.reason) == {"dim"}
+
+
+def test_without_the_comparison_at_the_commit_it_would_be_bright(rig, monkeypatch):
+    """Mutant: the queue's commit alone decides."""
+    shown = rig.dimmer.display
+    constant = property(lambda dimmer: shown, lambda dimmer, display: None)
+    monkeypatch.setattr(Dimmer, "display", constant, raising=False)
+
+    def dim():
+        rig.before_loop_action = lambda: None
+        rig.dimmer.set_share(0.1)
+
+    rig.before_loop_action = dim
+    assert play(rig, build_frame(90.0))[1] > 0.1
+
+
+def test_under_refuse_a_dimmed_pulse_is_refused(rig):
+    rig.dimmer.set_share(0.1)
+    request = PlanningRequest(
+        build_frame, "push", resolve_policy("trim", strict=True), arrived_s=rig.remote.board_s(), epoch=rig.remote.epoch
+    )
+    with pytest.raises(OverBudgetError, match="the dim cap allows") as caught:
+        rig.planner.submit(request).result()
+    assert caught.value.cap == "dim"
+
+
+def test_a_later_planner_is_as_dim():
+    memory = ThermalMemory()
+    dimmer = Dimmer(DISPLAY, memory)
+    assert dimmer.power_share == 1.0
+    assert dimmer.display is DISPLAY
+    dimmer.set_share(0.3)
+    assert Dimmer(DISPLAY, memory).power_share == 0.3
+    assert Dimmer(dimmer.display, ThermalMemory()).power_share == 0.3  # as configured
+    with pytest.raises(InputError, match=r"a number from 0 to 0\.3"):
+        Dimmer(dimmer.display, ThermalMemory()).set_share(0.4)
+    for share in (-0.1, 1.1, float("nan")):
+        with pytest.raises(InputError, match="a number from 0 to 1"):
+            dimmer.set_share(share)
+    assert dimmer.power_share == 0.3
+
+
+def test_a_dry_run_is_as_dim():
+    start = DryRunStart(*DISPLAY.build_cold_state(), 0.0, power_share=0.1)
+    fields = {"name": "dry", "policy": "trim", "fit": "as_is"}
+    report = plan_dry_run(DISPLAY, REQUIREMENTS.scale, build_frame(90.0), start, fields)
+    assert set(report.pulses.reason) == {"dim"}
+    assert max(report.pulses.power_w) <= 0.1 * DISPLAY.config.laser.max_power_w
