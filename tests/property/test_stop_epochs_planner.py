@@ -88,7 +88,10 @@ class Interleaving:
             return
         assert push.epoch >= self.answered_epoch, "a push of an older epoch was answered 201"
         self.accepted += 1
-        for duty in self.rig.store.find(report.plan).points.table[:, 4].tolist():
+        queue = self.rig.queue
+        accepted = (*queue.waiting, *(run.plan for run in queue.running))
+        (points,) = (plan.points for plan in accepted if plan.record.plan_id == report.plan)
+        for duty in points.table[:, 4].tolist():
             self.epochs_by_duty.setdefault(duty, set()).add(push.epoch)
 
     def run(self):
