@@ -1,7 +1,6 @@
 """A board and a daemon that the tests of a module share, and what they do to both."""
 
 from rig import Board, Daemon, wait_for
-from stop_rig import SHORT_INDICATOR_BOARD
 
 INTERLOCK = """
 [[step]]
@@ -21,12 +20,12 @@ SAFE_INPUTS = 0b011  # interlock closed, key on, emergency stop released
 
 
 class Bench:
-    """Board and daemon. The board's indicator is short, unless a test asks for the true one."""
+    """Board and daemon."""
 
     def __init__(self, folder, display="display-437"):
         self.folder = folder
         self.is_plain = self.is_plain_daemon = True
-        self.board = Board(folder, program=SHORT_INDICATOR_BOARD)
+        self.board = Board(folder)
         try:
             self.daemon = Daemon(folder, self.board.port, name=display)
         except BaseException:
@@ -36,7 +35,7 @@ class Bench:
     def reset(self):
         """Bring both to a known state: a board without a script, linked, disarmed, without a fault."""
         if not self.is_plain or self.board.process.poll() is not None:
-            self.replace_board(program=SHORT_INDICATOR_BOARD)
+            self.replace_board()
             self.is_plain = True
         if not self.is_plain_daemon:
             self.restart_daemon()

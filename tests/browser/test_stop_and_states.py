@@ -7,6 +7,7 @@ import signal
 import pytest
 from playwright.sync_api import expect
 
+from forked_process import FULL_INDICATOR
 from page_bench import INTERLOCK, SAFE_INPUTS
 from rig import wait_for
 from window import arm, list_violations, play_for, press_escape
@@ -216,17 +217,20 @@ def list_violations_in_both_schemes(page, axe):
 
 
 def test_an_open_interlock_is_said_in_words_acknowledged_and_kept_in_the_history(kept_window, bench, axe):
-    bench.replace_board(script=INTERLOCK)  # with the true indicator
+    bench.replace_board(script=INTERLOCK, program=FULL_INDICATOR)
     kept_window.reset()  # afterwards, so that the loss of the other board is not in the history
     page, board, daemon = kept_window.page, bench.board, bench.daemon
     faults = page.get_by_role("list", name="Faults").get_by_role("listitem")
     plans = page.get_by_role("list", name="Plans").get_by_role("listitem")
     expect(faults).to_have_text(["None."])
-    page.get_by_role("button", name="Arm …").click()
-    page.get_by_role("button", name="Confirm: arm the laser").click()
-    expect(page.locator("#board-state")).to_have_text("ARMING")
-    expect(page.locator("#bar")).to_have_attribute("data-state", "arming")
-    expect(page.locator("#board-state")).to_have_text("ARMED")
+    page.evaluate("""() => {
+        window.looks = [];
+        const note = (changes) => window.looks.push(...changes.map((change) => change.oldValue));
+        const observed = { attributes: true, attributeOldValue: true };
+        new MutationObserver(note).observe(document.getElementById("bar"), observed);
+    }""")
+    arm(page)
+    assert page.evaluate("window.looks") == ["off", "arming"]
     failed, waiting = play_for(daemon, 8.0), play_for(daemon, 1.0)
     trouble = page.get_by_role("alert").filter(has_text="Fault: INTERLOCK")
     expect(trouble).to_contain_text("close the enclosure")

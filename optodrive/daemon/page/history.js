@@ -2,6 +2,7 @@
 
 const FAULTS_MAX = 50;
 const PLANS_MAX = 50;
+const LEAVING_MS = 5000; // a page that is left or reloaded ends its own connection
 const STORE = "history";
 const TIME = new Intl.DateTimeFormat(undefined, { timeStyle: "medium", hourCycle: "h23" });
 const FRAME_NAME = /^frame \d+$/; // of a streamed frame, as the daemon names its plan
@@ -11,6 +12,8 @@ export class History {
     this.lists = { faults: find("fault-history"), plans: find("plan-history") };
     this.entries = { faults: [], plans: [] };
     this.planned = 0;
+    this.leftAt = -Infinity;
+    addEventListener("beforeunload", () => (this.leftAt = performance.now()));
     this.#restore();
     this.#show("faults");
     this.#show("plans");
@@ -27,7 +30,9 @@ export class History {
   }
 
   addNoDaemon() {
-    this.#addFault("bad", "The daemon does not answer");
+    if (performance.now() - this.leftAt > LEAVING_MS) {
+      this.#addFault("bad", "The daemon does not answer");
+    }
   }
 
   showPlans({ queue, totals }) {
