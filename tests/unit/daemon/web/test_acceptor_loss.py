@@ -1,0 +1,125 @@
+"""What the web process tells the link process about the acceptor, over real sockets."""
+
+import socket
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from optodrive.core.beat import BeatWriter
+from optodrive.core.ipc import IpcError, MessageSocket
+from optodrive.core.unix_listener import open_unix_listener
+from optodrive.daemon.runtime_folder import RuntimeFolder
+from optodrive.daemon.web import acceptor_client
+from optodrive.daemon.web.acceptor_client import AcceptorClient
+from optodrive.daemon.web.acceptor_protocol import BEAT
+from optodrive.daemon.web.access_policy import AccessPolicy
+from optodrive.daemon.web.daemon_client import DaemonClient
+from optodrive.daemon.web.tokens import Token, Tokens
+from optodrive.daemon.web.web_process import WebProcess
+from optodrive.device.config import DaemonSection
+from optodrive.device.config_file import load_config
+from optodrive.planning.display_model import DisplayModel
+
+PATIENCE_S = 5.0
+
+
+class WebRig:
+    """A web process in a thread, with the sockets of link and acceptor."""
+
+    def __init__(self, path, on_web_loss):
+        folder = RuntimeFolder(path, path / "link.sock", 0o600, Path("nowhere"))
+        link = open_unix_listener(folder.link_socket, 0o600, 1, "link")
+        acceptor = open_unix_listener(folder.acceptor_socket, 0o600, 1, "acceptor", socket.SOCK_SEQPACKET)
+        self._supervisor, channel = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        daemon = DaemonSection(on_web_loss=on_web_loss)
+        policy = AccessPolicy(Tokens([Token("viewer", "viewer", "x" * 16)]), daemon)
+        display = DisplayModel.from_config(load_config("display-16"))
+        client = AcceptorClient(folder.acceptor_socket)
+        self._beat = BeatWriter(channel.detach())
+        self._process = WebProcess(DaemonClient(display, folder), client, policy, self._beat, daemon)
+        self._thread = threading.Thread(target=self._process.server.run)
+        with link, acceptor:
+            self._thread.start()
+            self.acceptor = acceptor.accept()[0]
+            self._link = MessageSocket(link.accept()[0])
+        self.kinds = []
+
+    def await_message(self, is_expected, patience_s=PATIENCE_S):
+        """Return whether an expected message reaches the link process in time; note the kinds of all."""
+        until_s = time.monotonic() + patience_s
+        while time.monotonic() < until_s:
+            for message in self._link.receive():
+                self.kinds.append(message.kind)
+                if is_expected(message):
+                    return True
+            time.sleep(0.01)
+        return False
+
+    def close(self):
+        self._process.end()
+        self._thread.join(20)
+        self.acceptor.close()
+        self._link.close()
+        self._supervisor.close()
+        self._beat.close()
+        assert not self._thread.is_alive()
+
+
+@pytest.fixture
+def start(tmp_path):
+    rigs = []
+
+    def start(on_web_loss="dark"):
+        rigs.append(WebRig(tmp_path, on_web_loss))
+        return rigs[-1]
+
+    yield start
+    for rig in rigs:
+        rig.close()
+
+
+def is_beat(alive):
+    return lambda message: message.kind == "beat" and message.fields["alive"] is alive
+
+
+def is_stop(message):
+    return message.kind == "stop"
+
+
+def test_the_lease_is_withheld_while_the_acceptor_sends_no_beats(start, monkeypatch):
+    monkeypatch.setattr(acceptor_client, "BEAT_AGE_MAX_S", 0.3)
+    rig = start()
+    rig.acceptor.send(BEAT)
+    assert rig.await_message(is_beat(True))
+    assert rig.await_message(is_beat(False))
+    rig.acceptor.send(BEAT)
+    assert rig.await_message(is_beat(True))
+    assert "stop" not in rig.kinds
+
+
+def test_the_end_of_the_acceptor_stops_the_board(start):
+    rig = start()
+    assert rig.await_message(is_beat(True))
+    assert "stop" not in rig.kinds
+    rig.acceptor.close()
+    assert rig.await_message(is_stop)
+    assert rig.await_message(is_beat(False))
+
+
+def test_a_plan_may_finish_without_the_acceptor_if_so_configured(start):
+    rig = start("finish")
+    assert rig.await_message(is_beat(True))
+    rig.acceptor.close()
+    assert rig.await_message(is_beat(False))
+    assert "stop" not in rig.kinds
+
+
+def test_the_board_is_stopped_before_the_last_client_has_gone(start):
+    rig = start()
+    assert rig.await_message(is_beat(True))
+    rig._process.end()
+    with pytest.raises(IpcError):
+        rig.await_message(lambda message: False)
+    assert "stop" in rig.kinds
