@@ -122,7 +122,7 @@ def check_caps(kind, seed):
         assert fraction <= 1 + 1e-6, f"{name} cap exceeded: {fraction}"
 
 
-@settings(max_examples=600, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(kind=st.sampled_from(KINDS), seed=st.integers(0, 2**40))
 def test_no_sequence_exceeds_a_cap(kind, seed):
     check_caps(kind, seed)

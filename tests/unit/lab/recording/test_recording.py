@@ -346,7 +346,7 @@ def test_a_file_is_tried_out_once(path, monkeypatch):
 
 
 def test_damage_on_which_hdf5_2_0_searches_for_ever_comes_to_an_end(path, monkeypatch):
-    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 2)
+    monkeypatch.setattr(sandboxed_probe, "CPU_LIMIT_S", 1)
     content = bytearray(path.read_bytes())
     content[content.index(b"GCOL") + 24] = 255  # the length of the first text of the file
     path.write_bytes(content)

@@ -106,9 +106,19 @@ def move_sequences(draw):
     return galvo, rows
 
 
-@settings(max_examples=400)
 @given(move_sequences())
 def test_no_servo_exceeds_the_bound(case):
+    check_bound(case)
+
+
+@pytest.mark.slow
+@settings(max_examples=400)
+@given(move_sequences())
+def test_no_servo_exceeds_the_bound_in_many_sequences(case):
+    check_bound(case)
+
+
+def check_bound(case):
     galvo, rows = case
     assert simulate_peak(galvo, rows) <= compute_bound(galvo, rows) * (1 + 1e-4)
 

@@ -34,6 +34,15 @@ def path_length(tour, origin=None):
     return sum(moves) / PITCH_RAD
 
 
+def shortest_path_length(active, origin=None):
+    """Compute the length of the shortest of all orders of some pixels, in pitches."""
+    tours = np.array(list(permutations(active)))
+    if origin is not None:
+        tours = np.hstack([np.full((len(tours), 1), origin), tours])
+    moves = np.maximum(np.abs(np.diff(X_RAD[tours])), np.abs(np.diff(Y_RAD[tours])))
+    return moves.sum(axis=1).min() / PITCH_RAD
+
+
 @given(
     active=st.sets(st.integers(0, COUNT - 1), min_size=1, max_size=80),
     origin=st.none() | st.integers(0, COUNT - 1),
@@ -55,7 +64,7 @@ def test_every_pixel_once_and_never_longer_than_row_by_row(active, origin):
     origin=st.none() | st.integers(0, COUNT - 1),
 )
 def test_small_sets_against_every_order(active, origin):
-    shortest = min(path_length(tour, origin) for tour in permutations(active))
+    shortest = shortest_path_length(active, origin)
     assert path_length(compute_order(active, origin), origin) <= 1.35 * shortest + 1e-9
 
 
@@ -65,7 +74,7 @@ def test_small_sets_are_close_to_the_shortest_on_average():
     for _ in range(60):
         active = generator.choice(COUNT, 7, replace=False).tolist()
         ours += path_length(compute_order(active))
-        best += min(path_length(tour) for tour in permutations(active))
+        best += shortest_path_length(active)
     assert ours <= 1.03 * best
 
 
