@@ -36,7 +36,7 @@ def test_a_board_that_comes_late_is_found(start, tmp_path):
     board = Board(tmp_path)
     try:
         line = daemon.process.stdout.readline()
-        assert line == f"optodrive: board at {board.port}, DISARMED; arm with `optodrive arm`\n"
+        assert line == f"optodrive: board at {board.port}, DISARMED; arm with `optodrive arm --url {daemon.url}`\n"
         assert daemon.arm()["board"]["state"] == "ARMED"
     finally:
         daemon.stop()

@@ -133,7 +133,10 @@ def test_a_signal_ends_it(make_board, start, number):
 
 @pytest.mark.parametrize(
     ("script", "says"),
-    [(step_of(3.5, "set", "interlock"), "INTERLOCK"), (step_of(3.5, "do", "close"), "lost")],
+    [
+        (f'{step_of(0.2, "set", "interlock")}from = "light"\n', "INTERLOCK"),
+        (f'{step_of(0.2, "do", "close")}from = "light"\n', "lost"),
+    ],
 )
 def test_a_failure_during_the_run(make_board, start, script, says):
     board = make_board(sensor=(), script=script)

@@ -65,9 +65,12 @@ def test_telemetry_is_as_documented(open_daemon):
     assert "1 selected" in schemathesis(open_daemon, *only, examples=2)
 
 
-def test_the_document_while_armed(open_daemon):
+@pytest.mark.parametrize(
+    "phases", ["examples,fuzzing", pytest.param("examples,coverage,fuzzing,stateful", marks=pytest.mark.slow)]
+)
+def test_the_document_while_armed(open_daemon, phases):
     open_daemon.arm()
-    schemathesis(open_daemon, *KEEPS_ARMED, "--exclude-path", TELEMETRY, examples=3)
+    schemathesis(open_daemon, *KEEPS_ARMED, "--exclude-path", TELEMETRY, "--phases", phases, examples=3)
     assert open_daemon.state()["totals"]["executed"] > 0
 
 

@@ -254,7 +254,7 @@ def test_a_port_in_use(armed, tmp_path):
 
 
 def test_no_daemon(tmp_path):
-    done = subprocess.run(
+    done = run_process(
         [OPTODRIVE, "status", "--url", "http://127.0.0.1:9"],
         capture_output=True,
         text=True,
@@ -264,10 +264,14 @@ def test_no_daemon(tmp_path):
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.parametrize("arguments", [["serve", "--port", "0"], ["config", "show", "--json"]])
-def test_a_full_disk_behind_stdout_ends_in_one_line(arguments, tmp_path):
+@pytest.mark.parametrize(
+    ("run_command", "arguments"),
+    [(run_process, ["serve", "--port", "0"]), (subprocess.run, ["config", "show", "--json"])],
+    ids=["serve", "config"],
+)
+def test_a_full_disk_behind_stdout_ends_in_one_line(run_command, arguments, tmp_path):
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
+        done = run_command(
             [OPTODRIVE, *arguments],
             stdout=full,
             stderr=subprocess.PIPE,
