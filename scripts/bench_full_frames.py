@@ -76,6 +76,10 @@ class FrameStream:
                 self.errors[type(error).__name__] += 1
                 time.sleep(1.0)
 
+    def stop(self):
+        """End the stream before its time."""
+        self._end_s = 0.0
+
     def _stream(self):
         url = self._daemon.url.replace("http", "ws") + "/v1/stream"
         header = {"Authorization": f"Bearer {TOKEN}"}

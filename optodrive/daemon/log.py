@@ -13,15 +13,15 @@ import sys
 import threading
 from contextlib import suppress
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import Literal
 
 from optodrive.core.clock import Clock, MonotonicClock
 
 JOURNAL = Path("/run/systemd/journal/socket")
 LINE_MAX = 8000
 BYTES_MAX = 256_000
-WRITE_MAX = 1000
-"""Characters per write, not more than a pipe accepts at once when it accepts any."""
+WRITE_MAX = 4000
+"""Bytes per write, not more than a pipe accepts at once when it accepts any."""
 PERIOD_S = 60.0
 """At most BYTES_MAX bytes of lines are written per period; the number of those omitted follows in one line."""
 LogLevel = Literal["err", "warning", "notice", "info"]
@@ -88,22 +88,19 @@ class DaemonLog:
 
 def _write_to_stderr(text: str) -> bool:
     """Write a text unless its reader has stalled. Return whether all of it was written."""
-    for begin in range(0, len(text), WRITE_MAX):
-        if not _accepts(sys.stderr):
-            return False
-        sys.stderr.write(text[begin : begin + WRITE_MAX])
-        sys.stderr.flush()
-    return True
-
-
-def _accepts(stream: TextIO) -> bool:
-    """Return whether a write of WRITE_MAX characters would not wait."""
-    poll = select.poll()
     try:
-        poll.register(stream.fileno(), select.POLLOUT)
+        descriptor = sys.stderr.fileno()
     except (OSError, ValueError):  # without a descriptor, nothing waits
+        sys.stderr.write(text)
         return True
-    return bool(poll.poll(0))
+    data = text.encode(errors="replace")
+    poll = select.poll()
+    poll.register(descriptor, select.POLLOUT)
+    for begin in range(0, len(data), WRITE_MAX):
+        if not poll.poll(0):
+            return False
+        os.write(descriptor, data[begin : begin + WRITE_MAX])  # past the stream's buffer, which keeps a failed text
+    return True
 
 
 def format_entry(line: str, level: LogLevel, fields: dict[str, object]) -> bytes:

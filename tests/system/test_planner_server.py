@@ -51,6 +51,7 @@ class Web:
 
     def submit(self, sequence, epoch=None, streamed=False, fit="as_is"):
         fields = {"name": "push", "policy": "trim", "fit": fit, "streamed": streamed, "caller": "token"}
+        fields["lists_pulses"] = not streamed
         epoch = self.engine.web.status["epoch"] if epoch is None else epoch
         return self.request("submit", encode_sequence(sequence), arrived_s=time.monotonic(), epoch=epoch, **fields)
 

@@ -190,6 +190,7 @@ class Engine:
         epoch: int | None = None,
         caller: str = "",
         caller_left: threading.Event = NEVER,
+        lists_pulses: bool = True,
     ) -> "Future[PlanReport]":
         """Plan the sequence that `build` returns, and queue the plan. Raise BusyError if too many requests wait.
 
@@ -197,6 +198,7 @@ class Engine:
         arrived_s: host time at which the request arrived; epoch: in which it arrived; both now by default
         caller: name of the token that submitted it
         caller_left: set when the caller no longer waits, which ends the planning
+        lists_pulses: whether the answer lists the pulses one by one
         """
         if streamed and fit != "as_is":
             raise InputError("fit", fit, "as_is for streamed plans: a stream has no time for a feasibility check")
@@ -204,7 +206,7 @@ class Engine:
         ago_s = 0.0 if arrived_s is None else self._clock.now_s() - arrived_s
         board_s = self.board_s() - ago_s
         return self._planner.submit(
-            PlanningRequest(build, name, policy, fit, streamed, board_s, epoch, caller, caller_left)
+            PlanningRequest(build, name, policy, fit, streamed, board_s, epoch, caller, caller_left, lists_pulses)
         )
 
     def _require_armed(self) -> None:

@@ -32,6 +32,7 @@ class PlanningRequest(NamedTuple):
     streamed: replace everything not yet sent; the next streamed plan replaces this one in the same way
     arrived_s: board time of the request's arrival; epoch: in which it arrived
     caller: name of the token that submitted it; caller_left: set when the caller no longer waits
+    lists_pulses: whether the answer lists the pulses one by one
     """
 
     build: Callable[[], FrameSequence]
@@ -43,6 +44,7 @@ class PlanningRequest(NamedTuple):
     epoch: int = 0
     caller: str = ""
     caller_left: threading.Event = NEVER
+    lists_pulses: bool = True
 
 
 def make_plan(

@@ -116,7 +116,7 @@ class Planner:
         try:
             check(0.0)
             plan = self._plan_until_committed(request.build(), request, check)
-            return plan.record.build_report(self._session.board_s())
+            return plan.record.build_report(self._session.board_s(), request.lists_pulses)
         finally:
             self._progress_at_s = self._clock.now_s()
 

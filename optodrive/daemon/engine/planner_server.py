@@ -100,6 +100,7 @@ class PlannerServer:
             fields["epoch"],
             fields["caller"],
             caller_left,
+            fields["lists_pulses"],
         )
         client.requests[request_id] = caller_left, future
 

@@ -1,7 +1,7 @@
 """Worker process of the preview process: a forked child that does one job at a time within limits.
 
-A job that exceeds its time ends with its worker. Fresh workers serve at normal priority; dry runs, and builds that take
-longer than usual, run at low priority and are the last job of their worker.
+A job that exceeds its time ends with its worker. Fresh workers have the priority of the preview process; dry runs, and
+builds that take longer than usual, run at low priority and are the last job of their worker.
 """
 
 import ctypes

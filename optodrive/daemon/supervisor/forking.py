@@ -30,8 +30,9 @@ def fork_child(run: Callable[[], int], name: str, kept: Iterable[int]) -> int:
     """
     if threading.active_count() != 1:
         raise RuntimeError(f"a process with {threading.active_count()} threads must not fork: {threading.enumerate()}")
-    sys.stdout.flush()
-    sys.stderr.flush()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError):  # a full disk
+            stream.flush()
     parent = os.getpid()
     previous_mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     pid = os.fork()

@@ -32,7 +32,10 @@ NO_EPOCH = 0
 
 
 class PushFields(NamedTuple):
-    """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token."""
+    """Fields of a push. arrived_s: monotonic time of its arrival; epoch: in which it arrived; caller: its token.
+
+    lists_pulses: whether the answer lists the pulses one by one
+    """
 
     name: str
     policy: Policy
@@ -41,6 +44,7 @@ class PushFields(NamedTuple):
     arrived_s: float
     epoch: int
     caller: str
+    lists_pulses: bool = True
 
 
 class LinkClient:

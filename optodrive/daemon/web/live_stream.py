@@ -98,6 +98,7 @@ class LiveStream:
                 arrived_s=frame.arrived_s,
                 epoch=frame.epoch,
                 caller=self._caller,
+                lists_pulses=False,
             )
             try:
                 result = await self._daemon.planner.submit(frame.sequence, push)

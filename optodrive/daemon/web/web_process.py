@@ -13,6 +13,7 @@ from fastapi import FastAPI
 
 from optodrive.core.beat import OUT_OF_MEMORY, BeatWriter, SupervisorGoneError
 from optodrive.daemon.log import open_daemon_log
+from optodrive.daemon.priority import raise_priority
 from optodrive.daemon.runtime_folder import RuntimeFolder
 from optodrive.daemon.web.acceptor_client import AcceptorClient
 from optodrive.daemon.web.access_policy import AccessPolicy
@@ -27,8 +28,6 @@ from optodrive.device.config import DaemonSection
 from optodrive.planning.display_model import DisplayModel
 
 BEAT_INTERVAL_S = 0.05
-NICE = -10
-"""Priority, so that STOP is read in time beside other work on the computer; less than real time, which the link has."""
 READY_TIMEOUT_S = 1.0
 """Time after which the server accepts callers and counts as ready, even if another process does not run."""
 STATE_POLL_S = 0.005
@@ -45,8 +44,7 @@ def run_web(
 
     daemon: settings, whose reloaded keys may differ from the display's
     """
-    with suppress(OSError):  # not permitted to every user
-        os.setpriority(os.PRIO_PROCESS, 0, NICE)
+    raise_priority()
     with ExitStack() as exit_stack:
         log = open_daemon_log()
         exit_stack.callback(log.close)
