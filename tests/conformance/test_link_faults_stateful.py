@@ -20,6 +20,8 @@ from optodrive.core.errors import LinkError
 from optodrive.link.session.session import BoardSession
 
 UNSAFE = (("interlock", False), ("key", False), ("estop", True))
+EXAMPLES = settings.default.max_examples * 3 // 5
+"""24 in every run, 60 with --slow."""
 ENDING = tuple(HOST[name][0] for name in ("HELLO", "ABORT"))
 
 
@@ -165,7 +167,7 @@ class Owner(RuleBasedStateMachine):
 
 
 TestOwner = Owner.TestCase
-TestOwner.settings = settings(max_examples=60, stateful_step_count=30)
+TestOwner.settings = settings(max_examples=EXAMPLES, stateful_step_count=30)
 
 
 def test_a_session_that_rearms_by_itself_is_detected(monkeypatch):

@@ -13,8 +13,8 @@ enum uart { UART_HOST, UART_WITNESS, UART_BENCH, UARTS };
 bool chip_start(void);
 /* Returns µs since power-up; must be called at least once per hour to detect wraps. */
 uint64_t chip_now_us(void);
-/* Sleeps until a byte arrives or until a time, a few milliseconds at most. */
-void chip_sleep(uint64_t until_us);
+/* Sleeps until a byte arrives or until a time, a few milliseconds at most. host: whether bytes of the host wait, too. */
+void chip_sleep(uint64_t until_us, bool host);
 void chip_feed_watchdog(void);
 /* Reads up to size received bytes. */
 size_t chip_read(enum uart uart, uint8_t *bytes, size_t size);

@@ -120,7 +120,7 @@ static void read_exactly(uint8_t *bytes, size_t n) {
     for (size_t have = 0; have < n;) {
         have += chip_read(UART_BENCH, bytes + have, n - have);
         if (have < n) {
-            chip_sleep(UINT64_MAX);
+            chip_sleep(UINT64_MAX, false);
         }
     }
 }
@@ -170,7 +170,7 @@ static void set_inputs(uint8_t value, uint64_t now_us) {
 static void miss_ticks(void) {
     uint64_t until_us = chip_now_us() + BOARD_TICK_LATE_US + 2u * BOARD_TICK_US;
     while (chip_now_us() < until_us) {
-        chip_sleep(until_us);
+        chip_sleep(until_us, false);
     }
 }
 
@@ -218,7 +218,7 @@ int main(void) {
     configure();
     board_init(&board, &hal, &config, watchdog_reset ? RESET_WATCHDOG : RESET_POWER_UP, chip_now_us());
     for (;;) {
-        chip_sleep(board_next_due_us(&board));
+        chip_sleep(board_next_due_us(&board), !loop_stopped);
         board_tick(&board, chip_now_us());
         run_bench_commands();
         if (!loop_stopped) {
