@@ -40,6 +40,7 @@ class Bench:
         if not self.is_plain_daemon:
             self.restart_daemon()
         self.daemon.call("POST", "/v1/disarm")
+        self.daemon.call("PUT", "/v1/dim", json={"share": 1.0})
         wait_for(lambda: self.daemon.board_state() == "DISARMED", "the board to be disarmed")
         self.board.forget()
 

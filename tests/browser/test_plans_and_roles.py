@@ -56,7 +56,7 @@ def check_state(daemon, *plans):
 
 
 ROLES = {
-    "viewer": {"Arm …": "armer", "Disarm": "operator", "Preview": "operator", "End p": "operator"},
+    "viewer": {"Arm …": "armer"} | dict.fromkeys(("Disarm", "Maximum power", "Preview", "End p"), "operator"),
     "operator": {"Arm …": "armer"},
     "armer": {},
 }
@@ -125,8 +125,9 @@ def test_confirm_follows_arm_within_five_seconds_and_the_focus_is_kept(page, dae
     expect(page.get_by_role("button", name="Arm …")).to_be_disabled()
     page.keyboard.press("Enter")
     expect(page.locator("#confirm-arm")).to_be_hidden()
-    page.keyboard.press("Tab")
-    assert read_focus(page) == "disarm"
+    for following in ("hold", "disarm"):
+        page.keyboard.press("Tab")
+        assert read_focus(page) == following
 
 
 def look_at_hold(page, daemon):
@@ -184,6 +185,48 @@ def test_a_page_that_is_not_there_holds_nothing(page, daemon, loss):
     wait_for(lambda: daemon.board_state() == "DISARMED", "the arming to end", patience_s=2.5)
     assert daemon.state()["control"] is None
     page.keyboard.up("Enter")
+
+
+def press_key_and_wait(page, key):
+    with page.expect_response("**/v1/dim"):
+        page.keyboard.press(key)
+
+
+def test_the_power_is_dimmed_by_operators_and_raised_by_armers(window, page, daemon, axe):
+    slider = page.get_by_role("slider", name="Maximum power")
+    mark = page.locator("#dimmed")
+    expect(slider).to_have_value("100")
+    expect(mark).to_be_hidden()
+    window.sign_in(read_role_tokens(daemon)["operator"])
+    expect(page.locator("#caller")).to_have_text("operator")
+    expect(slider).to_be_enabled()
+    slider.focus()
+    for _ in range(2):
+        press_key_and_wait(page, "PageDown")
+    share = daemon.state()["limits"]["power_share"]
+    assert share in (0.8, 0.9)
+    expect(mark).to_have_text(f"≤ {share:.0%}".replace("%", " %"))
+    expect(page.locator("#dim-note")).to_contain_text("From the next plan on")
+    page.keyboard.press("ArrowUp")
+    expect(page.locator("#dim-note")).to_have_text("Raising the power needs the role armer.")
+    assert list_violations(page, axe) == []
+    assert daemon.state()["limits"]["power_share"] == share
+    daemon.call("PUT", "/v1/dim", json={"share": 0.25})
+    expect(mark).to_have_text("≤ 25 %")
+    page.locator("#display").focus()
+    expect(slider).to_have_value("25")
+
+    window.sign_in(read_role_tokens(daemon)["viewer"])
+    expect(slider).to_be_disabled()
+    window.sign_in(TOKEN)
+    daemon.arm()
+    planned = play_for(daemon, 3.0)
+    expect(page.locator("#timeline-text")).to_contain_text("of them trimmed (dimmed power)")
+    assert set(daemon.call("GET", f"/v1/plans/{planned}")["summary"]["trimmed"]["by_reason"]) == {"dim"}
+    slider.focus()
+    press_key_and_wait(page, "End")
+    expect(mark).to_be_hidden()
+    assert daemon.state()["limits"]["power_share"] == 1.0
 
 
 ANNA = "a-token-for-anna"

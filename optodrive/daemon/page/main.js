@@ -5,6 +5,7 @@ import { call } from "./api.js";
 import { LEASED_STATES } from "./board_states.js";
 import { setCapLabels } from "./caps.js";
 import { buildColourMap } from "./colours.js";
+import { DimControl } from "./dim.js";
 import { DisplayView } from "./display.js";
 import { Drawing } from "./draw.js";
 import { Freshness } from "./freshness.js";
@@ -75,6 +76,7 @@ const arm = new ArmControl(find, announce, showError);
 const hold = new HoldControl(find, announce, () => plans.playPreviewed());
 const header = new Header(find, announce);
 const permissions = new Permissions(find);
+const dim = new DimControl(find, config.limits.power_share, () => permissions.caller, announce, showError);
 const status = new Status(find, () => arm.disarm(), () => permissions.apply());
 const panelOf = (id) => find(id).closest(".panel");
 const freshness = new Freshness(
@@ -240,6 +242,7 @@ function showNothingKnown(reason) {
   arm.show("");
   hold.show("");
   arm.showControl(null);
+  dim.show(null);
   showTitle();
 }
 
@@ -286,6 +289,7 @@ telemetry.addEventListener("state", ({ detail }) => {
   queue.show(detail.queue);
   pastEvents.showPlans(detail);
   arm.show(isLinked ? detail.board.state : "");
+  dim.show(detail.limits.power_share);
   hold.show(isLinked ? detail.board.state : "");
   arm.showControl(isLinked ? detail.control : null, permissions.caller?.name);
   hasLink = isLinked;

@@ -137,7 +137,7 @@ CAPS = (
     ),
     Cap(
         key="dim",
-        label="power, dimmed to",
+        label="dimmed power",
         message="dim cap",
         unit="of full power",
         setting="power_share",

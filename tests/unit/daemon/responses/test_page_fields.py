@@ -47,6 +47,7 @@ VARIABLES = {
     "permissions.js": {"caller": CallerReport},
     "plans.js": {"plan": PlanReport, "summary": PlanSummary, "delay": DelaySummary},
     "queue.js": {"plan": QueuedPlan, "queue": QueueReport},
+    "dim.js": {"state": StateReport},
     "hold.js": {"report": HoldReport},
     "header.js": {"board": StateReport.model_fields["board"].annotation},
     "status.js": {"fault": FaultEvent, "board": StateReport.model_fields["board"].annotation},
