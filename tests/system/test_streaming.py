@@ -13,7 +13,7 @@ from optodrive.planning.pipeline import plan_sequence
 from rig import ended, wait_for
 
 RESERVED_S = 0.5
-"""Time reserved for planning where a late plan would make a pause, which is right, but not what is tested."""
+"""Time reserved for planning, so that no plan is late on a busy machine, which would make a pause."""
 
 
 def frame(pixels, height_um=100.0):
@@ -26,11 +26,13 @@ def stream(armed, sequence):
     return armed.submit(lambda: sequence, "stream", streamed=True).result(10)
 
 
-def test_the_newest_frame_wins_without_a_pause(armed, board):
+@pytest.mark.parametrize("reserved_s", [RESERVED_S, pytest.param(None, marks=pytest.mark.slow)])
+def test_the_newest_frame_wins_without_a_pause(armed, board, reserved_s):
     """A frame of 85 pixels takes seconds. A new one follows when a part of the previous one was executed."""
     answers = []
     for k in range(5):
-        armed._planner._last_planning_s = RESERVED_S / PLANNING_TIME_FACTOR
+        if reserved_s is not None:
+            armed._planner._last_planning_s = reserved_s / PLANNING_TIME_FACTOR
         answers.append(stream(armed, frame(range(85 * k, 85 * k + 85), 300.0 if k < 4 else 60.0)))
         wait_for(lambda: armed.get_plan(answers[-1].plan).executed >= 12, "a part of the frame")
     records = [ended(armed, answer) for answer in answers]
