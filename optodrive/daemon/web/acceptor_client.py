@@ -13,6 +13,8 @@ from optodrive.daemon.web.waiting_room import Waiting
 RETRY_S = 0.05
 BEAT_AGE_MAX_S = 1.0
 """Age of the acceptor's last beat beyond which it counts as stalled."""
+STALL_S = 0.5
+"""A loop that was away for longer was stalled itself, and judges nobody by the time that has passed."""
 PACKETS_MAX = 16
 """Packets taken per turn of the loop."""
 PERMITTED = {Rank.STOP: 16, Rank.TOKEN: 2, Rank.OTHER: 1}
@@ -32,17 +34,20 @@ class AcceptorClient:
         self._path = path
         self._socket: socket.socket | None = None
         self._retry: asyncio.TimerHandle | None = None
-        self._beaten_s = -float("inf")
+        self._beaten_s = self._checked_s = -float("inf")
 
     @property
     def is_connected(self) -> bool:
         """Whether the connection is up."""
         return self._socket is not None
 
-    @property
-    def is_alive(self) -> bool:
-        """Whether the acceptor's loop runs, so that a new caller could stop."""
-        return self._socket is not None and time.monotonic() - self._beaten_s <= BEAT_AGE_MAX_S
+    def check_beats(self) -> bool:
+        """Return whether the acceptor's loop runs, so that a new caller could stop. Call it at every beat."""
+        now_s = time.monotonic()
+        if now_s - self._checked_s > STALL_S:
+            self._beaten_s = now_s
+        self._checked_s = now_s
+        return self._socket is not None and now_s - self._beaten_s <= BEAT_AGE_MAX_S
 
     def start(self) -> None:
         """Connect, and keep connecting until `close`."""

@@ -126,7 +126,7 @@ class WebProcess:
     async def _send_beats(self) -> None:
         deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False
         while True:
-            self._client.link.beat(alive=self._acceptor.is_alive)
+            self._client.link.beat(alive=self._acceptor.check_beats())
             self._beat.beat()
             is_complete = self._client.is_complete and self._acceptor.is_connected
             if not is_ready and self.server.started and (is_complete or time.monotonic() > deadline_s):

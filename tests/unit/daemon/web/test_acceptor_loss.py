@@ -51,11 +51,17 @@ class WebRig:
         until_s = time.monotonic() + patience_s
         while time.monotonic() < until_s:
             for message in self._link.receive():
-                self.kinds.append(message.kind)
+                self.kinds.append("not alive" if message.fields.get("alive") is False else message.kind)
                 if is_expected(message):
                     return True
             time.sleep(0.01)
         return False
+
+    def suspend(self, duration_s):
+        """Keep the web process's loop for a time, and discard what it sent before."""
+        self._process.server.loop.call_soon_threadsafe(time.sleep, duration_s)
+        self.await_message(lambda message: False, duration_s / 2)
+        self.kinds.clear()
 
     def close(self):
         self._process.end()
@@ -97,6 +103,14 @@ def test_the_lease_is_withheld_while_the_acceptor_sends_no_beats(start, monkeypa
     rig.acceptor.send(BEAT)
     assert rig.await_message(is_beat(True))
     assert "stop" not in rig.kinds
+
+
+def test_a_web_process_that_was_suspended_itself_does_not_blame_the_acceptor(start):
+    rig = start()
+    assert rig.await_message(is_beat(True))
+    rig.suspend(1.5 * acceptor_client.BEAT_AGE_MAX_S)
+    assert rig.await_message(is_beat(True))
+    assert "not alive" not in rig.kinds
 
 
 def test_the_end_of_the_acceptor_stops_the_board(start):

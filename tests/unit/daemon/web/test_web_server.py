@@ -224,6 +224,21 @@ def test_a_connection_with_a_valid_token_gives_way_last(open_client, monkeypatch
     assert trusted.ask(GET)
 
 
+def test_who_has_no_token_takes_no_place_from_who_has_one(open_client, monkeypatch):
+    monkeypatch.setattr(connections, "CONNECTIONS_MAX", 4)
+    get_trusted = GET.replace(b"/v1/state", b"/trusted")
+    trusted = [open_client() for _ in range(4)]
+    assert all(client.ask(get_trusted) for client in trusted)
+    newcomers = [open_client() for _ in range(3)]
+    for newcomer in newcomers:
+        newcomer.send(GET)
+    time.sleep(0.3)
+    assert not any(client.is_closed() for client in trusted)
+    with_token = open_client()
+    assert with_token.ask(STOP.replace(b"POST /v1/stop", b"GET /trusted"))
+    assert [client.is_closed() for client in trusted] == [True, False, False, False]
+
+
 def test_the_longest_idle_connection_gives_way_to_a_new_one(open_client, monkeypatch):
     monkeypatch.setattr(connections, "CONNECTIONS_MAX", 10)
     idle = [open_client() for _ in range(10)]
