@@ -63,7 +63,9 @@ def test_an_operator_lowers_the_power_an_armer_raises_it_and_a_restart_keeps_it(
     assert find_max_share(board) > 0.2
 
 
-@pytest.mark.parametrize("body", [b"", b"{}", b"[]", b'{"share": 1.1}', b'{"share": -1}', b'{"share": "x"}', b"0.5"])
+@pytest.mark.parametrize(
+    "body", [b"", b"{}", b"[]", b'{"share": 1.1}', b'{"share": -1}', b'{"share": "0.5"}', b'{"share": true}', b"0.5"]
+)
 def test_other_bodies_are_refused(bright, body):
     problem = bright.call("PUT", "/v1/dim", 422, content=body)
     assert problem["expected"] == '{"share": a number from 0 to 1}'

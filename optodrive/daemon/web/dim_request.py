@@ -20,7 +20,7 @@ DIM_EXAMPLE = {"share": 0.4}
 class DimRequest(JsonModel):
     """The largest power of a pulse, as a share of the laser's."""
 
-    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+    share: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False, strict=True)]
 
 
 def parse_dim_request(body: bytes) -> DimRequest:
