@@ -206,7 +206,7 @@ def test_the_power_is_dimmed_by_operators_and_raised_by_armers(window, page, dae
     share = daemon.state()["limits"]["power_share"]
     assert share in (0.8, 0.9)
     expect(mark).to_have_text(f"≤ {share:.0%}".replace("%", " %"))
-    expect(page.locator("#dim-note")).to_contain_text("From the next plan on")
+    expect(page.locator("#dim-note")).to_have_text("Applies from the next plan on.")
     page.keyboard.press("ArrowUp")
     expect(page.locator("#dim-note")).to_have_text("Raising the power needs the role armer.")
     assert list_violations(page, axe) == []

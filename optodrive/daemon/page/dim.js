@@ -38,7 +38,7 @@ export class DimControl {
     this.slider.value = share === null ? this.slider.max : Math.round(share * 100);
     this.value.textContent = share === null ? "unknown" : format(share);
     this.note.hidden = share === null || share >= 1;
-    this.note.textContent = "From the next plan on; what plays and waits keeps its power.";
+    this.note.textContent = "Applies from the next plan on.";
   }
 
   #choose() {

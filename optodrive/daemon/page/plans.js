@@ -96,9 +96,9 @@ export class PlanControl extends EventTarget {
     this.#showLines(...lines);
   }
 
-  // Play what was previewed, if anything was.
+  // Play what was previewed, if anything was; also while the end of what it has played before is not known yet.
   playPreviewed() {
-    if (!this.playButton.disabled) {
+    if (this.previewed) {
       this.#play();
     }
   }
