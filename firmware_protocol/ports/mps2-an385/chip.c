@@ -111,3 +111,8 @@ void chip_write(enum uart uart, const uint8_t *bytes, size_t n) {
         REGISTER(UART_AT(uart) + UART_DATA) = bytes[k];
     }
 }
+
+void chip_flush(enum uart uart) {
+    while (REGISTER(UART_AT(uart) + UART_STATE) & 1u) {
+    }
+}

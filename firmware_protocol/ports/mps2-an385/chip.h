@@ -19,5 +19,7 @@ void chip_feed_watchdog(void);
 /* Reads up to size received bytes. */
 size_t chip_read(enum uart uart, uint8_t *bytes, size_t size);
 void chip_write(enum uart uart, const uint8_t *bytes, size_t n);
+/* Waits until the last written byte has left. */
+void chip_flush(enum uart uart);
 
 #endif

@@ -87,6 +87,7 @@ static int16_t on_temperature(void *context) {
 
 static void on_send(void *context, const uint8_t *frame, size_t length) {
     (void)context;
+    chip_flush(UART_WITNESS); /* the log precedes the answer, also if a full socket delayed its last byte */
     chip_write(UART_HOST, frame, length);
 }
 
