@@ -12,6 +12,7 @@ import sys
 import time
 from contextlib import suppress
 from functools import partial
+from math import inf
 from pathlib import Path
 
 from optodrive.core.beat import BeatWriter
@@ -27,7 +28,7 @@ from optodrive.daemon.supervisor.link_view import LinkView
 from optodrive.daemon.supervisor.supervisor import Supervisor
 
 LIFE_S = 0.1
-"""A child that dies or hangs does so after this time."""
+"""A child that dies or hangs does so after this time, and not before the daemon serves: that would end the daemon."""
 STATUS = {"connected": True, "port": "tty", "board": {"state": "DISARMED"}}
 
 MUTANTS = {
@@ -54,12 +55,14 @@ def behave(behaviour, name, folder, beat):
     note(folder, f"{name} starts", descriptors=len(list(Path("/proc/self/fd").iterdir())) - 1)
     beat.report_ready()
     clients = []
-    started_s = time.monotonic()
+    served_s = inf
     while True:
         is_last = bool(ends)
-        if time.monotonic() - started_s > LIFE_S and behaviour == "die":
+        if served_s == inf and (folder / "serving").exists():
+            served_s = time.monotonic()
+        if time.monotonic() - served_s > LIFE_S and behaviour == "die":
             os._exit(3)
-        if time.monotonic() - started_s > LIFE_S and behaviour == "hang":
+        if time.monotonic() - served_s > LIFE_S and behaviour == "hang":
             note(folder, f"{name} hangs")
             time.sleep(60)
         beat.beat()
@@ -111,6 +114,7 @@ def main():
         web = children.pop("web")
         if supervisor.start_others(list(children.values()), web):
             note(folder, "serves")
+            (folder / "serving").touch()
             supervisor.serve()
     finally:
         supervisor.close()
