@@ -181,7 +181,7 @@ def test_a_page_that_is_not_there_holds_nothing(page, daemon, loss):
     elif loss == "navigated":
         page.goto("about:blank")
     else:
-        page.evaluate("setTimeout(() => { for (const end = Date.now() + 3000; Date.now() < end; ); })")
+        page.evaluate("setTimeout(() => { for (const end = Date.now() + 2000; Date.now() < end; ); })")
     wait_for(lambda: daemon.board_state() == "DISARMED", "the arming to end", patience_s=2.5)
     assert daemon.state()["control"] is None
     page.keyboard.up("Enter")
