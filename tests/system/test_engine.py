@@ -44,7 +44,11 @@ def test_a_busy_planner_keeps_the_lease(armed):
 
 
 def test_a_queued_plan_accounts_for_the_heat_of_the_previous_one(armed):
-    first = armed.submit(lambda: frame(300.0), "first").result(10)
+    heated = np.zeros(437)
+    heated[17] = 300e-6
+    lead = frame(100.0, pixel=100, duration_s=1.0).frames[0]  # time to hand over the second, which must not be late
+    sequence = FrameSequence((lead, TactileFrame("f", 1.0, 0.05, heated)))
+    first = armed.submit(lambda: sequence, "first").result(10)
     second = armed.submit(lambda: frame(350.0), "second").result(10)
     rest = armed.submit(lambda: frame(350.0, pixel=300), "rest").result(10)
     assert second.pulses.energy_j[0] < 0.99 * rest.pulses.energy_j[0]
