@@ -347,7 +347,7 @@ class PlanQueue:
         self.events.append(ClockShift(delay_s))
         with self.lock:
             self._thermal = self._thermal.with_delay(delay_s)
-            self._queue_end_s = 0.0
+            self._queue_end_s = self._thermal.budget.at_s
 
     # --- restarts of the planner --------------------------------------------------------------------------------
 

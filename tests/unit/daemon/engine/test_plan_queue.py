@@ -239,5 +239,13 @@ def test_heat_and_budget_follow_a_restart_of_the_board_s_clock(rig):
     assert float(after.thermal.budget.at_s - before.thermal.budget.at_s) == pytest.approx(-now_s)
 
 
+def test_a_plan_may_follow_a_new_link_process_at_once(rig):
+    record = submit(rig, build_train(3.0))
+    rig.until(lambda: record.executed_count > 5)
+    rig.queue.fail_all("the link process has ended")  # up to a lease from now pulses may have started
+    rig.queue.on_board_restarted(0.0)
+    assert finish(rig, submit(rig, build_frame(60.0))).status == "done"
+
+
 def test_an_empty_plan_is_done_at_once(rig):
     assert finish(rig, submit(rig, build_frame(0.0))).status == "done"
