@@ -41,10 +41,10 @@ def _is_writable(folder: Path) -> bool:
     return os.access(folder, os.W_OK)
 
 
-CACHE_VERSION = "3"
+CACHE_VERSION = "4"
 """Changes with what cached machine code refers to and with the compiler's options.
 
-1 named generated modules by their content; 2 counted references in every kernel.
+1 named generated modules by their content; 2 counted references in every kernel; 3 did not tell those that do so apart.
 """
 _FOLDER = _cache_dir()
 CACHED = _is_writable(_FOLDER)
@@ -92,6 +92,7 @@ def _collect_code(code: CodeType, docstring: str | None, parts: list[str], names
 def _collect_value(value: Any, names: list[str], parts: list[str], visited: set[int]) -> None:
     callee = getattr(value, "py_func", value)
     if isinstance(callee, FunctionType):
+        parts.append(repr(getattr(value, "targetoptions", None)))
         _collect_function(callee, parts, visited)
     elif isinstance(value, np.ndarray):
         parts.append(f"{value.dtype} {value.shape} {sha256(np.ascontiguousarray(value).tobytes()).hexdigest()}")
@@ -173,11 +174,13 @@ class _KernelCache(FunctionCache):
     """
 
     _impl_class = _KernelCacheImpl
+    counts_references = False
 
     @cached_property
     def file_base(self) -> str:
         """Name of the kernel's cache files without their suffixes."""
-        return f"{self._impl.filename_base}-{code_stamp(self._py_func)[:24]}"
+        kind = "array" if self.counts_references else "plain"
+        return f"{self._impl.filename_base}-{kind}-{code_stamp(self._py_func)[:24]}"
 
     def is_empty(self) -> bool:
         """Return whether no machine code of the kernel is cached."""
@@ -230,6 +233,7 @@ def _compile(function: Callable[P, T], counts_references: bool) -> Callable[P, T
     compiled = _njit(nogil=True, error_model="numpy", _nrt=counts_references)(function)
     if CACHED:
         compiled._cache = _new_cache(function)
+        compiled._cache.counts_references = counts_references
         _caches.append(compiled._cache)
     result: Callable[P, T] = compiled
     return result
