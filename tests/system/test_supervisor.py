@@ -12,10 +12,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pytest
-from tiny_daemon import LIFE_S
 
 from optodrive.daemon.supervisor.child import HANG_S, RESTART_DELAYS_S
 from optodrive.daemon.supervisor.supervisor import END_GRACE_S
+from tiny_daemon import LIFE_S
 
 PROGRAM = Path(__file__).with_name("tiny_daemon.py")
 PATIENCE_S = 20.0
