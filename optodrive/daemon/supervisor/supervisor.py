@@ -248,9 +248,13 @@ class Supervisor:
     def _publish(self) -> None:
         """Feed the watchdog while all beats are fresh, and tell the service manager about processes and board."""
         missing = [child.name for child in self._children if not child.is_ready or child.killed_because]
-        board = f"board at {self.link_view.status.get('port', '')}, {self.link_view.board_state}"
-        text = f"waiting for {', '.join(missing)}" if missing else board
-        if text != self._status_text and (missing or self.link_view.status):
+        if missing:
+            text = f"waiting for {', '.join(missing)}"
+        elif self.link_view.status:
+            text = f"board at {self.link_view.status.get('port', '')}, {self.link_view.board_state}"
+        else:
+            text = "waiting for the state of the board"
+        if text != self._status_text:
             self._status_text = text
             self._notifier.send(f"STATUS={text}")
         if not missing:
