@@ -88,3 +88,15 @@ def test_the_model_file_is_a_parameter_set_for_a_configuration(recording, tmp_pa
     assert str(out) in config.read_text()
     assert run(["config", "check", "--config", str(config)]) == 0
     capsys.readouterr()
+
+
+def test_the_readme_chain_records_the_noise_of_instruments_and_finds_no_error(tmp_path, capsys):
+    frames, out = tmp_path / "frames.json", tmp_path / "recording.h5"
+    targets = {str(pixel): 60 + 80 * pixel for pixel in range(4)}
+    frames.write_text(json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": targets}]}))
+    for noise, said in (([], "1 K, 0.25 µm, 0.1 mN rms"), (["--noise", "0"], "none: the recording is exact")):
+        out.unlink(missing_ok=True)
+        assert run(["simulate", str(frames), "--out", str(out), *noise]) == 0
+        assert said in capsys.readouterr().out
+        assert run(["diagnose", str(out), "--json", "-"]) == 0
+        assert json.loads(capsys.readouterr().out)["verdict"] == "none"

@@ -1,7 +1,5 @@
 """Outputs of commands: every path is checked before anything is read or computed, by its folder and its suffix."""
 
-import json
-
 import pytest
 
 from optodrive.cli.main import run
@@ -73,15 +71,3 @@ def test_forms_of_an_output(tmp_path):
     ):
         with pytest.raises(InputError, match="--out"):
             check_output("--out", path, *suffixes, folder=folder)
-
-
-def test_the_readme_chain_records_the_noise_of_instruments_and_finds_no_error(tmp_path, capsys):
-    frames, out = tmp_path / "frames.json", tmp_path / "recording.h5"
-    targets = {str(pixel): 60 + 80 * pixel for pixel in range(4)}
-    frames.write_text(json.dumps({"frames": [{"show_at_s": 0.0, "duration_s": 0.5, "target_um": targets}]}))
-    for noise, said in (([], "1 K, 0.25 µm, 0.1 mN rms"), (["--noise", "0"], "none: the recording is exact")):
-        out.unlink(missing_ok=True)
-        assert run(["simulate", str(frames), "--out", str(out), *noise]) == 0
-        assert said in capsys.readouterr().out
-        assert run(["diagnose", str(out), "--json", "-"]) == 0
-        assert json.loads(capsys.readouterr().out)["verdict"] == "none"
