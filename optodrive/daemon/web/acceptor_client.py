@@ -25,11 +25,12 @@ class AcceptorClient:
     """Connection to the acceptor, which connects again after its end. The event loop's thread calls everything.
 
     on_connection: receives each connection, and owns it; it calls `permit` when the next may come
-    on_lost: called after the end of the acceptor's process
+    on_connected: called before the first connection may come; on_lost: after the end of the acceptor's process
     """
 
     def __init__(self, path: Path) -> None:
         self.on_connection: Callable[[Waiting], None] = lambda waiting: waiting.sock.close()
+        self.on_connected: Callable[[], None] = lambda: None
         self.on_lost: Callable[[], None] = lambda: None
         self._path = path
         self._socket: socket.socket | None = None
@@ -63,6 +64,7 @@ class AcceptorClient:
             return
         self._socket, self._beaten_s = link, time.monotonic()
         loop.add_reader(link, self._receive, link)
+        self.on_connected()
         for rank, count in PERMITTED.items():
             for _ in range(count):
                 self.permit(rank)

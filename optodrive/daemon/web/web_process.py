@@ -77,6 +77,7 @@ class WebProcess:
     ) -> None:
         self._client = client
         self._acceptor = acceptor
+        acceptor.on_connected = self._beat_link  # the first caller may arm at once
         acceptor.on_lost = self._go_dark
         self._policy = policy
         self._beat = beat
@@ -126,13 +127,16 @@ class WebProcess:
     async def _send_beats(self) -> None:
         deadline_s, is_ready = time.monotonic() + READY_TIMEOUT_S, False
         while True:
-            self._client.link.beat(alive=self._acceptor.check_beats())
+            self._beat_link()
             self._beat.beat()
             is_complete = self._client.is_complete and self._acceptor.is_connected
             if not is_ready and self.server.started and (is_complete or time.monotonic() > deadline_s):
                 is_ready = True
                 self._beat.report_ready()
             await asyncio.sleep(BEAT_INTERVAL_S)
+
+    def _beat_link(self) -> None:
+        self._client.link.beat(alive=self._acceptor.check_beats())
 
     def _go_dark(self) -> None:
         """Stop, unless a plan may finish: soon no new caller can."""
